@@ -266,7 +266,7 @@ def test_corrected_with_the_papers_inputs_the_bias_is_stored_energy() -> None:
     ("arguments", "words"),
     [
         ({"dt": 0.0}, "dt is 0.0"), ({"R": [[0.0]]}, "R must be positive definite"),
-        ({"R": np.eye(2)}, r"R is \(2, 2\)"),
+        ({"R": np.eye(2)}, "R is 2 by 2"),
         ({"parameter_scales": [0.0]}, "must be positive"), ({"u": np.ones((1, 1))}, "at least 2"),
         ({"u": np.ones((9, 2))}, r"\(samples, 1\)"), ({"initial_state": [1.0, np.inf]}, r"initial_state\.b is inf"),
     ],

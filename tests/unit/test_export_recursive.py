@@ -166,13 +166,13 @@ def test_a_nonlinear_design_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: obsynth.load(None), "path is None"),
-        (lambda: obsynth.load(3), "path is 3"),
+        (lambda: obsynth.load(None), "path is a NoneType"),
+        (lambda: obsynth.load(3), "path is a int"),
         (lambda: obsynth.sample_observer(None, 0.1), "observer is a NoneType"),
         (lambda: obsynth.sample_observer(designed("filter"), 0.1), "observer is a ObserverDesign"),
         (lambda: obsynth.export(None, "a.c"), "design is a NoneType"),
         (lambda: obsynth.export(designed("filter"), None), "path is a NoneType"),
-        (lambda: designed("filter").save(None), "path is None"),
+        (lambda: designed("filter").save(None), "path is a NoneType"),
         (lambda: obsynth.run_on_data(None, "log.csv"), "design is a NoneType"),
         (lambda: obsynth.run_on_data(designed("filter"), None), "data is a NoneType"),
         (lambda: obsynth.run_on_data(designed("filter"), [[0.0]]), "data is a list"),

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.newton import ScaledMatrix
 from obsynth.numerics.ranks import IDENTIFIABLE_SHARE, NAMED_SHARE, SINGULAR_CONDITION, covariance_factor, is_definite
@@ -125,8 +126,7 @@ def identifiability(
     inputs, noise, length = checked_inputs(model, u), as_matrix(R, "R"), step_length(dt)
     if len(inputs) < FEWEST_SAMPLES:
         raise SpecError(f"u has {len(inputs)} samples: a trajectory needs at least {FEWEST_SAMPLES}.", path="u")
-    if noise.shape != (model.ny, model.ny):
-        raise SpecError(f"R is {noise.shape}, but ({model.ny}, {model.ny}) is needed.", path="R")
+    require_shape(noise.shape, (model.ny, model.ny), "R")
     root = covariance_factor(noise, "R")
     if not is_definite(noise, root):
         raise SpecError("R must be positive definite: a sensor without noise has no likelihood.", path="R")

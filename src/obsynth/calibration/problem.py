@@ -11,7 +11,7 @@ import numpy as np
 from obsynth.calibration.logs import EVEN, Log, bad_log, quantum, refused, repeats
 from obsynth.calibration.plants import CalibrationPlant, SampleGraphs, sample_graphs
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_number, whole_number
+from obsynth.numerics.arguments import is_number, real_number, require_mapping, require_shape, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.records import named_covariance, named_vector
@@ -225,27 +225,22 @@ def _priors(
 
 def _variances(given: Mapping[str, float | None] | None, names: Sequence[str], what: str) -> FloatArray:
     """Return known variances, NaN for those that are to be found."""
-    if given is not None and not isinstance(given, Mapping):
-        raise SpecError(f"{what} must be a mapping from names to variances.", path=what)
+    require_mapping(given, what)
     found = np.full(len(names), np.nan)
     for name, value in (given or {}).items():
         i = index_of(name, names, what=what)
         if value is None:
             continue
-        if not is_number(value) or not value > 0.0:
-            raise SpecError(
-                f"{what}.{name} is {value!r}: give a positive variance, or leave it out to have it found.",
-                path=f"{what}.{name}",
-            )
-        found[i] = float(value)
+        found[i] = real_number(
+            value, f"{what}.{name}", "a positive variance, or leave it out to have it found", above=0.0
+        )
     return found
 
 
 def _covariance(plant: CalibrationPlant, value: Any) -> FloatArray:
     default, nx = plant.state_deviations**2, len(plant.state_names)
     matrix = named_covariance(value, plant.state_names, "initial_covariance", default, others=default)
-    if matrix.shape != (nx, nx):
-        raise SpecError(f"initial_covariance is {matrix.shape}, but {(nx, nx)} is needed.", path="initial_covariance")
+    require_shape(matrix.shape, (nx, nx), "initial_covariance")
     covariance_factor(matrix, "initial_covariance")
     return matrix
 

@@ -14,7 +14,7 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.alarm_proof import ALARM_KIND
 from obsynth.experiments.assumptions import Log, file_digest
 from obsynth.experiments.tolerance_study import study_statement, tolerance_study
-from obsynth.files.inputs import file_to_read, read_json
+from obsynth.files.inputs import path_of, read_json
 from obsynth.results.certificate_files import (
     CALIBRATION_KIND,
     COMPARISON,
@@ -75,7 +75,7 @@ def verify_certificate(path: str | Path, *, data: str | Path | None = None) -> V
     SpecError
         The file is no certificate (gain sets are read by `load`), or ``data`` does not belong to its kind.
     """
-    kind = kind_of_file(file_to_read(path))
+    kind = kind_of_file(path_of(path))
     if data is not None and kind not in (ALARM_KIND, COMPARISON):
         raise SpecError("data is for the certificates of alarms and comparisons.", path="data")
     if kind == ALARM_KIND:

@@ -15,7 +15,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.methods.conic import lmi
-from obsynth.numerics.arguments import is_finite_number, shown
+from obsynth.numerics.arguments import real_number, require_shape
 from obsynth.numerics.regions import LMIRegion, checked_region
 
 if TYPE_CHECKING:
@@ -152,8 +152,7 @@ def h2(
     .. [Scherer1997] C. Scherer, P. Gahinet, M. Chilali, IEEE TAC 42 (7), 1997, section III.
     """
     n, nw, nz = _sizes(A, B, C, D, P)
-    if getattr(Z, "shape", None) != (nw, nw):
-        raise SpecError(f"Z is {_shape(Z)}, but {(nw, nw)} is needed.", path="Z")
+    require_shape(_shape(Z), (nw, nw), "Z")
     pa, pb = _moved(A, P, Y, Cy), _moved(B, P, Y, Dy)
     if dt > 0.0:
         first = lmi.symmetric_blocks([[P], [pa, P], [C, np.zeros((nz, n)), np.eye(nz)]])
@@ -246,8 +245,7 @@ def admissible(
     .. [Xu1999] S. Xu, C. Yang, Stabilization of discrete-time singular systems, Automatica 35 (9), 1999.
     """
     _square_matrix(A, P)
-    if _shape(E) != _shape(A):
-        raise SpecError(f"E is {_shape(E)}, but {_shape(A)} is needed.", path="E")
+    require_shape(_shape(E), _shape(A), "E")
     e, a = np.asarray(E, dtype=np.float64), A
     if dt > 0.0:
         if Y is not None:
@@ -264,15 +262,12 @@ def _moved(matrix: Any, P: Any, Y: Any, measured: Any) -> Any:
         return P @ matrix
     if measured is None:
         return P @ matrix
-    if getattr(Y, "shape", None) != (_shape(P)[0], _shape(measured)[0]):
-        raise SpecError(f"Y is {_shape(Y)}, but {(_shape(P)[0], _shape(measured)[0])} is needed.", path="Y")
+    require_shape(_shape(Y), (_shape(P)[0], _shape(measured)[0]), "Y")
     return P @ matrix - Y @ measured
 
 
 def _square(gamma: Any) -> float:
-    if not is_finite_number(gamma) or not gamma > 0.0:
-        raise SpecError(f"gamma is {shown(gamma)}: give a positive number, or gamma_squared=.", path="gamma")
-    return float(gamma) ** 2
+    return real_number(gamma, "gamma", "a positive number, or gamma_squared=", above=0.0) ** 2
 
 
 def _shape(matrix: Any) -> tuple[int, ...]:
@@ -283,8 +278,7 @@ def _square_matrix(A: Any, P: Any) -> int:
     shape = _shape(A)
     if len(shape) != 2 or shape[0] != shape[1]:
         raise SpecError(f"A is {shape}: give a square matrix.", path="A")
-    if _shape(P) != shape:
-        raise SpecError(f"P is {_shape(P)}, but {shape} is needed.", path="P")
+    require_shape(_shape(P), shape, "P")
     return shape[0]
 
 
@@ -297,6 +291,5 @@ def _sizes(A: Any, B: Any, C: Any, D: Any, P: Any) -> tuple[int, int, int]:
             raise SpecError(f"{name} is {shape}: give a matrix.", path=name)
     nw, nz = shapes["B"][1], shapes["C"][0]
     for name, wanted in (("B", (n, nw)), ("C", (nz, n)), ("D", (nz, nw))):
-        if shapes[name] != wanted:
-            raise SpecError(f"{name} is {shapes[name]}, but {wanted} is needed.", path=name)
+        require_shape(shapes[name], wanted, name)
     return n, nw, nz

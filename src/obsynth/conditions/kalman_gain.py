@@ -24,11 +24,12 @@ from obsynth.analysis.time_varying import as_time_varying
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.conditions import atoms
 from obsynth.conditions.problem import Conditions, Values, require_data
-from obsynth.errors import ObsynthError, SpecError, VerificationError
+from obsynth.errors import ObsynthError, VerificationError
 from obsynth.methods.functions import descriptor_kalman
 from obsynth.methods.recursive.steady_filter import steady_state_filter
 from obsynth.methods.recursive.synthesis import with_stated_noise
 from obsynth.methods.recursive.unknown_inputs import kalman_conditions, without_unknown_inputs
+from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.norms import output_covariance
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, covariance_factor
@@ -198,8 +199,7 @@ def _noisy_plant(own: DescriptorSystem, Q: Any, R: Any) -> tuple[TimeVaryingDesc
 def _covariance(given: Any, size: int, name: str) -> FloatArray:
     matrix = as_matrix(given, name)
     matrix = float(matrix[0, 0]) * np.eye(size) if np.ndim(given) == 0 else matrix
-    if matrix.shape != (size, size):
-        raise SpecError(f"{name} is {matrix.shape}, but {(size, size)} is needed.", path=name)
+    require_shape(matrix.shape, (size, size), name)
     return matrix
 
 

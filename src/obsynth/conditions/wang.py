@@ -37,7 +37,7 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import (
     restricted_equivalent_from,
     with_sensor_faults_as_states,
 )
-from obsynth.numerics.arguments import chosen, is_finite_number, shown
+from obsynth.numerics.arguments import chosen, real_number, require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.ranks import RANK_TOLERANCE
@@ -155,7 +155,8 @@ def wang2015(
         gamma_squared = variables["gamma_squared"] = cp.Variable(nonneg=True, name="gamma_squared")
         goal = cp.Minimize(gamma_squared)
     else:
-        gamma_squared = cp.Parameter(nonneg=True, value=_level(gamma) ** 2, name="gamma_squared")
+        level = real_number(gamma, "gamma", "a positive number", above=0.0)
+        gamma_squared = cp.Parameter(nonneg=True, value=level**2, name="gamma_squared")
         goal = cp.Minimize(0)
     if free:
         Vw = variables["Vw"] = cp.Variable((q, m - q), name="Vw") if m > q else np.zeros((q, 0))
@@ -220,8 +221,7 @@ def _restricted_equivalent(
         return states * found.T * found.scaling.equations, states * found.N * found.scaling.outputs
     t, n = as_matrix(T, "T"), as_matrix(N, "N")
     for name, matrix, shape in (("T", t, (work.nx, work.nx)), ("N", n, (work.nx, work.ny))):
-        if matrix.shape != shape:
-            raise SpecError(f"{name} is {matrix.shape}, but {shape} is needed.", path=name)
+        require_shape(matrix.shape, shape, name)
     _require_identity("T E + N C", t @ work.E + n @ work.C, np.abs(t) @ np.abs(work.E) + np.abs(n) @ np.abs(work.C))
     return t, n
 
@@ -241,8 +241,7 @@ def _left_inverse(W: Any, Upsilon: FloatArray) -> FloatArray:
     if isinstance(W, str):
         raise SpecError(f"W is {W!r}: give a matrix, or 'free'.", path="W")
     weight = as_matrix(W, "W")
-    if weight.shape != Upsilon.T.shape:
-        raise SpecError(f"W is {weight.shape}, but {Upsilon.T.shape} is needed.", path="W")
+    require_shape(weight.shape, Upsilon.T.shape, "W")
     _require_identity("W Upsilon", weight @ Upsilon, np.abs(weight) @ np.abs(Upsilon))
     return weight
 
@@ -251,12 +250,6 @@ def _require_identity(name: str, found: FloatArray, size: FloatArray) -> None:
     miss = float(np.max(np.abs(found - np.eye(len(found))) / np.maximum(size, 1.0), initial=0.0))
     if not miss <= RANK_TOLERANCE:
         raise SpecError(f"{name} misses the identity by {miss:.3g}: give all digits.", path=name.split()[0])
-
-
-def _level(gamma: Any) -> float:
-    if not is_finite_number(gamma) or not gamma > 0.0:
-        raise SpecError(f"gamma is {shown(gamma)}: give a positive number.", path="gamma")
-    return float(gamma)
 
 
 def _existence(held: Sequence[Condition], convex: GainProblem, gamma: float | None) -> list[Condition]:

@@ -31,10 +31,10 @@ from obsynth.experiments.alarm_proof import (
 from obsynth.experiments.assumptions import Log, file_digest
 from obsynth.experiments.monitors.guaranteed import is_guaranteed
 from obsynth.experiments.monitors.options import WINDOW
-from obsynth.files.inputs import file_to_read
+from obsynth.files.inputs import path_of
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.verifying import verify
-from obsynth.numerics.arguments import is_whole, require_kind, require_mapping
+from obsynth.numerics.arguments import is_whole, require_kind, require_mapping, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.windows import WindowObserver
 from obsynth.results.certificate_files import SHOWN_DIGITS, opened
@@ -109,8 +109,7 @@ def prove_alarm(
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     for name, value in (("columns", columns), ("scales", scales)):
         require_mapping(value, name)
-    if not is_whole(row) or row < 2:
-        raise SpecError(f"row is {row!r}: give the number of a row, 2 or more.", path="row")
+    whole_number(row, "row", "the number of a row", least=2)
     if isinstance(design.observer, WindowObserver):
         raise SpecError(
             "prove-alarm is for plants with constant matrices: of this test obsynth verify proves the threshold of "
@@ -190,7 +189,7 @@ def verify_alarm(path: str | Path, *, data: str | Path | None = None) -> Verific
         The file is no certificate.
     """
     again = "prove the alarm again (obsynth prove-alarm)"
-    _, body, intact = opened(file_to_read(path), (ALARM_KIND,), ALARM_VERSION, "certificate of an alarm", again)
+    _, body, intact = opened(path_of(path), (ALARM_KIND,), ALARM_VERSION, "certificate of an alarm", again)
     checks = [_row("digest", "the file is as it was written", float(intact), 1.0, intact)]
     try:
         for check in _checked(body, None if data is None else Path(data)):

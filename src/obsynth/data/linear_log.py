@@ -15,7 +15,7 @@ import numpy as np
 from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, LogObserver, Row
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.experiments.monitors.monitor import LinearSample
-from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.linear.derived import noise_variances, transient
@@ -170,8 +170,8 @@ class LinearLogObserver(LogObserver):
 
     def __init__(self, design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None) -> None:
         self.plant, self.observer = design.linear
-        if gap is not None and not (is_finite_number(gap) and gap > 0.0):
-            raise SpecError(f"gap is {gap!r}: give seconds, a positive number.", path="gap")
+        if gap is not None:
+            real_number(gap, "gap", "seconds, a positive number", above=0.0)
         if gap is not None and self.observer.dt > 0.0:
             raise SpecError(SAMPLED_GAP, path="gap")
         super().__init__(self.observer, warm_up, transient(self.observer))

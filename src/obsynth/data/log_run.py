@@ -23,7 +23,7 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.monitor import LinearSample, Monitor, Sample
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.numerics.arguments import is_finite_number, is_number
+from obsynth.numerics.arguments import is_finite_number, is_number, real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.running import BY_COLUMNS
 from obsynth.plants.validation import index_of
@@ -215,8 +215,7 @@ class LogRun:
                 raise SpecError(
                     f"There is no column {name!r} to monitor: there are {', '.join(names)}.", path="thresholds"
                 )
-            if not (is_finite_number(level) and level > 0.0):
-                raise SpecError(f"The threshold of {name!r} is {level!r}: give a positive number.", path="thresholds")
+            real_number(level, f"The threshold of {name!r}", "a positive number", above=0.0, path="thresholds")
         self._levels = tuple((name, names.index(name), level) for name, level in thresholds.items())
         lags = observer.lags
         if self.recovered is not None and self.recovered.delay:

@@ -27,7 +27,7 @@ from obsynth.files.tables import table_writer
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.tolerant import rows_before
-from obsynth.numerics.arguments import is_whole, require_kind, require_mapping, truth
+from obsynth.numerics.arguments import require_kind, require_mapping, truth, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
@@ -437,8 +437,7 @@ def _require_arguments(
     if out is not None and not hasattr(out, "write"):
         require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
     for name, count in counts.items():
-        if not is_whole(count) or count < 1:
-            raise SpecError(f"{name} is {count!r}: give a whole number, 1 or more.", path=name)
+        whole_number(count, name)
     require_distinct(
         {
             "state": state,

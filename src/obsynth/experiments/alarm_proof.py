@@ -43,7 +43,7 @@ from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.methods.tracking import tracking_of
 from obsynth.methods.verifying import verify
-from obsynth.numerics.arguments import is_finite_number, is_whole
+from obsynth.numerics.arguments import real_number, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import MOST_LISTED, shown
 from obsynth.plants.validation import index_of
@@ -301,10 +301,12 @@ def _stated(affine: AffinePlant, given: Mapping[str, Any], steps: int) -> tuple[
         raise SpecError(
             f"Nothing bounds the state {missing[0]!r}: give initial_set (--initial), or its bound.", path="initial_set"
         )
-    for name in names:
-        if not (is_finite_number(given[name]) and given[name] >= 0.0):
-            raise SpecError(f"The bound of {name!r} is {given[name]!r}: give a number, 0 or more.", path="state_bounds")
-    sizes = np.array([float(given[name]) for name in names])
+    sizes = np.array(
+        [
+            real_number(given[name], f"The bound of {name!r}", "a number, 0 or more", least=0.0, path="state_bounds")
+            for name in names
+        ]
+    )
     back = np.abs(2.0 * np.eye(len(names)) - affine.coordinates) @ sizes
     high = np.tile(back, (steps, 1))
     return -high, high
@@ -634,8 +636,7 @@ def assumptions_of(
     plant, _ = design.linear
     if not plant.is_discrete:
         raise SpecError("A window is proved for sampled designs: this one is continuous in time.", path="gains")
-    if not is_whole(window) or window < 2:
-        raise SpecError(f"window is {window!r}: give a whole number of samples, 2 or more.", path="window")
+    whole_number(window, "window", "a whole number of samples", least=2)
     bounds = np.full(plant.nd, np.nan)
     for name, value in (disturbance_bounds or {}).items():
         bounds[index_of(name, plant.disturbance_names, what="disturbance_bounds")] = value

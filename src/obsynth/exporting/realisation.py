@@ -18,7 +18,7 @@ from obsynth.data.linear_log import GAP_LEFT_SHARE, LEAST_SHOWN, LinearLogObserv
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned import LearnedThresholds
 from obsynth.methods.handing_on import unverified_mark
-from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
+from obsynth.numerics.arguments import real_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
@@ -275,8 +275,7 @@ class Alarms:
                 raise SpecError(
                     f"There is no output {name!r} to monitor: there are {', '.join(watched)}.", path="thresholds"
                 )
-            if not is_finite_number(level) or level <= 0.0:
-                raise SpecError(f"The threshold of {name!r} is {level!r}: give a positive number.", path="thresholds")
+            real_number(level, f"The threshold of {name!r}", "a positive number", above=0.0, path="thresholds")
         levels = {name: float((thresholds or {}).get(name, 0.0)) for name in watched}
         if learned is not None:
             levels[STATISTIC] = 1.0

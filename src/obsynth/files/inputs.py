@@ -165,8 +165,8 @@ def reason(error: BaseException) -> str:
     return str(getattr(error, "strerror", None) or error).rstrip(".")
 
 
-def file_to_read(path: Any) -> Path:
-    """Return the path of a file that a caller names; raise `SpecError` for what names none."""
+def path_of(path: Any) -> Path:
+    """Return the path that a caller names; raise `SpecError` for what names none."""
     if not isinstance(path, (str, os.PathLike)):
         raise SpecError(f"path is a {type(path).__name__}: give the name of a file.", path="path")
     return Path(path)

@@ -20,7 +20,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from obsynth.errors import SpecError
-from obsynth.files.inputs import protected_as, reason, special_kind
+from obsynth.files.inputs import path_of, protected_as, reason, special_kind
 
 #: The system's ways to end a process; there is no hang-up on Windows.
 ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
@@ -113,9 +113,7 @@ class FileKind:
 
 def check_output(path: str | Path, *, option: str = "") -> Path:
     """Return where to write; refuse a hopeless place, and any file that the running command has read."""
-    if not isinstance(path, (str, os.PathLike)):
-        raise SpecError(f"path is {path!r}: give the name of a file.", path="path")
-    target = Path(path)
+    target = path_of(path)
     where = str(target)
     wanted = f"give the name of a file{f' to {option}' if option else ''}"
     try:

@@ -19,9 +19,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.files.inputs import file_to_read
+from obsynth.files.inputs import path_of
 from obsynth.importing.python_objects import plant_of
-from obsynth.numerics.arguments import is_finite_number, require_mapping
+from obsynth.numerics.arguments import real_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import imported
 from obsynth.plants.descriptor import DescriptorSystem
@@ -270,9 +270,8 @@ def from_fmu(
     """
     require_mapping(at, "at")
     for name, value in (at or {}).items():
-        if not is_finite_number(value):
-            raise SpecError(f"at[{name!r}] is {value!r}: give a finite number.", path="at")
-    with _instance(file_to_read(path)) as instance:
+        real_number(value, f"at[{name!r}]", "a finite number", path="at")
+    with _instance(path_of(path)) as instance:
         used = _used(instance.input_names, inputs, "inputs"), _used(instance.output_names, outputs, "outputs")
         for name in at or {}:
             if name not in instance.settable:

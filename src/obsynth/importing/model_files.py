@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.files.inputs import file_to_read, read_text
+from obsynth.files.inputs import path_of, read_text
 from obsynth.importing.python_objects import plant_of
 from obsynth.numerics.arguments import number_in_text
 from obsynth.numerics.arrays import FloatArray
@@ -65,7 +65,7 @@ def from_matlab(
     SpecError
         The file cannot be read, holds no such struct, or its matrices do not fit together.
     """
-    source = file_to_read(path)
+    source = path_of(path)
     content = _content(source)
     fields = _fields(content, variable, source)
     if "A" not in fields:
@@ -183,7 +183,7 @@ def from_modelica(path: str | Path, **plant: Any) -> DescriptorSystem:
     The file does not hold the outputs at the operating point: add them by ``operating_point={...}``.  Constant terms
     are not in it either: linearise in a steady state.
     """
-    source = file_to_read(path)
+    source = path_of(path)
     if not source.exists():
         raise SpecError(f"{source} cannot be read: {os.strerror(errno.ENOENT)}.", path=str(source))
     text = re.sub(r"//[^\n]*|/\*.*?\*/", "", read_text(source), flags=re.DOTALL)

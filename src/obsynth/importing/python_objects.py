@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, require_mapping, shown
+from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping, require_shape, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.libraries import imported
 from obsynth.plants.dae.model import DAEModel
@@ -96,11 +96,7 @@ def plant_of(
 def _full(matrix: FloatArray | None, rows: int, columns: int, name: str) -> FloatArray:
     if matrix is None or (matrix.size == 0 and 0 in (rows, columns)):
         return np.zeros((rows, columns))
-    if matrix.shape != (rows, columns):
-        hint = " Is it transposed?" if matrix.shape == (columns, rows) else ""
-        raise SpecError(
-            f"{name} is {matrix.shape[0]} by {matrix.shape[1]}, but {rows} by {columns} is needed.{hint}", path=name
-        )
+    require_shape(matrix.shape, (rows, columns), name)
     return matrix
 
 
@@ -163,10 +159,7 @@ def from_control(
     control = imported("control", extra=None)
     if isinstance(system, control.TransferFunction):
         system = control.ss(system)
-    if not isinstance(system, control.StateSpace):
-        raise SpecError(
-            f"system is a {type(system).__name__}: give a control.StateSpace, such as control.ss(...).", path="system"
-        )
+    require_kind(system, control.StateSpace, "system", "a control.StateSpace, such as control.ss(...)")
     labels = {
         "state_names": system.state_labels,
         "input_names": system.input_labels,
@@ -215,8 +208,7 @@ def from_scipy(
         It is no linear system of scipy, a name is unknown, or a discrete system does not say its ``dt``.
     """
     signal = imported("scipy.signal", extra=None)
-    if not isinstance(system, (signal.lti, signal.dlti)):
-        raise SpecError(f"system is a {type(system).__name__}: give a scipy.signal.StateSpace.", path="system")
+    require_kind(system, (signal.lti, signal.dlti), "system", "a scipy.signal.StateSpace")
     state_space = system.to_ss()
     return plant_of(
         {"E": E, **{name: np.asarray(getattr(state_space, name)) for name in "ABCD"}},

@@ -20,18 +20,44 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, holds_truth, unmasked
 
 
-def real_number(value: Any, name: str, what: str = "a number") -> float:
-    """Return a finite real number; raise `SpecError` naming the argument and ``what`` it should be."""
-    if not is_finite_number(value):
-        raise SpecError(f"{name} is {shown(value)}: give {what}.", path=name)
+def real_number(
+    value: Any,
+    name: str,
+    what: str = "a number",
+    *,
+    above: float = -math.inf,
+    least: float = -math.inf,
+    below: float = math.inf,
+    path: str | None = None,
+) -> float:
+    """Return a finite number in a range; raise `SpecError` naming the argument and ``what`` it should be."""
+    if not is_finite_number(value) or not (above < value < below and value >= least):
+        raise SpecError(f"{name} is {shown(value)}: give {what}.", path=path or name)
     return float(value)
 
 
-def whole_number(value: Any, name: str, what: str = "a whole number") -> int:
-    """Return an integer that is one or more; raise `SpecError` naming the argument and ``what`` it should be."""
-    if not is_whole(value) or value < 1:
-        raise SpecError(f"{name} is {shown(value)}: give {what}, at least 1.", path=name)
+def whole_number(value: Any, name: str, what: str = "a whole number", *, least: int = 1) -> int:
+    """Return a whole number; raise `SpecError` naming the argument, ``what`` it should be, and the least one."""
+    if not is_whole(value) or value < least:
+        raise SpecError(f"{name} is {shown(value)}: give {what}, at least {least}.", path=name)
     return int(value)
+
+
+def shape_problem(found: tuple[int, ...], wanted: tuple[int, ...], name: str) -> str | None:
+    """Return what is wrong with the shape of an array, as a sentence; ``None`` where nothing is."""
+    if found == wanted:
+        return None
+    turned = len(found) == len(wanted) == 2 and found[1] == wanted[0] != found[0]
+    hint = " Is it transposed?" if turned or found == wanted[::-1] else ""
+    sides = [" by ".join(map(str, shape)) or "a single number" for shape in (found, wanted)]
+    return f"{name} is {sides[0]}, but {sides[1]} is needed.{hint}"
+
+
+def require_shape(found: tuple[int, ...], wanted: tuple[int, ...], name: str) -> None:
+    """Raise `SpecError` naming the argument where an array has another shape than is needed."""
+    problem = shape_problem(found, wanted, name)
+    if problem:
+        raise SpecError(problem, path=name)
 
 
 def truth(value: Any, name: str) -> bool:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, shown
+from obsynth.numerics.arguments import real_number, shown
 from obsynth.numerics.arrays import FloatArray, read_only
 
 
@@ -90,7 +90,7 @@ def disk(center: float, radius: float) -> LMIRegion:
     SpecError
         The center is no real number, or the radius is not positive.
     """
-    c, r = _number(center, "center"), _positive(radius, "radius")
+    c, r = real_number(center, "center"), real_number(radius, "radius", "a positive number", above=0.0)
     return LMIRegion(
         np.array([[-r, -c], [-c, -r]]),
         np.array([[0.0, 1.0], [0.0, 0.0]]),
@@ -117,7 +117,7 @@ def half_plane(decay: float) -> LMIRegion:
     SpecError
         The decay is no real number.
     """
-    a = _number(decay, "decay")
+    a = real_number(decay, "decay")
     return LMIRegion(np.array([[2.0 * a]]), np.array([[1.0]]), f"half_plane({a:g})", ({"half_plane": a},))
 
 
@@ -140,9 +140,7 @@ def sector(damping: float) -> LMIRegion:
     SpecError
         The damping is no number between 0 and 1.
     """
-    c = _number(damping, "damping")
-    if not 0.0 < c < 1.0:
-        raise SpecError(f"damping is {shown(damping)}: give a ratio between 0 and 1.", path="damping")
+    c = real_number(damping, "damping", "a ratio between 0 and 1", above=0.0, below=1.0)
     s = float(np.sqrt(1.0 - c**2))
     return LMIRegion(np.zeros((2, 2)), np.array([[s, c], [-c, s]]), f"sector({c:g})", ({"sector": c},))
 
@@ -173,15 +171,3 @@ def _written(part: Mapping[str, Any], name: str) -> LMIRegion:
     if len(numbers) != (2 if kind == "disk" else 1):
         raise SpecError(f"{name}: {kind} takes {'[center, radius]' if kind == 'disk' else 'one number'}.", path=name)
     return makers[kind](*numbers)
-
-
-def _number(value: Any, name: str) -> float:
-    if not is_finite_number(value):
-        raise SpecError(f"{name} is {shown(value)}: give a number.", path=name)
-    return float(value)
-
-
-def _positive(value: Any, name: str) -> float:
-    if not is_finite_number(value) or not value > 0.0:
-        raise SpecError(f"{name} is {shown(value)}: give a positive number.", path=name)
-    return float(value)

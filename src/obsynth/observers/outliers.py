@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arguments import chosen, is_finite_number
+from obsynth.numerics.arguments import chosen, real_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.records import named_bounds, named_vector
 
@@ -47,11 +47,7 @@ def checked_limit(kind: str, limit: float | None) -> float:
     chosen(kind, "outliers", OUTLIER_KINDS)
     if limit is None:
         return LIMITS.get(kind, float("inf"))
-    if not is_finite_number(limit) or not limit > 0.0:
-        raise SpecError(
-            f"outlier_limit is {limit!r}: give a positive number of standard deviations.", path="outlier_limit"
-        )
-    return float(limit)
+    return real_number(limit, "outlier_limit", "a positive number of standard deviations", above=0.0)
 
 
 def checked_sizes(value: Any, names: Sequence[str]) -> FloatArray | None:

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arguments import is_whole
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arguments import whole_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.numerics.square_root_estimation import Gaussian, SmootherGain, joint_step, nothing_later, stepped_back
@@ -500,12 +500,7 @@ def checked_lag(lag: Any) -> int | None:
     """Return the lag of a smoother in samples, or ``None`` for the whole record."""
     if lag is None:
         return None
-    if not is_whole(lag) or lag < 1:
-        raise SpecError(
-            f"lag is {lag!r}: give how many samples are waited for, 1 or more, or None for the whole record.",
-            path="lag",
-        )
-    return int(lag)
+    return whole_number(lag, "lag", "how many samples are waited for, or None for the whole record")
 
 
 def smoothed_record(observer: SmoothedObserver, y: ArrayLike, u: ArrayLike | None, lag: int | None) -> Estimates:

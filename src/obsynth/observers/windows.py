@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_whole, real_array, real_vector
+from obsynth.numerics.arguments import real_array, real_vector, whole_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.records import (
@@ -77,10 +77,7 @@ class WindowObserver(Observer[WindowState, float]):
     def __post_init__(self) -> None:
         for field in NAME_FIELDS:
             require_names(getattr(self, field), field)
-        if not is_whole(self.samples) or self.samples < 1:
-            raise SpecError(
-                f"samples of the observer is {self.samples!r}: give a whole number, 1 or more.", path="samples"
-            )
+        whole_number(self.samples, "samples")
         weights = as_matrix(self.weights, "weights")
         width = self.samples * (len(self.input_names) + len(self.output_names))
         programmes = np.asarray(self.programmes, dtype=np.float64).ravel()

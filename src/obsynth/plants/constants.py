@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, is_number
+from obsynth.numerics.arguments import chosen, is_finite_number, is_number, real_number
 from obsynth.numerics.arrays import FloatArray
 
 VARIATIONS = ("constant", "varying")
@@ -58,11 +58,7 @@ class Constant:
     def __post_init__(self) -> None:
         path = f"constants.{self.name}"
         for key, value in (("nominal", self.nominal), ("range", self.low), ("range", self.high)):
-            if not is_finite_number(value):
-                raise SpecError(
-                    f"The {key} of {self.name!r} is {value!r}: give finite numbers. A box needs both ends.",
-                    path=path,
-                )
+            real_number(value, f"The {key} of {self.name!r}", "finite numbers. A box needs both ends", path=path)
         if not self.low <= self.nominal <= self.high:
             raise SpecError(
                 f"The nominal value {self.nominal:g} of {self.name!r} is outside its range {self.low:g} .. "
@@ -136,10 +132,8 @@ class ConstantsBox:
     def __post_init__(self) -> None:
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
         object.__setattr__(self, "calibrated", tuple(self.calibrated))
-        if self.variation not in VARIATIONS:
-            raise SpecError(f"variation is {self.variation!r}: use one of {', '.join(VARIATIONS)}.", path="variation")
-        if self.source not in SOURCES:
-            raise SpecError(f"source is {self.source!r}: use one of {', '.join(SOURCES)}.", path="source")
+        chosen(self.variation, "variation", VARIATIONS)
+        chosen(self.source, "source", SOURCES)
         calibrated = self.source == "calibrated"
         if calibrated and not (is_finite_number(self.level) and 0.0 < float(self.level or 0.0) < 1.0):
             raise SpecError(

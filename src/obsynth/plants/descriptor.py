@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse, same_matrix
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertainty_of
@@ -337,12 +338,7 @@ def _noise_of_sensors(
     """Append a column to Bw, Dw in ``given`` for each sensor with a standard deviation; return their names."""
     if sensor_noise is None:
         return ()
-    if not isinstance(sensor_noise, Mapping):
-        raise SpecError(
-            f"sensor_noise is a {type(sensor_noise).__name__}: give a standard deviation by output, such "
-            "as {'speed': 0.01}.",
-            path="sensor_noise",
-        )
+    require_kind(sensor_noise, Mapping, "sensor_noise", "a standard deviation by output, such as {'speed': 0.01}")
     require_picked(sensor_noise, outputs, what="sensor_noise")
     columns = np.zeros((len(outputs), len(sensor_noise)))
     for column, (name, value) in enumerate(sensor_noise.items()):

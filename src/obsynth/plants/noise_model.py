@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arguments import real_number, require_mapping
 from obsynth.plants.dae.functions import BUTCHER
 from obsynth.plants.validation import index_of
 
@@ -92,17 +92,12 @@ def stated_number(value: Any, path: str) -> float:
             f"{path} is unknown: find it from normal rows (obsynth calibrate --write-spec), or state a number.",
             path=path,
         )
-    if not is_finite_number(value) or not value > 0.0:
-        raise SpecError(
-            f"{path} is {value!r}: give a number above 0 ({', '.join(SECONDS_OF_UNITS)} for times).", path=path
-        )
-    return float(value)
+    return real_number(value, path, f"a number above 0 ({', '.join(SECONDS_OF_UNITS)} for times)", above=0.0)
 
 
 def sensor_noises(given: Mapping[str, Any] | None, outputs: Sequence[str]) -> dict[str, SensorNoise]:
     """Return the noise of each sensor of which something is stated."""
-    if given is not None and not isinstance(given, Mapping):
-        raise SpecError("sensor_noise must be a mapping from outputs to their noise.", path="sensor_noise")
+    require_mapping(given, "sensor_noise")
     found = {}
     for name, item in (given or {}).items():
         index_of(name, outputs, what="sensor_noise")

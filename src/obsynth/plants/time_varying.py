@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, is_whole
+from obsynth.numerics.arguments import real_number, require_mapping, whole_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.expressions import NAMED_NUMBERS, Expression, parse_expression
 from obsynth.plants.descriptor import DescriptorSystem
@@ -227,14 +227,11 @@ def positive_dt(dt: Any) -> float:
 def checked_constants(constants: Mapping[str, float] | None) -> dict[str, float]:
     """Return names and finite values that expressions may use."""
     checked: dict[str, float] = {}
-    if constants is not None and not isinstance(constants, Mapping):
-        raise SpecError(f"constants is a {type(constants).__name__}: give names and values.", path="constants")
+    require_mapping(constants, "constants")
     for name, value in (constants or {}).items():
         if not (isinstance(name, str) and name.isidentifier()) or name == "k" or name in NAMED_NUMBERS:
             raise SpecError(f"constants names {name!r}: use letters, digits and '_', not k or pi.", path="constants")
-        if not is_finite_number(value):
-            raise SpecError(f"The constant {name!r} is {value!r}: give a finite number.", path=f"constants.{name}")
-        checked[name] = float(value)
+        checked[name] = real_number(value, f"The constant {name!r}", "a finite number", path=f"constants.{name}")
     return checked
 
 
@@ -262,8 +259,8 @@ def completed(found: Mapping[str, MatrixSequence | None], problems: Problems) ->
 
 def checked_horizon(horizon: int | None, values: Mapping[str, MatrixSequence]) -> int | None:
     """Return the number of steps that all stacks are good for, or ``None`` without any limit."""
-    if horizon is not None and (not is_whole(horizon) or horizon < 1):
-        raise SpecError(f"horizon is {horizon!r}: give the number of steps, at least 1.", path="horizon")
+    if horizon is not None:
+        whole_number(horizon, "horizon", "the number of steps")
     lengths = {name: m.length - _FIRST_INDEX[name] for name, m in values.items() if m.length is not None}
     if not lengths:
         return None if horizon is None else int(horizon)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, is_number, require_mapping, shown
+from obsynth.numerics.arguments import is_finite_number, is_number, require_mapping, shape_problem, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix, require_no_overflow
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
 
@@ -156,10 +156,9 @@ class Problems:
 
     def require_shape(self, found: tuple[int, ...], name: str, shape: tuple[int, int]) -> None:
         """Note a wrong shape."""
-        if found != shape:
-            turned = found[1] == shape[0] != found[0]
-            hint = " Is it transposed?" if turned or found == shape[::-1] else ""
-            self.note(f"{name} is {_by(found)}, but {_by(shape)} is needed.{hint}", name)
+        problem = shape_problem(found, shape, name)
+        if problem:
+            self.note(problem, name)
 
     def raise_if_any(self) -> None:
         """Raise one `SpecError` with all problems noted so far."""
@@ -203,10 +202,6 @@ def signal_counts(given: Mapping[str, FloatArray | None]) -> dict[str, int]:
     return counts | {"y": 0 if outputs is None else outputs.shape[0]}
 
 
-def _by(shape: tuple[int, ...]) -> str:
-    return " by ".join(map(str, shape))
-
-
 def checked_dt(dt: Any) -> float:
     """Return a sampling time in seconds, 0 for continuous time."""
     if not is_number(dt):
@@ -242,8 +237,7 @@ def _values(given: Mapping[str, float] | None, known: set[str], what: str, kind:
 
 def checked_units(units: Mapping[str, str] | None, known: set[str]) -> dict[str, str]:
     """Return units whose signals all exist."""
-    if units is not None and not isinstance(units, Mapping):
-        raise SpecError(f"units is a {type(units).__name__}: give signal names and their units.", path="units")
+    require_mapping(units, "units")
     require_known(units or {}, known, what="units", kind="signal")
     for name, value in (units or {}).items():
         if not isinstance(value, str):

@@ -15,6 +15,7 @@ from obsynth.analysis.zeros import fault_zeros, regularity_of
 from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.methods.ui_pi_observer.pencils import equilibrated
+from obsynth.numerics.arguments import chosen
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.modal_response import resolved
 from obsynth.numerics.norms import response
@@ -228,8 +229,7 @@ def estimate_gains(design: ObserverDesign, *, to: str = "faults") -> EstimateGai
         The design is recursive, or has no such output.
     """
     plant, observer = design.linear
-    if to not in TARGETS:
-        raise SpecError(f"to is {to!r}: use one of {', '.join(TARGETS)}.", path="to")
+    chosen(to, "to", tuple(TARGETS))
     rows = {"faults": observer.fault_rows, "states": observer.state_rows, "residuals": observer.residual_rows}[to]
     if rows.start == rows.stop:
         what = "estimates no faults" if to == "faults" else f"has no {to}"

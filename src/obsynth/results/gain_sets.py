@@ -16,7 +16,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.recovery import RecoveryOperator, StateRecovery
 from obsynth.errors import SpecError
-from obsynth.files.inputs import input_file, json_data, read_json
+from obsynth.files.inputs import input_file, json_data, path_of, read_json
 from obsynth.numerics.arguments import is_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
@@ -89,9 +89,7 @@ def load(path: str | Path) -> ObserverDesign:
     SpecError
         The file is missing, is no gain set, has an unknown schema version, or was changed.
     """
-    if not isinstance(path, (str, os.PathLike)):
-        raise SpecError(f"path is {path!r}: give the name of a file that a design was saved to.", path="path")
-    source = Path(path)
+    source = path_of(path)
     if source.is_dir() or not source.exists():
         why = os.strerror(errno.EISDIR if source.is_dir() else errno.ENOENT)
         raise SpecError(f"{source} cannot be read: {why}.", path=str(source))

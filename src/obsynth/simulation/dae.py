@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arguments import is_whole
+from obsynth.numerics.arguments import require_shape, whole_number
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.plants.dae.functions import Compiled, DAEFunctions, take_samples
@@ -69,8 +69,7 @@ def simulate_dae(
     inputs, length = checked_inputs(model, u), step_length(dt)
     theta = _parameters(model, parameters, len(inputs))
     x = finite_vector(initial_state, model.state_names, model.nominal_state, "initial_state")
-    if not is_whole(seed) or seed < 0:
-        raise SpecError(f"seed is {seed!r}: give a whole number, not negative.", path="seed")
+    whole_number(seed, "seed", least=0)
     rng = np.random.default_rng(seed)
     pushed = _noise(Q, model.nx, "Q", rng, len(inputs))
     measurement_noise = _noise(R, model.ny, "R", rng, len(inputs))
@@ -165,6 +164,5 @@ def _noise(value: ArrayLike | None, size: int, name: str, rng: np.random.Generat
     if value is None:
         return np.zeros((samples, size))
     covariance = as_matrix(value, name)
-    if covariance.shape != (size, size):
-        raise SpecError(f"{name} must be ({size}, {size}).", path=name)
+    require_shape(covariance.shape, (size, size), name)
     return np.asarray(rng.standard_normal((samples, size)) @ covariance_factor(covariance, name).T)

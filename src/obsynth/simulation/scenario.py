@@ -15,7 +15,15 @@ from typing import Any, ClassVar
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, is_number, is_whole, real_array, shown
+from obsynth.numerics.arguments import (
+    is_finite_number,
+    is_number,
+    real_array,
+    real_number,
+    require_kind,
+    shown,
+    whole_number,
+)
 from obsynth.numerics.arrays import FloatArray, require_no_overflow
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
@@ -388,13 +396,11 @@ class Scenario:
     def __post_init__(self) -> None:
         for name in ("horizon", "sample_time"):
             value = getattr(self, name)
-            if not (value is None and name == "sample_time") and not (is_finite_number(value) and value > 0.0):
-                raise SpecError(f"{name} is {shown(value)}: give seconds, a positive number.", path=name)
-        if not (is_finite_number(self.noise) and self.noise >= 0.0):
-            raise SpecError(f"noise is {shown(self.noise)}: give a factor, 0 or more.", path="noise")
+            if value is not None or name != "sample_time":
+                real_number(value, name, "seconds, a positive number", above=0.0)
+        real_number(self.noise, "noise", "a factor, 0 or more", least=0.0)
         require_no_overflow(self.noise, "noise", "noise")
-        if not is_whole(self.seed) or self.seed < 0:
-            raise SpecError(f"seed is {shown(self.seed)}: give a whole number, 0 or more.", path="seed")
+        whole_number(self.seed, "seed", least=0)
         for group, kinds in _ALLOWED.items():
             object.__setattr__(self, group, MappingProxyType(_checked_profiles(getattr(self, group), group, kinds)))
         for name in ("sensor_noise", "initial_state"):
@@ -514,8 +520,7 @@ def _made(given: dict[str, Any]) -> Scenario:
 
 
 def _checked_profiles(given: Any, group: str, kinds: tuple[type[Profile], ...]) -> dict[str, tuple[Profile, ...]]:
-    if not isinstance(given, Mapping):
-        raise SpecError(f"{group} must map names of signals to profiles.", path=group)
+    require_kind(given, Mapping, group, "profiles by the names of signals")
     found = {}
     for name, value in given.items():
         profiles = (value,) if isinstance(value, Profile) else tuple(value) if isinstance(value, (list, tuple)) else ()
@@ -536,10 +541,8 @@ def _checked_profiles(given: Any, group: str, kinds: tuple[type[Profile], ...]) 
 
 
 def _checked_numbers(given: Any, name: str) -> dict[str, float]:
-    if not isinstance(given, Mapping):
-        raise SpecError(f"{name} must map names of signals to numbers.", path=name)
+    require_kind(given, Mapping, name, "numbers by the names of signals")
     for key, value in given.items():
-        if not is_finite_number(value):
-            raise SpecError(f"{key!r} is {shown(value)}: give a finite number.", path=f"{name}.{key}")
+        real_number(value, repr(key), "a finite number", path=f"{name}.{key}")
         require_no_overflow(value, f"{name}[{key!r}]", f"{name}.{key}")
     return {str(key): float(value) for key, value in given.items()}

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.files.inputs import file_to_read, input_file
+from obsynth.files.inputs import input_file, path_of
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.libraries import one_thread_if_small
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
@@ -701,7 +701,7 @@ def load_spec(path: str | Path) -> Spec:
     PreconditionError
         The plant cannot be transformed as asked, for example because its index is not one.
     """
-    source = file_to_read(path)
+    source = path_of(path)
     return spec_of(read_yaml(source), source)
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.arguments import chosen, real_number, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import parse_expression
 from obsynth.numerics.ranks import JACOBIAN_RANK_TOLERANCE
@@ -59,8 +59,7 @@ def nominal_point(model: DAEModel, given: Mapping[str, float], free: Sequence[st
     known = [*model.state_names, *model.input_names, *model.parameter_names, *model.output_names]
     for name, value in given.items():
         index_of(name, known, what="given")
-        if not is_finite_number(value):
-            raise SpecError(f"given.{name} is {value!r}: give a finite number.", path=f"given.{name}")
+        real_number(value, f"given.{name}", "a finite number")
         if name in free:
             raise SpecError(f"{name!r} is both given and free: choose one.", path=f"given.{name}")
         for names, vector in places:
@@ -591,8 +590,7 @@ def linearise(
        moving point we keep E x' as an input, which is exact to first order.
     """
     require_kind(model, DAEModel, "model", "a DAEModel")
-    if at not in ("equilibrium", "point"):
-        raise SpecError(f"at is {at!r}: use 'equilibrium' or 'point'.", path="at")
+    chosen(at, "at", ("equilibrium", "point"))
     values, freed = dict(given or {}), _names(free, "free")
     for name, bounds in free.items() if isinstance(free, Mapping) else ():
         if np.shape(bounds) != (2,) or not float(bounds[0]) <= float(bounds[1]):
@@ -635,10 +633,7 @@ def _with_noise(
         columns = np.zeros((linear.nx, len(process_noise)))
         for column, (name, value) in enumerate(process_noise.items()):
             row = index_of(name, equations, what="process_noise")
-            if not is_finite_number(value) or not value > 0.0:
-                raise SpecError(
-                    f"process_noise[{name!r}] is {value!r}: give an intensity above 0.", path=f"process_noise.{name}"
-                )
+            real_number(value, f"process_noise.{name}", "an intensity above 0", above=0.0)
             columns[row, column] = value
         linear = linear.replace(Bw=columns, Dw=np.zeros((linear.ny, len(process_noise))))
     return linear.replace(sensor_noise=sensor_noise) if sensor_noise else linear

@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.recovery import Transformation, unchanged_states
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -105,8 +105,7 @@ def _intensities_by_equation(model: DAEModel, given: Mapping[str, float] | None)
     """Return the intensity of white noise by equation."""
     for name, value in (given or {}).items():
         index_of(name, model.equation_names, what="process_noise")
-        if not is_finite_number(value) or not value > 0.0:
-            raise SpecError(f"process_noise.{name} is {value!r}: give an intensity above 0.", path="process_noise")
+        real_number(value, f"process_noise.{name}", "an intensity above 0", above=0.0, path="process_noise")
     return {name: float(value) for name, value in (given or {}).items()}
 
 

@@ -11,7 +11,7 @@ from obsynth.analysis.transformations.exact_elimination import MOST_STATES_EXACT
 from obsynth.analysis.transformations.recovery import Transformation, unchanged_states
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arguments import is_finite_number, shown
+from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import LARGEST, FloatArray, require_no_overflow
 from obsynth.numerics.continuous import zero_order_hold
 from obsynth.numerics.libraries import on_one_thread_if_small
@@ -62,8 +62,7 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
         return plant.then(discretise(plant.plant, sample_time))
     if plant.dt > 0.0:
         raise SpecError(f"The plant is already sampled (dt = {plant.dt:g} s): give a continuous plant.", path="dt")
-    if not is_finite_number(sample_time) or not sample_time > 0.0:
-        raise SpecError(f"sample_time is {shown(sample_time)}: give a positive number of seconds.", path="sample_time")
+    real_number(sample_time, "sample_time", "a positive number of seconds", above=0.0)
     require_no_overflow(sample_time, "sample_time", "sample_time")
     first = eliminate_algebraic_states(plant)
     smooth = first.plant

@@ -30,7 +30,7 @@ from obsynth.experiments.monitors.learned_levels import (
     sample_score,
 )
 from obsynth.experiments.monitors.monitor import Evidence, Judged, LinearSample, Monitor, Rule, Sample
-from obsynth.files.inputs import file_to_read
+from obsynth.files.inputs import path_of
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import error_model
 from obsynth.numerics.arguments import is_finite_number
@@ -264,7 +264,7 @@ def load_thresholds(path: str | Path) -> LearnedThresholds:
     SpecError
         The file is none of these, or was changed.
     """
-    file = file_to_read(path)
+    file = path_of(path)
     again = "learn the thresholds again (obsynth thresholds)"
     _, body, intact = opened(
         file, (LEARNED_KIND,), LEARNED_VERSION, "file of learned thresholds", again, under="thresholds"

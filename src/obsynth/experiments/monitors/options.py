@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, is_whole
+from obsynth.numerics.arguments import real_number, whole_number
 
 _BOUNDED = ("disturbance_bounds", "noise_bound", "initial_error", "scenario", "sample_time")
 _STATISTICAL = ("window", "false_alarms", "scenario", "sample_time")
@@ -52,15 +52,12 @@ def checked_options(
     refuse_idle(table, kind, given)
     for name in ("noise_bound", "initial_error", "gamma"):
         value = given[name]
-        if value is not None and not (is_finite_number(value) and value >= 0.0):
-            raise SpecError(f"{name} is {value!r}: give a number, 0 or more.", path=name)
+        if value is not None:
+            real_number(value, name, "a number, 0 or more", least=0.0)
     defaults: dict[str, Any] = {"window": WINDOW, "false_alarms": FALSE_ALARMS, "change": CHANGE}
     window, false_alarms, change = (defaults[name] if given[name] is None else given[name] for name in defaults)
     for name, count, least in (("window", window, 1), ("isolation_delay", isolation_delay, 0)):
-        if not is_whole(count) or count < least:
-            raise SpecError(f"{name} is {count!r}: give a whole number of samples, {least} or more.", path=name)
-    if not (is_finite_number(false_alarms) and 0.0 < false_alarms < 1.0):
-        raise SpecError(f"false_alarms is {false_alarms!r}: give a probability between 0 and 1.", path="false_alarms")
-    if not (is_finite_number(change) and change > 0.0):
-        raise SpecError(f"change is {change!r}: give a positive number of deviations.", path="change")
+        whole_number(count, name, "a whole number of samples", least=least)
+    real_number(false_alarms, "false_alarms", "a probability between 0 and 1", above=0.0, below=1.0)
+    real_number(change, "change", "a positive number of deviations", above=0.0)
     return window, false_alarms, change

@@ -8,7 +8,6 @@ from typing import Any, cast
 
 import numpy as np
 
-from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions
 from obsynth.experiments.monitors.adaptive import (
     NO_TOLERANCE,
@@ -34,7 +33,7 @@ from obsynth.experiments.monitors.residual_model import (
 from obsynth.experiments.monitors.rules import NormRule, WhitenedRule
 from obsynth.experiments.simulation import Bench, make_bench
 from obsynth.methods.handing_on import require_verified
-from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
+from obsynth.numerics.arguments import chosen, real_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.validation import index_of
@@ -126,8 +125,7 @@ def monitor(
     require_verified(design, unverified=unverified)
     require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
     require_mapping(disturbance_bounds, "disturbance_bounds")
-    if kind not in MONITOR_KINDS:
-        raise SpecError(f"kind is {kind!r}: use one of {', '.join(MONITOR_KINDS)}.", path="kind")
+    chosen(kind, "kind", MONITOR_KINDS)
     given = {
         "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound, "initial_error": initial_error,
         "gamma": gamma, "window": window, "false_alarms": false_alarms, "change": change, "constants": constants,
@@ -219,9 +217,9 @@ def bounds_of(design: ObserverDesign, model: ResidualModel, given: Mapping[str, 
     bounds = model.bounds.copy()
     for name, value in (given or {}).items():
         place = index_of(name, design.linear[0].disturbance_names, what="disturbance_bounds")
-        if not (is_finite_number(value) and value >= 0.0):
-            raise SpecError(f"The bound of {name!r} is {value!r}: give a number, 0 or more.", path="disturbance_bounds")
-        bounds[place] = float(value)
+        bounds[place] = real_number(
+            value, f"The bound of {name!r}", "a number, 0 or more", least=0.0, path="disturbance_bounds"
+        )
     return bounds
 
 

@@ -20,7 +20,7 @@ from obsynth.errors import SpecError
 from obsynth.experiments.monitors.between_samples import InputResponse
 from obsynth.experiments.monitors.monitor import Judged, LinearSample, Monitor, Rule, Sample
 from obsynth.experiments.monitors.residual_model import ResidualModel, UnlimitedHorizonBound
-from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import NIS_WINDOW, WALKING_FORMS, alone, two_sided_sums
@@ -517,9 +517,7 @@ def parameter_monitor(
     theta = np.array(observer.initial_parameters, dtype=np.float64)
     for name, value in nominal.items():
         place = index_of(name, names, what="nominal")
-        if not is_finite_number(value):
-            raise SpecError(f"The nominal value of {name!r} is {value!r}: give a finite number.", path="nominal")
-        theta[place] = float(value)
+        theta[place] = real_number(value, f"The nominal value of {name!r}", "a finite number", path="nominal")
     if kind != "nis" and not len(theta):
         raise SpecError(f"{kind} monitors parameters, and this design estimates none: use nis.", path="kind")
     if kind == "cusum" and observer.form in WALKING_FORMS:

@@ -21,6 +21,7 @@ from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     exact_indexes,
     fault_detectability,
 )
+from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
 from obsynth.numerics.scaling import Scaling, balance_system, power_of_two_below
@@ -52,8 +53,7 @@ def restricted_equivalent(e: FloatArray, c: FloatArray) -> tuple[FloatArray, Flo
 def restricted_equivalent_from(e: FloatArray, c: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return T and N by the paper's general solution (16)-(17) with its free matrix ``S (nx, nx + ny)``."""
     nx, ny = e.shape[0], c.shape[0]
-    if s.shape != (nx, nx + ny):
-        raise SpecError(f"S is {s.shape[0]} by {s.shape[1]}, but {nx} by {nx + ny} is needed.", path="S")
+    require_shape(s.shape, (nx, nx + ny), "S")
     stacked = np.vstack([e, c])
     # Of full column rank: its columns may be scaled, so that states in small units are not taken for zero.
     units = np.exp2(np.round(np.log2(np.linalg.norm(stacked, axis=0))))

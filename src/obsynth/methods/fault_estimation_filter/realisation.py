@@ -24,7 +24,7 @@ from obsynth.methods.fault_estimation_filter.detectability_indexes import (
 )
 from obsynth.methods.fault_estimation_filter.prepared_plant import prepare, with_sensor_faults_as_states
 from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
-from obsynth.numerics.arguments import is_whole
+from obsynth.numerics.arguments import is_whole, require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.linear.derived import poles_of
@@ -145,8 +145,7 @@ def synthesis_from_gains(
     gains = {name: as_matrix(value, name) for name, value in (("T", T), ("N", N), ("L", L), ("W", W))}
     shapes = {"T": (work.nx, work.nx), "N": (work.nx, work.ny), "L": (work.nx, work.ny), "W": (work.nf, work.ny)}
     for name, shape in shapes.items():
-        if gains[name].shape != shape:
-            raise SpecError(f"{name} is {gains[name].shape}, but {shape} is needed.", path=name)
+        require_shape(gains[name].shape, shape, name)
     detectability = _detectability(work, gains["T"], _checked(indexes, work))
     if not detectability.finite:
         raise SpecError("With this T some fault never reaches the outputs.", path="T")

@@ -22,7 +22,7 @@ from obsynth.methods.guaranteed_test.windows import (
     fault_names,
     window_of,
 )
-from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arguments import is_finite_number, real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.linear.observer import LinearObserver
@@ -372,8 +372,7 @@ def by_name(given: Any, names: tuple[str, ...], option: str, *, every: bool, mis
                 "larger end.",
                 path=path,
             )
-        if not (is_finite_number(value) and value >= 0.0):
-            raise SpecError(f"{option} of {name} is {value!r}: give a finite number, 0 or more.", path=path)
+        real_number(value, f"{option} of {name}", "a finite number, 0 or more", least=0.0, path=path)
     return np.array([float(by_name.get(name, missing)) for name in names])
 
 

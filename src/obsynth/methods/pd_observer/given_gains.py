@@ -16,6 +16,7 @@ from obsynth.methods.pd_observer.realisation import (
     realise_pd_observer,
     with_faults_as_states,
 )
+from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.linear.observer import LinearObserver
@@ -46,8 +47,7 @@ def synthesis_from_gains(
     work = plant if form is None else form.plant
     matrices = {name: as_matrix(value, name) for name, value in gains.items()}
     for name, rows in (("J", work.nx), ("L", work.nx), ("M", work.nf), ("N", work.nf)):
-        if matrices[name].shape != (rows, work.ny):
-            raise SpecError(f"{name} is {matrices[name].shape}, but {(rows, work.ny)} is needed.", path=name)
+        require_shape(matrices[name].shape, (rows, work.ny), name)
     if not (np.isfinite(decay) and decay >= 0.0):
         raise SpecError(f"decay is {decay}: give 0 or a positive number in 1/seconds.", path="decay")
     g = None if adaptation_gain is None else checked_adaptation_gain(adaptation_gain, work.nf)

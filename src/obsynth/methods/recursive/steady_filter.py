@@ -13,6 +13,7 @@ from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.analysis.zeros import are_outside
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.recursive.conditions import described_mode, recursive_conditions
+from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.matrix_equations import discrete_lyapunov, discrete_riccati
 from obsynth.numerics.norms import spectral_radius
@@ -105,8 +106,7 @@ def steady_state_filter(
         for given, found, size in ((Q, q, varying.ne), (R, r, varying.ny))
     )
     for name, matrix, size in (("Q", q, varying.ne), ("R", r, varying.ny)):
-        if matrix.shape != (size, size):
-            raise SpecError(f"{name} is {matrix.shape}, but {(size, size)} is needed.", path=name)
+        require_shape(matrix.shape, (size, size), name)
     roots = covariance_factor(q, "Q"), covariance_factor(r, "R")
     reached_condition(varying, *roots).require()
     E, A, C = varying.E.at(1), varying.A.at(0), varying.C.at(1)

@@ -20,6 +20,7 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.time_varying import as_time_varying
 from obsynth.errors import SpecError
 from obsynth.methods.recursive.conditions import recursive_conditions
+from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
@@ -53,8 +54,7 @@ class WithoutUnknownInputs:
             )
         matrix = as_matrix(given, "Q")
         count = self.equations.shape[1]
-        if matrix.shape != (count, count):
-            raise SpecError(f"Q is {matrix.shape[0]} by {matrix.shape[1]}, but {count} by {count} is needed.", path="Q")
+        require_shape(matrix.shape, (count, count), "Q")
         return self.equations @ matrix @ self.equations.T
 
     def initial_state(self, given: object) -> object:
@@ -67,11 +67,7 @@ class WithoutUnknownInputs:
         count = self.equations.shape[1]
         own = np.eye(count) if given is None else as_matrix(given, "initial_covariance")
         own = own[0, 0] * np.eye(count) if own.shape == (1, 1) else own
-        if own.shape != (count, count):
-            raise SpecError(
-                f"initial_covariance is {own.shape[0]} by {own.shape[1]}, but {count} by {count} is needed.",
-                path="initial_covariance",
-            )
+        require_shape(own.shape, (count, count), "initial_covariance")
         whole = np.zeros((count + len(self.names),) * 2)
         whole[:count, :count] = own
         deviation = UNKNOWN_INPUT_PRIOR * self.scale * max(float(np.sqrt(np.max(np.diag(own)))), 1.0)

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import SpecError
 from obsynth.methods.method import Synthesis, plain
 from obsynth.methods.riccati import lyapunov_factor
 from obsynth.methods.ui_pi_observer.augmented_plant import ObserverGains, combinations_seen, realise
 from obsynth.methods.ui_pi_observer.placement_problem import (
     with_faults,
 )
+from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import ComplexArray, as_matrix
 from obsynth.numerics.spectra import (
     PRINTED_DIGITS,
@@ -42,8 +42,7 @@ def synthesis_from_gains(plant: DescriptorSystem, *, U: Any, D: Any, K: Any, F: 
     given = {name: as_matrix(value, name) for name, value in (("U", U), ("D", D), ("K", K), ("F", F))}
     shapes = {"U": (nx, nx), "D": (nx, ny), "K": (nx, ny), "F": (count, ny)}
     for name, shape in shapes.items():
-        if given[name].shape != shape:
-            raise SpecError(f"{name} is {given[name].shape}, but {shape} is needed.", path=name)
+        require_shape(given[name].shape, shape, name)
     u, d = with_faults(given["U"], given["D"], plant, model)
     gains = ObserverGains(u, d, np.vstack([given["K"], given["F"]]))
     options = {"from_gains": True, "fault_model": plain(fault_model)}

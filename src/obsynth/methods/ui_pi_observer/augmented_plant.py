@@ -17,6 +17,7 @@ import numpy as np
 
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank, product_but_rounding
 from obsynth.observers.linear.observer import LinearObserver
@@ -162,8 +163,7 @@ def paper_decoupling(
     nx, ny = plant.nx, plant.ny
     shapes = {"E_sharp": (e_sharp, (nx, nx)), "C_sharp": (c_sharp, (nx, ny)), "G": (g, (nx, ny))}
     for name, (matrix, shape) in shapes.items():
-        if matrix.shape != shape:
-            raise SpecError(f"{name} is {matrix.shape}, but {shape} is needed.", path=name)
+        require_shape(matrix.shape, shape, name)
     if plant.Dd.any():
         raise SpecError("E_sharp, C_sharp and G are for plants without Dd: leave them out.", path="E_sharp")
     miss = np.abs(e_sharp @ plant.E + c_sharp @ plant.C - np.eye(nx))

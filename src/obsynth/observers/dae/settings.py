@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, check_fields
+from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, check_fields, require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import covariance_factor, is_definite
 from obsynth.observers.outliers import Outliers
@@ -66,8 +66,7 @@ class DAESettings(StepObserver):
         sizes = {"Q": nx, "R": ny, "initial_covariance": nx, "initial_parameter_covariance": nq, "random_walk": nq}
         for name, size in sizes.items():
             matrix = as_matrix(getattr(self, name), name) if size else np.zeros((0, 0))
-            if matrix.shape != (size, size):
-                raise SpecError(f"{name} is {matrix.shape}, but {(size, size)} is needed.", path=name)
+            require_shape(matrix.shape, (size, size), name)
             factor = covariance_factor(matrix, name)
             if name in _DEFINITE:
                 self._require_definite(name, matrix, factor)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.arguments import real_number, require_kind
 from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.modal_response import Modes
@@ -80,8 +80,7 @@ def sample_observer(observer: LinearObserver, dt: float) -> LinearObserver:
     require_kind(observer, LinearObserver, "observer", "the LinearObserver of a continuous design")
     if observer.dt > 0.0:
         raise SpecError(f"The observer is discrete in time already (dt = {observer.dt:g} s).", path="dt")
-    if not (is_finite_number(dt) and dt > 0.0):
-        raise SpecError(f"dt is {dt!r}: give the seconds between two samples, a positive number.", path="dt")
+    real_number(dt, "dt", "the seconds between two samples, a positive number", above=0.0)
     inputs = len(observer.input_names)
     b, d = np.hstack([observer.Bu, observer.By]), np.hstack([observer.Du, observer.Dy])
     transition, constant, ramp = first_order_hold(observer.Az, b, dt)
@@ -209,9 +208,7 @@ def checked_warm_up(asked: float | None, default: float) -> float:
     """Return the warm-up in seconds."""
     if asked is None:
         return default
-    if not (is_finite_number(asked) and asked >= 0.0):
-        raise SpecError(f"warm_up is {asked!r}: give seconds, 0 or more.", path="warm_up")
-    return float(asked)
+    return real_number(asked, "warm_up", "seconds, 0 or more", least=0.0)
 
 
 #: Frequencies of the grid, and how far it reaches beyond the slowest and the fastest pole of the observer.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_whole
+from obsynth.numerics.arguments import is_whole, require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.records import NAME_FIELDS, checked_sample, require_names, whole_record
@@ -81,13 +81,11 @@ class LinearObserver(Observer[LinearState, FloatArray]):
         shapes = {"Az": (nz, nz), "Bu": (nz, nu), "By": (nz, ny), "Cz": (rows, nz), "Du": (rows, nu), "Dy": (rows, ny)}
         for name, shape in shapes.items():
             matrix = np.zeros(shape) if 0 in shape and given[name].size == 0 else given[name]
-            if matrix.shape != shape:
-                raise SpecError(f"{name} of the observer is {matrix.shape}, but {shape} is needed.", path=name)
+            require_shape(matrix.shape, shape, name)
             object.__setattr__(self, name, read_only(matrix))
         if self.constant is not None:
             added = as_matrix(np.atleast_2d(self.constant), "constant")[0]
-            if added.shape != (rows,):
-                raise SpecError(f"constant of the observer is {added.shape}, but {(rows,)} is needed.", path="constant")
+            require_shape(added.shape, (rows,), "constant")
             object.__setattr__(self, "constant", read_only(added) if added.any() else None)
         if not (math.isfinite(self.dt) and self.dt >= 0.0):
             raise SpecError(f"dt of the observer is {self.dt}: give seconds, or 0 for continuous time.", path="dt")

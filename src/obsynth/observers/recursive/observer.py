@@ -32,6 +32,7 @@ from obsynth.numerics.arguments import (
     real_array,
     real_number,
     real_vector,
+    require_shape,
     truth,
 )
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
@@ -122,8 +123,7 @@ class Adaptation:
         object.__setattr__(self, "initial_parameters", read_only(self.initial_parameters))
         for field, option in (("initial_covariance", "initial_parameter_covariance"), ("walk", "random_walk")):
             matrix = as_matrix(getattr(self, field), option)
-            if matrix.shape != (q, q):
-                raise SpecError(f"{option} is {matrix.shape}, but {(q, q)} is needed.", path=option)
+            require_shape(matrix.shape, (q, q), option)
             object.__setattr__(self, field, matrix)
             factor = covariance_factor(matrix, option)
             if field == "initial_covariance" and (np.diag(matrix) <= 0.0).any() | (rounding_rank(factor) < q):
@@ -859,13 +859,11 @@ class RecursiveObserver(StepObserver):
         plant = self.plant
         for name, size in (("Q", plant.ne), ("R", plant.ny)):
             shape = getattr(self, name).shape
-            if shape != (size, size):
-                raise SpecError(f"{name} is {shape[0]} by {shape[1]}, but {size} by {size} is needed.", path=name)
+            require_shape(shape, (size, size), name)
         state = real_vector(self.initial_state, plant.nx, "initial_state")
         object.__setattr__(self, "early_constraints", truth(self.early_constraints, "early_constraints"))
         covariance = as_matrix(self.initial_covariance, "initial_covariance")
-        if covariance.shape != (plant.nx, plant.nx):
-            raise SpecError(f"initial_covariance must be {plant.nx} by {plant.nx}.", path="initial_covariance")
+        require_shape(covariance.shape, (plant.nx, plant.nx), "initial_covariance")
         covariance_factor(covariance, "initial_covariance")
         object.__setattr__(self, "initial_state", read_only(state))
         object.__setattr__(self, "initial_covariance", covariance)

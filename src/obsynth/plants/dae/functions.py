@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
+from obsynth.numerics.arguments import chosen
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.symbols import DAESymbols, symbols_of
@@ -65,8 +65,7 @@ class DAEFunctions:
     """What an observer or a simulation needs of a model, compiled, for an implicit method."""
 
     def __init__(self, model: DAEModel, method: str = "backward-euler") -> None:
-        if method not in BUTCHER:
-            raise SpecError(f"The method of integration is {method!r}: use one of {', '.join(BUTCHER)}.", path="method")
+        chosen(method, "method", tuple(BUTCHER))
         self.model, self.method, self.stages = model, method, len(BUTCHER[method])
         if (method,) not in model.graphs:
             model.graphs[(method,)] = _graphs(model, method)

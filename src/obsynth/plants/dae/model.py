@@ -14,7 +14,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arguments import is_finite_number, real_array
+from obsynth.numerics.arguments import real_array, real_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.expressions import DECIDING_WORDS, FUNCTIONS, FUNCTIONS_OF_TWO, NAMED_NUMBERS
 from obsynth.numerics.libraries import imported
@@ -35,9 +35,7 @@ def checked_signals(values: Mapping[str, float] | None, what: str) -> dict[str, 
     for name, value in (values or {}).items():
         if not isinstance(name, str) or not name.isidentifier() or not name.isascii() or name in RESERVED:
             raise SpecError(f"{what} names {name!r}: use letters, digits and '_', and no function's name.", path=what)
-        if not is_finite_number(value):
-            raise SpecError(f"{what}.{name} is {value!r}: give a finite number.", path=f"{what}.{name}")
-        checked[name] = float(value)
+        checked[name] = real_number(value, f"{what}.{name}", "a finite number")
     if what == "states" and not checked:
         raise SpecError("states is empty: a plant needs at least one.", path=what)
     return checked
@@ -191,9 +189,7 @@ def _every_signal_used(model: DAEFields, symbols: DAESymbols, problems: Problems
 
 def step_length(dt: Any) -> float:
     """Return the seconds between samples; raise `SpecError` unless they are a positive number."""
-    if not is_finite_number(dt) or not dt > 0.0:
-        raise SpecError(f"dt is {dt!r}: give the seconds between samples, a positive number.", path="dt")
-    return float(dt)
+    return real_number(dt, "dt", "the seconds between samples, a positive number", above=0.0)
 
 
 def checked_inputs(model: DAEFields, u: Any, samples: int | None = None) -> FloatArray:
