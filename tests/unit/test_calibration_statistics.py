@@ -296,3 +296,6 @@ def test_a_box_ends_where_the_deviance_says_or_at_the_bound_that_was_given() -> 
     # The bound itself, not what a division and a product leave of it.
     assert above.is_open
     assert above.value == 0.023 != 0.023 / 0.3 * 0.3
+    there = Maximum(np.array([0.0, 0.023 / 0.3]), 0.0, objective.hessian, np.zeros(2))
+    at_it = profile_box(objective, there, 2.0, SimpleNamespace(undetermined=()))[1][1]
+    assert (at_it.value, at_it.is_open) == (0.023, True)

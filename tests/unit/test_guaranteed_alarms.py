@@ -150,3 +150,15 @@ def test_a_bank_proves_which_fault_it_is_and_bounds_are_those_of_the_design() ->
         obsynth.prove_alarm(tank(), record(0.0), 20, noise_bound=1.0)
     with pytest.raises(obsynth.SpecError, match="the window of this test has 6 samples"):
         obsynth.prove_alarm(tank(), record(0.0), 20, window=9)
+
+
+def test_a_statement_names_the_start_and_the_noise_of_each_sensor_whatever_its_sign() -> None:
+    plant = obsynth.DescriptorSystem(
+        None, [[0.9]], C=[[1.0], [1.0]], Bf=[[1.0]], Bw=np.zeros((1, 2)), Dw=[[-0.02, 0.0], [0.01, -0.03]], dt=1.0,
+        output_names=["a", "b"],
+    )  # fmt: skip
+    test = obsynth.guaranteed_test(plant, course="constant", samples=3, noise_bound=2.0, initial_bounds={"x1": 4.0})
+    proof = obsynth.prove_alarm(
+        test, pd.DataFrame({"time": range(5), "a": [0, 9, 99, 9, 99], "b": [9, 0, 0, 99, 9]}), 5
+    )
+    assert "noise of a within 0.04, noise of b within 0.08, x1 at first within 4:" in proof.statement

@@ -160,3 +160,44 @@ def test_the_largest_common_tolerance_is_told_where_all_are_the_same_share() -> 
     same = obsynth.robustness(design)
     assert same.largest_tolerance == pytest.approx(0.05 * same.largest_factor)
     assert obsynth.robustness(design, constants={"q": {"tolerance": "10 %"}}).largest_tolerance is None
+
+
+def test_what_breaks_regularity_is_named_although_stability_is_not_decided() -> None:
+    plant = obsynth.uncertain_system(
+        {"E": [[1, 0], [0, 0]], "A": [[0.5, 0.1], [1.0, "g"]], "C": np.eye(2), "Bf": [[1], [0]], "dt": 1.0},
+        {"g": {"nominal": 1.0, "range": [-0.5, 1.5]}},
+    )
+    found = obsynth.robustness(obsynth.fault_estimation_filter(plant))
+    assert (found.regular, found.stable) == ("refuted", "open")
+    assert found.breaking["g"] == pytest.approx(0.0, abs=0.1)
+
+
+def test_an_integrator_that_no_constant_touches_is_told_and_a_stable_mode_is_not() -> None:
+    plant = obsynth.uncertain_system(
+        {"A": np.diag([1.0, 0.7, 0.5]).tolist(), "B": [[0], [0], ["g"]], "C": np.eye(3), "Bf": [[1], [0], [0]],
+         "dt": 1.0},
+        {"g": {"nominal": 1.0, "tolerance": "5 %"}},
+    )  # fmt: skip
+    assert obsynth.robustness(obsynth.fault_estimation_filter(plant)).untouched == (1.0,)
+
+
+def test_gains_at_the_vertices_are_those_of_responses_to_pulses() -> None:
+    """The disturbance is in the sensor too, and the gain is largest where the constant is smallest."""
+    plant = obsynth.uncertain_system(
+        {"A": [["p", 0.1], [0.2, 0.3]], "C": np.eye(2), "Bf": [[1], [0]], "Bd": [[0], [1]], "Dd": [[0.3], [0]],
+         "dt": 1.0},
+        {"p": {"nominal": 0.5, "range": [0.2, 0.6]}},
+    )  # fmt: skip
+    design = obsynth.fault_estimation_filter(plant)
+    observer = design.observer
+    gains = []
+    for p in (0.2, 0.6):
+        x, y = np.zeros(2), np.zeros((300, 2))
+        A = plant.A + np.array([[p - 0.5, 0.0], [0.0, 0.0]])
+        for k in range(300):
+            d = float(k == 0)
+            y[k] = x + plant.Dd[:, 0] * d
+            x = A @ x + plant.Bd[:, 0] * d
+        gains.append(np.abs(observer.run(y).faults[:, 0]).sum())
+    assert gains[0] > 1.01 * gains[1]
+    assert obsynth.robustness(design).vertex_gains["fhat[f1]"] == pytest.approx(gains[0], rel=1e-4)
