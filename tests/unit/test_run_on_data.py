@@ -59,6 +59,39 @@ def estimates(table, kind):
     return table[[name for name in table.columns if name.startswith(f"{kind}[")]].to_numpy()
 
 
+def test_the_numbers_of_a_frame_are_there_once(sampled):
+    """Results were parts of 10,000 rows, which were joined and copied into the frame: a million rows took 505 MB."""
+    import tracemalloc
+
+    from obsynth.data.run import FrameSink
+    from obsynth.data.signals import Stamps
+
+    rows = 20_000
+    table = np.arange(3.0 * rows).reshape(3, rows)
+    for room in (rows, 10):
+        sink = FrameSink(("time", "a", "b"), Stamps(), room)
+        for start in range(0, rows, 1000):
+            sink(table[:, start : start + 1000].T.tolist())
+        sink.frame()  # loads what pandas loads late
+        tracemalloc.start()
+        try:
+            frame = sink.frame()
+            held = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        assert held < 8 * rows  # not one column
+        np.testing.assert_array_equal(frame.to_numpy().T, table)
+
+
+def test_a_frame_gives_back_what_was_read(sampled, tmp_path):
+    table = random_log(sampled, np.arange(25) * sampled.linear[1].dt)
+    table.to_csv(tmp_path / "log.csv", index=False)
+    runs = [run_on_data(sampled, data, chunk_rows=k) for data in (table, tmp_path / "log.csv") for k in (4, 100)]
+    for run in runs:
+        pd.testing.assert_frame_equal(run.measured, table)
+        pd.testing.assert_frame_equal(run.table, runs[0].table)
+
+
 def test_a_sampled_design_gives_what_its_observer_gives(sampled):
     table, _ = log_of(sampled)
     observer = sampled.linear[1]

@@ -36,6 +36,15 @@ def test_power_of_two_below_is_exact_at_the_borders():
     np.testing.assert_array_equal(power_of_two_below(sizes), expected)
 
 
+def test_a_large_matrix_that_is_not_definite_is_factored_by_pivots():
+    """Cholesky's factorisation takes the place of one half of it: from the other it is there again."""
+    rng = np.random.default_rng(3)
+    matrix = rng.normal(size=(scaling.MANY_UNKNOWNS, scaling.MANY_UNKNOWNS))
+    matrix, wanted = matrix + matrix.T, rng.normal(size=len(matrix))
+    right = matrix @ wanted
+    np.testing.assert_allclose(scaling._factored(matrix)(right), wanted, rtol=1e-8, atol=1e-8)
+
+
 def test_paper_example_is_left_alone():
     scaling = balance_system(PAPER_E, PAPER_A, [np.ones((4, 2))], [PAPER_C])
     np.testing.assert_array_equal(scaling.equations, np.ones(4))

@@ -6,7 +6,7 @@ Where estimates go: CSV and Parquet files that appear whole or not at all, data 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,7 +18,7 @@ import numpy as np
 
 from obsynth.data.alarm_events import AlarmEvent
 from obsynth.data.log_run import LogRun, resume_state, save_state
-from obsynth.data.signals import TIME_HEADER, Signals, Stamps
+from obsynth.data.signals import TIME_HEADER, Stamps
 from obsynth.data.sources import CHUNK_ROWS, Data, check_suffix, chunks
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.monitor import Monitor
@@ -74,36 +74,45 @@ def text_sink(stream: TextIO, header: Sequence[str], stamps: Stamps) -> Sink:
 
 
 class FrameSink:
-    """A sink whose rows come to a data frame, in which dates stay dates; numbers are kept as arrays, not as objects."""
+    """A sink whose rows come to a data frame, in which dates stay dates.
 
-    def __init__(self, header: Sequence[str], stamps: Stamps) -> None:
-        self._header, self._stamps = list(header), stamps
+    Numbers stand where the frame will have them, room for ``rows`` at first: parts that are joined in the end would be
+    there twice."""
+
+    def __init__(self, header: Sequence[str], stamps: Stamps, rows: int) -> None:
+        self._header, self._stamps, self._count = list(header), stamps, 0
         self._times = frozenset(time_columns(header))
-        self._numbers: list[list[FloatArray]] = [[] for _ in header]
+        self._numbers = [np.empty(rows) for _ in header]
         self._others: list[list[Any]] = [[] for _ in header]
 
     def __call__(self, rows: Sequence[Sequence[Any]]) -> None:
         """Keep rows."""
-        for place, cells in enumerate(zip(*rows, strict=True)):
+        self.keep(zip(*rows, strict=True), len(rows))
+
+    def keep(self, columns: Iterable[Any], count: int) -> None:
+        """Keep so many rows, which are given as columns."""
+        end = self._count + count
+        for place, cells in enumerate(columns):
             if self._header[place] in TEXT_COLUMNS:
                 self._others[place].extend(cells)
             elif self._stamps.is_dated and place in self._times:
                 self._others[place].extend(map(self._stamps.moment, cells))
             else:
-                self._numbers[place].append(np.array(cells, dtype=np.float64))
+                numbers = self._numbers[place]
+                if end > len(numbers):
+                    self._numbers[place] = numbers = np.concatenate([numbers, np.empty(end)])
+                numbers[self._count : end] = cells
+        self._count = end
 
-    def frame(self) -> Any:
+    def frame(self) -> pd.DataFrame:
         """Return the data frame."""
         import pandas as pd
 
-        found = {}
-        for place, name in enumerate(self._header):
-            parts = self._numbers[place]
-            found[place] = pd.Series(np.concatenate(parts) if parts else self._others[place], name=name)
-            self._numbers[place] = []
-        if not found or not len(found[0]):
+        if not self._count:
             return pd.DataFrame([], columns=self._header)
-        frame = pd.DataFrame(found, copy=False)
+        columns = zip(self._header, self._others, self._numbers, strict=True)
+        found = [pd.Series(others or kept[: self._count], name=name, copy=False) for name, others, kept in columns]
+        frame = pd.DataFrame(dict(enumerate(found)), copy=False)
         frame.columns = pd.Index(self._header)
         return frame
 
@@ -143,24 +152,6 @@ def sink_for(out: str | Path | TextIO, header: Sequence[str], stamps: Stamps) ->
         else:
             with os.fdopen(handle, "w", encoding="utf-8", newline="") as stream:
                 yield text_sink(stream, header, stamps)
-
-
-def measured_frame(kept: list[FloatArray] | None, signals: Signals, stamps: Stamps) -> pd.DataFrame | None:
-    """Return what was read, in the signals' units."""
-    if kept is None:
-        return None
-    import pandas as pd
-
-    count, done = sum(map(len, kept)), 0
-    seconds, found = np.empty(count), np.empty((len(signals.names), count))
-    for chunk in kept:
-        part = slice(done, done + len(chunk))
-        seconds[part], found[:, part] = chunk[:, 0], signals.measured(chunk).T
-        done += len(chunk)
-    kept.clear()
-    frame = pd.DataFrame(found.T, columns=list(signals.names), copy=False)
-    frame.insert(0, TIME_HEADER, [stamps.moment(time) for time in seconds.tolist()] if stamps.is_dated else seconds)
-    return frame
 
 
 #: Rows of a stream after which its state is saved.
@@ -378,7 +369,8 @@ def run_on_data(
     digest = gain_set_digest(design)
     if state is not None and Path(state).exists():
         resume_state(Path(state), run, digest)
-    kept: list[FloatArray] | None = [] if out is None else None
+    room = len(data) if isinstance(data, Sized) and not isinstance(data, str) else CHUNK_ROWS
+    kept = FrameSink((TIME_HEADER, *run.signals.names), stamps, room) if out is None else None
     # What has left a stream cannot be taken back: there the state is saved however the run ends.
     save = None
     if not (state is None or out is None or isinstance(out, str | Path)):
@@ -387,7 +379,7 @@ def run_on_data(
     if not hasattr(data, "readline"):
         # What cannot be read leaves no header behind; of a stream the header comes before the first row.
         rows = chain(list(islice(rows, 1)), rows)
-    gathered = FrameSink(run.header, stamps)
+    gathered = FrameSink(run.header, stamps, room)
     with nullcontext(gathered) if out is None else sink_for(out, run.header, stamps) as sink:
         _run_rows(run, rows, sink, kept, save, progress or bool, state_every)
         if state is None and not hasattr(data, "readline"):
@@ -406,7 +398,7 @@ def run_on_data(
         (*run.observer.notes, *stamps.warnings(), *run.first.warnings()),
         digest,
         table,
-        measured_frame(kept, run.signals, stamps),
+        None if kept is None else kept.frame(),
         stamps,
         dict(thresholds or {}),
         dict(run.alarm_rows),
@@ -485,7 +477,7 @@ def _run_rows(
     run: LogRun,
     rows: Iterator[FloatArray],
     sink: Sink,
-    kept: list[FloatArray] | None,
+    kept: FrameSink | None,
     save: Callable[[], None] | None,
     progress: Callable[[int], object],
     state_every: int = STATE_ROWS,
@@ -495,7 +487,7 @@ def _run_rows(
     if save is None:
         for chunk in rows:
             if kept is not None:
-                kept.append(chunk)
+                kept.keep([chunk[:, 0].tolist(), *run.signals.measured(chunk).T], len(chunk))
             sink(run.take(chunk))
             progress(run.rows)
         sink(run.finish())

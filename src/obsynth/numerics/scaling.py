@@ -281,14 +281,19 @@ class LogBalance:
 
 
 def _factored(matrix: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return what solves equations with a matrix ``(n, n)``, definite beyond rounding, which is factored once."""
+    """Return what solves equations with a matrix ``(n, n)``, definite beyond rounding; what is given is lost."""
     if not matrix.size:
         return lambda right: right
     matrix = np.asarray_chkfinite(matrix)
     if len(matrix) >= MANY_UNKNOWNS:
-        factor, failed = lapack.dpotrf(matrix.T, lower=1, clean=0)
+        # In the place of one half, from the other of which all is there again.
+        diagonal = matrix.diagonal().copy()
+        factor, failed = lapack.dpotrf(matrix.T, lower=1, clean=0, overwrite_a=1)
         if not failed:
             return lambda right: np.asarray(lapack.dpotrs(factor, right, lower=1)[0], dtype=np.float64)
+        below = np.tril(matrix, -1)
+        matrix = below + below.T
+        np.fill_diagonal(matrix, diagonal)
     factors, pivots, failed = lapack.dgetrf(matrix)
     if failed:
         raise np.linalg.LinAlgError("Singular matrix")
