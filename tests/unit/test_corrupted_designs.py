@@ -567,7 +567,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     # The last digits: every identity passes, and the claimed error per unit of a state or an input is passed.
     "By in the last digits": ("paper", lambda d: with_observer(d, By=d.observer.By * (1.0 + 3e-13)), (STORED_X,)),
     "a claimed error per unit of a state": ("paper", certificate_times("state_error", 0.9), (STORED_X,)),
-    "a claimed error per unit of an input": ("direct", certificate_times("input_error", 0.9), (STORED_U,)),
+    "a claimed error per unit of an input": ("direct", certificate_times("input_error", 0.1), (STORED_U,)),
     "a claimed error that is no number": ("paper", certificate_entry("state_error", 0, 0, np.nan), (STORED_X,)),
     "a claimed error of another shape": ("paper", certificate_cut("state_error", slice(1, None)), (STORED_X,)),
     "a gain from a state that never decays": (

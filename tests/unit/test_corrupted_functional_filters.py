@@ -139,9 +139,9 @@ TABLE = {
         "both", matrix("deviations", lambda found: 0.99 * found), [NOISE_A, NOISE_B, ERROR_A, ERROR_B],
     ),
     "claimed errors per unit, a little too small": (
-        "both", lambda d: matrix("state_error", lambda found: 0.95 * found)(
-            matrix("input_error", lambda found: 0.95 * found)(
-                matrix("disturbance_error", lambda found: 0.95 * found)(d))),
+        "both", lambda d: matrix("state_error", lambda found: 0.9 * found)(
+            matrix("input_error", lambda found: 0.9 * found)(
+                matrix("disturbance_error", lambda found: 0.9 * found)(d))),
         ["stored numbers: states", "stored numbers: inputs", "stored numbers: disturbances"],
     ),
     "a fault that nothing shows": (

@@ -344,7 +344,7 @@ TABLE: dict[str, tuple[str, Corruption, tuple[str, ...]]] = {
     "By in the last digits": (
         "paper", lambda d: with_observer(d, By=d.observer.By * (1.0 + 1e-12)), ("stored numbers: states",)),
     "a claimed error per unit of an input": (
-        "direct", lambda d: with_certificate(d, input_error=0.9 * d.certificate.matrices["input_error"]),
+        "direct", lambda d: with_certificate(d, input_error=0.1 * d.certificate.matrices["input_error"]),
         ("stored numbers: inputs",)),
     "a claimed gain": ("paper", claim("gamma", 1e-9), ("claims covered",)),
 }  # fmt: skip

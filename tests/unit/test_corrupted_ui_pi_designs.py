@@ -299,10 +299,10 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "By in the last digits": (
         "paper", lambda d: d.replace(observer=dataclasses.replace(d.observer, By=d.observer.By * (1.0 + 3e-12))),
         ("stored numbers: states",)),
-    "a claimed error per unit of an input": ("direct", scaled("input_error", 0.9), ("stored numbers: inputs",)),
+    "a claimed error per unit of an input": ("direct", scaled("input_error", 0.1), ("stored numbers: inputs",)),
     "a claimed error per unit of a disturbance": (
-        "direct", scaled("disturbance_error", 0.9), ("stored numbers: disturbances",)),
-    "a claimed error per unit of a state": ("paper", scaled("state_error", 0.9), ("stored numbers: states",)),
+        "direct", scaled("disturbance_error", 0.1), ("stored numbers: disturbances",)),
+    "a claimed error per unit of a state": ("paper", scaled("state_error", 0.1), ("stored numbers: states",)),
     "a claimed gain": ("paper", lambda d: with_certificate(d, {"gamma": 1e-9}), ("claims covered",)),
 }  # fmt: skip
 

@@ -48,7 +48,7 @@ def test_what_elimination_knows_is_kept_by_changes_that_do_not_matter():
 
 
 #: Plants of the campaign, eliminated and sampled, of which an answer was another when their matrices alone were kept.
-CHANGED = [12, 47, 283, 346, 370, 428, 432, 500, 567, 596]
+CHANGED = [12, 47, 346, 370, 428, 432, 500, 567, 596]
 
 
 @pytest.mark.parametrize("seed", CHANGED)

@@ -17,7 +17,7 @@ from obsynth.analysis.transformations.elimination import dynamic_coordinates
 from obsynth.numerics import scaling
 from obsynth.numerics.scaling import LogBalance
 from obsynth.proofs import contraction
-from obsynth.proofs.contraction import prove_contraction, proved_contractions
+from obsynth.proofs.contraction import LEFT_OF_SUM, prove_contraction, proved_contractions
 from obsynth.verification import certificates
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
@@ -56,9 +56,24 @@ def test_bounds_are_found_again_with_another_factor_of_the_lyapunov_equation(
     again = obsynth.verify(design.replace(observer=replace(design.observer, Az=design.observer.Az.copy())))
     assert not [row.name for row in again.failures]
     row = again["stored numbers: states"]
-    # The room is what rounding can do, and not a share that somebody chose.
-    assert 0.999 * row.bound <= row.value <= row.bound
+    # The room is what rounding can do and where a sum may end, and not a share that somebody chose.
+    assert 0.999 * row.bound / (1.0 + LEFT_OF_SUM) <= row.value <= row.bound
     assert np.all(np.isfinite(shipped))
+
+
+@pytest.mark.parametrize("time", PLANTS)
+def test_bounds_are_found_again_whatever_the_contraction_was(time: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of poles of 8e-3 a factor was 5 % another on another machine, a thousand times what its condition says."""
+    design = METHODS[time](PLANTS[time])
+    plain, rng = contraction._summed_factor, np.random.default_rng(2)
+
+    def otherwise(a: np.ndarray, rate: float, *, discrete: bool) -> np.ndarray | None:
+        found = plain(a, rate, discrete=discrete)
+        return None if found is None else np.triu(found * (1.0 + 0.05 * rng.uniform(size=found.shape)))
+
+    monkeypatch.setattr(contraction, "_summed_factor", otherwise)
+    again = obsynth.verify(design.replace(observer=replace(design.observer, Az=design.observer.Az.copy())))
+    assert not [row.name for row in again.failures]
 
 
 def test_every_contraction_that_is_proved_counts() -> None:
@@ -206,3 +221,46 @@ def test_states_of_an_elimination_hold_no_rounding() -> None:
     basis = dynamic_coordinates(obsynth.DescriptorSystem(e, a, C=np.eye(2, 5)))
     assert basis is not None
     assert np.min(np.abs(basis[basis != 0.0])) > 0.1
+
+
+@pytest.mark.parametrize("turned", range(3))
+def test_states_of_an_elimination_do_not_hang_on_how_singular_vectors_are_turned(
+    turned: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Equal singular values: any vectors of their space, of any sign, are right, and each machine has its own.
+    e = np.zeros((5, 5))
+    e[:3, :3], e[0, 4] = np.eye(3), 1.0
+    a = np.array([[-1, 2, 0, 1, 0], [0, -3, 1, 0, 2], [1, 0, -2, 0, 1], [0, 1, 1, 2, 1], [1, 0, 2, 1, 3]], dtype=float)
+    plain = obsynth.eliminate_algebraic_states(obsynth.DescriptorSystem(e, a, C=np.eye(2, 5))).plant
+    svd = np.linalg.svd
+
+    def otherwise(matrix: np.ndarray, *given: Any, **named: Any) -> Any:
+        found = svd(matrix, *given, **named)
+        if not isinstance(found, tuple):
+            return found
+        left, values, right = found
+        turn = np.linalg.qr(np.random.default_rng(turned).standard_normal((3, 3)))[0]
+        if right.shape == (5, 5):
+            right = np.vstack([turn @ right[:3], right[3:]])
+        return left, values, right
+
+    monkeypatch.setattr(np.linalg, "svd", otherwise)
+    again = obsynth.eliminate_algebraic_states(obsynth.DescriptorSystem(e, a, C=np.eye(2, 5))).plant
+    assert again.state_names[0] == "xi 1"
+    for name in ("A", "C"):
+        np.testing.assert_array_equal(getattr(plain, name), getattr(again, name))
+
+
+def test_sampling_leaves_nothing_where_nothing_is() -> None:
+    # A fault that moves two of three states was left with 7e-13 in the third, and with 9e-13 on another machine.
+    a, b = np.array([[0.0, 0.0, -2.8], [2.8, 0.0, -4.0], [0.0, 0.0, 0.0]]), np.array([[-5.8e3], [1.2e4], [0.0]])
+    plant = obsynth.DescriptorSystem(None, a, C=np.eye(3), Bf=b)
+    few = obsynth.discretise(plant, 0.5).plant
+    # With many states by a library: the same pattern.
+    many = obsynth.DescriptorSystem(None, np.kron(np.eye(12), a), C=np.eye(36), Bf=np.tile(b, (12, 1)))
+    for sampled in (few, obsynth.discretise(many, 0.5).plant):
+        assert not sampled.Bf[2::3].any()
+        np.testing.assert_array_equal(sampled.A[2::3] != 0.0, np.eye(sampled.nx)[2::3] != 0.0)
+    t = 0.5
+    wanted = np.array([[1.0, 0.0, -2.8 * t], [2.8 * t, 1.0, -4.0 * t - 2.8**2 * t**2 / 2.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(few.A, wanted, rtol=4e-16, atol=0.0)

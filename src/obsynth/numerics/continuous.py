@@ -7,6 +7,7 @@ decays with the transition over all intervals. Everything but rounding is accoun
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -137,29 +138,47 @@ def _in_lyapunov_norm(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[Floa
     return root @ a @ inverse, root @ b, c @ inverse
 
 
-def zero_order_hold(a: FloatArray, inputs: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
-    """Return ``exp(A h)`` and its integral times ``inputs``, from one balanced block exponential."""
-    from scipy.linalg import expm
-
+def zero_order_hold(
+    a: FloatArray,
+    inputs: FloatArray,
+    step: float,
+    *,
+    exponential: Callable[[FloatArray, float], FloatArray | None] | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``exp(A h)`` and its integral times ``inputs``, from one balanced block exponential, as it is given
+    or by a library."""
     n, m = inputs.shape
     balanced, scale, scaled, sizes = _in_like_sizes(a, inputs)
     block = np.zeros((n + m, n + m))
     block[:n, :n], block[:n, n:] = balanced, scaled
-    row = expm(block * step)[:n]
+    whole = None if exponential is None else exponential(block, step)
+    row = (_exponential(block, step) if whole is None else whole)[:n]
     return scale[:, None] * row[:, :n] / scale, scale[:, None] * row[:, n:] * sizes
 
 
 def first_order_hold(a: FloatArray, inputs: FloatArray, step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return Phi, Gamma0 and Gamma1 of ``x(h) = Phi x(0) + Gamma0 s(0) + Gamma1 (s(h) - s(0))``."""
-    from scipy.linalg import expm
-
     n, m = inputs.shape
     balanced, scale, scaled, sizes = _in_like_sizes(a, inputs)
     chain = np.zeros((n + 2 * m, n + 2 * m))
     chain[:n, :n], chain[:n, n : n + m], chain[n : n + m, n + m :] = balanced * step, scaled * step, np.eye(m)
-    row = expm(chain)[:n]
+    row = _exponential(chain, 1.0)[:n]
     held, ramped = (scale[:, None] * block * sizes for block in (row[:, n : n + m], row[:, n + m :]))
     return scale[:, None] * row[:, :n] / scale, held, ramped
+
+
+def _exponential(block: FloatArray, step: float) -> FloatArray:
+    """Return ``exp(A h)`` without what rounding leaves where no power of A has an entry."""
+    from scipy.linalg import expm
+
+    reached = np.eye(len(block), dtype=bool) | (block != 0.0)
+    while not reached.all():
+        # Paths of twice the length.
+        further = reached.astype(np.float64) @ reached > 0.0
+        if np.array_equal(further, reached):
+            break
+        reached = further
+    return np.where(reached, np.asarray(expm(block * step), dtype=np.float64), 0.0)
 
 
 def _in_like_sizes(a: FloatArray, inputs: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

@@ -360,6 +360,8 @@ LENGTH, MOST_CONTINUOUS_STATES = 0.4, 12
 #: Share of such a gain that the rest may have, and most steps towards it: what it bounds is a rounding, and slow modes
 #: would take a hundred thousand.
 LEFT_OF_GAINS, MOST_STEPS_OF_GAINS = 0.05, 1_024
+#: Most steps for given columns, where another machine's bound is to be found again, whatever its contraction was.
+MOST_STEPS_OF_COLUMNS = 2_048
 
 
 def peak_sums(
@@ -500,23 +502,32 @@ def gathered(pieces: Pieces, sums: FloatArray, inputs: int) -> FloatArray:
     return np.asarray(rounded_up(found, len(pieces.weights) + 4))
 
 
-def absolute_gains(a: FloatArray, rows: FloatArray, contraction: Contraction) -> FloatArray:
-    """Return upper bounds on ``sum_j |c A^j|`` (the integral of ``|c e^{A t}|``), entry by entry, for ``c (p, n)``."""
-    n = len(a)
-    loose = contraction.gain(rows, np.eye(n))
-    if not n or (not contraction.discrete and n > MOST_CONTINUOUS_STATES):
+def absolute_gains(
+    a: FloatArray, rows: FloatArray, contraction: Contraction, columns: Ball | None = None
+) -> FloatArray:
+    """Return upper bounds on ``sum_j |c A^j b|`` (the integral of ``|c e^{A t} b|``), for ``c (p, n)``: ``(p, m)``.
+
+    ``b`` are the unit vectors, or ``columns (n, m)``.  Bounds hang on the contraction by what is left of the sum alone:
+    where it settles, by `LEFT_OF_GAINS` at most, of given columns by `LEFT_OF_SUM`."""
+    n, given = len(a), columns is not None
+    into = Ball.exact(np.eye(n)) if columns is None else columns
+    loose = contraction.gain(rows, into.midpoint, into.radius)
+    if not loose.size or not n or (not contraction.discrete and n > MOST_CONTINUOUS_STATES):
         return loose
+    left, most = (LEFT_OF_SUM, MOST_STEPS_OF_COLUMNS) if given else (LEFT_OF_GAINS, MOST_STEPS_OF_GAINS)
     if contraction.discrete:
-        moving, columns, gather = Ball.exact(a), Ball.exact(np.eye(n)), None
-        held: Contraction | None = contraction
-    else:
-        length = LENGTH / _natural_norm(a)
-        gather = interval_pieces(a, np.eye(n), Ball.exact(np.eye(n)), length)
-        moving, columns = exponential(a, length), gather.columns
-        # The contraction in continuous time is one of its samples as well.
-        rate = float(rounded_up(np.exp(-contraction.rate * length), 4))
-        held = replace(contraction, rate=rate, discrete=True) if rate < 1.0 else None
-    if held is None:
+        return np.asarray(
+            np.minimum(loose, peak_sums(Ball.exact(a), rows, into, contraction, left=left, each=True, most=most)[1])
+        )
+    length = LENGTH / _natural_norm(a)
+    gather = interval_pieces(a, into.midpoint, Ball.exact(np.eye(n)), length)
+    # The contraction in continuous time is one of its samples as well.
+    rate = float(rounded_up(np.exp(-contraction.rate * length), 4))
+    if not rate < 1.0:
         return loose
-    whole = peak_sums(moving, rows, columns, held, left=LEFT_OF_GAINS, each=True, most=MOST_STEPS_OF_GAINS)[1]
-    return np.asarray(np.minimum(loose, whole if gather is None else gathered(gather, whole, n)))
+    held = replace(contraction, rate=rate, discrete=True)
+    sums = peak_sums(exponential(a, length), rows, gather.columns, held, left=left, each=True, most=most)[1]
+    whole = gathered(gather, sums, loose.shape[1])
+    if given and into.radius.any():
+        whole = rounded_up(whole + contraction.gain(rows, np.zeros_like(into.radius), into.radius), 2)
+    return np.asarray(np.minimum(loose, whole))

@@ -398,17 +398,24 @@ class RemainderChannel:
     W: Ball  # (nz, nd), of decoupled disturbances
     V: Ball  # (rows, nd)
 
-    def errors_per_unit(self, observer: LinearObserver, contraction: Contraction) -> tuple[FloatArray, ...]:
+    def errors_per_unit(
+        self, observer: LinearObserver, contraction: Contraction, *, closely: bool = False
+    ) -> tuple[FloatArray, ...]:
         """Return upper bounds on each output row's error for each state, input and disturbance always within one.
 
-        ``sum_j |c Az^j k| + |direct|``, outward rounded; ``(rows, n)``, ``(rows, nu)``, ``(rows, nd)``.
+        ``sum_j |c Az^j k| + |direct|``, outward rounded; ``(rows, n)``, ``(rows, nu)``, ``(rows, nd)``; ``closely``:
+        each of them by a sum of its own.
         """
         pairs = ((self.K, self.J), (self.U, self.L), (self.W, self.V))
         rows = observer.fault_rows
         gains = absolute_gains(observer.Az, observer.Cz[rows], contraction)
         found = []
         for k, direct in pairs:
-            bound = contraction.gain(observer.Cz, k.midpoint, k.radius)
+            bound = (
+                absolute_gains(observer.Az, observer.Cz, contraction, k)
+                if closely
+                else contraction.gain(observer.Cz, k.midpoint, k.radius)
+            )
             # The rows that matter most get a tighter one.
             bound[rows] = np.minimum(bound[rows], rounded_up(gains @ k.magnitude, 2 * observer.order + 4))
             # Of what is nothing exactly nothing comes.

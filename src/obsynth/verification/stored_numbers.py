@@ -20,7 +20,7 @@ from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.derived import modes_of, poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.balls import rounded_up
-from obsynth.proofs.contraction import proved_contractions
+from obsynth.proofs.contraction import LEFT_OF_SUM, proved_contractions
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import (
@@ -33,6 +33,8 @@ from obsynth.verification.error_system import (
 
 #: Claimed bounds have room for what rounding of the contraction can do on another machine; at most this share of them.
 MOST_ROOM = 1.0
+#: Up to so many states each bound is found by a sum of its own where another machine's is to be found again.
+MOST_STATES_CLOSELY = 40
 #: A gain is claimed for disturbances that last up to one over this, rad per sample: slower ones are reported.
 SLOWEST_CLAIMED, CLAIM_POINTS = 1e-7, 120
 #: With more states, of plant and observer together, fewer are looked at.
@@ -63,7 +65,7 @@ class StoredErrors:
 
     channel: RemainderChannel
     bounds: tuple[FloatArray, ...]
-    room: float  # factor, one or more
+    room: FloatArray  # (rows, 1): factors, one or more
 
     @classmethod
     def of(cls, model: ErrorModel) -> StoredErrors | None:
@@ -78,7 +80,9 @@ class StoredErrors:
         bounds = model.remainder.errors_per_unit(model.observer, contraction)
         if not all(np.all(np.isfinite(bound)) for bound in bounds):
             return None
-        room = 1.0 + min(contraction.roundings, MOST_ROOM)
+        room = np.full((len(model.observer.Cz), 1), 1.0 + min(contraction.roundings, MOST_ROOM))
+        # Sums that another machine takes closely are no larger, whichever term these end at.
+        room[model.observer.fault_rows] *= 1.0 + LEFT_OF_SUM
         return cls(model.remainder, bounds, room if model.is_evaluated_exactly else BOTH_BALLS * room)
 
     def witnesses(self) -> dict[str, FloatArray]:
@@ -91,10 +95,13 @@ class StoredErrors:
         }
 
     def least(self, observer: LinearObserver) -> StoredErrors:
-        """Return the least bounds by all contractions that are found: any of them is a proof."""
+        """Return the least bounds by all contractions that are found, by the first with a sum of each: any of them is a
+        proof."""
         bounds = self.bounds
-        for contraction in proved_contractions(observer.Az, discrete=observer.dt > 0.0, poles=poles_of(observer)):
-            others = self.channel.errors_per_unit(observer, contraction)
+        found = proved_contractions(observer.Az, discrete=observer.dt > 0.0, poles=poles_of(observer))
+        for i, contraction in enumerate(found):
+            closely = not i and observer.order <= MOST_STATES_CLOSELY
+            others = self.channel.errors_per_unit(observer, contraction, closely=closely)
             bounds = tuple(np.fmin(one, other) for one, other in zip(bounds, others, strict=True))
         return replace(self, bounds=bounds)
 

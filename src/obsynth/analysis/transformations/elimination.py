@@ -54,6 +54,11 @@ from obsynth.proofs.exact_arithmetic import holds_computed
 
 #: Rank that a matrix may lack beyond what its shape says, to begin with.
 BORDER = 8
+#: Lengths of projected states that differ by less count as equal: the first is taken, and not the one that rounding
+#: makes larger.
+EQUAL_LENGTHS = 1.0 - 1e-6
+#: Binary digits of coordinates that are combinations: what rounding of a basis may be, times a million, is below.
+BASIS_DIGITS = 20
 #: How much rather a repeated equation is left out whose own variable is left out.
 OTHERS_WEIGHT = 1e-3
 
@@ -492,10 +497,24 @@ def _coordinates(plant: DescriptorSystem, count: int) -> tuple[FloatArray, Float
         order = np.argsort(~moving, kind="stable")
         basis, names = np.eye(plant.nx)[:, order], tuple(plant.state_names[i] for i in order[:count])
     else:
-        # Entries that are only rounding would be other ones on another machine, and so would the plant.
-        directions = but_rounding(right.T, np.ones_like(right))
+        directions = np.hstack([_settled_basis(right[:count].T), right[count:].T])
         basis, names = units.states[:, None] * directions, tuple(f"xi {i + 1}" for i in range(count))
     return rows, basis[:, :count], basis[:, count:], names
+
+
+def _settled_basis(directions: FloatArray) -> FloatArray:
+    """Return a basis ``(n, m)`` of the span of orthonormal columns that does not hang on how these were turned.
+
+    Singular vectors of values that are equal are any, and so is every sign: another machine would make another plant.
+    This one is the pivoted Cholesky factor of the projection, in few digits: any basis that E tells apart will do.
+    """
+    left, columns = directions @ directions.T, []
+    for _ in range(directions.shape[1]):
+        sizes = np.diag(left)
+        first = int(np.flatnonzero(sizes >= EQUAL_LENGTHS * np.max(sizes))[0])
+        columns.append(left[:, first] / np.sqrt(sizes[first]))
+        left = left - np.outer(columns[-1], columns[-1])
+    return np.asarray(np.ldexp(np.round(np.ldexp(np.array(columns).T, BASIS_DIGITS)), -BASIS_DIGITS))
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
@@ -635,6 +654,8 @@ class _Pieces:
             left, values, right = np.linalg.svd(block)
             rank = int(np.sum(values > RANK_TOLERANCE * norm))
             whole_rows, whole_columns = rank == len(rows), rank == len(columns)
+            if not whole_columns:
+                right[:rank] = _settled_basis(right[:rank].T).T
         for k in range(rank, len(values)):
             if values[k] > len(values) * np.finfo(float).eps * values[0]:
                 self.neglected.append(int(columns[np.argmax(np.abs(right[k]))]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import flint
 import numpy as np
 
 from obsynth.analysis.transformations.elimination import columns_of, eliminate_algebraic_states
@@ -20,7 +21,14 @@ from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
 from obsynth.numerics.sparse import dense
 from obsynth.plants.descriptor import DescriptorSystem, note_source
 from obsynth.plants.uncertainty import SAMPLED
+from obsynth.proofs.extended_balls import arb_matrix
+from obsynth.proofs.products import as_ball
 
+#: With so many states and signals, whose exponential takes 10 ms, each entry is rounded once: another machine finds it
+#: again, and entries that are small beside those they come from have all their digits.
+MOST_ROUNDED_ONCE = 24
+#: Digits, in bits: a chain of integrators in large units, whose exponential is squared thirty times, takes over 300.
+SQUARING_BITS = 640
 #: Fault zeros of a sampled plant between this radius and 1 make the fault estimate ring for long.
 SLOW_ZERO_RADIUS = 0.98
 
@@ -77,7 +85,9 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
             signals=signals,
         )
     _require_bounded_growth(smooth.A, float(sample_time))
-    transition, held = zero_order_hold(smooth.A, np.hstack([smooth.B, smooth.Bf, smooth.Bd]), sample_time)
+    signals_in = np.hstack([smooth.B, smooth.Bf, smooth.Bd])
+    few = sum(signals_in.shape) <= MOST_ROUNDED_ONCE
+    transition, held = zero_order_hold(smooth.A, signals_in, sample_time, exponential=_rounded_once if few else None)
     B, Bf, Bd = columns_of(held, (smooth.nu, smooth.nf, smooth.nd))
     factor = _noise_factor(smooth.A, smooth.Bw, sample_time)
     kept = [smooth.noise_names[i] for i in direct]
@@ -93,6 +103,16 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
     note_source(smooth, sampled, sample_time=float(sample_time))
     step = Transformation(smooth, sampled, description, recovery)
     return first.then(step.with_tolerances(SAMPLED, sample_time))
+
+
+def _rounded_once(block: FloatArray, step: float) -> FloatArray | None:
+    """Return ``exp(A h)`` in which every entry is rounded once; ``None`` where its balls are too wide."""
+    with flint.ctx.workprec(SQUARING_BITS):
+        found = as_ball((arb_matrix(block) * flint.arb(float(step))).exp())
+    size = np.abs(found.midpoint)
+    if not np.max(found.radius, initial=0.0) <= CANCELLATION_TOLERANCE * np.max(size, initial=0.0):
+        return None
+    return np.where(size > found.radius, found.midpoint, 0.0)
 
 
 def _require_bounded_growth(A: FloatArray, sample_time: float) -> None:
