@@ -17,6 +17,8 @@ from obsynth.proofs.exact_arithmetic import (
     pivot_columns,
     primitive,
     rank_of,
+    whole_matrices,
+    whole_null_basis,
     written_fraction,
     written_matrix,
 )
@@ -144,6 +146,21 @@ def test_pivots_and_null_space():
     assert (basis.nrows(), basis.ncols()) == (4, 2)
     assert matrix * basis == fmpq_mat(2, 2)
     assert blocks([[matrix], [matrix]])[3, 3] == fmpq(1)
+
+
+def test_a_whole_multiple_of_a_null_basis_is_that_basis():
+    matrix = fmpq_mat(2, 5, [0, fmpq(1, 3), 2, fmpq(5, 7), 0, 0, 2, fmpq(1, 11), 4, 1])
+    whole, size, free = whole_null_basis(matrix)
+    assert free == [0, 3, 4]
+    assert matrix * fmpq_mat(whole) == fmpq_mat(2, 3)
+    assert [int(whole[j, k]) for k, j in enumerate(free)] == [int(size)] * 3
+
+
+def test_matrices_as_stored_are_whole_in_one_unit():
+    matrices = [np.array([[0.1, -3.0, 0.0]]), np.array([[2.0**-60], [1e300]]), np.zeros((0, 2))]
+    whole, unit = whole_matrices(matrices)
+    for found, matrix in zip(whole, matrices, strict=True):
+        assert [Fraction(int(value), int(unit)) for value in found.entries()] == [*map(Fraction, matrix.ravel())]
 
 
 def test_powers_of_two_as_units_change_nothing():

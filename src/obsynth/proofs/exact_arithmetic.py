@@ -64,7 +64,7 @@ def pivot_columns(matrix: fmpq_mat) -> list[int]:
     return _leading(*matrix.rref())
 
 
-def _leading(reduced: fmpq_mat, rank: int) -> list[int]:
+def _leading(reduced: Any, rank: int) -> list[int]:
     return [next(j for j in range(reduced.ncols()) if reduced[i, j] != 0) for i in range(rank)]
 
 
@@ -79,6 +79,21 @@ def null_basis(matrix: fmpq_mat) -> fmpq_mat:
         for i, pivot in enumerate(pivots):
             basis[pivot, k] = -reduced[i, j]
     return basis
+
+
+def whole_null_basis(matrix: fmpq_mat) -> tuple[Any, fmpz, list[int]]:
+    """Return the basis of `null_basis` times a number that makes it whole, that number, and the columns that are free.
+
+    Entries in lowest terms take most of the time of a large basis."""
+    reduced, size, rank = matrix.numer_denom()[0].rref()
+    columns, pivots, table = int(matrix.ncols()), _leading(reduced, rank), reduced.tolist()
+    free = [j for j in range(columns) if j not in set(pivots)]
+    basis = fmpz_mat(columns, len(free))
+    for k, j in enumerate(free):
+        basis[j, k] = size
+        for i, pivot in enumerate(pivots):
+            basis[pivot, k] = -table[i][j]
+    return basis, fmpz(size), free
 
 
 def left_null_basis(matrix: fmpq_mat) -> fmpq_mat:
@@ -189,14 +204,24 @@ def written_matrix(matrix: FloatArray) -> fmpq_mat:
 
 def stored_matrix(matrix: FloatArray) -> fmpq_mat:
     """Return a matrix ``(m, n)`` of doubles as the rational numbers that are stored, whatever they stand for."""
-    # Whole numbers of one power of two.
-    parts, exponents = np.frexp(matrix)
-    least = int(np.min(exponents, initial=0, where=matrix != 0.0)) - MANTISSA_BITS
-    whole, shifts = np.ldexp(parts, MANTISSA_BITS).astype(np.int64), exponents - MANTISSA_BITS - least
-    shifted = [value << shift for value, shift in zip(whole.ravel().tolist(), shifts.ravel().tolist(), strict=True)]
-    rows, columns = matrix.shape
-    found: fmpq_mat = fmpq_mat(fmpz_mat(rows, columns, shifted)) / fmpz(2) ** -least
+    (whole,), unit = whole_matrices([matrix])
+    found: fmpq_mat = fmpq_mat(whole) / unit
     return found
+
+
+def whole_matrices(matrices: Sequence[FloatArray]) -> tuple[list[fmpz_mat], fmpz]:
+    """Return matrices of doubles as they are stored, times a power of two that makes all entries whole, and that."""
+    parts = [np.frexp(matrix) for matrix in matrices]
+    least = min(int(np.min(powers, initial=0, where=half != 0.0)) for half, powers in parts) - MANTISSA_BITS
+    found = []
+    for half, powers in parts:
+        whole, shifts = np.ldexp(half, MANTISSA_BITS).astype(np.int64), powers - MANTISSA_BITS - least
+        # What is zero is not shifted.
+        shifts = np.where(whole != 0, shifts, 0)
+        shifted = [value << shift for value, shift in zip(whole.ravel().tolist(), shifts.ravel().tolist(), strict=True)]
+        rows, columns = half.shape
+        found.append(fmpz_mat(rows, columns, shifted))
+    return found, fmpz(2) ** -least
 
 
 def rational_matrix(rows: FractionRows, columns: int) -> fmpq_mat:

@@ -18,11 +18,22 @@ from typing import Any
 
 import flint
 import numpy as np
+from flint import fmpq_mat
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.covariances import squared_norm
-from obsynth.proofs.exact_arithmetic import blocks, null_basis, picked_rows, row_basis, stored_matrix, zeros_matrix
+from obsynth.proofs.exact_arithmetic import (
+    blocks,
+    null_basis,
+    picked_columns,
+    picked_rows,
+    row_basis,
+    stored_matrix,
+    whole_matrices,
+    whole_null_basis,
+    zeros_matrix,
+)
 from obsynth.proofs.extended_balls import arb_matrix, undecided_pivot
 from obsynth.results.checks import Check, information
 
@@ -67,21 +78,33 @@ class InvisiblePairs:
     @classmethod
     @lru_cache(maxsize=2)
     def _of(cls, *numbers: tuple[tuple[int, ...], bytes]) -> InvisiblePairs:
-        t, n, feedback, w, upsilon, plain, c, bd, dd = (
-            stored_matrix(np.frombuffer(data).reshape(shape)) for shape, data in numbers
-        )
-        ta, direct = t * plain, dd - c * (n * dd)
-        a, b = ta - feedback * c, t * bd - ta * (n * dd) - feedback * direct
+        matrices, unit = whole_matrices([np.frombuffer(data).reshape(shape) for shape, data in numbers])
+        t, n, feedback, w, upsilon, plain, c, bd, dd = matrices
+        # Whole numbers: a and z are `unit^2` times what they stand for, b and zd `unit^4` times.
+        square = unit * unit
+        ta, direct = t * plain, dd * square - c * (n * dd)
+        a, b = ta - feedback * c, t * bd * square - ta * (n * dd) - feedback * direct
         z, zd = w * c, w * direct
-        pairs = null_basis(blocks([[c, direct, upsilon]]))
-        count, states, inputs = int(pairs.ncols()), int(plain.ncols()), int(bd.ncols())
-        tops, bottoms = picked_rows(pairs, range(states)), picked_rows(pairs, range(states, states + inputs))
+        pairs, size, free = whole_null_basis(blocks([[fmpq_mat(c), fmpq_mat(direct) / square, fmpq_mat(upsilon)]]))
+        states, inputs = int(plain.ncols()), int(bd.ncols())
+        # A start has `size` times x where a state is free, and these come first.
+        own = [j for j in free if j < states]
+        others = [j for j in range(states) if j not in set(own)]
+        first, beside = (
+            fmpq_mat(picked_columns(picked_rows(pairs, others), range(*ends)))
+            for ends in ((0, len(own)), (len(own), len(free)))
+        )
+        bottoms = fmpq_mat(picked_rows(pairs, range(states, states + inputs)))
         reached = zeros_matrix(states, 0)
         while True:
-            # Pairs that start where others have ended.
-            chosen = picked_rows(null_basis(blocks([[tops, reached]])), range(count))
-            starts, ends = tops * chosen, bottoms * chosen
-            images = a * starts + b * ends
+            # Pairs x that start where others have ended, at -y in the basis of that.
+            ended = picked_rows(reached, own)
+            chosen = null_basis(blocks([[beside, picked_rows(reached, others) * size - first * ended]]))
+            width = int(beside.ncols())
+            y = picked_rows(chosen, range(width, int(chosen.nrows())))
+            starts = -reached * y
+            ends = bottoms * blocks([[-ended * y], [picked_rows(chosen, range(width))]]) / size
+            images = (a * starts * square + b * ends) / (square * square)
             # A basis of the range whose rows at `_pivot_rows` are the identity.
             larger = row_basis(blocks([[reached, images]]).transpose()).transpose()
             if larger.ncols() == reached.ncols():
@@ -89,7 +112,8 @@ class InvisiblePairs:
             reached = larger
         places = _pivot_rows(reached)
         top, image = picked_rows(starts, places), picked_rows(images, places)
-        return cls(reached, top, ends, image, z * starts + zd * ends, z * reached, zd)
+        shown = (z * starts * square + zd * ends) / (square * square)
+        return cls(reached, top, ends, image, shown, z * reached / square, fmpq_mat(zd) / (square * square))
 
     def bound(self, matrices: Mapping[str, FloatArray], *, free_weight: bool) -> float:
         """Return the lower bound that a certificate proves, rounded down; zero where it proves nothing."""
