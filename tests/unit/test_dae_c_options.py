@@ -109,6 +109,26 @@ def test_a_sample_beside_a_missing_input_is_left_out_however_near_it_is(tmp_path
     assert whole.states[33, 0] - states[33, 0] < -10.0 * expected[33].state_deviations[0, 0]
 
 
+def test_two_outliers_in_a_row_and_one_after_missing_inputs_in_c(tmp_path) -> None:
+    """They are left out where the sensor's outliers are known; the third of a row is believed."""
+    design = tank_observer("augmented-kalman", OPTIONS["sizes"])
+    y, u = leaking(design)
+    y[30:32, 0] += 2.0
+    u[10] *= 3.0
+    u[39:41] = np.nan
+    y[41, 2] -= 1.0
+    running, refused = design.observer.start(), []
+    found = run_c(design, y[:60], u[:60], tmp_path, quick=True)
+    states = []
+    for sample in zip(y[:60], u[:60], strict=True):
+        states.append(running.step(*sample).states[0])
+        refused.append(running.state.refused[1])
+    assert np.abs(found["states"] - states).max() <= 1e-10
+    lost = np.diff(refused, axis=0, prepend=0.0)
+    assert lost[30:33, 0].tolist() == [1.0, 1.0, 0.0]
+    assert lost[41, 2] == 1.0
+
+
 @pytest.mark.one_in(3)
 @pytest.mark.parametrize("form", FORMS)
 def test_everything_at_once_in_c(form, tmp_path) -> None:

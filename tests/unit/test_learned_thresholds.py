@@ -127,8 +127,9 @@ def test_the_stated_rate_is_kept_out_of_sample(m: int, memory: float, share: Cal
 
 
 def test_the_rows_learned_from_keep_the_rate_where_something_slow_is_in_them() -> None:
-    """An offset for 150 of 1,500 rows: blocks of the bootstrap are shorter, and four alarms were raised there."""
-    rng, every = np.random.default_rng(2), 1500.0
+    """An offset for 150 of 1,500 rows: blocks of the bootstrap are shorter, and more alarms were raised there. With one
+    fewer than the rate allows in these rows, later ones keep it on average."""
+    rng, every = np.random.default_rng(2), 900.0
     x = rng.standard_normal((3_000, 1)) + 0.5 * (np.sin(2.0 * np.pi * np.arange(3_000) / 1_500) > 0.95)[:, None]
     model = fitted_autoregression(x)
     statistics = Statistics(model, np.eye(1), ("y",))
@@ -136,7 +137,7 @@ def test_the_rows_learned_from_keep_the_rate_where_something_slow_is_in_them() -
     e = model.whitened(x[None])
     assert np.isfinite(e).all()
     largest = (statistics.of_rows(e)[:, 0] / levels.own[:, None]).max(axis=0)
-    assert 1 <= count_alarms(largest[None], levels.factor) <= 3_000 / every
+    assert 1 <= count_alarms(largest[None], levels.factor) <= 3_000 / every - 1.0
 
 
 def test_many_rows_show_their_rate_themselves() -> None:

@@ -203,6 +203,42 @@ def test_a_sample_nearer_than_outliers_are_is_believed_at_once(kind):
     assert np.abs(far.innovations[at]).max() > 1.5 * np.abs(near.innovations[at]).max()
 
 
+@pytest.mark.parametrize("kind", ["recursive", "nonlinear"])
+def test_of_a_sensor_whose_outliers_are_known_two_in_a_row_are_left_out(kind):
+    """Two wrong samples on one side may come together; three are a sensor, or a plant, that has moved."""
+    design, y, u, at, size, _ = gated(kind)
+    observer = replace(design.observer, outlier_sizes={design.plant.output_names[0]: 1.5 * size})
+    for count, lost in ((2, [1.0, 1.0, 0.0, 0.0]), (4, [1.0, 1.0, 0.0, 0.0])):
+        moved = y.copy()
+        moved[at : at + count, 0] += 2.0 * size
+        found, row = gate_counts(observer, moved[: at + 4], u[: at + 4])
+        assert np.diff(found[at - 1 : at + 4, 0]).tolist() == lost
+        hidden = y.copy()
+        hidden[at : at + 2, 0] = np.nan
+        same = np.allclose(row.x, gate_counts(observer, hidden[: at + 4], u[: at + 4])[1].x, rtol=0.0, atol=1e-3 * size)
+        assert same == (count == 2)
+
+
+@pytest.mark.parametrize("kind", ["recursive", "nonlinear"])
+def test_an_outlier_after_missing_inputs_is_left_out_however_unsure_the_prediction_is(kind):
+    """What inputs may have been meanwhile widens the deviations so far that any sample would pass."""
+    design, y, u, at, size, _ = gated(kind)
+    known = replace(design.observer, outlier_sizes={design.plant.output_names[0]: 1.5 * size})
+    nothing, wrong = np.full_like(y[0], np.nan), y[at].copy()
+    wrong[0] += 4.0 * size
+    for observer, lost in ((design.observer, 0.0), (known, 1.0)):
+        state = observer.init()
+        for k in range(at - 3):
+            state, _ = observer.advance(state, y[k], u[k])
+        # Inputs that moved as far as these before may be anywhere now.
+        wide = np.stack([state.u - 1e3, state.u + 1e3, np.full_like(state.u, 1e3), *state.inputs[3:]])
+        state = state._replace(inputs=wide)
+        for k in range(at - 3, at):
+            state, _ = observer.advance(state, nothing, np.full_like(u[k], np.nan))
+        assert observer.advance(state, wrong, u[at])[0].refused[1, 0] == lost
+        assert observer.advance(state, y[at], u[at])[0].refused[1, 0] == 0.0
+
+
 def test_run_leaves_outliers_out_by_default_and_counts_them(tmp_path):
     design, u, true = tank_log()
     # An observer that has run before is as good as a new one.

@@ -27,8 +27,8 @@ OUTLIER_KINDS = ("none", "gate", "huber")
 LIMITS = {"gate": 6.0, "huber": 3.0}
 #: What is larger has no square: it is no measurement, whatever the model says.
 NO_SQUARE = 1e150
-#: Samples of one sensor in a row that are left out where their sides change; the second on one side is believed, and
-#: so are those that follow it there, unless they are wild.
+#: Samples of one sensor in a row that are left out where their sides change, or where its outliers are known, so that
+#: two may come together; else the second on one side is believed. So are those that follow it there, unless wild.
 LONGEST_LEFT_OUT = 2
 #: How many times further off than the one before it a sample may be that is believed for it: at the onset of a fault
 #: that grows with the square of time the second is 4 times further off, and noise moves both.
@@ -88,13 +88,15 @@ def robust_advance(
     ``predicted(state, received, u)``: mean and deviation of each output ``(ny,)`` from the samples that are received;
     ``predicted_outputs(state, u)``: of outputs that determine the state; these may be `BLIND` times further off.
     ``held (nu,)``, where inputs are missing: as they last were. What these exclude, by deviations alone, may be wrong,
-    or the inputs have moved: it counts once the next sample goes on with it."""
+    or the inputs have moved: it counts once the next sample goes on with it. So does what is as far off as outliers of
+    its sensor are once inputs are known again, until a sample is nearer or goes on with those before."""
     failed, mean, reach, far = False, y, y, np.zeros(len(y), dtype=bool)
     least = np.zeros(len(y)) if sizes is None else sizes
+    wary = None if sizes is None or kind != "gate" or held is not None else _wary(state, sizes)
     try:
         with np.errstate(all="ignore"):
             after, row = plain(state, y, u)
-            passes = float(row.nis) <= limit**2 and held is None
+            passes = float(row.nis) <= limit**2 and held is None and wary is None
             if passes and predicted_outputs is not None:
                 mean, deviation = predicted_outputs(state, u)
                 reach = np.maximum(limit * deviation, least)
@@ -107,10 +109,14 @@ def robust_advance(
         # Beside a missing input nearer samples wait for the next one as well: no fault is told of in this row.
         least, u_taken = (least, u) if held is None else (np.zeros(len(y)), held)
         mean, reach, far = _judged(limit, least, predicted, state, y, u_taken)
+        if wary is not None:
+            reach = np.where(wary & np.isfinite(reach), least, reach)
+            far |= wary & (np.abs(y - mean) > reach)
     off, gone = np.where(far, y - mean, 0.0), far
     if kind == "gate":
         # A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off.
-        gone = far & (~_follows(state.refused, off) | (np.abs(y) > NO_SQUARE))
+        known = np.zeros(len(y), dtype=bool) if sizes is None else sizes > 0.0
+        gone = far & (~_follows(state.refused, off, known) | (np.abs(y) > NO_SQUARE))
         received = np.where(gone, np.nan, y)
     else:
         pulled = mean + reach * np.sign(y - mean)
@@ -125,15 +131,25 @@ def robust_advance(
     return after._replace(refused=_remembered(state.refused, y, far, gone, off)), row
 
 
-def _follows(refused: FloatArray, off: FloatArray) -> BoolArray:
+def _wary(state: Any, sizes: FloatArray) -> BoolArray | None:
+    """Return of which sensors with known outliers ``(ny,)`` a sample waits for the next whatever its deviation: what
+    inputs may have been while they were missing makes it so large that an outlier would pass. `None`: of none."""
+    if state.inputs[3].any():
+        return np.asarray(sizes > 0.0)
+    waiting = state.refused[2]
+    return np.asarray((sizes > 0.0) & (waiting != 0.0)) if waiting.any() else None
+
+
+def _follows(refused: FloatArray, off: FloatArray, known: BoolArray) -> BoolArray:
     """Return which samples ``off (ny,)`` their prediction go on with what was off before: with what was believed, or as
-    far as the one that was left out, on its side or after `LONGEST_LEFT_OUT` of them on any."""
+    far as the one that was left out: after `LONGEST_LEFT_OUT` of them, or on its side where the sensor's outliers are
+    not ``known (ny,)``."""
     row, _, left, believed = refused
     sizes, others = np.abs(off), np.abs(left)
     with np.errstate(over="ignore"):
         on = (off * np.sign(believed) > 0.0) & (sizes <= COMPARABLE * np.abs(believed))
         like = (others > 0.0) & (sizes <= COMPARABLE * others) & (others <= COMPARABLE * sizes)
-    return np.asarray(on | like & ((off * np.sign(left) > 0.0) | (np.abs(row) >= LONGEST_LEFT_OUT)))
+    return np.asarray(on | like & ((~known & (off * np.sign(left) > 0.0)) | (np.abs(row) >= LONGEST_LEFT_OUT)))
 
 
 def _remembered(refused: FloatArray, y: FloatArray, far: BoolArray, gone: BoolArray, off: FloatArray) -> FloatArray:

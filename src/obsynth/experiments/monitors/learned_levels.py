@@ -423,8 +423,8 @@ def conformal_levels(
     """Return statistics fitted to the first half of rows ``(n, m)``, and their levels from the second; ``scores``:
     what these rows say of faults, which are where the first half has them.
 
-    Alarms in the second half are as exchangeable with later ones as blocks of rows are: with one fewer than allowed
-    there, the mean rate of what comes is at most the stated one (split conformal: Papadopoulos et al. 2002).
+    Alarms in the second half are as exchangeable with later ones as blocks of rows are (split conformal: Papadopoulos
+    et al. 2002).
     """
     half = len(x) // 2
     model = fitted_autoregression(x[:half])
@@ -434,8 +434,8 @@ def conformal_levels(
     own, _ = _union(first, every, half - SETTLING)
     union = (second / own[None, :, None]).max(axis=1)
     rows = int(np.asarray(np.isfinite(x[half + SETTLING :]).all(axis=1)).sum())
-    allowed = int(rows / every) - 1
-    return found, Levels(read_only(own), level_of(union, union[:, SETTLING:].size / allowed), extrapolated=False)
+    stretched = union[:, SETTLING:].size / rows
+    return found, Levels(read_only(own), level_of(union, stretched * _exchangeable(rows, every)), extrapolated=False)
 
 
 def _changes(scores: Scores, centre: FloatArray) -> FloatArray:
@@ -488,8 +488,16 @@ def learned_levels(
         before = level_of(union, seen_rate / OBSERVED)
         level += max(level - before, 0.0) * float(np.log(every / seen_rate) / np.log(OBSERVED))
     # What lasts longer in these rows than a block raises alarms in them that no stream of blocks shows.
-    itself = (_of_normal(x, statistics, scores) / own[:, None]).max(axis=0)
-    return Levels(read_only(own), max(level * sure, level_of(itself[None], every)), every > seen_rate)
+    itself = (_of_normal(x, statistics, scores) / own[:, None]).max(axis=0)[None]
+    shown_there = level_of(itself, _exchangeable(itself[:, SETTLING:].size, every))
+    return Levels(read_only(own), max(level * sure, shown_there), every > seen_rate)
+
+
+def _exchangeable(rows: int, every: float) -> float:
+    """Return how many rows there may be for each alarm in so many normal ones: with one fewer than a rate of one in
+    ``every`` allows, the mean rate of later rows is at most that, as their alarms are exchangeable with these."""
+    allowed = int(rows / every) - 1
+    return rows / allowed if allowed > 0 else np.inf
 
 
 def _of_normal(

@@ -74,8 +74,8 @@ static int forecasted(const struct observer *state, const double *u, const doubl
     return call(forecast, inputs, 2, outputs, 2) == 0 ? 0 : 2;
 }
 
-/* Whether a sample goes on with what was off before: with what was believed, or as far as the one that was left out, on
-   its side or after LONGEST_REFUSAL of them on any. */
+/* Whether a sample goes on with what was off before: with what was believed, or as far as the one that was left out:
+   after LONGEST_REFUSAL of them, or on its side where the sensor's outliers are not known. */
 static int follows(const struct observer *state, int i, double off)
 {
     double size = fabs(off);
@@ -85,7 +85,8 @@ static int follows(const struct observer *state, int i, double off)
     int in_a_row = state->in_a_row[i] < 0 ? -state->in_a_row[i] : state->in_a_row[i];
     int on = (believed > 0.0 ? off : -off) > 0.0 && size <= COMPARABLE * fabs(believed);
     int like = other > 0.0 && size <= COMPARABLE * other && other <= COMPARABLE * size;
-    return on || (like && ((left > 0.0 ? off : -off) > 0.0 || in_a_row >= LONGEST_REFUSAL));
+    int on_its_side = (left > 0.0 ? off : -off) > 0.0 && !(OUTLIER_SIZES[i] > 0.0);
+    return on || (like && (on_its_side || in_a_row >= LONGEST_REFUSAL));
 }
 
 /* Remember of a sample that is there how far off it was, and whether it was left out (or pulled). */
@@ -109,10 +110,22 @@ static int robust(const struct observer *state, const double *u, const double *v
     int far[NY];
     int gone[NY];
     int failed, any = 0;
+    int wary[NY];
+    int is_back = 0;
+    int any_wary = 0;
     int i;
     copy(received, y, NY);
+    for (i = 0; i < NU; i++) {
+        is_back = is_back || state->inputs[3 * NU + i] > 0.0;
+    }
+    /* What the inputs may have been meanwhile makes deviations so large that an outlier would pass once they are known
+       again: what is as far off as outliers of its sensor are waits until others go on with it. */
+    for (i = 0; i < NY; i++) {
+        wary[i] = GATE && OUTLIER_SIZES[i] > 0.0 && (is_back || state->left_out[i] != 0.0) && !is_missing;
+        any_wary = any_wary || wary[i];
+    }
     failed = watched(state, u, variances, y, after, said);
-    if (!failed && !is_missing && said[AT_NIS] <= OUTLIER_LIMIT * OUTLIER_LIMIT) {
+    if (!failed && !is_missing && !any_wary && said[AT_NIS] <= OUTLIER_LIMIT * OUTLIER_LIMIT) {
         for (i = 0; i < NY; i++) {
             if (!isnan(y[i])) {
                 remember(state, after, i, 0, 0, 0.0);
@@ -132,7 +145,9 @@ static int robust(const struct observer *state, const double *u, const double *v
         int huge = fabs(y[i]) > OVERFLOW_LIMIT;
         double most = OUTLIER_LIMIT * deviation[i];
         double reach = most < OUTLIER_SIZES[i] && !is_missing ? OUTLIER_SIZES[i] : most;
-        double pulled = mean[i] + reach * (y[i] > mean[i] ? 1.0 : -1.0);
+        double pulled;
+        reach = wary[i] ? OUTLIER_SIZES[i] : reach;
+        pulled = mean[i] + reach * (y[i] > mean[i] ? 1.0 : -1.0);
         far[i] = fabs(y[i] - mean[i]) > reach || huge;
         off[i] = y[i] - mean[i];
         /* A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off. */
