@@ -28,7 +28,7 @@ from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.files.tables import html_table, standing_page, text_table
 from obsynth.methods.automatic import SETTLING_TIMES, Candidate, Maker, candidate, linear_methods
 from obsynth.methods.designing import design
-from obsynth.methods.fault_figures import DECOUPLED, FaultFigures, Held, held, on_the_clock, step_responses
+from obsynth.methods.fault_figures import DECOUPLED, FaultFigures, held, on_the_clock, step_responses
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import MOST_STATES, problem_of
@@ -515,9 +515,9 @@ def design_beside_least(design: ObserverDesign, scenario: Scenario) -> dict[str,
     try:
         sampled = on_the_clock(plant, plant.dt)
         steps = int(min(max(SETTLING_TIMES * settling_time(plant) / plant.dt, observer.order + 2), MOST_RESPONSE_STEPS))
-        kept = held(sampled, steps)
-        impulses, _ = step_responses(sampled, observer, kept.steps, kept.feedback)
-        bounds = largest_disturbances(scenario, sampled.disturbance_names, kept.steps, plant.dt)
+        steps, feedback = held(sampled, steps)
+        impulses, _ = step_responses(sampled, observer, steps, feedback)
+        bounds = largest_disturbances(scenario, sampled.disturbance_names, steps, plant.dt)
     except ObsynthError:
         return {}
     pairs = thresholds_beside_least(sampled, impulses, observer.fault_names, bounds)
@@ -796,26 +796,26 @@ def side_by_side(
     happening = _scenario(plant, scenario, dt, disturbance)
     steps = int(min(happening.horizon / dt, MOST_SCENARIO_SAMPLES)) + 1
     kept = held(sampled, steps)
-    if kept.steps < steps:
-        steps, happening = kept.steps, happening.replace(horizon=kept.steps * dt)
+    if kept[0] < steps:
+        steps, happening = kept[0], happening.replace(horizon=kept[0] * dt)
     found = []
     for method in methods:
         report_stage(f"designing by {method}")
         found.append(candidate(method, plant, sampled, steps, maker, (options or {}).get(method, {})))
     report_stage("running the scenario")
     faulty, healthy = drawn_runs(
-        plant, sampled, happening, runs=runs, tolerance=tolerance, seed=COMPARISON_SEED, feedback=kept.feedback
+        plant, sampled, happening, runs=runs, tolerance=tolerance, seed=COMPARISON_SEED, feedback=kept[1]
     )
     log = None if data is None else _log(data, sampled, columns, scales, input_delay)
     limit = within if within is not None else settling_time(plant)
-    bounds = largest_disturbances(happening, sampled.disturbance_names, kept.steps, dt)
+    bounds = largest_disturbances(happening, sampled.disturbance_names, kept[0], dt)
     compared = [_compared(entry, sampled, faulty, healthy, log, kept, limit, false_alarms, bounds) for entry in found]
     compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.rms))
     setting = (
         f"{runs} runs of {happening.horizon:g} s, sampled every {dt:g} s, disturbances and noise drawn"
         + (", constants within their tolerances" if plant.uncertainty is not None else "")
         + (f", parameters off by up to {tolerance:.0%}" if tolerance else "")
-        + (", a state feedback stabilises the plant" if kept.feedback.any() else "")
+        + (", a state feedback stabilises the plant" if kept[1].any() else "")
         + f"; 90 % of a step to be reached within {limit:.3g} s"
     )
     shown = faulty if log is None else log
@@ -968,7 +968,7 @@ def _compared(
     faulty: Record,
     healthy: Record,
     log: Record | None,
-    kept: Held,
+    kept: tuple[int, FloatArray],
     limit: float,
     false_alarms: float,
     bounds: FloatArray,
@@ -977,7 +977,7 @@ def _compared(
     if entry.observer is None:
         return ComparedMethod(entry.method, entry.refused, None, 0, entry.milliseconds, (), False, nothing, nothing)
     observer = entry.observer
-    impulses, responses = step_responses(plant, observer, kept.steps, kept.feedback)
+    impulses, responses = step_responses(plant, observer, *kept)
     names = [figures.fault for figures in entry.figures]
     beside = thresholds_beside_least(plant, impulses, names, bounds)
     found, quiet = estimates(observer, faulty), estimates(observer, healthy)

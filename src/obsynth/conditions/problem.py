@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from obsynth.analysis.conditions import Condition
 from obsynth.errors import SolverError, SpecError, VerificationError
 from obsynth.methods.designing import failed_rows
 from obsynth.numerics.arguments import shown
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.results.design import ObserverDesign
 from obsynth.results.verification_report import VerificationReport
 from obsynth.verification.plant import condition_rows
@@ -61,9 +60,8 @@ class Conditions:
     weight: Any = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "data", MappingProxyType({k: read_only(v) for k, v in self.data.items()}))
-        for name in ("variables", "parameters", "constraints"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+        data = {name: read_only(value) for name, value in self.data.items()}
+        freeze(self, "variables", "parameters", "constraints", data=data)
 
     @cached_property
     def existence(self) -> VerificationReport:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast, overload
@@ -19,7 +19,7 @@ from obsynth.errors import SpecError
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.files.tables import table_writer
 from obsynth.numerics.arguments import require_kind
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.dae.observer import DAEObserver
@@ -374,9 +374,7 @@ class Simulation:
     notes: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if isinstance(getattr(self, field.name), np.ndarray):
-                object.__setattr__(self, field.name, read_only(getattr(self, field.name)))
+        freeze(self, *(name for name, value in vars(self).items() if isinstance(value, np.ndarray)))
 
     @property
     def fault_errors(self) -> FloatArray:

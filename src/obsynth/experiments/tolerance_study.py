@@ -18,7 +18,7 @@ from obsynth.files.tables import text_table
 from obsynth.methods.handing_on import require_verified
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import require_kind, whole_number
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray, freeze
 from obsynth.plants.constants import shown, tolerance_share
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.certificate_files import SHOWN_DIGITS, STUDY, result_text
@@ -71,8 +71,7 @@ class ToleranceStudy:
     asked: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("tolerances", "false_alarms", "least_faults"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
+        freeze(self, "tolerances", "false_alarms", "least_faults")
 
     def rows(self) -> list[tuple[str, ...]]:
         """Return a heading, and for each tolerance a row of each monitor, as text."""

@@ -82,27 +82,20 @@ def on_the_clock(plant: DescriptorSystem, sample_time: float) -> DescriptorSyste
     return discretise(plant, sample_time).plant
 
 
-@dataclass(frozen=True, eq=False)
-class Held:
-    """How an unstable plant is kept in bounds: ``u = -feedback x`` with ``feedback (nu, nx)``, for so many samples."""
-
-    feedback: FloatArray
-    steps: int
-
-
-def held(plant: DescriptorSystem, steps: int) -> Held:
-    """Return what holds a sampled plant ``(E = I)``: nothing where it hardly grows; with no input, a shorter time."""
+def held(plant: DescriptorSystem, steps: int) -> tuple[int, FloatArray]:
+    """Return for how many samples, and with which ``feedback (nu, nx)``, ``u = -feedback x``, a sampled plant
+    ``(E = I)`` is kept in bounds: with none where it hardly grows; with no input, for a shorter time."""
     nothing = np.zeros((plant.nu, plant.nx))
     rate = float(np.log(max(float(np.max(np.abs(np.linalg.eigvals(plant.A)), initial=0.0)), 1.0)))
     if rate * steps <= np.log(HELD_GROWTH):
-        return Held(nothing, steps)
+        return steps, nothing
     try:
         found = stabilising_feedback(plant)
         if float(np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ found)))) < 1.0:
-            return Held(found, steps)
+            return steps, found
     except PreconditionError:
         pass
-    return Held(nothing, max(int(np.log(LARGEST_STEP_GROWTH) / rate), 2))
+    return max(int(np.log(LARGEST_STEP_GROWTH) / rate), 2), nothing
 
 
 def step_responses(
@@ -134,8 +127,7 @@ def step_responses(
 
 def fault_figures(plant: DescriptorSystem, observer: LinearObserver, steps: int) -> tuple[FaultFigures, ...]:
     """Return the figures of every fault that a sampled observer estimates on a sampled plant ``(E = I)``."""
-    kept = held(plant, steps)
-    impulse, step = step_responses(plant, observer, kept.steps, kept.feedback)
+    impulse, step = step_responses(plant, observer, *held(plant, steps))
     unknown = impulse[:, :, plant.nf : plant.nf + plant.nd]
     noise = impulse[:, :, plant.nf + plant.nd :]
     # An observer that runs away has figures beyond all numbers, and needs no warning besides.

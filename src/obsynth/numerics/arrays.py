@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from inspect import Parameter, signature
+from types import MappingProxyType
 from typing import Any, Concatenate, ParamSpec, TypeAlias, TypeVar
 from weakref import WeakKeyDictionary
 
@@ -48,6 +49,13 @@ def read_only(array: FloatArray) -> FloatArray:
     copy = np.array(array, dtype=np.float64, order="C", copy=True)
     copy.setflags(write=False)
     return copy
+
+
+def freeze(record: Any, *names: str, **values: Any) -> None:
+    """Make arrays and mappings of a frozen record private and read-only: its own ones by name, or others given."""
+    for name, value in ({name: getattr(record, name) for name in names} | values).items():
+        kept = MappingProxyType(dict(value)) if isinstance(value, Mapping) else read_only(value)
+        object.__setattr__(record, name, kept)
 
 
 def largest_singular_value(matrix: NDArray[Any]) -> float:

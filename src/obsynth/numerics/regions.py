@@ -15,7 +15,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_number, shown
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray, freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +40,7 @@ class LMIRegion:
     parts: tuple[dict[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "L", read_only(self.L))
-        object.__setattr__(self, "M", read_only(self.M))
+        freeze(self, "L", "M")
 
     def __repr__(self) -> str:
         return self.text

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_array, real_vector, whole_number
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.arrays import FloatArray, as_matrix, freeze, read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.records import (
     NAME_FIELDS,
@@ -96,9 +96,7 @@ class WindowObserver(Observer[WindowState, float]):
             raise SpecError("The observer names weights that it does not have, or not one signal.", path="programmes")
         if len(self.fault_delays) != len(self.fault_names):
             raise SpecError("The observer needs one delay for its fault.", path="delays")
-        object.__setattr__(self, "weights", read_only(weights))
-        object.__setattr__(self, "programmes", read_only(programmes))
-        object.__setattr__(self, "constants", read_only(constants))
+        freeze(self, weights=weights, programmes=programmes, constants=constants)
 
     @property
     def order(self) -> int:

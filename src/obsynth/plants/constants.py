@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import chosen, is_finite_number, is_number, real_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, freeze
 
 VARIATIONS = ("constant", "varying")
 SOURCES = ("stated", "set-membership", "calibrated")
@@ -375,8 +375,7 @@ class CalibratedBox:
     stands: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("nominal", "low", "high"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+        freeze(self, "nominal", "low", "high")
 
     def holds(self, values: Mapping[str, float]) -> bool:
         """Return whether given values of all constants are inside.

@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.extensions import extension
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.sensor_timing import LONGEST_DELAY
 from obsynth.plants.descriptor import DescriptorSystem
@@ -30,6 +29,8 @@ if TYPE_CHECKING:
     from obsynth.plants.dae.model import DAEModel
     from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
+OfPlant = TypeVar("OfPlant")
+OfObserver = TypeVar("OfObserver")
 #: Larger plants are not stored: their elimination is checked where it is done.
 MOST_STORED_STATES = 500
 
@@ -114,9 +115,7 @@ class Certificate:
     claims: Mapping[str, float]
 
     def __post_init__(self) -> None:
-        frozen = {name: read_only(matrix) for name, matrix in self.matrices.items()}
-        object.__setattr__(self, "matrices", MappingProxyType(frozen))
-        object.__setattr__(self, "claims", MappingProxyType(dict(self.claims)))
+        freeze(self, "claims", matrices={name: read_only(matrix) for name, matrix in self.matrices.items()})
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -175,10 +174,7 @@ class ObserverDesign:
             raise SpecError(
                 f"input_delay is {rows!r}: give a whole number of rows, at most {LONGEST_DELAY}.", path="input_delay"
             )
-        frozen = {name: read_only(matrix) for name, matrix in self.gains.items()}
-        object.__setattr__(self, "gains", MappingProxyType(frozen))
-        object.__setattr__(self, "options", MappingProxyType(dict(self.options)))
-        object.__setattr__(self, "solver", MappingProxyType(dict(self.solver)))
+        freeze(self, "options", "solver", gains={name: read_only(matrix) for name, matrix in self.gains.items()})
 
     @property
     def linear(self) -> tuple[DescriptorSystem, LinearObserver]:
@@ -189,9 +185,7 @@ class ObserverDesign:
         SpecError
             The design is a recursive one.
         """
-        if not isinstance(self.plant, DescriptorSystem) or not isinstance(self.observer, LinearObserver):
-            raise SpecError(f"Design {self.name!r} is no linear time-invariant observer.", path="observer")
-        return self.plant, self.observer
+        return self._parts(DescriptorSystem, LinearObserver, "linear time-invariant observer")
 
     @property
     def recursive(self) -> tuple[TimeVaryingDescriptorSystem, RecursiveObserver]:
@@ -205,9 +199,7 @@ class ObserverDesign:
         from obsynth.observers.recursive.observer import RecursiveObserver
         from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
-        if not isinstance(self.plant, TimeVaryingDescriptorSystem) or not isinstance(self.observer, RecursiveObserver):
-            raise SpecError(f"Design {self.name!r} is no recursive observer.", path="observer")
-        return self.plant, self.observer
+        return self._parts(TimeVaryingDescriptorSystem, RecursiveObserver, "recursive observer")
 
     @property
     def nonlinear(self) -> tuple[DAEModel, DAEObserver]:
@@ -221,8 +213,11 @@ class ObserverDesign:
         from obsynth.observers.dae.observer import DAEObserver
         from obsynth.plants.dae.model import DAEModel
 
-        if not isinstance(self.plant, DAEModel) or not isinstance(self.observer, DAEObserver):
-            raise SpecError(f"Design {self.name!r} is no observer of a nonlinear plant.", path="observer")
+        return self._parts(DAEModel, DAEObserver, "observer of a nonlinear plant")
+
+    def _parts(self, plant: type[OfPlant], observer: type[OfObserver], what: str) -> tuple[OfPlant, OfObserver]:
+        if not isinstance(self.plant, plant) or not isinstance(self.observer, observer):
+            raise SpecError(f"Design {self.name!r} is no {what}.", path="observer")
         return self.plant, self.observer
 
     def __repr__(self) -> str:

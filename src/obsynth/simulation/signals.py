@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.arrays import FloatArray, as_matrix, freeze
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -239,9 +239,7 @@ class Trajectory:
     residuals: FloatArray = field(default_factory=_none)
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            if isinstance(getattr(self, item.name), np.ndarray):
-                object.__setattr__(self, item.name, read_only(getattr(self, item.name)))
+        freeze(self, *(name for name, value in vars(self).items() if isinstance(value, np.ndarray)))
 
 
 def signal_of(value: ArrayLike | None, name: str, shape: tuple[int, int]) -> FloatArray:

@@ -42,7 +42,7 @@ from obsynth.spec.documents import DocumentProblems, checked_plant, checked_spec
 if TYPE_CHECKING:
     from obsynth.analysis.transformations.recovery import Transformation
     from obsynth.results.design import ObserverDesign
-    from obsynth.spec.schema import ProfileSection, ScenarioSection
+    from obsynth.spec.schema import ScenarioSection
     from obsynth.spec.schema_rare import DAESection, TimeVaryingSection
     from obsynth.spec.schema_values import EntrySection, PlantReference, PlantSection, TransformSection
 
@@ -564,7 +564,7 @@ def built_scenario(
     return scenario
 
 
-def _profile(section: ProfileSection, where: str, problems: DocumentProblems) -> Profile | None:
+def _profile(section: Any, where: str, problems: DocumentProblems) -> Profile | None:
     """Return the profile; note what is wrong with it."""
     kind = PROFILE_KINDS[section.kind]
     given = {name: getattr(section, name) for name in section.model_fields_set - {"kind"}}

@@ -5,12 +5,14 @@ This module imports pydantic, so it is imported only when a spec is read.
 
 from __future__ import annotations
 
+from dataclasses import fields
 from functools import cache
 from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag, create_model
 
 from obsynth.numerics.arguments import Positive
+from obsynth.simulation.scenario import PROFILE_KINDS
 from obsynth.spec.schema_values import LIST_TAG, ONE_TAG, PlantReference, PlantSection, Section, Text
 
 SPEC_VERSION = 1
@@ -50,26 +52,14 @@ def _kind_of_profiles(value: Any) -> str:
     return LIST_TAG if isinstance(value, list) else ONE_TAG
 
 
-class ProfileSection(Section):
-    """How a signal goes with time; which keys belong to which kind is checked when it is built."""
-
-    kind: Literal["step", "ramp", "sine", "drift", "intermittent", "stuck", "lost-effectiveness", "uniform", "gaussian"]
-    start: float | None = None
-    end: float | None = None
-    size: float | None = None
-    rate: float | None = None
-    amplitude: float | None = None
-    frequency: float | None = None
-    phase: float | None = None
-    time_constant: float | None = None
-    period: float | None = None
-    duty: float | None = None
-    value: float | None = None
-    share: float | None = None
-    low: float | None = None
-    high: float | None = None
-    deviation: float | None = None
-    mean: float | None = None
+_PROFILE_KEYS = [item.name for profile in PROFILE_KINDS.values() for item in fields(profile)]
+#: How a signal goes with time; which keys belong to which kind is checked when it is built.
+ProfileSection: Any = create_model(  # type: ignore[call-overload]
+    "ProfileSection",
+    __base__=Section,
+    kind=(Literal[tuple(PROFILE_KINDS)], ...),
+    **dict.fromkeys(_PROFILE_KEYS, (float | None, None)),
+)
 
 
 Profiles = Annotated[

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,7 @@ from obsynth.methods.handing_on import require_verified
 from obsynth.methods.tracking import tracking_of
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import require_kind
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, freeze
 from obsynth.plants.constants import SAME_TOLERANCE, ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system
@@ -124,8 +123,7 @@ class Robustness:
     design: ObserverDesign | None = None
 
     def __post_init__(self) -> None:
-        for name in ("breaking", "blame", "rows", "error_per_unit", "vertex_gains"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+        freeze(self, "breaking", "blame", "rows", "error_per_unit", "vertex_gains")
 
     @property
     def finite_for_ever(self) -> bool:

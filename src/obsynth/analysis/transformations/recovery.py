@@ -15,7 +15,7 @@ import numpy as np
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arguments import require_kind
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, NEGLIGIBLE_INPUT, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.numerics.sparse import MEAN_FACTOR, SIZE_SAMPLES, SparseFactor, csr, sparse_factor
@@ -167,8 +167,7 @@ class StateRecovery:
     operating_point: Mapping[str, float] = field(default_factory=dict)  # of the source states
 
     def __post_init__(self) -> None:
-        for name in (*_RECOVERED_SIGNALS, "noise_kept"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
+        freeze(self, *_RECOVERED_SIGNALS, "noise_kept")
         object.__setattr__(self, "operating_point", dict(self.operating_point))
 
     @classmethod
