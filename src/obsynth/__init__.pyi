@@ -77,8 +77,8 @@ from obsynth.plants.uncertain_system import uncertain_system as uncertain_system
 from obsynth.report.page import html_report as html_report
 from obsynth.results.design import Certificate as Certificate
 from obsynth.results.design import ObserverDesign as ObserverDesign
+from obsynth.results.design import VerificationReport as VerificationReport
 from obsynth.results.gain_sets import load as load
-from obsynth.results.verification_report import VerificationReport as VerificationReport
 from obsynth.simulation.dae import simulate_dae as simulate_dae
 from obsynth.simulation.linear import simulate_time_varying as simulate_time_varying
 from obsynth.simulation.scenario import Drift as Drift

@@ -20,7 +20,7 @@ from obsynth.methods.ui_pi_observer.checks.fault_response import fault_response
 from obsynth.methods.verifying import verify
 from obsynth.plotting import estimate_gains, plot_gains, plot_poles
 from obsynth.report.page import html_report
-from obsynth.results.verification_report import VerificationReport
+from obsynth.results.design import VerificationReport
 from obsynth.spec import load_spec
 
 ROOT = Path(__file__).parents[2]

@@ -21,7 +21,7 @@ mpl.use("Agg")
 
 import obsynth
 from obsynth.report.page import html_report
-from obsynth.results.verification_report import VerificationReport
+from obsynth.results.design import VerificationReport
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

@@ -447,8 +447,8 @@ def run_report(options: argparse.Namespace) -> int:
     if options.data is None:
         own = ("gains", "unverified", "system", "out", "force", "json")
         refuse_given(options, [name for name in vars(options) if name not in own], "a log: give --data")
-    from obsynth.methods.handing_on import unverified_mark
     from obsynth.report.page import PAGE, html_report
+    from obsynth.results.design import unverified_mark
 
     scenario = None if options.system is None else required_scenario(obsynth.load_spec(options.system))
     system = None if options.system is None else str(options.system)

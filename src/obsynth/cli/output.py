@@ -69,7 +69,7 @@ def verified_again(path: Path) -> tuple[obsynth.ObserverDesign, obsynth.Verifica
 def gains_to_hand_on(path: Path, *, unverified: bool) -> tuple[obsynth.ObserverDesign, str]:
     """Return a saved design verified again, and the mark of one that fails; `VerificationError` unless that is wanted.
     A file's digest is no signature, and its report may be edited like all else: only a new one counts."""
-    from obsynth.methods.handing_on import require_verified, unverified_mark
+    from obsynth.results.design import require_verified, unverified_mark
 
     design, report = verified_again(path)
     mark = unverified_mark(report)

@@ -28,9 +28,11 @@ from obsynth.results.certificate_files import (
     verify_calibration,
 )
 from obsynth.results.checks import Check, information, nothing_wrong
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import (
+    ObserverDesign,
+    VerificationReport,
+)
 from obsynth.results.gain_sets import loaded
-from obsynth.results.verification_report import VerificationReport
 from obsynth.simulation.scenario import scenario_from
 from obsynth.tolerances.robustness import robustness, robustness_statement
 

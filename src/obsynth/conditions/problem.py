@@ -15,8 +15,10 @@ from obsynth.errors import SolverError, SpecError, VerificationError
 from obsynth.methods.designing import failed_rows
 from obsynth.numerics.arguments import shown
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
-from obsynth.results.design import ObserverDesign
-from obsynth.results.verification_report import VerificationReport
+from obsynth.results.design import (
+    ObserverDesign,
+    VerificationReport,
+)
 from obsynth.verification.plant import condition_rows
 
 if TYPE_CHECKING:

@@ -39,9 +39,11 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.windows import WindowObserver
 from obsynth.results.certificate_files import SHOWN_DIGITS, opened
 from obsynth.results.checks import Check, information
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import (
+    ObserverDesign,
+    VerificationReport,
+)
 from obsynth.results.gain_sets import loaded, restored
-from obsynth.results.verification_report import VerificationReport
 
 
 def prove_alarm(

@@ -69,14 +69,16 @@ from obsynth.experiments.monitors.rules import (
     gap_growth,
     parameter_monitor,
 )
-from obsynth.methods.handing_on import require_verified
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.constants import shown
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import (
+    ObserverDesign,
+    require_verified,
+)
 from obsynth.simulation.scenario import Scenario
 
 #: Probability below which so many pairs are no chance: wrong samples, or something else, come in a row here.

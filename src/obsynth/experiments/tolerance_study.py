@@ -15,14 +15,16 @@ from obsynth.experiments.monitors.residual_monitor import monitor
 from obsynth.experiments.simulation import Runs, make_bench
 from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import text_table
-from obsynth.methods.handing_on import require_verified
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray, freeze
 from obsynth.plants.constants import shown, tolerance_share
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.certificate_files import SHOWN_DIGITS, STUDY, result_text
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import (
+    ObserverDesign,
+    require_verified,
+)
 from obsynth.results.gain_sets import design_as_dict
 from obsynth.simulation.scenario import Scenario, Step
 from obsynth.tolerances.exact_plant import drawn_points, plant_at

@@ -36,14 +36,16 @@ from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.methods.guaranteed_test.bank import groups_of, is_bank
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
-from obsynth.methods.handing_on import require_verified
 from obsynth.numerics.arguments import chosen, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.sensor_timing import require_plain
 from obsynth.observers.windows import WindowObserver
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import (
+    ObserverDesign,
+    require_verified,
+)
 from obsynth.results.gain_sets import gain_set_digest
 
 #: Relative rounding of a float, and of a double.

@@ -17,7 +17,6 @@ import numpy as np
 from obsynth.data.linear_log import GAP_LEFT_SHARE, LEAST_SHOWN, LinearLogObserver
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned import LearnedThresholds
-from obsynth.methods.handing_on import unverified_mark
 from obsynth.numerics.arguments import real_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
@@ -29,7 +28,10 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import (
+    ObserverDesign,
+    unverified_mark,
+)
 from obsynth.results.gain_sets import gain_set_digest
 
 #: What a file says about the steady state of a recursion.

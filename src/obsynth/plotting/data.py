@@ -12,7 +12,6 @@ import numpy as np
 from obsynth.data.log_estimator import DECIDING
 from obsynth.data.run import DataRun
 from obsynth.errors import SpecError
-from obsynth.methods.handing_on import unverified_mark
 from obsynth.numerics.arguments import require_kind
 from obsynth.observers.estimates import BAND_WIDTH
 from obsynth.plotting.estimates import MODEL_BAND
@@ -33,6 +32,7 @@ from obsynth.plotting.panels import (
     tidy,
     with_unit,
 )
+from obsynth.results.design import unverified_mark
 
 if TYPE_CHECKING:
     import pandas as pd

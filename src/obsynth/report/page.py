@@ -64,10 +64,12 @@ from obsynth.report.designs import (
     tolerance_facts,
 )
 from obsynth.results.checks import FITS, Check, CheckKind, Status
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import (
+    ObserverDesign,
+    VerificationReport,
+)
 from obsynth.results.gain_sets import gain_set_digest
 from obsynth.results.layout import headed_table, number, verdict, verdict_line, worth
-from obsynth.results.verification_report import VerificationReport
 from obsynth.simulation.scenario import Scenario, Step
 
 if TYPE_CHECKING:

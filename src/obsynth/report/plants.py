@@ -19,8 +19,8 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import plant_facts
 from obsynth.results.checks import Check
+from obsynth.results.design import VerificationReport
 from obsynth.results.layout import checks_table, complex_numbers, facts_table, headed_table, name_list, print_section
-from obsynth.results.verification_report import VerificationReport
 from obsynth.verification.plant import PLANT_MATRICES
 
 

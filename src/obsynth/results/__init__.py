@@ -1,7 +1,10 @@
 """Results: the design, its report, and files of them."""
 
 from obsynth.results.checks import Check
-from obsynth.results.design import Certificate, ObserverDesign
-from obsynth.results.verification_report import VerificationReport
+from obsynth.results.design import (
+    Certificate,
+    ObserverDesign,
+    VerificationReport,
+)
 
 __all__ = ["Certificate", "Check", "ObserverDesign", "VerificationReport"]

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, VerificationError
 from obsynth.extensions import extension
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.sensor_timing import LONGEST_DELAY
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.validation import listed
+from obsynth.results.checks import Check, all_hold
 from obsynth.results.gain_set_writing import save
-from obsynth.results.verification_report import VerificationReport
 
 if TYPE_CHECKING:
     import control
@@ -33,6 +35,78 @@ OfPlant = TypeVar("OfPlant")
 OfObserver = TypeVar("OfObserver")
 #: Larger plants are not stored: their elimination is checked where it is done.
 MOST_STORED_STATES = 500
+
+
+#: Checks by the names that they had once; asked for by these, they answer with a DeprecationWarning.
+FORMER_NAMES = {"state part": "state error alone", "P part alone": "proportional part alone"}
+
+
+@dataclass(frozen=True)
+class VerificationReport:
+    """All checks of one design; an empty report fails.
+
+    Parameters
+    ----------
+    checks : tuple of Check
+        The rows, in the order of the argument they make.
+    """
+
+    checks: tuple[Check, ...] = field(default_factory=tuple)
+
+    @classmethod
+    def of(cls, checks: Iterable[Check]) -> VerificationReport:
+        """Return a report.
+
+        Parameters
+        ----------
+        checks : iterable of Check
+            Its rows.
+        """
+        return cls(tuple(checks))
+
+    @property
+    def passed(self) -> bool:
+        """Whether there is at least one real check and all of them hold."""
+        return all_hold(self.checks)
+
+    @property
+    def failures(self) -> tuple[Check, ...]:
+        """The checks that do not hold."""
+        return tuple(check for check in self.checks if not check.passed)
+
+    def __getitem__(self, name: str) -> Check:
+        for check in self.checks:
+            if check.name == name:
+                return check
+        if name in FORMER_NAMES:
+            warnings.warn(f"The check {name!r} is now {FORMER_NAMES[name]!r}.", DeprecationWarning, stacklevel=2)
+            return self[FORMER_NAMES[name]]
+        raise KeyError(f"no check named {name!r}; there are: {', '.join(c.name for c in self.checks)}")
+
+    def __str__(self) -> str:
+        """Return the table of the checks."""
+        from obsynth.results.layout import report_text
+
+        return report_text(self.checks)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as plain data."""
+        rows = [asdict(check) for check in self.checks]
+        for row in rows:
+            if not row["unclear"]:
+                del row["unclear"]
+        return {"passed": self.passed, "checks": rows}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> VerificationReport:
+        """Return the report that `as_dict` wrote.
+
+        Parameters
+        ----------
+        data : dict
+            With the key ``checks``.
+        """
+        return cls.of(Check(**row) for row in data["checks"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,4 +413,31 @@ def _from_inputs_and_outputs(observer: LinearObserver) -> tuple[FloatArray, Floa
         np.hstack([observer.Bu, observer.By]),
         observer.Cz,
         np.hstack([observer.Du, observer.Dy]),
+    )
+
+
+#: Checks that a mark names; the others are counted.
+_MOST_NAMED_CHECKS = 4
+
+
+def unverified_mark(report: VerificationReport) -> str:
+    """Return what is written beside a design whose report fails, in one line of plain text; empty where it holds."""
+    if report.passed:
+        return ""
+    names = [check.name for check in report.failures]
+    if not names:
+        return "UNVERIFIED: no check was made"
+    return f"UNVERIFIED: {len(names)} of {len(report.checks)} checks FAIL: {listed(names, most=_MOST_NAMED_CHECKS)}"
+
+
+def require_verified(design: ObserverDesign, *, unverified: bool = False) -> None:
+    """Raise `VerificationError` where the report of a design fails, unless it is wanted ``unverified``.
+    A design that was put together by hand and has no report is the caller's own: it is marked, not refused."""
+    report = design.report
+    if unverified or report.passed or not report.checks:
+        return
+    raise VerificationError(
+        f"{design.name!r} fails its verification ({unverified_mark(report).partition(': ')[2]}): it is not used. "
+        "Design it again, or allow it (--unverified, unverified=True): every file that is written then says so.",
+        report=report,
     )

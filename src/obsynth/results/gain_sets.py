@@ -20,7 +20,12 @@ from obsynth.files.inputs import input_file, json_data, path_of, read_json
 from obsynth.numerics.arguments import is_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.design import Certificate, ObserverDesign, PlantSource
+from obsynth.results.design import (
+    Certificate,
+    ObserverDesign,
+    PlantSource,
+    VerificationReport,
+)
 from obsynth.results.gain_set_writing import (
     ARRAYS,
     DESIGN_KINDS,
@@ -39,7 +44,6 @@ from obsynth.results.gain_set_writing import (
     save,
     types_of,
 )
-from obsynth.results.verification_report import VerificationReport
 
 __all__ = [
     "GAIN_SET",

@@ -29,14 +29,16 @@ from obsynth.files.inputs import input_file, read_json
 from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import table_writer
 from obsynth.methods.designing import design
-from obsynth.methods.handing_on import require_verified
 from obsynth.methods.registry import Plant
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.progress import RunsProgress, as_they_come, progress_of_runs
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import (
+    ObserverDesign,
+    require_verified,
+)
 from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain, restored
 from obsynth.spec.documents import read_yaml
 from obsynth.spec.loader import changed_document, design_of_spec, spec_of

@@ -32,12 +32,14 @@ from obsynth.experiments.monitors.residual_model import (
 )
 from obsynth.experiments.monitors.rules import NormRule, WhitenedRule
 from obsynth.experiments.simulation import Bench, make_bench
-from obsynth.methods.handing_on import require_verified
 from obsynth.numerics.arguments import chosen, real_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.validation import index_of
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import (
+    ObserverDesign,
+    require_verified,
+)
 from obsynth.simulation.scenario import Scenario
 
 #: What rounding may add to a residual, relative to the terms it is made of.

@@ -34,11 +34,13 @@ from obsynth.exporting.c_source import (
 )
 from obsynth.exporting.realisation import STATISTIC, Alarms, Realisation, linear_alarms, verification_words
 from obsynth.files.outputs import write_atomically
-from obsynth.methods.handing_on import unverified_mark
 from obsynth.numerics.arguments import chosen
 from obsynth.observers.dae.c_code import FLAGS, compiler, shared_library
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import (
+    ObserverDesign,
+    unverified_mark,
+)
 
 
 @dataclass(frozen=True)

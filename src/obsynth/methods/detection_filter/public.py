@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from obsynth.methods.detection_filter.checks import TOGETHER
 from obsynth.methods.detection_filter.method import DetectionFilterMethod
 from obsynth.methods.functions import design_function
-from obsynth.results.design import ObserverDesign
-from obsynth.results.verification_report import VerificationReport
+from obsynth.results.design import (
+    ObserverDesign,
+    VerificationReport,
+)
 
 
 @dataclass(frozen=True, repr=False)
