@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -407,7 +408,6 @@ class Comparison:
     def page(self) -> str:
         """Return a page of HTML that stands alone, with table, picture, refusals and recommendation."""
         from base64 import b64encode
-        from io import BytesIO
 
         picture = BytesIO()
         self.plot().savefig(picture, format="png", dpi=110)

@@ -10,12 +10,12 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned import LearnedRule, LearnedThresholds
+from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.exporting.c_source import (
     c_identifier,
     comment,
@@ -47,6 +47,7 @@ from obsynth.results.design import (
     require_verified,
 )
 from obsynth.results.gain_sets import gain_set_digest
+from obsynth.verification.adaptive_bound import AdaptiveBound
 
 #: Relative rounding of a float, and of a double.
 UNIT = 2.0**-24
@@ -285,9 +286,6 @@ COPY_U    for (i = NU; i < WIDTH; i++) {
 
 C_PRECISIONS = ("double", "float")
 EXPORT_SUFFIXES = (".mat", ".npz", ".c", ".fmu")
-if TYPE_CHECKING:
-    from obsynth.experiments.monitors.monitor import Monitor
-    from obsynth.verification.adaptive_bound import AdaptiveBound
 
 #: What an existing file has to be for another export to take its place.
 _C_FILE = FileKind("C code that obsynth has exported", rb"sha256 of the gain set")

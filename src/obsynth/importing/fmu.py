@@ -6,6 +6,7 @@ One instance of an FMU for model exchange, of either version of FMI, with the sa
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
 import zipfile
@@ -173,8 +174,6 @@ class Instance:
 
     def set_states(self, states: FloatArray) -> None:
         """Set the continuous states ``(nx,)``."""
-        import ctypes
-
         values = (ctypes.c_double * len(states))(*states)
         if len(states):
             self.model.setContinuousStates(values, len(states))

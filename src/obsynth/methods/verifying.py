@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from obsynth.errors import SpecError
@@ -11,14 +9,11 @@ from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arguments import is_whole, shown
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.results.design import VerificationReport
+from obsynth.results.design import ObserverDesign, VerificationReport
 from obsynth.verification.claims import before_the_mean, closed_claims, mean_noise_rows
 from obsynth.verification.error_system import error_model_row
 from obsynth.verification.plant import derivation_rows, stored_twice_rows, tolerance_rows
 from obsynth.verification.stored_numbers import stored_number_rows
-
-if TYPE_CHECKING:
-    from obsynth.results.design import ObserverDesign
 
 
 def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> VerificationReport:

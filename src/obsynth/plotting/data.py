@@ -32,13 +32,11 @@ from obsynth.plotting.panels import (
     tidy,
     with_unit,
 )
-from obsynth.results.design import unverified_mark
+from obsynth.results.design import ObserverDesign, unverified_mark
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
-
-    from obsynth.results.design import ObserverDesign
 
 #: Kinds of panels, in their order.
 PANELS = ("outputs", "faults", "residuals", "statistic", "shares")

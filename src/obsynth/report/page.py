@@ -12,6 +12,7 @@ A scenario that shows what a design does, made from the design alone: each fault
 from __future__ import annotations
 
 import base64
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from html import escape
@@ -71,6 +72,7 @@ from obsynth.results.design import (
 from obsynth.results.gain_sets import gain_set_digest
 from obsynth.results.layout import headed_table, number, verdict, verdict_line, worth
 from obsynth.simulation.scenario import Scenario, Step
+from obsynth.version import __version__
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -735,10 +737,6 @@ def _gains(design: ObserverDesign) -> Iterator[str]:
 def _reproduction(
     design: ObserverDesign, digest: str, gains_file: str | None, system_file: str | None, data_file: str | None
 ) -> Iterator[str]:
-    import shlex
-
-    from obsynth.version import __version__
-
     file = shlex.quote(gains_file or f"{design.name}.gains.json")
     yield "<p>Every check again, from the gain set alone and without a solver; and this page:</p>"
     again = f"obsynth report --gains {file} --out report.html"

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from obsynth.analysis.transformations.recovery import StateRecovery, Transformation
 from obsynth.errors import SpecError, VerificationError
 from obsynth.extensions import extension
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.sensor_timing import LONGEST_DELAY
+from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import listed
 from obsynth.results.checks import Check, all_hold
@@ -24,11 +26,9 @@ from obsynth.results.gain_set_writing import save
 if TYPE_CHECKING:
     import control
 
-    from obsynth.analysis.transformations.recovery import StateRecovery, Transformation
     from obsynth.observers.dae.observer import DAEObserver
     from obsynth.observers.recursive.observer import RecursiveObserver
     from obsynth.observers.windows import WindowObserver
-    from obsynth.plants.dae.model import DAEModel
     from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 OfPlant = TypeVar("OfPlant")
@@ -285,7 +285,6 @@ class ObserverDesign:
             The design is for a linear plant.
         """
         from obsynth.observers.dae.observer import DAEObserver
-        from obsynth.plants.dae.model import DAEModel
 
         return self._parts(DAEModel, DAEObserver, "observer of a nonlinear plant")
 

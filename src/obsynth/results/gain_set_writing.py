@@ -24,6 +24,7 @@ from obsynth.errors import SpecError
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 
 GAIN_SET_VERSION = 2
@@ -126,7 +127,6 @@ def types_of(kind: str | None) -> tuple[Any, Any]:
         return TimeVaryingDescriptorSystem, WindowObserver
     if kind == "dae":
         from obsynth.observers.dae.observer import DAEObserver
-        from obsynth.plants.dae.model import DAEModel
 
         return DAEModel, DAEObserver
     return DescriptorSystem, LinearObserver

@@ -22,6 +22,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.recovery import Transformation
+from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, path_of
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
@@ -35,13 +38,12 @@ from obsynth.plants.uncertain_system import with_expressions
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
 from obsynth.plants.validation import index_of
 from obsynth.results.certificate_files import read_calibration
+from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import PROFILE_KINDS, Profile, Scenario
 from obsynth.simulation.signals import check_parameters
 from obsynth.spec.documents import DocumentProblems, checked_plant, checked_spec, read_names, read_yaml
 
 if TYPE_CHECKING:
-    from obsynth.analysis.transformations.recovery import Transformation
-    from obsynth.results.design import ObserverDesign
     from obsynth.spec.schema import ScenarioSection
     from obsynth.spec.schema_rare import DAESection, TimeVaryingSection
     from obsynth.spec.schema_values import EntrySection, PlantReference, PlantSection, TransformSection
@@ -926,8 +928,6 @@ def _transformed(
             f"(dt = {plant.dt:g} s): remove it, or set dt to 0.",
             path=f"{where}.sample_time",
         )
-    from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
-    from obsynth.analysis.transformations.sampling import discretise
 
     try:
         if wanted.sample_time is None:

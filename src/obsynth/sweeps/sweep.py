@@ -42,6 +42,7 @@ from obsynth.results.design import (
 from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain, restored
 from obsynth.spec.documents import read_yaml
 from obsynth.spec.loader import changed_document, design_of_spec, spec_of
+from obsynth.version import __version__
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -519,7 +520,6 @@ def sweep(
 
 
 def _cases(cases: Any, parameters: Mapping[str, Sequence[Any]], method: str | None) -> list[Work]:
-    from obsynth.version import __version__
 
     if not isinstance(parameters, Mapping):
         raise SpecError("parameters must be a mapping of names to lists of values.", path="parameters")

@@ -119,7 +119,6 @@ def everything_active(plant: DescriptorSystem) -> ActiveVariables:
 
 def active_part(plant: DescriptorSystem, found: ActiveVariables) -> DescriptorSystem:
     """Return the plant without idle variables."""
-    from obsynth.analysis.transformations.recovery import with_states
 
     if not found.dropped:
         return plant

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +18,10 @@ from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, NEGLIGIBLE_INPUT, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
-from obsynth.numerics.sparse import MEAN_FACTOR, SIZE_SAMPLES, SparseFactor, csr, sparse_factor
+from obsynth.numerics.sparse import MEAN_FACTOR, SIZE_SAMPLES, SolutionBounds, SparseFactor, csr, sparse_factor
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import Uncertainty, matrices_of
 from obsynth.plants.validation import index_of
-
-if TYPE_CHECKING:
-    from obsynth.numerics.sparse import SolutionBounds
 
 #: Signals in the order in which they stand in the algebraic equations.
 SIGNAL_ORDER = ("state", "input", "fault", "disturbance", "noise")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from obsynth.methods.detection_filter.checks import TOGETHER
 from obsynth.methods.detection_filter.method import DetectionFilterMethod
 from obsynth.methods.functions import design_function
+from obsynth.methods.verifying import verify
 from obsynth.results.design import (
     ObserverDesign,
     VerificationReport,
@@ -54,7 +55,6 @@ class DetectionFilter(ObserverDesign):
 
     def verify(self) -> VerificationReport:
         """Prove both norms again, from the plant and the shipped filter alone."""
-        from obsynth.methods.verifying import verify
 
         return verify(self)
 

@@ -11,7 +11,7 @@ from obsynth.errors import SpecError
 from obsynth.extensions import extension
 from obsynth.methods.functions import design_function
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
-from obsynth.methods.guaranteed_test.problem import Programmes, problem_as_designed, window_as_designed
+from obsynth.methods.guaranteed_test.problem import Programmes, free_faults, problem_as_designed, window_as_designed
 from obsynth.methods.guaranteed_test.tolerant import rows_before
 from obsynth.methods.guaranteed_test.windows import courses_of
 from obsynth.numerics.arguments import require_kind
@@ -75,7 +75,6 @@ class GuaranteedTest(ObserverDesign):
         isolates.
         """
         from obsynth.methods.guaranteed_test.bank import groups_of, is_bank
-        from obsynth.methods.guaranteed_test.problem import free_faults
 
         names = self.fault_names
         if is_bank(self):

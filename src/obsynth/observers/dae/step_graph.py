@@ -7,18 +7,15 @@ update; the parameters; the state that follows them; H, L and K at the result.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.newton import definite_solved
-from obsynth.observers.dae.settings import Layout, memory_layout, row_layout
+from obsynth.observers.dae.settings import DAESettings, Layout, memory_layout, row_layout
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step import StepGraph, input_effect, step_graph
-
-if TYPE_CHECKING:
-    from obsynth.observers.dae.settings import DAESettings
 
 Arrays = dict[str, Any]
 

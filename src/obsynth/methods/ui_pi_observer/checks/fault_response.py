@@ -8,7 +8,6 @@ direction.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,10 +25,8 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import balanced_transition
 from obsynth.results.checks import Check, information
+from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
-
-if TYPE_CHECKING:
-    from obsynth.results.design import ObserverDesign
 
 #: A fault estimate counts as faithful up to the frequency where it misses by this share of the fault.
 FAITHFUL = 0.1
