@@ -17,6 +17,12 @@ class Report(Protocol):
         """Return the report as plain data."""
 
 
+def a_kind(value: Any) -> str:
+    """Return what kind of thing a value is, with its article, for a message: ``an int``."""
+    name = type(value).__name__
+    return f"an {name}" if name[:1].lower() in "aeio" else f"a {name}"
+
+
 def _plain(value: Any) -> Any:
     """Return an attribute of an error as plain data."""
     if isinstance(value, complex):

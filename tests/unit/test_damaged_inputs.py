@@ -178,7 +178,7 @@ def test_names_may_be_an_array_or_the_index_of_a_frame() -> None:
         (lambda: named(operating_point=3.0), "operating_point is a float: give a mapping"),
         (lambda: named(scales=np.zeros((1, 0))), "scales is a ndarray: give a mapping"),
         (lambda: obsynth.with_noise(named(), sensor_noise={1: 2}), "has no signal named 1"),
-        (lambda: obsynth.load_spec(3), "path is a int: give the name of a file"),
+        (lambda: obsynth.load_spec(3), "path is an int: give the name of a file"),
         (lambda: obsynth.load_thresholds(None), "path is a NoneType: give the name of a file"),
         (lambda: obsynth.verify_alarm(True), "path is a bool: give the name of a file"),
         (lambda: obsynth.verify_certificate([]), "path is a list: give the name of a file"),

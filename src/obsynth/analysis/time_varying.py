@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.transformations.recovery import Transformation
-from obsynth.errors import SpecError
+from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
@@ -99,11 +99,8 @@ def as_time_varying(
     plant = plant.plant if isinstance(plant, Transformation) else plant
     if isinstance(plant, TimeVaryingDescriptorSystem):
         return plant
-    if not isinstance(plant, DescriptorSystem):
-        raise SpecError(
-            f"The plant is a {type(plant).__name__}: give an obsynth.DescriptorSystem or TimeVaryingDescriptorSystem.",
-            path="plant",
-        )
+    wanted = "an obsynth.DescriptorSystem or TimeVaryingDescriptorSystem"
+    require_kind(plant, DescriptorSystem, "The plant", wanted, path="plant")
     return TimeVaryingDescriptorSystem.from_descriptor(plant)
 
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.errors import SolverError, SpecError, VerificationError
+from obsynth.errors import SolverError, SpecError, VerificationError, a_kind
 from obsynth.methods.designing import failed_rows
-from obsynth.numerics.arguments import shown
+from obsynth.numerics.arguments import require_kind, shown
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.results.design import (
     ObserverDesign,
@@ -203,11 +203,8 @@ def named_constraints(given: Any, count: int = 0) -> dict[str, Any]:
         raise SpecError(f"constraints are {shown(given)}: give a list of cvxpy constraints.", path="constraints")
     pairs = dict(given) if isinstance(given, Mapping) else {f"own {i + 1}": part for i, part in enumerate(given)}
     for name, part in pairs.items():
-        if not isinstance(part, Constraint):
-            raise SpecError(
-                f"Constraint {name!r} is a {type(part).__name__}: give cvxpy constraints, such as P >> numpy.eye(n).",
-                path="constraints",
-            )
+        wanted = "cvxpy constraints, such as P >> numpy.eye(n)"
+        require_kind(part, Constraint, f"Constraint {name!r}", wanted, path="constraints")
     return pairs
 
 
@@ -219,7 +216,7 @@ def checked_objective(given: Any) -> Any:
         return given
     if not isinstance(given, cvxpy.Expression) or given.size != 1:
         raise SpecError(
-            f"The objective is a {type(given).__name__}: give cvxpy.Minimize(...), or a scalar expression.",
+            f"The objective is {a_kind(given)}: give cvxpy.Minimize(...), or a scalar expression.",
             path="objective",
         )
     return cvxpy.Minimize(given)

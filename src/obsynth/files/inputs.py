@@ -13,7 +13,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, TextIO
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, a_kind
 
 #: Documents larger than this are refused: matrices of that size belong in matrix files.
 MOST_DOCUMENT_CHARACTERS = 32_000_000
@@ -168,5 +168,5 @@ def reason(error: BaseException) -> str:
 def path_of(path: Any) -> Path:
     """Return the path that a caller names; raise `SpecError` for what names none."""
     if not isinstance(path, (str, os.PathLike)):
-        raise SpecError(f"path is a {type(path).__name__}: give the name of a file.", path="path")
+        raise SpecError(f"path is {a_kind(path)}: give the name of a file.", path="path")
     return Path(path)

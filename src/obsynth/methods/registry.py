@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import Any, TypeAlias
 
 from obsynth.analysis.conditions import Condition
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, a_kind
 from obsynth.methods.installed import OWN, REGISTRY, not_loadable
 from obsynth.methods.method import Method, PlantKind
 from obsynth.plants.dae.model import DAEModel
@@ -72,8 +72,7 @@ def kind_of(plant: Any) -> PlantKind:
         if isinstance(plant, plant_type):
             return kind
     raise SpecError(
-        f"The plant is a {type(plant).__name__}: give an obsynth.DescriptorSystem, TimeVaryingDescriptorSystem or "
-        "DAEModel.",
+        f"The plant is {a_kind(plant)}: give an obsynth.DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel.",
         path="plant",
     )
 

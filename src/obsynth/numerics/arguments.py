@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, a_kind
 from obsynth.numerics.arrays import FloatArray, holds_truth, unmasked
 
 
@@ -114,10 +114,12 @@ def is_whole(value: Any) -> bool:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
-def require_kind(value: Any, kinds: type | tuple[type, ...], name: str, wanted: str) -> None:
+def require_kind(
+    value: Any, kinds: type | tuple[type, ...], name: str, wanted: str, *, path: str | None = None
+) -> None:
     """Raise `SpecError` unless an argument is of some kind."""
     if not isinstance(value, kinds):
-        raise SpecError(f"{name} is a {type(value).__name__}: give {wanted}.", path=name)
+        raise SpecError(f"{name} is {a_kind(value)}: give {wanted}.", path=path or name)
 
 
 def require_mapping(value: Any, name: str) -> None:
@@ -151,7 +153,7 @@ def shown(value: Any) -> str:
         # Python refuses to print whole numbers of more than 4300 digits.
         return f"a whole number of about {int(int(value).bit_length() * math.log10(2.0)) + 1} digits"
     text = repr(value.item() if isinstance(value, np.generic) else value)
-    return text if len(text) <= 60 and "\n" not in text else f"a {type(value).__name__}"
+    return text if len(text) <= 60 and "\n" not in text else a_kind(value)
 
 
 Positive = Annotated[float, Gt(0.0)]

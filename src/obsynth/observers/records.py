@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_number, real_array, real_number
+from obsynth.numerics.arguments import is_number, real_array, real_number, require_kind
 from obsynth.numerics.arrays import FloatArray, as_matrix, unmasked
 from obsynth.plants.dae.model import finite_vector
 from obsynth.plants.validation import index_of, suggestion
@@ -20,8 +20,7 @@ NAME_FIELDS = ("input_names", "output_names", "state_names", "fault_names", "res
 
 def require_names(names: Any, field: str) -> None:
     """Raise `SpecError` unless ``names`` is a tuple of unique, non-empty texts."""
-    if not isinstance(names, tuple):
-        raise SpecError(f"{field} of the observer is a {type(names).__name__}: give a tuple of names.", path=field)
+    require_kind(names, tuple, f"{field} of the observer", "a tuple of names", path=field)
     if not all(isinstance(name, str) and name.strip() for name in names):
         raise SpecError(f"{field} of the observer must be a tuple of non-empty texts.", path=field)
     if len(set(names)) < len(names):

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, a_kind
 from obsynth.files.inputs import read_json, read_text
 from obsynth.numerics.arguments import is_whole
 from obsynth.plants.validation import suggestion
@@ -108,7 +108,7 @@ def described(value: Any) -> str:
         )
     if isinstance(value, dict):
         return "a mapping"
-    return "a list" if isinstance(value, list) else f"a {type(value).__name__}"
+    return "a list" if isinstance(value, list) else a_kind(value)
 
 
 def _one_line(error: Exception) -> str:

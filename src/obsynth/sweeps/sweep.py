@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, get_args
 import numpy as np
 
 from obsynth.data.run import DataRun, run_on_data
-from obsynth.errors import ObsynthError, SpecError
+from obsynth.errors import ObsynthError, SpecError, a_kind
 from obsynth.experiments.assumptions import file_digest
 from obsynth.files.inputs import input_file, read_json
 from obsynth.files.outputs import write_atomically
@@ -102,7 +102,7 @@ def plant_cases(
                 if not key.startswith("plant.")
             }
             if changes and not isinstance(plant, DescriptorSystem):
-                raise SpecError(f"Fields of a {type(plant).__name__} cannot be varied in a sweep.", path="parameters")
+                raise SpecError(f"Fields of {a_kind(plant)} cannot be varied in a sweep.", path="parameters")
             varied = _varied(plant, changes) if changes and isinstance(plant, DescriptorSystem) else plant
             written = varied.dense() if isinstance(varied, DescriptorSystem) else varied
             body = json.dumps(plain([version, method, options, written.as_dict()]), sort_keys=True)

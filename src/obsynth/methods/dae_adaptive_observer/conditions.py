@@ -8,7 +8,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.dae_structure import identifiability, index_report
-from obsynth.errors import SolverError
+from obsynth.errors import SolverError, a_kind
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.model import DAEModel
 
@@ -27,7 +27,7 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
             0.0,
             1.0,
             f"{SOURCE}, (3)",
-            f"the plant is a {type(model).__name__}",
+            f"the plant is {a_kind(model)}",
         )
         return
     found = index_report(model, dt)
