@@ -19,6 +19,8 @@ class Report(Protocol):
 
 def a_kind(value: Any) -> str:
     """Return what kind of thing a value is, with its article, for a message: ``an int``."""
+    if value is None:
+        return "missing"
     name = type(value).__name__
     return f"an {name}" if name[:1].lower() in "aeio" else f"a {name}"
 

@@ -266,7 +266,7 @@ SHAPES = [
     Case("Bw too long", put("plant", "Bw", zeros(5, 1)), "Bw is 5 by 1, but 4 by 1 is needed"),
     Case("Dw too short", put("plant", "Dw", zeros(2, 1)), "Dw is 2 by 1, but 3 by 1 is needed"),
     Case("S of a wrong shape", put("method", "options", "S", eye(4)), "S is 4 by 4"),
-    Case("too few names", put("plant", "state_names", ["a"]), "state_names has 1 names, but there are 4"),
+    Case("too few names", put("plant", "state_names", ["a"]), "state_names has 1 name(s), but there are 4"),
     Case("repeated names", put("plant", "output_names", ["a", "b", "a"]), "output_names repeats 'a'"),
     Case("one state measured twice", put("plant", "C", {"outputs": ["x2", "x2"]}), "repeats 'x2'"),
     Case("unknown output", put("plant", "C", {"outputs": ["x2", "x9"]}), "C has no signal named 'x9'"),

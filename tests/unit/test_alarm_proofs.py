@@ -211,6 +211,6 @@ def test_a_record_with_a_gap_proves_nothing(design) -> None:
     blank.loc[19, names[-1]] = np.nan
     with pytest.raises(obsynth.SpecError, match="Row 20 has a gap before it or misses a sample"):
         obsynth.prove_alarm(design, blank, 34, **options(design))
-    for row, words in ((1, "2 or more"), (51, "have 50 rows")):
+    for row, words in ((1, "at least 2"), (51, "have 50 rows")):
         with pytest.raises(obsynth.SpecError, match=words):
             obsynth.prove_alarm(design, whole, row, **options(design))

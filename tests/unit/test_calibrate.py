@@ -218,7 +218,7 @@ def test_one_sensor_in_other_units_is_refused_by_name():
         ({"method": "em"}, "innovations"),
         ({"integration": "euler"}, "backward-euler"),
         ({"level": 95}, "probability"),
-        ({"input_delay": 1.5}, "whole rows"),
+        ({"input_delay": 1.5}, "whole number"),
         ({"initial_state": {"x9": 1.0}}, "x9"),
     ],
 )

@@ -253,7 +253,7 @@ BAD = {
     "gamma": (lambda: conditions.wang2015(plant_of("wang2015"), gamma=0), "gamma is 0: give a positive number"),
     "delta": (lambda: conditions.filasova_theorem1(plant_of("filasova"), delta=0.0), "delta is 0.0"),
     "reading": (lambda: conditions.filasova_theorem1(plant_of("filasova"), delta=1, reading="x"), "use one of safe"),
-    "region": (lambda: conditions.sharepasand(plant_of("sharepasand"), region={"decay": 1}), "use one of disk"),
+    "region": (lambda: conditions.sharepasand(plant_of("sharepasand"), region={"decay": 1}), "give a region, such as"),
     "both": (
         lambda: conditions.sharepasand(plant_of("sharepasand"), region=conditions.disk(0, 1), poles=[-1] * 4),
         "poles and region are given",

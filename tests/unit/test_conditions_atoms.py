@@ -151,7 +151,7 @@ BAD = {
     "no gamma": (lambda a, b, c, d: conditions.bounded_real(a, b, c, d, P, None, 1.0), "gamma is missing"),
     "Z": (lambda a, b, c, d: conditions.h2(a, b, c, d, P, P, 1.0), "Z is 3 by 3, but 2 by 2"),
     "H2 with D": (lambda a, b, c, d: conditions.h2(a, b, c, d + 1, P, Z, 0.0), "the H2 norm is infinite"),
-    "no region": (lambda a, b, c, d: conditions.region(a, P, "disk"), "where is 'disk': give conditions.disk"),
+    "no region": (lambda a, b, c, d: conditions.region(a, P, "disk"), "where is a str: give a region"),
     "Y": (lambda a, b, c, d: conditions.region(a, P, conditions.disk(0, 1), Y=Z, Cy=c), "Y is 2 by 2, but 3 by 2"),
     "E": (lambda a, b, c, d: conditions.admissible(np.eye(2), a, P, 0.0), "E is 2 by 2, but 3 by 3"),
     "Y in discrete time": (lambda a, b, c, d: conditions.admissible(np.eye(3), a, P, 1.0, Y=P, Cy=P), "Y is for cont"),

@@ -358,7 +358,7 @@ def test_an_observer_travels_to_another_process_after_it_has_run() -> None:
     [
         ({"dt": 0.0}, "dt is 0.0: give the seconds"), ({"parameters": [np.nan, 0.0]}, r"parameters\.phi is nan"),
         ({"parameters": np.ones((3, 2))}, r"parameters is \(3, 2\)"), ({"seed": -1}, "seed is -1"),
-        ({"initial_state": ["a", 1, 1, 1]}, "initial_state must be 4"), ({"Q": [[1.0]]}, "Q is 1 by 1"),
+        ({"initial_state": ["a", 1, 1, 1]}, "initial_state is a list"), ({"Q": [[1.0]]}, "Q is 1 by 1"),
         ({"u": np.full((5, 4), np.nan)}, "'m1' is nan at k = 0"), ({"u": None}, "u is missing"),
         ({"integration": "rk4"}, "'rk4'"),
     ],

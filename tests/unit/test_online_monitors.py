@@ -403,7 +403,7 @@ def test_quiet_runs_have_no_alarm(kind, share):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda wang, noisy: obsynth.online_monitor(None), "design is a NoneType"),
+        (lambda wang, noisy: obsynth.online_monitor(None), "design is missing"),
         (lambda wang, noisy: obsynth.online_monitor(wang, "nis"), "for this design use one of"),
         (lambda wang, noisy: obsynth.online_monitor(wang, "glr"), "cusum is nearest to it"),
         (lambda wang, noisy: obsynth.online_monitor(wang), "No bound is given on w "),

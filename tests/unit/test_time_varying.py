@@ -140,7 +140,7 @@ def nan_at_5(k):
         ({"horizon": True}, "horizon is True", "horizon"),
         ({"constants": {"k": 1.0}}, "constants names 'k'", "constants"),
         ({"constants": {"half": float("nan")}}, "'half' is nan", "constants.half"),
-        ({"state_names": ["a"]}, "1 names, but there are 2", "state_names"),
+        ({"state_names": ["a"]}, r"1 name\(s\), but there are 2", "state_names"),
         ({"units": {"zz": "m"}}, "'zz', which is no signal", "units"),
     ],
 )

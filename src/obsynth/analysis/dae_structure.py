@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import require_shape
+from obsynth.numerics.arguments import arguments_checked, require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.newton import ScaledMatrix
 from obsynth.numerics.ranks import IDENTIFIABLE_SHARE, NAMED_SHARE, SINGULAR_CONDITION, covariance_factor, is_definite
@@ -74,6 +74,7 @@ class Identifiability:
         return tuple(n for n, d in zip(self.names, self.deviations, strict=True) if not np.isfinite(d))
 
 
+@arguments_checked
 def identifiability(
     model: DAEModel,
     u: ArrayLike,

@@ -12,6 +12,7 @@ import numpy as np
 from obsynth.analysis.existence.statements import Evaluator
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.analysis.zeros import structure_of, unstable_poles
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.ranks import RankDecision, decide_rank
@@ -48,6 +49,7 @@ class Structure:
 
 
 # Conditions, synthesis and verification ask for the same plant's; plants never change.
+@arguments_checked
 @lru_cache(maxsize=4)
 @on_one_thread_if_small
 def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:

@@ -52,7 +52,7 @@ from obsynth.calibration.problem import Problem, calibration_problem, require_va
 from obsynth.calibration.reporting import Calibration, IntegrationError, integration_error, reported
 from obsynth.calibration.simulation_error import FIRST_ROWS, Fit, SimulationError, simulation_fits, with_seen_start
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arguments import chosen, is_whole, whole_number
+from obsynth.numerics.arguments import Seed, arguments_checked, chosen, is_whole, whole_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -296,6 +296,7 @@ INTEGRATIONS = ("auto", "backward-euler", "radau")
 SAME_TIME = 1e-6
 
 
+@arguments_checked
 def calibrate(
     model: DAEModel | DescriptorSystem | TimeVaryingDescriptorSystem,
     log: LogData,
@@ -317,7 +318,7 @@ def calibrate(
     substeps: int = 1,
     level: float = 0.95,
     starts: int = 3,
-    seed: int = 0,
+    seed: Seed = 0,
     sensor_noise: Mapping[str, Any] | None = None,
     offset: Mapping[str, Any] | Sequence[str] | None = None,
     walks: Mapping[str, Any] | Sequence[str] | None = None,
@@ -478,7 +479,8 @@ def calibrate(
 
 def _loads_as_parameters(model: Any, walks: Mapping[str, Any] | Sequence[str] | None) -> Any:
     """Return a nonlinear plant whose inputs that walk are parameters: no log holds them."""
-    if not isinstance(model, DAEModel) or not (loads := [name for name in walks or () if name in model.inputs]):
+    loads = [name for name in (() if walks is None else walks) if name in model.inputs]
+    if not isinstance(model, DAEModel) or not loads:
         return model
     inputs = {name: value for name, value in model.inputs.items() if name not in loads}
     return model.replace(inputs=inputs, parameters={**model.parameters, **{name: model.inputs[name] for name in loads}})

@@ -186,7 +186,7 @@ def _table(log: Any, wanted: Sequence[str]) -> tuple[dict[str, Any], list[str], 
         found, names, said = log_table(log, wanted[1:], wanted[0])
         return found, names, Path(log).name if isinstance(log, str | Path) else "", said
     if isinstance(log, Mapping):
-        found = {str(name): np.asarray(log[name]) for name in log}
+        found = {str(name): np.atleast_1d(np.asarray(log[name])) for name in log}
         there = {name: found[name] for name in wanted if name in found}
         if any(values.dtype.kind in "OU" for values in there.values()) and len(set(map(len, there.values()))) == 1:
             import pandas as pd

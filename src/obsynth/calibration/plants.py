@@ -451,9 +451,10 @@ def asked_states(
             continue
         value = item["correlation"]
         correlations[name] = None if value == UNKNOWN_NUMBER else seconds(value, f"sensor_noise.{name}.correlation")
-    for name in offset or ():
+    offsets = () if offset is None else tuple(offset)
+    for name in offsets:
         index_of(name, output_names, what="offset")
-    return NoiseStates(correlations, tuple(offset or ()), tuple(walks or ()))
+    return NoiseStates(correlations, offsets, () if walks is None else tuple(walks))
 
 
 def correlation_name(output: str) -> str:

@@ -36,7 +36,7 @@ from obsynth.calibration.problem import Problem
 from obsynth.calibration.reporting import IntegrationError, integration_error
 from obsynth.calibration.simulation_error import Fit
 from obsynth.errors import PreconditionError, SolverError, SpecError
-from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arguments import arguments_checked, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.estimates import GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
@@ -277,6 +277,7 @@ LEAST_VALIDATED_ROWS = 20
 LEAST_RATIO = 1e-6
 
 
+@arguments_checked
 def validate(
     design: ObserverDesign,
     log: LogData,

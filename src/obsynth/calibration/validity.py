@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from obsynth.analysis.transformations.linearisation import DRIFT
 from obsynth.calibration.logs import EVEN, Log, LogData, quantum, read_log
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arguments import arguments_checked, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.records import named_vector
 from obsynth.plants.dae.functions import BUTCHER
@@ -73,6 +73,7 @@ class Validity:
         return _figure(self)
 
 
+@arguments_checked
 def validity(
     model: DAEModel,
     linear: DescriptorSystem,

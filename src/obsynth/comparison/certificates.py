@@ -15,6 +15,7 @@ from obsynth.experiments.alarm_proof import ALARM_KIND
 from obsynth.experiments.assumptions import Log, file_digest
 from obsynth.experiments.tolerance_study import study_statement, tolerance_study
 from obsynth.files.inputs import path_of, read_json
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.results.certificate_files import (
     CALIBRATION_KIND,
     COMPARISON,
@@ -48,7 +49,7 @@ def kind_of_file(path: Path) -> str:
     try:
         with path.open("rb") as stream:
             found = re.match(rb'\s*\{\s*"kind":\s*"([a-z ]+)"', stream.read(_CERTIFICATE_HEAD_BYTES))
-    except OSError:
+    except (OSError, ValueError):  # there is no such file, or no file can have this name
         return ""
     return "" if found is None else found.group(1).decode()
 
@@ -57,6 +58,7 @@ def kind_of_file(path: Path) -> str:
 _CERTIFICATE_HEAD_BYTES = 200
 
 
+@arguments_checked
 def verify_certificate(path: str | Path, *, data: str | Path | None = None) -> VerificationReport:
     """Check a certificate of any kind, to the end of what it rests on, without a solver.
 

@@ -39,6 +39,7 @@ from obsynth.numerics.arguments import (
     NonNegative,
     Positive,
     Probability,
+    arguments_checked,
     checked_value,
     is_finite_number,
     require_kind,
@@ -649,6 +650,7 @@ COMPARISON_SEED = 7
 PERIOD_SHARE = 0.2
 
 
+@arguments_checked
 @on_one_thread_if_small
 def compare(
     plant: DescriptorSystem | Transformation,

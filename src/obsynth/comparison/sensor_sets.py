@@ -26,7 +26,7 @@ from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.files.tables import html_table, text_table
 from obsynth.methods.functions import functional_filter
 from obsynth.methods.guaranteed_test.result import GuaranteedTest, guaranteed_test
-from obsynth.numerics.arguments import Count, checked_value, is_finite_number, real_vector
+from obsynth.numerics.arguments import Count, arguments_checked, checked_value, is_finite_number, real_vector
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -197,6 +197,7 @@ class SensorSets:
         return html_table(self.rows()) + texts
 
 
+@arguments_checked
 @on_one_thread_if_small
 def sensor_sets(
     plant: DescriptorSystem | Transformation,

@@ -13,9 +13,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, a_kind
 from obsynth.methods.conic import lmi
-from obsynth.numerics.arguments import real_number, require_shape
+from obsynth.numerics.arguments import (
+    arguments_checked,
+    real_array,
+    real_number,
+    require_shape,
+)
+from obsynth.numerics.arrays import require_no_overflow
 from obsynth.numerics.regions import LMIRegion, checked_region
 
 if TYPE_CHECKING:
@@ -25,6 +31,7 @@ if TYPE_CHECKING:
 MARGIN = 1e-9
 
 
+@arguments_checked
 def bounded_real(
     A: Any,
     B: Any,
@@ -83,7 +90,7 @@ def bounded_real(
     """
     n, nw, nz = _sizes(A, B, C, D, P)
     pa, pb = _moved(A, P, Y, Cy), _moved(B, P, Y, Dy)
-    level = _square(gamma) if gamma_squared is None else gamma_squared
+    level = _square(gamma) if gamma_squared is None else _scalar(gamma_squared, "gamma_squared")
     if dt > 0.0:
         whole = lmi.symmetric_blocks(
             [
@@ -98,6 +105,7 @@ def bounded_real(
     return [lmi.at_least(P, margin), lmi.at_least(whole, margin)]
 
 
+@arguments_checked
 def h2(
     A: Any,
     B: Any,
@@ -165,6 +173,7 @@ def h2(
     return [lmi.at_least(first, margin), lmi.at_least(second, margin)]
 
 
+@arguments_checked
 def region(
     A: Any, P: Any, where: LMIRegion, *, Y: Any = None, Cy: Any = None, margin: float = MARGIN
 ) -> list[cvxpy.Constraint]:
@@ -207,6 +216,7 @@ def region(
     return [lmi.at_least(P, margin), lmi.at_most(lmi.symmetric_blocks(blocks), -margin)]
 
 
+@arguments_checked
 def admissible(
     E: Any, A: Any, P: Any, dt: float, *, Y: Any = None, Cy: Any = None, margin: float = MARGIN
 ) -> list[cvxpy.Constraint]:
@@ -267,17 +277,26 @@ def _moved(matrix: Any, P: Any, Y: Any, measured: Any) -> Any:
 
 
 def _square(gamma: Any) -> float:
-    return real_number(gamma, "gamma", "a positive number, or gamma_squared=", above=0.0) ** 2
+    level = real_number(gamma, "gamma", "a positive number, or gamma_squared=", above=0.0)
+    require_no_overflow(level, "gamma", "gamma")
+    return level**2
 
 
 def _shape(matrix: Any) -> tuple[int, ...]:
-    return tuple(getattr(matrix, "shape", np.shape(matrix)))
+    return tuple(matrix.shape) if hasattr(matrix, "shape") else real_array(matrix, "A matrix").shape
+
+
+def _scalar(value: Any, name: str) -> Any:
+    """Return a number, or a scalar expression of cvxpy as it is."""
+    return value if hasattr(value, "is_scalar") and value.is_scalar() else real_number(value, name)
 
 
 def _square_matrix(A: Any, P: Any) -> int:
     shape = _shape(A)
     if len(shape) != 2 or shape[0] != shape[1]:
         raise SpecError(f"A is {shape}: give a square matrix.", path="A")
+    if not hasattr(P, "is_symmetric"):
+        raise SpecError(f"P is {a_kind(P)}: give a square variable of cvxpy.", path="P")
     require_shape(_shape(P), shape, "P")
     return shape[0]
 

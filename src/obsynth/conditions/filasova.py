@@ -34,7 +34,7 @@ from obsynth.methods.conic import lmi
 from obsynth.methods.designing import design_from_gains
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
 from obsynth.methods.pd_observer.inequalities import PD_MARGIN
-from obsynth.numerics.arguments import chosen, is_finite_number, shown
+from obsynth.numerics.arguments import arguments_checked, chosen, is_finite_number, shown
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.regions import LMIRegion, checked_region
 from obsynth.plants.descriptor import DescriptorSystem
@@ -44,6 +44,7 @@ from obsynth.results.design import ObserverDesign
 LEFT_TO_THE_PD_INEQUALITY = ("nf <= ny", "rank F", "detectability", "rank [A F; C Df]")
 
 
+@arguments_checked
 def filasova_theorem1(
     plant: DescriptorSystem | Transformation,
     *,
@@ -91,6 +92,7 @@ def filasova_theorem1(
     return _theorem(plant, 1, delta, reading, decay, margin, region)
 
 
+@arguments_checked
 def filasova_theorem2(
     plant: DescriptorSystem | Transformation,
     *,

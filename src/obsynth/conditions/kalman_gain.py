@@ -29,8 +29,8 @@ from obsynth.methods.functions import descriptor_kalman
 from obsynth.methods.recursive.steady_filter import steady_state_filter
 from obsynth.methods.recursive.synthesis import with_stated_noise
 from obsynth.methods.recursive.unknown_inputs import kalman_conditions, without_unknown_inputs
-from obsynth.numerics.arguments import require_shape
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arguments import arguments_checked, require_shape
+from obsynth.numerics.arrays import SMALLEST, FloatArray, as_matrix
 from obsynth.numerics.norms import output_covariance
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, covariance_factor
 from obsynth.plants.descriptor import DescriptorSystem
@@ -42,6 +42,7 @@ from obsynth.results.design import ObserverDesign
 SAME_GAIN = 1e-3
 
 
+@arguments_checked
 def kalman(
     plant: DescriptorSystem | Transformation,
     *,
@@ -208,5 +209,7 @@ def _coordinates(varying: TimeVaryingDescriptorSystem, process: FloatArray, sens
     try:
         values, vectors = np.linalg.eigh(steady_state_filter(varying, Q=process, R=sensor).P)
     except (ObsynthError, np.linalg.LinAlgError):
+        return np.eye(varying.nx)
+    if not values[-1] > SMALLEST:
         return np.eye(varying.nx)
     return np.asarray(vectors * np.sqrt(np.maximum(values, CANCELLATION_TOLERANCE * values[-1])))

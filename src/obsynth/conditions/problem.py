@@ -15,10 +15,7 @@ from obsynth.errors import SolverError, SpecError, VerificationError, a_kind
 from obsynth.methods.designing import failed_rows
 from obsynth.numerics.arguments import require_kind, shown
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
-from obsynth.results.design import (
-    ObserverDesign,
-    VerificationReport,
-)
+from obsynth.results.design import ObserverDesign, VerificationReport
 from obsynth.verification.plant import condition_rows
 
 if TYPE_CHECKING:

@@ -45,6 +45,7 @@ from obsynth.methods.ui_pi_observer.augmented_plant import (
 )
 from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.methods.ui_pi_observer.placement_problem import with_faults
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.matrix_equations import continuous_riccati, discrete_riccati
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane
@@ -59,6 +60,7 @@ LEFT_TO_THE_UI_PI_INEQUALITY = ("(D2)", "(D3)", "fixed modes", "order of the fau
 _REAL_RATES, _REAL_NUMBERS = -np.logspace(-6, 9, 151), np.linspace(-1.0, 1.0, 401)
 
 
+@arguments_checked
 def sharepasand(
     plant: DescriptorSystem | Transformation,
     *,

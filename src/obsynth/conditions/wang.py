@@ -37,8 +37,8 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import (
     restricted_equivalent_from,
     with_sensor_faults_as_states,
 )
-from obsynth.numerics.arguments import chosen, real_number, require_shape
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arguments import arguments_checked, chosen, real_number, require_shape
+from obsynth.numerics.arrays import FloatArray, as_matrix, require_no_overflow
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
@@ -48,6 +48,7 @@ from obsynth.results.design import ObserverDesign
 CLAIMED_ABOVE_NORM = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 
 
+@arguments_checked
 def wang2015(
     plant: DescriptorSystem | Transformation,
     *,
@@ -156,6 +157,7 @@ def wang2015(
         goal = cp.Minimize(gamma_squared)
     else:
         level = real_number(gamma, "gamma", "a positive number", above=0.0)
+        require_no_overflow(level, "gamma", "gamma")
         gamma_squared = cp.Parameter(nonneg=True, value=level**2, name="gamma_squared")
         goal = cp.Minimize(0)
     if free:

@@ -34,7 +34,7 @@ from obsynth.experiments.monitors.options import WINDOW
 from obsynth.files.inputs import path_of
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.verifying import verify
-from obsynth.numerics.arguments import is_whole, require_kind, require_mapping, whole_number
+from obsynth.numerics.arguments import arguments_checked, is_whole, require_kind, require_mapping, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.windows import WindowObserver
 from obsynth.results.certificate_files import SHOWN_DIGITS, opened
@@ -46,6 +46,7 @@ from obsynth.results.design import (
 from obsynth.results.gain_sets import loaded, restored
 
 
+@arguments_checked
 def prove_alarm(
     design: ObserverDesign,
     data: Data,
@@ -170,6 +171,7 @@ def rows_of(
     return np.array(found)
 
 
+@arguments_checked
 def verify_alarm(path: str | Path, *, data: str | Path | None = None) -> VerificationReport:
     """Check the certificate of an alarm again, without a solver, with all that it rests on.
 

@@ -69,7 +69,7 @@ from obsynth.experiments.monitors.rules import (
     gap_growth,
     parameter_monitor,
 )
-from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
+from obsynth.numerics.arguments import Seed, arguments_checked, is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
@@ -146,6 +146,7 @@ def are_chance(pairs: int, rate: float, rows: int, every: float) -> bool:
 FALSE_ALARM_RATE = "1 per 1000 rows"
 
 
+@arguments_checked
 def learn_thresholds(
     design: ObserverDesign,
     data: Data,
@@ -157,7 +158,7 @@ def learn_thresholds(
     scales: Mapping[str, float] | None = None,
     gap: float | None = None,
     warm_up: float | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> LearnedThresholds:
     """Learn the thresholds of a design from rows of its plant without faults.
 
@@ -333,6 +334,7 @@ _NOT_CLOSER = "; rows are no closer than {dt} s"
 _REGULAR = "; no row is further than {dt} s from the last"
 
 
+@arguments_checked
 def online_monitor(
     design: ObserverDesign,
     kind: str = "pointwise",

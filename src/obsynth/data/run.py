@@ -27,7 +27,7 @@ from obsynth.files.tables import table_writer
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.tolerant import rows_before
-from obsynth.numerics.arguments import require_kind, require_mapping, truth, whole_number
+from obsynth.numerics.arguments import arguments_checked, require_kind, require_mapping, truth, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
@@ -236,6 +236,7 @@ class DataRun:
         }
 
 
+@arguments_checked
 def run_on_data(
     design: ObserverDesign,
     data: Data,

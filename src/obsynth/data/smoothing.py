@@ -15,7 +15,7 @@ from obsynth.data.signals import TIME_HEADER
 from obsynth.data.sources import samples
 from obsynth.data.step_log import SteppingLogObserver
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arguments import arguments_checked, require_kind
 from obsynth.numerics.arrays import read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
@@ -89,6 +89,7 @@ class LaterRows:
         return row._replace(values=values), self.chain.row(k), found
 
 
+@arguments_checked
 def smooth(
     design: ObserverDesign,
     data: Any,

@@ -529,10 +529,12 @@ def parsed_rows(rows: str | slice | Sequence[int] | None, count: int) -> tuple[i
         if found is None:
             raise SpecError(f"rows is {rows!r}: give a:b, such as 0:56 for the first 56 rows.", path="rows")
         rows = slice(*(int(text) if text else None for text in found.groups()))
-    elif isinstance(rows, Sequence):
+    elif isinstance(rows, (Sequence, np.ndarray)):
         if len(rows) != 2 or not all(isinstance(row, (int, np.integer)) for row in rows):
             raise SpecError(f"rows is {list(rows)}: give the first row and one past the last.", path="rows")
         rows = slice(int(rows[0]), int(rows[1]))
+    elif rows is not None:
+        require_kind(rows, slice, "rows", "a:b, a slice, or the first row and one past the last")
     first, last, step = (rows or slice(None)).indices(count)
     if step != 1 or last <= first:
         asked = rows if isinstance(rows, slice) else slice(None)

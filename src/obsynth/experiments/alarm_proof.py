@@ -44,7 +44,7 @@ from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.methods.tracking import tracking_of
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import real_number, whole_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, require_no_overflow
 from obsynth.plants.constants import MOST_LISTED, shown
 from obsynth.plants.validation import index_of
 from obsynth.proofs.balls import gamma
@@ -655,6 +655,7 @@ def assumptions_of(
         )
     if initial_set is None and state_bounds is None:
         raise SpecError("Nothing bounds the state: give initial_set (--initial), or state_bounds.", path="initial_set")
+    require_no_overflow(noise_bound or 0.0, "noise_bound", "noise_bound")
     return Assumptions(plant, bounds, float(noise_bound or 0.0) if plant.nw else 0.0, initial_set, state_bounds)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.constants import MOST_LISTED, ConstantsBox, shown
+from obsynth.plants.constants import MOST_LISTED, ConstantsBox, deviations_told, shown
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.gain_sets import digest_of, plain
 
@@ -72,7 +72,7 @@ class Assumptions:
 
     def _noise(self) -> str:
         """Return the phrase on the noise: the largest value at each sensor, where each has its own."""
-        plant, times = self.plant, f"{shown(self.noise_bound)} standard deviations"
+        plant, times = self.plant, deviations_told(self.noise_bound)
         sizes = self.noise_bound * np.abs(plant.Dw).sum(axis=1)
         each = [
             f"{shown(float(f'{size:.6g}'), plant.units.get(name, ''))} at {name}"

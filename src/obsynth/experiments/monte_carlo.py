@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.simulation import Bench, Runs, aligned_errors, bench_of, make_bench
-from obsynth.numerics.arguments import OpenUnitInterval, checked_value, require_kind, whole_number
+from obsynth.numerics.arguments import OpenUnitInterval, arguments_checked, checked_value, require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import ParameterMonitor
@@ -153,6 +153,7 @@ def _run(
     return {**found, "false": judged[0], "found": judged[1], "wrong": judged[2]}
 
 
+@arguments_checked
 def evaluate(
     design: ObserverDesign,
     scenario: Scenario,

@@ -18,7 +18,7 @@ from obsynth.analysis.transformations.recovery import Transformation, plant_and_
 from obsynth.errors import SpecError
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.files.tables import table_writer
-from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arguments import arguments_checked, require_kind
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.ranks import covariance_factor
@@ -471,6 +471,7 @@ def simulate(
 ) -> Trajectory: ...
 
 
+@arguments_checked
 def simulate(
     design: ObserverDesign | DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel | Transformation,
     scenario: Scenario | None = None,

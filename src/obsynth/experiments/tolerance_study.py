@@ -16,9 +16,9 @@ from obsynth.experiments.simulation import Runs, make_bench
 from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import text_table
 from obsynth.methods.verifying import verify
-from obsynth.numerics.arguments import require_kind, whole_number
+from obsynth.numerics.arguments import arguments_checked, require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray, freeze
-from obsynth.plants.constants import shown, tolerance_share
+from obsynth.plants.constants import deviations_told, shown, tolerance_share
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.certificate_files import SHOWN_DIGITS, STUDY, result_text
 from obsynth.results.design import (
@@ -165,7 +165,7 @@ def study_statement(result: Mapping[str, Any], asked: Mapping[str, Any], digest:
         )
     ]
     bounds = ", ".join(f"{name} within {shown(value)}" for name, value in (asked["disturbance_bounds"] or {}).items())
-    noise = "" if asked["noise_bound"] is None else f"noise within {shown(asked['noise_bound'])} standard deviations"
+    noise = "" if asked["noise_bound"] is None else f"noise within {deviations_told(asked['noise_bound'])}"
     kept = "; ".join(part for part in (bounds, noise) if part)
     return (
         f"Of {result['runs']} runs of {shown(asked['scenario']['horizon'])} s, seeds from {asked['scenario']['seed']}, "
@@ -174,6 +174,7 @@ def study_statement(result: Mapping[str, Any], asked: Mapping[str, Any], digest:
     )
 
 
+@arguments_checked
 def tolerance_study(
     design: ObserverDesign,
     scenario: Scenario,

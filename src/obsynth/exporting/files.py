@@ -36,7 +36,7 @@ from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.methods.guaranteed_test.bank import groups_of, is_bank
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
-from obsynth.numerics.arguments import chosen, require_kind
+from obsynth.numerics.arguments import arguments_checked, chosen, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -298,6 +298,7 @@ EXPORTED = {
 }
 
 
+@arguments_checked
 def export(
     design: ObserverDesign,
     path: str | Path,

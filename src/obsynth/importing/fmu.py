@@ -22,7 +22,7 @@ import numpy as np
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.files.inputs import path_of
 from obsynth.importing.python_objects import plant_of
-from obsynth.numerics.arguments import real_number, require_mapping
+from obsynth.numerics.arguments import arguments_checked, real_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import imported
 from obsynth.plants.descriptor import DescriptorSystem
@@ -226,6 +226,7 @@ _EQUILIBRIUM_STEPS = 50
 _AT_REST = 1e-8
 
 
+@arguments_checked
 def from_fmu(
     path: str | Path,
     *,

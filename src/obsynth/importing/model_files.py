@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.files.inputs import path_of, read_text
 from obsynth.importing.python_objects import plant_of
-from obsynth.numerics.arguments import number_in_text
+from obsynth.numerics.arguments import arguments_checked, number_in_text
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -30,6 +30,7 @@ _MATLAB_NAMES = {
 _SAMPLE_TIME_NAMES = ("Ts", "dt")
 
 
+@arguments_checked
 def from_matlab(
     path: str | Path,
     variable: str | None = None,
@@ -155,6 +156,7 @@ _ALIAS = re.compile(r"Real\s+'([xuy])_([^']*)'\s*=\s*([xuy])\[(\d+)\]\s*;")
 _OUTPUT_ALIAS = "$outputAlias_"
 
 
+@arguments_checked
 def from_modelica(path: str | Path, **plant: Any) -> DescriptorSystem:
     """Return the plant of a linearised Modelica model, with the names of its variables.
 

@@ -18,7 +18,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping, require_shape, shown
+from obsynth.numerics.arguments import (
+    arguments_checked,
+    is_finite_number,
+    require_kind,
+    require_mapping,
+    require_shape,
+    shown,
+)
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.libraries import imported
 from obsynth.plants.dae.model import DAEModel
@@ -122,6 +129,7 @@ def _refuse_both(more: Mapping[str, Any], role: str, names: Sequence[str]) -> No
         raise SpecError(f"{role} and {twice[0]} are both given: use one of them.", path=twice[0])
 
 
+@arguments_checked
 def from_control(
     system: Any,
     *,
@@ -173,6 +181,7 @@ def from_control(
     )
 
 
+@arguments_checked
 def from_scipy(
     system: Any,
     *,
@@ -229,6 +238,7 @@ def _sampling_time(own: Any, given: float | None) -> float:
     return float(own)
 
 
+@arguments_checked
 def from_sympy(
     A: Any, B: Any = None, C: Any = None, *, parameters: Mapping[Any, float] | None = None, **plant: Any
 ) -> DescriptorSystem:
@@ -273,6 +283,7 @@ def from_sympy(
     return DescriptorSystem(**{"E": None, **arguments})
 
 
+@arguments_checked
 def from_pandas(A: Any, B: Any = None, C: Any = None, **plant: Any) -> DescriptorSystem:
     """Return the plant of labelled frames of pandas; `DescriptorSystem` takes them as well.
 
@@ -347,6 +358,7 @@ def _evaluated(matrix: Any, numbers: Mapping[Any, Any], name: str) -> FloatArray
 INTEGRATOR_INPUTS, OUTPUTS = ("x", "z", "u", "p"), ("ode", "alg", "y")
 
 
+@arguments_checked
 def from_casadi(
     system: Any,
     *,
@@ -466,6 +478,7 @@ Picked: TypeAlias = "Sequence[str] | Mapping[str, Sequence[str]]"
 _PENCIL = ("E.mtx", "A.mtx", "names.json")
 
 
+@arguments_checked
 def from_andes(
     case: Any, *, outputs: Picked, faults: Picked = (), disturbances: Picked = (), **plant: Any
 ) -> DescriptorSystem:

@@ -19,6 +19,7 @@ from obsynth.methods.method import Method, Synthesis
 from obsynth.methods.refusals import require_above_rounding, with_advice
 from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_class
 from obsynth.methods.verifying import verify
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.libraries import failed_computations, failure_of, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -39,6 +40,7 @@ def _silent(_: str) -> None:
     """Progress that does nothing (no-op)."""
 
 
+@arguments_checked
 def design(
     plant: Plant | Transformation,
     method: str = AUTO,
@@ -158,6 +160,7 @@ def _with_arrays(
     return found.plant, through, found.notes
 
 
+@arguments_checked
 def check(
     plant: Plant | Transformation, options: Mapping[str, Mapping[str, Any]] | None = None
 ) -> dict[str, VerificationReport]:
@@ -278,6 +281,7 @@ def failed_rows(report: VerificationReport) -> str:
     return "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
 
 
+@arguments_checked
 def design_from_gains(
     plant: Plant | Transformation, method: str, *, name: str = "design from gains", **gains: Any
 ) -> ObserverDesign:

@@ -26,7 +26,7 @@ def own_terms(method: Any) -> tuple[str, ...]:
     for name in ("constraints", "objective", "region"):
         value = getattr(method, name)
         own = callable(value) if name != "region" else isinstance(value, (LMIRegion, list, tuple))
-        if own or (name == "objective" and value == "h2"):
+        if own or (name == "objective" and isinstance(value, str) and value == "h2"):
             found.append(name)
     return tuple(found)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY, method_class
-from obsynth.numerics.arguments import is_whole, shown
+from obsynth.numerics.arguments import arguments_checked, is_whole, shown
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.design import ObserverDesign, VerificationReport
@@ -16,6 +16,7 @@ from obsynth.verification.plant import derivation_rows, stored_twice_rows, toler
 from obsynth.verification.stored_numbers import stored_number_rows
 
 
+@arguments_checked
 def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> VerificationReport:
     """Recompute every claim of a design from its plant and its shipped realisation.
 

@@ -8,16 +8,18 @@ from __future__ import annotations
 import math
 import operator
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
-from functools import cache
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from functools import cache, wraps
+from inspect import signature, unwrap
+from pathlib import Path
+from typing import Annotated, Any, Literal, ParamSpec, TextIO, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
 from obsynth.errors import SpecError, a_kind
-from obsynth.numerics.arrays import FloatArray, holds_truth, unmasked
+from obsynth.numerics.arrays import FloatArray, as_given, holds_truth
 
 
 def real_number(
@@ -81,10 +83,7 @@ def real_vector(value: Any, size: int, name: str) -> FloatArray:
 
 def real_array(value: Any, name: str) -> FloatArray:
     """Return real numbers of any shape, NaN (masked entries too) and infinities among them; else raise `SpecError`."""
-    try:
-        raw = np.asarray(unmasked(value))
-    except (TypeError, ValueError):
-        raise SpecError(f"{name} has rows of different lengths.", path=name) from None
+    raw = as_given(value, name, f"{name} has rows of different lengths.")
     if (raw.dtype.kind not in "fiu" and raw.size) or holds_truth(value):
         raise SpecError(f"{name} is {shown(value)}: give real numbers.", path=name)
     return np.asarray(raw, dtype=np.float64) if raw.size else np.zeros(raw.shape)
@@ -162,6 +161,8 @@ NonNegative = Annotated[float, Ge(0.0)]
 ForgettingFactor = Annotated[float, Gt(0.0), Le(1.0)]
 #: Per sample; 0 never.
 Probability = Annotated[float, Ge(0.0), Lt(1.0)]
+#: Of random numbers.
+Seed = Annotated[int, Ge(0)]
 OpenUnitInterval = Annotated[float, Gt(0.0), Lt(1.0)]
 #: More than the upper ends is a mistake that would fill the memory.
 Count = Annotated[int, Ge(1), Le(1_000_000)]
@@ -183,11 +184,100 @@ class WrittenAs:
         self.kind = kind
 
 
+class _Numbers:
+    """Stands for ``ArrayLike`` in annotations, whose own parts tell nothing apart."""
+
+
+class _ByName:
+    """Base class of what stands for a class that the module of an annotation imports for types only."""
+
+
+#: How a message asks for what an annotation says, by name; what is not here is called by its own name.
+_WORDS: Mapping[str, str] = {
+    "bool": "True or False",
+    "int": "a whole number",
+    "float": "a number",
+    "str": "a text",
+    "Path": "the name of a file",
+    "TextIO": "a text stream",
+    "Mapping": "a mapping from names, such as {'speed': 1.0}",
+    "Sequence": "a list",
+    "Iterable": "a list",
+    "Callable": "a function",
+    "_Numbers": "real numbers",
+    "ObserverDesign": "an ObserverDesign, such as obsynth.load(path)",
+    "Scenario": "an obsynth.Scenario",
+    "DescriptorSystem": "an obsynth.DescriptorSystem",
+    "Monitor": "what obsynth.online_monitor returns",
+    "DataRun": "what obsynth.run_on_data returns",
+    "Simulation": "what obsynth.simulate returns for a design",
+    "Estimates": "the Estimates of a whole run, such as observer.run(y, u)",
+    "Detection": "what a monitor's watch returns",
+    "Decision": "what obsynth.decide returns",
+    "ToleranceStudy": "what obsynth.tolerance_study returns",
+    "LinearObserver": "the LinearObserver of a continuous design",
+    "VerificationReport": "what obsynth.verify returns",
+    "LMIRegion": "a region, such as obsynth.conditions.disk(0.0, 0.9)",
+    "Executor": "an executor of concurrent.futures",
+    "Axes": "axes of matplotlib",
+}
+
+
+def _is_one_of(value: Any, kind: Any) -> bool:
+    """Whether a value is of one of the kinds that an annotation says; what is not known here is not judged."""
+    origin, inner = get_origin(kind) or kind, get_args(kind)
+    if origin in (Union, types.UnionType):
+        return any(_is_one_of(value, part) for part in inner)
+    if origin in (bool, int, float):
+        tell = {bool: lambda item: isinstance(item, (bool, np.bool_)), int: is_whole, float: is_number}
+        return bool(tell[origin](value))
+    if origin in (Sequence, Iterable):
+        # What can be gone through only once is not looked into, and what has no order may hold names only.
+        once = origin is Iterable and isinstance(value, Iterator)
+        listed = isinstance(value, Collection) and not isinstance(value, (str, bytes, Mapping))
+        ordered = inner[0] is str or not isinstance(value, (set, frozenset))
+        return once or (listed and ordered and all(_is_one_of(item, inner[0]) for item in value))
+    if origin is _Numbers:
+        try:
+            return real_array(value, "") is not None
+        except SpecError:
+            return False
+    if origin is Callable:
+        return callable(value)
+    if origin is TextIO:
+        return hasattr(value, "write") or hasattr(value, "read")
+    if not isinstance(origin, type) or origin is Any:
+        return True
+    if issubclass(origin, _ByName):
+        return any(known.__name__ == origin.__name__ for known in type(value).__mro__)
+    return isinstance(value, origin)
+
+
+def _problem_with_kind(value: Any, name: str, kind: Any) -> str | None:
+    """Return what is wrong with a value of the wrong kind, as a sentence."""
+    if _is_one_of(value, kind):
+        return None
+    options = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+    asked = []
+    for option in options:
+        plain = (get_origin(option) or option).__name__
+        if plain in ("Sequence", "Iterable") and get_args(option)[0] is str:
+            asked.append("a list of names")
+        elif plain != "NoneType" and not (option is str and Path in options):
+            asked.append(_WORDS.get(plain, f"an obsynth.{plain}"))
+    return f"{name} is {a_kind(value)}: give {' or '.join(dict.fromkeys(asked))}."
+
+
 def problem_with(value: Any, name: str, kind: Any) -> str | None:
     """Return what is wrong with a value of an annotated type, as a sentence; ``None`` where nothing is."""
     options = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
     if value is None and type(None) in options:
         return None
+    kinds = [option for option in options if option is not type(None)]
+    if not any(get_origin(option) in (Annotated, Literal) for option in kinds) and (
+        len(kinds) > 1 or kinds[0] not in (bool, int, float)
+    ):
+        return _problem_with_kind(value, name, kind)
     plain, *marks = next((get_args(part) for part in options if get_origin(part) is Annotated), (options[0],))
     if plain is Any:
         return _problem_with_written(
@@ -222,7 +312,7 @@ _LISTS: Mapping[str, tuple[str, tuple[type, ...]]] = {
 def _problem_with_written(value: Any, name: str, kind: str) -> str | None:
     wanted, kinds = _LISTS.get(kind, ("numbers", ()))
     if kind == "samples":
-        fits = value == "auto" or (is_whole(value) and value >= 1)
+        fits = (isinstance(value, str) and value == "auto") or (is_whole(value) and value >= 1)
         return None if fits else f"{name} is {shown(value)}: give a whole number of samples, at least 1, or 'auto'."
     fits = not isinstance(value, (bool, np.bool_)) and (not kinds or value is None or isinstance(value, kinds))
     if fits and kind == "fault sets" and not isinstance(value, (str, type(None))):
@@ -251,3 +341,44 @@ def check_fields(made: Any, kind: Any) -> None:
         parts = get_args(stated) if get_origin(stated) in (Union, types.UnionType) else (stated,)
         if any(get_origin(part) in (Annotated, Literal) for part in parts):
             object.__setattr__(made, name, checked_value(getattr(made, name), name, stated))
+
+
+Given = ParamSpec("Given")
+Returned = TypeVar("Returned")
+
+
+@cache
+def _argument_kinds(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return name -> kind of the arguments of a function, as its annotations say them."""
+    known: dict[str, Any] = {"ArrayLike": _Numbers}
+    kinds = {}
+    for name, parameter in signature(function).parameters.items():
+        said = parameter.annotation
+        while isinstance(said, str) and parameter.kind is not parameter.VAR_KEYWORD and name not in kinds:
+            try:
+                kinds[name] = eval(said, unwrap(function).__globals__, known)
+            except NameError as missing:
+                known[str(missing.name)] = type(str(missing.name), (_ByName,), {})
+    return kinds
+
+
+def arguments_checked(function: Callable[Given, Returned]) -> Callable[Given, Returned]:
+    """Make a public function raise `SpecError` for arguments that are not of the kinds that its annotations say."""
+    stated = signature(function)
+
+    @wraps(function)
+    def called(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
+        kinds = _argument_kinds(function)
+        given = dict(zip(stated.parameters, args, strict=False)) | kwargs
+        wrong = {
+            name: text
+            for name, value in given.items()
+            if name in kinds and (text := problem_with(value, name, kinds[name]))
+        }
+        if wrong:
+            first = next(iter(wrong))
+            message = wrong[first] if len(wrong) == 1 else f"Arguments of {function.__name__}:"
+            raise SpecError(message, path=first, problems=tuple(wrong.values()) if len(wrong) > 1 else ())
+        return function(*args, **kwargs)
+
+    return called

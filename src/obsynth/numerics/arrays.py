@@ -98,12 +98,21 @@ def require_no_overflow(numbers: Any, what: str, path: str) -> None:
         )
 
 
+def as_given(value: Any, name: str, ragged: str) -> NDArray[Any]:
+    """Return what a caller gives as an array of any kind; raise `SpecError` where it is none, ``ragged`` where its rows
+    have different lengths."""
+    try:
+        return np.asarray(unmasked(value))
+    except ValueError:
+        raise SpecError(ragged, path=name) from None
+    except (TypeError, RuntimeError) as error:
+        # Arrays of other libraries may refuse, with a reason of their own.
+        raise SpecError(f"{name} is a {type(value).__name__} that is no array: {error}.", path=name) from error
+
+
 def as_matrix(value: Any, name: str) -> FloatArray:
     """Convert nested lists, an array or a scalar to a finite, read-only real matrix; raise `SpecError` naming it."""
-    try:
-        raw = np.asarray(unmasked(value))
-    except ValueError:
-        raise SpecError(f"{name} has rows of different lengths: give a full matrix.", path=name) from None
+    raw = as_given(value, name, f"{name} has rows of different lengths: give a full matrix.")
     truths = holds_truth(value)
     if raw.dtype.kind not in "fiu" or truths:
         if raw.size == 0:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import real_number, shown
+from obsynth.numerics.arguments import arguments_checked, real_number, shown
 from obsynth.numerics.arrays import FloatArray, freeze
 
 
@@ -69,6 +69,7 @@ class LMIRegion:
         return bool(np.all(self.margins(values) > 0.0))
 
 
+@arguments_checked
 def disk(center: float, radius: float) -> LMIRegion:
     """Return the open disk ``abs(z - center) < radius``.
 
@@ -98,6 +99,7 @@ def disk(center: float, radius: float) -> LMIRegion:
     )
 
 
+@arguments_checked
 def half_plane(decay: float) -> LMIRegion:
     """Return the open half-plane ``Re z < -decay``.
 
@@ -120,6 +122,7 @@ def half_plane(decay: float) -> LMIRegion:
     return LMIRegion(np.array([[2.0 * a]]), np.array([[1.0]]), f"half_plane({a:g})", ({"half_plane": a},))
 
 
+@arguments_checked
 def sector(damping: float) -> LMIRegion:
     """Return the open sector of the left half-plane with ``-Re z > damping abs(z)``.
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arguments import arguments_checked, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.c_code import BATCH_PARTS, compiler
 from obsynth.observers.dae.estimates import DAERow
@@ -110,6 +110,7 @@ def _one(observer: DAEObserver, y: FloatArray, u: FloatArray, trial: int) -> dic
     return {name: np.concatenate([row.several.part(name) for row in rows]) for name in BATCH_PARTS}
 
 
+@arguments_checked
 def run_batch(
     observer: LinearObserver | RecursiveObserver | DAEObserver,
     y: ArrayLike,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import chosen, real_array, real_number, real_vector, require_kind
+from obsynth.numerics.arguments import arguments_checked, chosen, real_array, real_number, real_vector, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
@@ -182,6 +182,7 @@ NIS_WINDOW = 20
 NIS_LOOKS = 1.0 / 2.0
 
 
+@arguments_checked
 def decide(
     observer: RecursiveObserver | DAEObserver,
     estimates: Estimates,

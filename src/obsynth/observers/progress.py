@@ -30,7 +30,7 @@ def shown_progress(
     if callable(progress):
         yield progress
         return
-    if progress not in (None, True, False):
+    if progress is not None and not isinstance(progress, bool):
         raise SpecError(f"progress is {progress!r}: give True, False, None, or a function.", path="progress")
     if progress is False or (progress is None and not sys.stderr.isatty()):
         yield bool

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number, real_array, real_number, require_kind
-from obsynth.numerics.arrays import FloatArray, as_matrix, unmasked
+from obsynth.numerics.arrays import FloatArray, as_given, as_matrix
 from obsynth.plants.dae.model import finite_vector
 from obsynth.plants.validation import index_of, suggestion
 
@@ -63,10 +63,7 @@ def measured_record(value: ArrayLike, columns: int) -> FloatArray:
 
 def _numbers(value: Any, name: str) -> FloatArray:
     """Return an array of finite real numbers of one or two dimensions; raise `SpecError` naming it."""
-    try:
-        raw = np.asarray(unmasked(value))
-    except ValueError:
-        raise SpecError(f"{name} is ragged: give the same number of signals at each sample.", path=name) from None
+    raw = as_given(value, name, f"{name} is ragged: give the same number of signals at each sample.")
     if raw.ndim <= 1:
         return np.asarray(as_matrix(raw.reshape(1, -1), name)[0])
     return as_matrix(raw, name)
@@ -142,7 +139,7 @@ def named_bounds(value: Any, names: Sequence[str], what: str) -> FloatArray:
     if isinstance(value, Mapping):
         pairs = {index_of(name, names, what=what): pair for name, pair in value.items()}
     else:
-        rows = np.asarray(value, dtype=object)
+        rows = np.asarray(value, dtype=object) if isinstance(value, (list, tuple, np.ndarray)) else np.zeros(0)
         if rows.shape != found.shape:
             raise SpecError(f"{what} must be {len(names)} pairs [low, high], or pairs by name.", path=what)
         pairs = {i: list(row) for i, row in enumerate(rows)}

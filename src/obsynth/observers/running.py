@@ -11,6 +11,7 @@ from typing import Any, Generic, Self, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.estimates import STEP_RESIDUAL, Estimates
 from obsynth.observers.outliers import Outliers, checked_limit, checked_sizes, checked_state_bounds
@@ -55,6 +56,7 @@ class Observer(ABC, Generic[State, Row]):
         data : mapping
             Every field by name; lists stand for tuples.
         """
+        require_kind(data, Mapping, "data", "what as_dict() returns")
         return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in data.items()})
 
 
@@ -162,6 +164,7 @@ class StepObserver(Observer[Any, Any]):
 
     def step(self, state: Any, y: ArrayLike, u: ArrayLike = ()) -> tuple[Any, Estimates]:
         """Return the state after a sample, and the estimates at it (``y (ny,)``, ``u (nu,)``)."""
+        require_kind(state, tuple, "state", "what init() or the step before returned")
         after, row = self.accept(state, *self._sample(state, y, u))
         return after, self._estimates(getattr(after, "latest", after), row)
 

@@ -33,6 +33,11 @@ def shown(value: float, unit: str = "") -> str:
     return f"{text} {unit}".rstrip()
 
 
+def deviations_told(count: float) -> str:
+    """Return so many standard deviations in words."""
+    return f"{shown(count)} standard deviation{'' if count == 1 else 's'}"
+
+
 @dataclass(frozen=True)
 class Constant:
     """A physical constant: what it should be, and what it may be.

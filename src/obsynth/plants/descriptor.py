@@ -111,6 +111,17 @@ class ExactNumbers:
         )
 
 
+def exact_numbers(data: Any) -> ExactNumbers | None:
+    """Return what `ExactNumbers.as_dict` described; `None` and exact numbers stay as they are."""
+    if data is None or isinstance(data, ExactNumbers):
+        return data
+    require_kind(data, Mapping, "exact", "what the exact numbers of a plant are as data (as_dict)")
+    missing = [field.name for field in fields(ExactNumbers) if field.name not in data]
+    if missing:
+        raise SpecError(f"exact has no {missing[0]!r}: give what as_dict() returns, or leave it out.", path="exact")
+    return ExactNumbers.from_dict(data)
+
+
 def _texts(matrices: RationalRows) -> dict[str, list[list[str]]]:
     return {name: [[_text(value) for value in row] for row in rows] for name, rows in matrices.items()}
 
@@ -296,7 +307,8 @@ def _appended(
         return {}
     if matrices["C"] is not None and given.get("C") is None:
         return {}
-    stated = labels["output_names"] or picked_names(matrices["C"])
+    names = labels["output_names"]
+    stated = picked_names(matrices["C"]) if names is None else names
     outputs = problems.collect(
         lambda: checked_names(stated, signal_counts(given)["y"], prefix="y", what="output_names")
     )
@@ -497,7 +509,7 @@ class DescriptorSystem:
             asked, names, dt=dt, operating_point=operating_point, scales=scales, units=units, sensor_noise=sensor_noise
         )
         values["uncertainty"] = uncertainty_of(uncertainty)
-        values["exact"] = ExactNumbers.from_dict(exact) if isinstance(exact, Mapping) else exact
+        values["exact"] = exact_numbers(exact)
         for field, value in values.items():
             object.__setattr__(self, field, read_only(value) if isinstance(value, np.ndarray) else value)
         if self.exact is not None and self.exact is not exact:

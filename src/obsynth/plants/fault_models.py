@@ -14,7 +14,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, is_whole
-from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, freeze, largest_singular_value, read_only
+from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, largest_singular_value, read_only
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.scaling import LogBalance
 from obsynth.plants.validation import index_of
@@ -99,7 +99,8 @@ class FaultModel:
 
     def __post_init__(self) -> None:
         """Make the arrays private and read-only."""
-        freeze(self, "Phi", "Cw")
+        for name in ("Phi", "Cw"):
+            object.__setattr__(self, name, as_matrix(getattr(self, name), name))
 
     @property
     def order(self) -> int:

@@ -14,8 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import real_number, require_mapping, whole_number
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.arguments import (
+    arguments_checked,
+    real_number,
+    require_mapping,
+    whole_number,
+)
+from obsynth.numerics.arrays import FloatArray, as_given, as_matrix, read_only
 from obsynth.numerics.expressions import NAMED_NUMBERS, Expression, parse_expression
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import Problems, any_matrix, checked_dt, checked_labels, checked_names
@@ -149,12 +154,7 @@ def _has_text(value: Any) -> bool:
 
 
 def _array(value: Any, name: str) -> FloatArray:
-    try:
-        array = np.asarray(value)
-    except ValueError:
-        raise SpecError(
-            f"{name} has matrices or rows of different sizes: shapes must not change with k.", path=name
-        ) from None
+    array = as_given(value, name, f"{name} has matrices or rows of different sizes: shapes must not change with k.")
     if array.ndim != 3:
         return np.zeros((0, 0))
     if array.dtype.kind not in "fiu":
@@ -423,6 +423,7 @@ class TimeVaryingDescriptorSystem:
             object.__setattr__(self, item, value)
 
     @classmethod
+    @arguments_checked
     def from_descriptor(cls, plant: DescriptorSystem) -> TimeVaryingDescriptorSystem:
         """Return a time-invariant plant as a time-varying one: its faults become parameters, its noise is left out.
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import require_mapping
+from obsynth.numerics.arguments import arguments_checked, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import CalibratedBox, Constant, ConstantsBox, constant_of, constants_box, tolerance_share
 from obsynth.plants.descriptor import DescriptorSystem
@@ -33,6 +33,7 @@ def stated_box(given: Any, variation: str | None = None) -> Any:
     )
 
 
+@arguments_checked
 def uncertain_system(
     plant: DescriptorSystem | Mapping[str, Any],
     constants: Mapping[str, Any] | ConstantsBox | None = None,

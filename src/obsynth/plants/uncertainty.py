@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import Expression, parse_expression
 from obsynth.plants.constants import ConstantsBox, constants_box
@@ -225,6 +226,10 @@ def uncertainty_of(data: Any) -> Uncertainty | None:
     """Return what `Uncertainty.as_dict` described; `None` and an `Uncertainty` stay as they are."""
     if data is None or isinstance(data, Uncertainty):
         return data
+    require_kind(data, Mapping, "uncertainty", "what obsynth.uncertain_system makes, or its as_dict()")
+    missing = [part for part in ("box", "entries", "written", "steps") if part not in data]
+    if missing:
+        raise SpecError(f"uncertainty has no {missing[0]!r}: give what its as_dict() returns.", path="uncertainty")
     box = dict(data["box"])
     return Uncertainty(
         constants_box(box.pop("constants"), **box),

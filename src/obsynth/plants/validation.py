@@ -28,7 +28,7 @@ def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what:
     if isinstance(names, str) or not all(isinstance(name, str) and name.strip() for name in given):
         raise SpecError(f"{what} must be a list of non-empty texts.", path=what)
     if len(given) != count:
-        raise SpecError(f"{what} has {len(given)} names, but there are {count} such signals.", path=what)
+        raise SpecError(f"{what} has {len(given)} name(s), but there are {count} such signal(s).", path=what)
     unwritable = [
         name
         for name in given

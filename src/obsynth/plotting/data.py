@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.data.log_estimator import DECIDING
 from obsynth.data.run import DataRun
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arguments import arguments_checked, require_kind
 from obsynth.observers.estimates import BAND_WIDTH
 from obsynth.plotting.estimates import MODEL_BAND
 from obsynth.plotting.panels import (
@@ -51,6 +51,7 @@ _UNDECIDED_ROWS: dict[str, Any] = {"color": "0.9", "linewidth": 0.0, "zorder": 0
 _ALARM: dict[str, Any] = {"color": "tab:red", "alpha": 0.15, "linewidth": 0.0, "zorder": 0}
 
 
+@arguments_checked
 def plot_data(
     run: DataRun,
     *,

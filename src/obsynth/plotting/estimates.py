@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.monitor import Detection
 from obsynth.experiments.simulation import Simulation
+from obsynth.numerics.arguments import arguments_checked, real_array
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.decisions import Decision
 from obsynth.observers.estimates import BAND_WIDTH, Estimates
@@ -43,6 +44,7 @@ CROSSING_MARKERS = ("o", "s", "^")
 ROOM_SHARE, USUAL_BANDS = 0.2, 3.0
 
 
+@arguments_checked
 def plot_faults(
     estimates: Estimates,
     *,
@@ -93,6 +95,7 @@ def plot_faults(
     return panels
 
 
+@arguments_checked
 def plot_parameters(
     estimates: Estimates,
     *,
@@ -141,6 +144,7 @@ def plot_parameters(
     return panels
 
 
+@arguments_checked
 def plot_states(
     estimates: Estimates,
     *,
@@ -264,6 +268,7 @@ def _show_what_moves(panel: Axes, drawn: FloatArray, half: FloatArray) -> None:
         panel.set_ylim(float(known.min()) - room, float(known.max()) + room)
 
 
+@arguments_checked
 def plot_residuals(
     estimates: Estimates,
     *,
@@ -316,7 +321,7 @@ def plot_residuals(
 
 
 def _curve(value: ArrayLike, name: str, steps: int) -> FloatArray:
-    curve = np.asarray(value, dtype=np.float64)
+    curve = real_array(value, name)
     if curve.ndim and curve.shape != (steps,):
         raise SpecError(f"{name} needs one number, or {steps} of them: one for each sample.", path="threshold")
     return np.broadcast_to(curve, (steps,)).copy()
@@ -333,6 +338,7 @@ _DECISION_LABELS = {
 LEAST_SHARE = 1e-3
 
 
+@arguments_checked
 def plot_decision(decision: Decision, *, dt: float = 1.0, axes: Axes | None = None) -> Axes:
     """Plot a decision statistic, its threshold, and the alarm with its onset, on a logarithmic scale.
 
@@ -387,6 +393,7 @@ _TRUTH_ON_BAND = {"color": "black", "linewidth": 1.8, "zorder": 2.5}
 DECADES_BELOW = 3
 
 
+@arguments_checked
 def plot_simulation(
     simulation: Simulation,
     *,
@@ -447,6 +454,7 @@ def _plot_linear(
             legend_above(panel)
 
 
+@arguments_checked
 def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None) -> Axes:
     """Plot a statistic with its threshold and the alarm, on a logarithmic scale.
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.observers.estimates import Estimates
 from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH, label_time, legend_above, new_panels, tidy
 from obsynth.results.design import ObserverDesign
@@ -21,6 +22,7 @@ ROUNDED_COURSE = 1e-12
 WIDE_THRESHOLDS = 5.0
 
 
+@arguments_checked
 def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
     """Plot the least threshold of a guaranteed test against the time that its samples take.
 
@@ -77,6 +79,7 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
     return panel
 
 
+@arguments_checked
 def plot_intervals(design: ObserverDesign, estimates: Estimates, *, axes: Axes | None = None) -> Axes:
     """Plot the interval in which a guaranteed test says the fault lies, and where it alarms.
 
@@ -118,6 +121,7 @@ def plot_intervals(design: ObserverDesign, estimates: Estimates, *, axes: Axes |
     return panel
 
 
+@arguments_checked
 def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes: Axes | None = None) -> Axes:
     """Plot the courses with which a fault looks like none: why no test finds a smaller one, or tells it from others.
 

@@ -15,7 +15,7 @@ from obsynth.analysis.zeros import fault_zeros, regularity_of
 from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.methods.ui_pi_observer.pencils import equilibrated
-from obsynth.numerics.arguments import chosen
+from obsynth.numerics.arguments import arguments_checked, chosen
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.modal_response import resolved
 from obsynth.numerics.norms import response
@@ -58,6 +58,7 @@ _ZEROS: dict[str, Any] = {
 Excess = Callable[[ComplexArray], FloatArray]
 
 
+@arguments_checked
 def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
     """Plot the observer's eigenvalues and the plant's fault zeros, the limit of stability, and the region asked for.
 
@@ -208,6 +209,7 @@ class EstimateGains:
     least: FloatArray
 
 
+@arguments_checked
 def estimate_gains(design: ObserverDesign, *, to: str = "faults") -> EstimateGains:
     """Return the singular values of the transfer functions that matter, from the plant and the shipped realisation.
 
@@ -323,6 +325,7 @@ def _least_state(pencil: ComplexArray, b: FloatArray) -> ComplexArray:
     return np.asarray(columns[:nx, None] * found / columns[nx:])
 
 
+@arguments_checked
 def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None = None) -> Axes:
     """Plot what reaches the fault estimates (or the state errors, or the residual), from whatever acts on the plant.
 

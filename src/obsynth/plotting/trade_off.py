@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.tolerance_study import ADAPTIVE, FIXED, ToleranceStudy
-from obsynth.numerics.arguments import is_number, require_kind
+from obsynth.numerics.arguments import arguments_checked, is_number, require_kind
 from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH, legend_above, new_panels, plain_decades, tidy
 from obsynth.results.design import ObserverDesign
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 WIDE_AXIS = 10.0
 
 
+@arguments_checked
 def plot_trade_off(
     designs: Sequence[ObserverDesign], along: str, against: str | Sequence[str], *, axes: Iterable[Axes] | None = None
 ) -> list[Axes]:
@@ -50,7 +51,7 @@ def plot_trade_off(
     SpecError
         No design, or one that has no such number (the names that it has are listed).
     """
-    if not designs:
+    if len(designs) == 0:
         raise SpecError("A trade-off needs designs: give at least one.", path="designs")
     names = [against] if isinstance(against, str) else list(against)
     panels = new_panels(axes, len(names), size=(WIDTH, PANEL_HEIGHT * len(names) + 1.2))
@@ -89,6 +90,7 @@ _MONITORS: tuple[dict[str, Any], ...] = (
 )
 
 
+@arguments_checked
 def plot_tolerances(study: ToleranceStudy, *, axes: Iterable[Axes] | None = None) -> list[Axes]:
     """Plot false alarms, and the least fault that is found in every run, against the tolerance.
 

@@ -40,6 +40,7 @@ from obsynth.methods.fault_figures import HELD_GROWTH
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.registry import REGISTRY, method_class
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.observers.dae.observer import DAEObserver
@@ -568,6 +569,7 @@ PAGE = FileKind("a report of obsynth", rb'name="generator" content="obsynth"')
 MOST_ENTRIES = 900
 
 
+@arguments_checked
 def html_report(
     design: ObserverDesign,
     path: str | Path,

@@ -14,6 +14,7 @@ import numpy as np
 from obsynth.analysis.transformations.recovery import StateRecovery, Transformation
 from obsynth.errors import SpecError, VerificationError
 from obsynth.extensions import extension
+from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.sensor_timing import LONGEST_DELAY
@@ -106,6 +107,7 @@ class VerificationReport:
         data : dict
             With the key ``checks``.
         """
+        require_kind(data, dict, "data", "what as_dict() returns")
         return cls.of(Check(**row) for row in data["checks"])
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from obsynth.analysis.transformations.recovery import RecoveryOperator, StateRecovery
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, json_data, path_of, read_json
-from obsynth.numerics.arguments import is_number
+from obsynth.numerics.arguments import arguments_checked, is_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import (
@@ -75,6 +75,7 @@ def written_for(gains: Path) -> str | None:
     return None if found is None else found.group(1).decode()
 
 
+@arguments_checked
 def load(path: str | Path) -> ObserverDesign:
     """Read a gain set and check its digest.
 

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arguments import require_shape, whole_number
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arguments import Seed, arguments_checked, require_shape
+from obsynth.numerics.arrays import FloatArray, as_given, as_matrix
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.plants.dae.functions import Compiled, DAEFunctions, take_samples
 from obsynth.plants.dae.model import DAEModel, checked_inputs, finite_vector, step_length
@@ -18,6 +18,7 @@ from obsynth.plants.dae.step import ImplicitStep, onto_constraint
 from obsynth.simulation.signals import Trajectory
 
 
+@arguments_checked
 def simulate_dae(
     model: DAEModel,
     u: ArrayLike,
@@ -28,7 +29,7 @@ def simulate_dae(
     Q: ArrayLike | None = None,
     R: ArrayLike | None = None,
     integration: str = "radau",
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> Trajectory:
     """Simulate a plant whose inputs are constant during each step.
 
@@ -69,7 +70,6 @@ def simulate_dae(
     inputs, length = checked_inputs(model, u), step_length(dt)
     theta = _parameters(model, parameters, len(inputs))
     x = finite_vector(initial_state, model.state_names, model.nominal_state, "initial_state")
-    whole_number(seed, "seed", least=0)
     rng = np.random.default_rng(seed)
     pushed = _noise(Q, model.nx, "Q", rng, len(inputs))
     measurement_noise = _noise(R, model.ny, "R", rng, len(inputs))
@@ -93,7 +93,7 @@ def _consistent(model: DAEModel, x: FloatArray, inputs: FloatArray, theta: Float
 
 def _parameters(model: DAEModel, value: ArrayLike | None, samples: int) -> FloatArray:
     """Return the parameters at each sample ``(samples, nq)``."""
-    if value is None or np.ndim(value) < 2:
+    if value is None or as_given(value, "parameters", "parameters has rows of different lengths.").ndim < 2:
         theta = finite_vector(value, model.parameter_names, model.nominal_parameters, "parameters")
         return np.tile(theta, (samples, 1))
     theta = as_matrix(value, "parameters")

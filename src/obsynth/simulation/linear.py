@@ -18,7 +18,7 @@ from obsynth.analysis.transformations.elimination import eliminate_algebraic_sta
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arguments import real_array, real_vector, whole_number
+from obsynth.numerics.arguments import arguments_checked, real_array, real_vector, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.libraries import failed_computations
@@ -218,6 +218,7 @@ def stabilising_feedback(plant: DescriptorSystem) -> FloatArray:
     return np.asarray(gain, dtype=np.float64)
 
 
+@arguments_checked
 def simulate_time_varying(
     plant: TimeVaryingDescriptorSystem,
     *,

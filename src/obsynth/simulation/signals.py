@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, as_matrix, freeze
+from obsynth.numerics.arrays import FloatArray, as_given, as_matrix, freeze
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -246,7 +246,7 @@ def signal_of(value: ArrayLike | None, name: str, shape: tuple[int, int]) -> Flo
     """Return a signal over a record, zero where none is given; a list of numbers is a single one."""
     if value is None or (0 in shape and not np.size(value)):
         return np.zeros(shape)
-    array = np.asarray(value)
+    array = as_given(value, name, f"{name} has rows of different lengths: give a full matrix.")
     matrix = as_matrix(array.reshape(-1, 1) if array.ndim == 1 and shape[1] == 1 else array, name)
     if matrix.shape != shape:
         raise SpecError(f"{name} has shape {matrix.shape}, but {shape} is needed (samples by signals).", path=name)

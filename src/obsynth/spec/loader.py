@@ -27,6 +27,7 @@ from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, path_of
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.libraries import one_thread_if_small
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
@@ -682,6 +683,7 @@ def load_plant(
     return spec.plant if spec.transformation is None else spec.transformation.source, spec
 
 
+@arguments_checked
 def load_spec(path: str | Path) -> Spec:
     """Read a spec; check it strictly; build its plant and transform it as asked.
 

@@ -31,6 +31,7 @@ from obsynth.files.tables import table_writer
 from obsynth.methods.designing import design
 from obsynth.methods.registry import Plant
 from obsynth.methods.verifying import verify
+from obsynth.numerics.arguments import arguments_checked, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.progress import RunsProgress, as_they_come, progress_of_runs
 from obsynth.plants.descriptor import DescriptorSystem
@@ -283,8 +284,9 @@ class ResultFolder(Generic[_Result]):
         self.fields = [item.name for item in fields(self.record) if item.name not in ("file", "content")]
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise SpecError(f"{folder} cannot be used as a folder: {error.strerror}.", path=str(folder)) from error
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error  # a name with the character zero
+            raise SpecError(f"{folder!s:.60} cannot be used as a folder: {reason}.", path=str(folder)) from error
 
     def _file(self, item: Work, ending: str) -> Path:
         """Return a file of a piece of work: its name in letters that every file may have, and its digest."""
@@ -460,6 +462,7 @@ class Sweep(ResultTable):
         return plot_sweep(self.results, claim, parameter=parameter)
 
 
+@arguments_checked
 def sweep(
     cases: str | Path | Sequence[str | Path] | Plant | Mapping[str, Plant],
     parameters: Mapping[str, Sequence[Any]] | None = None,
@@ -691,6 +694,7 @@ class Fleet(ResultTable):
         return figure
 
 
+@arguments_checked
 def run_fleet(
     gains: str | Path | Sequence[str | Path],
     data: str | Path | Sequence[str | Path],
@@ -752,6 +756,8 @@ def run_fleet(
 
 def _files(given: Any, endings: tuple[str, ...], what: str) -> list[Path]:
     listed = [given] if isinstance(given, (str, Path)) else list(given)
+    for name in listed:
+        require_kind(name, (str, Path), what, "names of files or of folders")
     found: list[Path] = []
     for path in map(Path, listed):
         inside = sorted(p for p in path.iterdir() if p.name.endswith(endings)) if path.is_dir() else [path]

@@ -24,7 +24,7 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.files.outputs import write_atomically
 from obsynth.methods.tracking import tracking_of
 from obsynth.methods.verifying import verify
-from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arguments import arguments_checked, require_kind
 from obsynth.numerics.arrays import FloatArray, freeze
 from obsynth.plants.constants import SAME_TOLERANCE, ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
@@ -315,6 +315,7 @@ def _with_tolerances_of(plant: DescriptorSystem, given: DescriptorSystem) -> Des
     return plant.replace(uncertainty=given.uncertainty)
 
 
+@arguments_checked
 def robustness(
     design: ObserverDesign, *, constants: Any = None, progress: Callable[[str], None] | None = None
 ) -> Robustness:

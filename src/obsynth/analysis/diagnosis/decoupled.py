@@ -14,6 +14,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value, read_only
 from obsynth.numerics.lapack import LAPACK_BLOCK, pencil_eigenvalues
 from obsynth.numerics.libraries import on_one_thread_if_small
@@ -303,6 +304,7 @@ class DecoupledPlant:
         )
 
 
+@arguments_checked
 @on_one_thread_if_small
 def decouple(
     plant: DescriptorSystem | Transformation, *, without: Sequence[str] = (), faults: Sequence[str] | None = None

@@ -34,7 +34,7 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.analysis.zeros import structure_of
 from obsynth.errors import SpecError
 from obsynth.files.tables import html_table, text_table
-from obsynth.numerics.arguments import is_finite_number, truth
+from obsynth.numerics.arguments import arguments_checked, is_finite_number, truth
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.libraries import failed_computations, on_one_thread_if_small
 from obsynth.numerics.ranks import REST_TOLERANCE
@@ -305,6 +305,7 @@ _PART_OF_THE_BANK = (
 )
 
 
+@arguments_checked
 @failed_computations()
 @on_one_thread_if_small
 def diagnose(

@@ -26,6 +26,7 @@ from obsynth.analysis.transformations.recovery import (
 )
 from obsynth.analysis.zeros import in_own_units, structure_of
 from obsynth.errors import PreconditionError
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import one_thread_if_small
 from obsynth.numerics.pencils import GENERIC_POINTS
@@ -275,6 +276,7 @@ MANY_VARIABLES = 500
 SPARSE_PENCIL_SHARE = 0.05
 
 
+@arguments_checked
 def eliminate_algebraic_states(plant: DescriptorSystem | Transformation) -> Transformation:
     """Solve the algebraic equations of an index-1 plant, so that ``E = I``.
 

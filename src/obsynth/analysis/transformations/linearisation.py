@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arguments import chosen, real_number, require_kind
+from obsynth.numerics.arguments import arguments_checked, chosen, real_number, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import parse_expression
 from obsynth.numerics.ranks import JACOBIAN_RANK_TOLERANCE
@@ -97,7 +97,7 @@ class _Problem:
         self.model, self.base = model, nominal_point(model, given, free)
         for name, value in start.items():
             if name not in given:
-                self.base.x[index_of(name, model.state_names, what="start")] = float(value)
+                self.base.x[index_of(name, model.state_names, what="start")] = real_number(value, f"start.{name}")
         self.states = [i for i, name in enumerate(model.state_names) if name not in given]
         self.inputs, self.parameters = (
             [names.index(name) for name in free if name in names]
@@ -502,6 +502,7 @@ DRIFT = "drift"
 SHIFT_INPUT = "shift"
 
 
+@arguments_checked
 def linearise(
     model: DAEModel,
     *,

@@ -10,9 +10,9 @@ import numpy as np
 
 from obsynth.analysis.transformations.recovery import Transformation, unchanged_states
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import real_number
-from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.dae.model import DAEModel
+from obsynth.numerics.arguments import arguments_checked, real_number
+from obsynth.numerics.arrays import SMALLEST, FloatArray, require_no_overflow
+from obsynth.plants.dae.model import DAEModel, step_length
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.noise_model import (
     OFFSET_SIZE,
@@ -28,6 +28,7 @@ from obsynth.plants.uncertainty import Uncertainty
 from obsynth.plants.validation import index_of
 
 
+@arguments_checked
 def with_noise(
     plant: DescriptorSystem | Transformation | DAEModel,
     *,
@@ -87,14 +88,17 @@ def with_noise(
     """
     names = plant.plant.output_names if isinstance(plant, Transformation) else plant.output_names
     noises = sensor_noises(sensor_noise, names)
-    offsets = _offsets(offset, names, noises)
+    offsets = _offsets(() if offset is None else offset, names, noises)
     loads = {name: stated_number(value, f"walks.{name}") for name, value in (walks or {}).items()}
     if isinstance(plant, DAEModel):
         model = _of_equations(plant, noises, offsets, loads)
         drives = _intensities_by_equation(plant, process_noise)
         if dt is None:
             return model, _intensities(plant, noises, offsets, loads, drives)
-        return model, _options(model, noises, offsets, loads, drives, dt, integration)
+        step = step_length(dt)
+        for what, value in (("dt", step), ("1 / dt", 1.0 / max(step, SMALLEST))):
+            require_no_overflow(value, what, "dt")
+        return model, _options(model, noises, offsets, loads, drives, step, integration)
     if isinstance(plant, Transformation):
         made, options = _of_matrices(plant.plant, noises, offsets, loads)
         return plant.then(made), options
@@ -112,7 +116,7 @@ def _intensities_by_equation(model: DAEModel, given: Mapping[str, float] | None)
 def _offsets(given: Any, names: Sequence[str], noises: Mapping[str, SensorNoise]) -> dict[str, tuple[float, float]]:
     """Return by output the deviation of its offset, and how far it walks: in the unit of a deviation."""
     found = {}
-    for name, value in (given if isinstance(given, Mapping) else dict.fromkeys(given or (), "unknown")).items():
+    for name, value in (given if isinstance(given, Mapping) else dict.fromkeys(given, "unknown")).items():
         index_of(name, names, what="offset")
         size = noises[name].size if name in noises else 1.0
         deviation = OFFSET_SIZE * size if value == "unknown" else stated_number(value, f"offset.{name}")

@@ -12,7 +12,7 @@ from obsynth.analysis.transformations.exact_elimination import MOST_STATES_EXACT
 from obsynth.analysis.transformations.recovery import Transformation, unchanged_states
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arguments import real_number
+from obsynth.numerics.arguments import arguments_checked, real_number
 from obsynth.numerics.arrays import LARGEST, FloatArray, require_no_overflow
 from obsynth.numerics.continuous import zero_order_hold
 from obsynth.numerics.libraries import on_one_thread_if_small
@@ -33,6 +33,7 @@ SQUARING_BITS = 640
 SLOW_ZERO_RADIUS = 0.98
 
 
+@arguments_checked
 @on_one_thread_if_small
 def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> Transformation:
     """Sample a continuous plant with a zero-order hold.

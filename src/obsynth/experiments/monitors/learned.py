@@ -33,7 +33,7 @@ from obsynth.experiments.monitors.monitor import Evidence, Judged, LinearSample,
 from obsynth.files.inputs import path_of
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import error_model
-from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arguments import arguments_checked, is_finite_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 from obsynth.observers.linear.observer import LinearObserver
@@ -246,6 +246,7 @@ def _duration(seconds: float) -> str:
     return f"{count:.3g} {name}{'' if count == 1.0 else 's'}"
 
 
+@arguments_checked
 def load_thresholds(path: str | Path) -> LearnedThresholds:
     """Read learned thresholds.
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.estimates import Estimates
@@ -399,6 +400,7 @@ class Monitor:
         """
         return int(np.argmax(np.abs(faults[min(k + self.isolation_delay, len(faults) - 1)]) / self.fault_scales))
 
+    @arguments_checked
     def watch(self, estimates: Estimates) -> Detection:
         """Return what this monitor sees in a record.
 

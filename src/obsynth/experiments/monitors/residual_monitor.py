@@ -32,7 +32,7 @@ from obsynth.experiments.monitors.residual_model import (
 )
 from obsynth.experiments.monitors.rules import NormRule, WhitenedRule
 from obsynth.experiments.simulation import Bench, make_bench
-from obsynth.numerics.arguments import chosen, real_number, require_kind, require_mapping
+from obsynth.numerics.arguments import arguments_checked, chosen, real_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.validation import index_of
@@ -46,6 +46,7 @@ from obsynth.simulation.scenario import Scenario
 RESIDUAL_ROUNDING_SHARE = 1e-10
 
 
+@arguments_checked
 def monitor(
     design: ObserverDesign,
     scenario: Scenario,

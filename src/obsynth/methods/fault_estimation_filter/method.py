@@ -20,7 +20,8 @@ from obsynth.methods.own_terms import (
     own_term_conflicts,
     own_terms,
 )
-from obsynth.numerics.arguments import FewSamples, OpenUnitInterval, Positive, WrittenAs, shown
+from obsynth.numerics.arguments import FewSamples, OpenUnitInterval, Positive, WrittenAs, checked_value, shown
+from obsynth.numerics.arrays import require_no_overflow
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
@@ -167,7 +168,7 @@ class FaultEstimationFilter(Method):
             yield "residual_weight_limit needs free_residual_weight: the weight is fixed otherwise."
         if self.residual_weight_limit is not None and self.engine == "riccati":
             yield "residual_weight_limit is not covered by engine 'riccati': use 'auto' or 'lmi'."
-        if self.objective is not None and self.objective != "h2" and not callable(self.objective):
+        if self.objective is not None and "objective" not in own_terms(self):
             yield f"objective is {shown(self.objective)}: give 'h2', or a function of the variables."
         if self.own_inequality and self.gamma_search == "bisection":
             yield "bisection does not know constraints, objective, region and decay: leave gamma_search out."
@@ -197,6 +198,9 @@ class FaultEstimationFilter(Method):
             raise SpecError(
                 "gamma is needed: the plant has disturbances, and a gain set claims a bound on them.", path="gamma"
             )
+        if gamma is not None:
+            for what, value in (("gamma", checked_value(gamma, "gamma", Positive)), ("1 / gamma", 1.0 / gamma)):
+                require_no_overflow(value, what, "gamma")
         return synthesis_from_gains(plant, T=T, N=N, L=L, W=W, gamma=gamma, indexes=indexes)
 
     @classmethod

@@ -23,7 +23,7 @@ from obsynth.methods.guaranteed_test.windows import (
     window_of,
 )
 from obsynth.numerics.arguments import is_finite_number, real_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import LARGEST, FloatArray, require_no_overflow
 from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.windows import WindowObserver
@@ -373,6 +373,12 @@ def by_name(given: Any, names: tuple[str, ...], option: str, *, every: bool, mis
                 path=path,
             )
         real_number(value, f"{option} of {name}", "a finite number, 0 or more", least=0.0, path=path)
+        require_no_overflow(value, f"{option} of {name}", path)
+        if 0.0 < value < 1.0 / LARGEST:
+            raise SpecError(
+                f"{option} of {name} is {value:.3g}, which underflows where it is multiplied: give it in other units.",
+                path=path,
+            )
     return np.array([float(by_name.get(name, missing)) for name in names])
 
 

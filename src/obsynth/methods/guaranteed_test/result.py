@@ -14,10 +14,11 @@ from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import Programmes, free_faults, problem_as_designed, window_as_designed
 from obsynth.methods.guaranteed_test.tolerant import rows_before
 from obsynth.methods.guaranteed_test.windows import courses_of
-from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arguments import real_array, require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.records import measured_record
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -112,6 +113,15 @@ class GuaranteedTest(ObserverDesign):
         """The fault that is looked for."""
         return str(self._single("fault").options["fault"])
 
+    def _record(self, y: FloatArray, u: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        """Return outputs ``(steps, ny)`` and known inputs ``(steps, nu)``, where NaN may mark what is missing."""
+        outputs = measured_record(y, self.plant.ny)
+        inputs = np.zeros((len(outputs), 0)) if u is None else np.atleast_2d(real_array(u, "u"))
+        needed = (len(outputs), self.plant.nu)
+        if inputs.shape != needed:
+            raise SpecError(f"u has shape {inputs.shape}, but {needed} is needed (samples by signals).", path="u")
+        return outputs, inputs
+
     def _single(self, what: str) -> GuaranteedTest:
         """Return this test; raise `SpecError` for a bank, whose tests have that each."""
         if self.options.get("isolate"):
@@ -186,7 +196,8 @@ class GuaranteedTest(ObserverDesign):
         y, u : FloatArray
             Outputs ``(steps, ny)`` and known inputs ``(steps, nu)``.
         """
-        known = np.abs(y) if u is None else np.hstack([np.abs(u), np.abs(y)])
+        outputs, inputs = self._record(y, u)
+        known = np.hstack([np.abs(inputs), np.abs(outputs)])
         rounding = self._single("its own rounding").certificate.matrices["rounding"]
         # Samples that are missing are in no window that has a verdict.
         largest = np.maximum.accumulate(np.nan_to_num(known), axis=0)
@@ -203,6 +214,7 @@ class GuaranteedTest(ObserverDesign):
         rows : int
             Of the record, the first at k = 0.  Where there is no verdict the threshold is infinite.
         """
+        whole_number(rows, "rows")
         if not isinstance(self.observer, WindowObserver):
             return np.full(rows, self.threshold)
         found = np.append(self.certificate.matrices["thresholds"].ravel(), np.inf)
@@ -229,6 +241,7 @@ class GuaranteedTest(ObserverDesign):
         estimates : Estimates
             What the observer said over a record, from its start.
         """
+        require_kind(estimates, Estimates, "estimates", "the Estimates of a whole run, such as observer.run(y, u)")
         self._single("a residual")
         row = np.hstack([estimates.faults, estimates.residuals])[..., 0].astype(np.float64)
         if isinstance(self.observer, LinearObserver):
@@ -270,10 +283,8 @@ class GuaranteedTest(ObserverDesign):
                 f"{self.name!r} is for a plant that changes with k: it has the fixed test of each row (interval).",
                 path="exact",
             )
-        plant, observer = self.linear
-        inputs = np.zeros((len(y), plant.nu)) if u is None else np.asarray(u, dtype=np.float64)
-        outputs = np.asarray(y, dtype=np.float64)
-        low, high = (np.array(end) for end in self.interval(observer.run(outputs, inputs)))
+        outputs, inputs = self._record(y, u)
+        low, high = (np.array(end) for end in self.interval(self.observer.run(outputs, inputs)))
         slack = self.slack(outputs, inputs)
         low, high = low - slack, high + slack
         length, programmes = rows_before(self) + 1, Programmes.of(self)

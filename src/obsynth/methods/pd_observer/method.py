@@ -12,7 +12,7 @@ from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
 from obsynth.methods.own_terms import OwnConstraints, OwnRegion, SolverName, SolverOptions, own_term_conflicts
-from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, shown
+from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, real_array, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
@@ -248,7 +248,7 @@ def _pair(value: Any) -> tuple[float, ...] | None:
     if value is None:
         return None
     try:
-        row = as_matrix(np.atleast_2d(np.asarray(value)), "option")
-    except (SpecError, ValueError):
+        row = as_matrix(np.atleast_2d(real_array(value, "option")), "option")
+    except SpecError:
         return None
     return tuple(map(float, row[0])) if row.shape == (1, 2) else None

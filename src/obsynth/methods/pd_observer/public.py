@@ -6,9 +6,11 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError, VerificationError
 from obsynth.methods.designing import design_from_gains, failed_rows
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.results.design import ObserverDesign
 
 
+@arguments_checked
 def apply_adaptation_gain(design: ObserverDesign, adaptation_gain: ArrayLike) -> ObserverDesign:
     """Put a matrix G into the loop of a finished design, and verify it there.
 

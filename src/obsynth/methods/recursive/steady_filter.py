@@ -13,8 +13,8 @@ from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.analysis.zeros import are_outside
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.recursive.conditions import described_mode, recursive_conditions
-from obsynth.numerics.arguments import require_shape
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.arguments import arguments_checked, require_shape
+from obsynth.numerics.arrays import FloatArray, as_matrix, read_only, require_no_overflow
 from obsynth.numerics.matrix_equations import discrete_lyapunov, discrete_riccati
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencils import finite_zeros
@@ -54,6 +54,7 @@ class SteadyState:
     rate: float
 
 
+@arguments_checked
 def steady_state_filter(
     plant: DescriptorSystem | TimeVaryingDescriptorSystem | Transformation, *, Q: ArrayLike, R: ArrayLike
 ) -> SteadyState:
@@ -107,6 +108,7 @@ def steady_state_filter(
     )
     for name, matrix, size in (("Q", q, varying.ne), ("R", r, varying.ny)):
         require_shape(matrix.shape, (size, size), name)
+        require_no_overflow(matrix, name, name)
     roots = covariance_factor(q, "Q"), covariance_factor(r, "R")
     reached_condition(varying, *roots).require()
     E, A, C = varying.E.at(1), varying.A.at(0), varying.C.at(1)

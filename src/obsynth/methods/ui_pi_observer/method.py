@@ -156,7 +156,7 @@ class UiPiObserver(Method):
             yield "E_sharp, C_sharp and G come together: give all three, or none."
         if any(given) and self.joint:
             yield "joint designs what E_sharp, C_sharp and G would fix: leave one of the two out."
-        if not callable(self.objective) and self.objective not in OBJECTIVES:
+        if not callable(self.objective) and not (isinstance(self.objective, str) and self.objective in OBJECTIVES):
             listed = ", ".join(OBJECTIVES)
             yield f"objective is {shown(self.objective)}: use one of {listed}, or a function of the variables."
         yield from own_term_conflicts(self, beside=("poles", "noise", "joint"))

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arrays import FloatArray, all_finite
+from obsynth.numerics.arguments import checked_value, real_array
+from obsynth.numerics.arrays import FloatArray, all_finite, as_given
 from obsynth.numerics.ranks import SINGULAR_CONDITION
 from obsynth.observers.dae.c_code import DAELibrary
 from obsynth.observers.dae.estimates import DAERow, GatheredRows, SampleEstimates, require_regular
@@ -159,15 +160,15 @@ class DAEObserver(DAESettings):
             require_regular(self, row, row.conditions)
 
     def _sample(self, state: DAEState, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        outputs = np.asarray(y)
+        outputs = as_given(y, "y", f"y must be {self.model.ny} number(s) at k = {state.k}.")
         # What can be wrong with plain numbers is an infinity: it is told below.
         if not (_is_plain(y, self.model.ny) and (all_finite(outputs) or not np.isinf(outputs).any())):
             outputs = measured_record(np.atleast_2d(outputs), self.model.ny)[0]
         if _is_plain(u, self.model.nu) and all_finite(np.asarray(u)):
             return outputs, np.asarray(u)
         try:
-            inputs = np.atleast_1d(np.asarray(u, dtype=np.float64))
-        except (TypeError, ValueError):
+            inputs = np.atleast_1d(real_array(u, "u"))
+        except SpecError:
             inputs = np.zeros((0, 0))
         if inputs.shape != (self.model.nu,):
             raise SpecError(f"u must be {self.model.nu} finite number(s) at k = {state.k}.", path="u")
@@ -229,8 +230,7 @@ class DAEObserver(DAESettings):
         SolverError
             A step has no solution; k, iteration and worst equation are named.
         """
-        if compiled not in (None, True, False):
-            raise SpecError(f"compiled is {compiled!r}: give True, False or None.", path="compiled")
+        checked_value(compiled, "compiled", bool | None)
         outputs = measured_record(y, self.model.ny)
         inputs = checked_inputs(self.model, u, len(outputs))
         alone = self.outside_graph

@@ -11,7 +11,15 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, check_fields, require_shape
+from obsynth.numerics.arguments import (
+    Count,
+    ForgettingFactor,
+    Positive,
+    Probability,
+    check_fields,
+    require_kind,
+    require_shape,
+)
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import covariance_factor, is_definite
 from obsynth.observers.outliers import Outliers
@@ -130,6 +138,7 @@ class DAESettings(StepObserver):
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Return the observer that `as_dict` described."""
+        require_kind(data, Mapping, "data", "what as_dict() returns")
         return cls(**{**data, "model": DAEModel(**data["model"])})
 
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import real_number, require_kind
+from obsynth.numerics.arguments import arguments_checked, real_number, require_kind
 from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.modal_response import Modes
@@ -50,6 +50,7 @@ def is_stable(observer: LinearObserver) -> bool:
     return bool(np.all(np.abs(poles) < 1.0) if observer.dt > 0.0 else np.all(poles.real < 0.0))
 
 
+@arguments_checked
 def sample_observer(observer: LinearObserver, dt: float) -> LinearObserver:
     r"""Sample a continuous-time observer by a first-order hold.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_whole, require_shape
+from obsynth.numerics.arguments import is_finite_number, is_whole, real_array, require_kind, require_shape, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.records import NAME_FIELDS, checked_sample, require_names, whole_record
@@ -84,11 +83,13 @@ class LinearObserver(Observer[LinearState, FloatArray]):
             require_shape(matrix.shape, shape, name)
             object.__setattr__(self, name, read_only(matrix))
         if self.constant is not None:
-            added = as_matrix(np.atleast_2d(self.constant), "constant")[0]
+            added = as_matrix(np.atleast_2d(real_array(self.constant, "constant")), "constant").ravel()
             require_shape(added.shape, (rows,), "constant")
             object.__setattr__(self, "constant", read_only(added) if added.any() else None)
-        if not (math.isfinite(self.dt) and self.dt >= 0.0):
-            raise SpecError(f"dt of the observer is {self.dt}: give seconds, or 0 for continuous time.", path="dt")
+        if not (is_finite_number(self.dt) and self.dt >= 0.0):
+            raise SpecError(
+                f"dt of the observer is {shown(self.dt)}: give seconds, or 0 for continuous time.", path="dt"
+            )
         for names, delays in ((self.state_names, self.state_delays), (self.fault_names, self.fault_delays)):
             whole = isinstance(delays, tuple) and all(is_whole(delay) and delay >= 0 for delay in delays)
             if not whole or len(names) != len(delays):
@@ -192,6 +193,7 @@ class LinearObserver(Observer[LinearState, FloatArray]):
         SpecError
             A sample has the wrong length or is not finite.
         """
+        require_kind(state, LinearState, "state", "what init() or the step before returned")
         outputs = checked_sample(y, len(self.output_names), "y")
         inputs = checked_sample(u, len(self.input_names), "u")
         after, row = self.advance(state, outputs, inputs)

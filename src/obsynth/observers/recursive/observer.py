@@ -28,10 +28,12 @@ from obsynth.numerics.arguments import (
     ForgettingFactor,
     Probability,
     check_fields,
+    checked_value,
     is_number,
     real_array,
     real_number,
     real_vector,
+    require_kind,
     require_shape,
     truth,
 )
@@ -119,8 +121,9 @@ class Adaptation:
         check_fields(self, Adaptation)
         if self.reset and self.form == "random-walk":
             raise SpecError("reset is for the forms with a forgetting factor.", path="reset")
-        q = len(self.initial_parameters)
-        object.__setattr__(self, "initial_parameters", read_only(self.initial_parameters))
+        start = np.atleast_1d(real_array(self.initial_parameters, "initial_parameters"))
+        q = len(start)
+        object.__setattr__(self, "initial_parameters", read_only(start))
         for field, option in (("initial_covariance", "initial_parameter_covariance"), ("walk", "random_walk")):
             matrix = as_matrix(getattr(self, field), option)
             require_shape(matrix.shape, (q, q), option)
@@ -917,6 +920,7 @@ class RecursiveObserver(StepObserver):
         data : mapping
             Every field by name.
         """
+        require_kind(data, Mapping, "data", "what as_dict() returns")
         given = dict(data)
         constants, adaptation = given.pop("noise_constants"), given["adaptation"]
         noise = {name: MatrixSequence.of(given[name], name, constants=constants) for name in ("Q", "R")}
@@ -986,6 +990,7 @@ class RecursiveObserver(StepObserver):
         PreconditionError
             Rank H_k is lost at some k (named) although no sample is missing.
         """
+        checked_value(compiled, "compiled", bool | None)
         outputs, inputs = whole_record(y, u, self.plant.ny, self.plant.nu)
         require_horizon(self.plant.horizon, len(outputs), early=self.early_constraints)
         if compiled and not self.is_plain:

@@ -15,7 +15,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import real_array, real_number
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray, as_given, read_only
 from obsynth.numerics.expressions import DECIDING_WORDS, FUNCTIONS, FUNCTIONS_OF_TWO, NAMED_NUMBERS
 from obsynth.numerics.libraries import imported
 from obsynth.plants.dae.symbols import EQUALS, DAEFields, DAESymbols, Equations, symbols_of
@@ -196,7 +196,7 @@ def checked_inputs(model: DAEFields, u: Any, samples: int | None = None) -> Floa
     """Return known inputs ``(samples, nu)``; raise `SpecError` naming the signal and k where one is not finite."""
     if u is None and (model.nu or samples is None):
         raise SpecError(f"u is missing: the model has {model.nu} input(s), {', '.join(model.input_names)}.", path="u")
-    raw = np.zeros((samples or 0, 0)) if u is None else np.asarray(u)
+    raw = np.zeros((samples or 0, 0)) if u is None else as_given(u, "u", "u has rows of different lengths.")
     if raw.ndim == 1 and model.nu == 1:
         raw = raw[:, None]
     if raw.dtype.kind in "OUSbc" or raw.ndim != 2 or raw.shape[1] != model.nu:
@@ -318,8 +318,10 @@ class DAEModel(DAEFields):
         given = {"states": states, "inputs": inputs, "parameters": parameters, "constants": constants}
         for field, values in given.items():
             fields[field] = problems.collect(partial(checked_signals, values, field))
-        for field, texts in (("equations", equations), ("outputs", outputs), ("definitions", definitions or {})):
+        for field, texts in (("equations", equations), ("outputs", outputs)):
             fields[field] = texts if callable(texts) else problems.collect(partial(checked_texts, texts, field))
+        expressions = {} if definitions is None else definitions
+        fields["definitions"] = problems.collect(partial(checked_texts, expressions, "definitions"))
         problems.raise_if_any()
         for field, names, what in (
             ("equation_names", equation_names, "equations"),

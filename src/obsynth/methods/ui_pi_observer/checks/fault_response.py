@@ -16,6 +16,7 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import is_outside, leading_names, system_pencil, system_zeros, zeros_with_directions
 from obsynth.errors import SpecError
 from obsynth.methods.ui_pi_observer.pencils import number
+from obsynth.numerics.arguments import arguments_checked, real_array
 from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.norms import balanced_realisation, response
 from obsynth.numerics.ranks import NEGLIGIBLE_INPUT
@@ -36,6 +37,7 @@ SETTLING_BAND, SETTLING_TIME_CONSTANTS = 0.02, 4.0
 CONSTANT = 1e-9
 
 
+@arguments_checked
 def fault_response(design: ObserverDesign, frequencies: ArrayLike) -> ComplexArray:
     """Return the frequency response from the faults to their estimates: what a sinusoidal fault looks like.
 
@@ -58,7 +60,7 @@ def fault_response(design: ObserverDesign, frequencies: ArrayLike) -> ComplexArr
     """
     if "tracking" not in design.certificate.matrices:
         raise SpecError("The design holds no tracking map: fhat/f cannot be computed.", path="certificate")
-    points = boundary_points(np.atleast_1d(np.asarray(frequencies, dtype=np.float64)), design.linear[0].dt)
+    points = boundary_points(np.atleast_1d(real_array(frequencies, "frequencies")).ravel(), design.linear[0].dt)
     return _transfer(*design.linear, design.certificate.matrices["tracking"], points)
 
 
