@@ -178,7 +178,9 @@ def test_errors_that_decay_beyond_the_horizon_are_unclear_not_impossible() -> No
         Bf=[[1e-05], [2e-06], [-1e-09], [0.0]], dt=0.5,
     )  # fmt: skip
     with pytest.raises(obsynth.PreconditionError, match=r"^Unclear: .* State Q and R in the units of") as caught:
-        obsynth.adaptive_observer(plant, Q=np.eye(4), R=np.eye(2))
+        obsynth.adaptive_observer(
+            plant, Q=np.eye(4), R=np.eye(2), initial_covariance=np.eye(4), initial_parameter_covariance=np.eye(1)
+        )
     assert (caught.value.unclear, caught.value.signals) == (True, ("x4",))
     # Weighed in its own units it is designed.
     states, outputs = np.array([1.0, 1e-3, 1e-5, 1e3]), np.array([5e2, 1e7])
@@ -186,3 +188,27 @@ def test_errors_that_decay_beyond_the_horizon_are_unclear_not_impossible() -> No
         plant, Q=np.eye(4), R=np.diag(outputs**-2.0), initial_covariance=np.diag(states**2)
     )
     assert weighed.report.passed
+
+
+@pytest.mark.parametrize("seed", [616105, 616156, 677787])
+def test_a_filter_and_its_checks_do_not_hang_on_units(seed: int) -> None:
+    # Of a plant in other units the checks took for zero what is small in these, and rows of a step in thousands cost
+    # those in millionths their digits: what was found was refused (12 of 480 filters).
+    rng = np.random.default_rng([91, seed])
+    n = int(rng.integers(2, 6))
+    a = np.round(0.5 * rng.normal(size=(n, n)), 2)
+    c, b = np.round(rng.normal(size=(2, n)), 2), np.round(rng.normal(size=(n, 1)), 1)
+    noise = np.hstack([np.diag(np.round(10.0 ** rng.uniform(-1, 0, n), 2)), np.zeros((n, 2))])
+    shown = np.hstack([np.zeros((2, n)), 0.1 * np.eye(2)])
+    rows, states, outputs = (np.exp2(rng.integers(-20, 21, count).astype(float)) for count in (n, n, 2))
+    plain = obsynth.DescriptorSystem(np.eye(n), a, C=c, Bf=b, Bw=noise, Dw=shown, dt=0.1)
+    other = obsynth.DescriptorSystem(
+        np.diag(rows * states), rows[:, None] * a * states, C=outputs[:, None] * c * states, Bf=rows[:, None] * b,
+        Bw=rows[:, None] * noise, Dw=outputs[:, None] * shown, dt=0.1,
+    )  # fmt: skip
+    first = obsynth.descriptor_kalman(plain, initial_covariance=np.eye(n))
+    second = obsynth.descriptor_kalman(other, initial_covariance=np.diag(states**-2.0))
+    assert second.report.passed
+    y = rng.normal(size=(30, 2))
+    found = [one.observer.run(record).states for one, record in ((first, y), (second, y * outputs))]
+    np.testing.assert_allclose(found[1] * states, found[0], rtol=1e-9, atol=1e-9 * np.max(np.abs(found[0])))

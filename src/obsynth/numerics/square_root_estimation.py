@@ -21,6 +21,7 @@ from obsynth.errors import PreconditionError
 from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import PERFECT_PARITY, RANK_TOLERANCE
+from obsynth.numerics.scaling import power_of_two_below
 
 #: Standard deviations above this outgrow double precision soon: their squares overflow at 1e154.
 OUTGROWN = 1e100
@@ -32,6 +33,8 @@ SUSPECT_COLUMN = RANK_TOLERANCE
 #: The same for a row of the parity covariance, relative to the whole noise: the rank-revealing step then decides. It
 #: must lie above `PERFECT_PARITY`, or rounding passes for noise.
 SUSPECT_PARITY = 1e-12
+#: Rows of H that differ by no more than this in size cost a factorisation no digits.
+FAR_ROWS = 256.0
 #: Columns that LAPACK's ``tpqrt`` treats at once.
 TPQRT_BLOCK = 32
 #: Room for each column that LAPACK's factorisations are given: more than any of their blocks takes.
@@ -60,16 +63,31 @@ class Projection(NamedTuple):
     lower: FloatArray
 
 
-def projection_of(H: FloatArray, *, least: float = DEPENDENT_COLUMN) -> Projection | None:
-    """Return the factorisation of ``H (rows, n)``, or ``None`` where its rank has to be decided."""
+def row_sizes(H: FloatArray) -> FloatArray | None:
+    """Return the sizes of the rows of ``H (rows, n)``, powers of two, where they are far from each other; or ``None``.
+
+    A factorisation adds rows: where one is in thousands and another in millionths, the latter lose their digits."""
+    lengths = np.sqrt(np.einsum("ij,ij->j", H, H))
+    sizes = power_of_two_below(np.max(np.abs(H) / np.where(lengths > 0.0, lengths, 1.0), axis=1, initial=0.0))
+    return None if not sizes.size or np.max(sizes) <= FAR_ROWS * np.min(sizes) else sizes
+
+
+def projection_of(
+    H: FloatArray, *, least: float = DEPENDENT_COLUMN, sizes: FloatArray | None = None
+) -> Projection | None:
+    """Return the factorisation of ``H (rows, n)``, of its rows over ``sizes (rows,)`` where these are given, as data
+    and noise are by the rotation; or ``None`` where its rank has to be decided."""
     rows, n = H.shape
     if rows < n:
         return None
+    if sizes is not None:
+        H = H / sizes[:, None]
     packed, tau, _, _ = lapack.dgeqrf(H)
     diagonal = np.abs(packed.diagonal())
     if (diagonal <= least * np.sqrt(np.einsum("ij,ij->j", H, H))).any():
         return None
-    transposed = lapack.dormqr("L", "T", packed, tau, np.eye(rows), 64 * rows)[0]
+    given = np.eye(rows) if sizes is None else np.diag(1.0 / sizes)
+    transposed = lapack.dormqr("L", "T", packed, tau, given, 64 * rows)[0]
     rotation = np.concatenate((transposed[n:], transposed[:n]))
     return Projection(rotation, np.asfortranarray(packed[:n]), np.tri(n))
 

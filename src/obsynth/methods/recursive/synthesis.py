@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import require_all
-from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.plant_units import FAR_UNITS, PlantUnits
 from obsynth.analysis.time_varying import WARN_MARKOV_CONDITION, HorizonRanks, as_time_varying, horizon_ranks
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
@@ -66,8 +66,12 @@ def synthesise(
     if options.get("guard", "") is None:
         options["guard"] = "none" if options["form"] == "literal" else "regularise"
     progress("computing the gains")
+    missing = _missing_noise(options)
+    far = isinstance(plant, DescriptorSystem) and PlantUnits.of(plant).spread > FAR_UNITS
+    if isinstance(plant, DescriptorSystem) and far:
+        options |= _identities(PlantUnits.of(plant).rounded(), options)
     if not isinstance(plant, DescriptorSystem) or not plant.nd:
-        return _of_varying(as_time_varying(plant), options)
+        return _of_varying(as_time_varying(plant), options, missing=missing, own_units=far)
     reduced = without_unknown_inputs(plant)
     options |= {
         "initial_state": reduced.initial_state(options["initial_state"]),
@@ -75,20 +79,25 @@ def synthesise(
     }
     if options["Q"] is not None:
         options["Q"] = reduced.process_covariance(options["Q"])
-    found = _of_varying(reduced.plant, options)
+    found = _of_varying(reduced.plant, options, missing=missing, own_units=far)
     return replace(found, notes=(reduced.note, *found.notes))
 
 
-def _of_varying(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> Synthesis:
-    """Return observer, gains, claims and notes."""
+def _of_varying(
+    plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any], *, missing: Sequence[str], own_units: bool
+) -> Synthesis:
+    """Return observer, gains, claims and notes; ``missing``: covariances of noise that were not stated."""
     observer = observer_from_options(plant, options)
     ranks = horizon_ranks(plant, early=observer.early_constraints)
-    facts, given, missing = gain_schedule_summary(observer), options, _missing_noise(options)
-    if missing and not _contracts(facts) and plant.ne == plant.nx and _has_steady_state(observer):
-        options = {**options, **_identities(plant, options)}
+    facts = gain_schedule_summary(observer)
+    if missing and not own_units and not _contracts(facts) and plant.ne == plant.nx and _has_steady_state(observer):
+        still = DescriptorSystem(
+            plant.E.at(1), plant.A.at(0), C=plant.C.at(1), Bf=plant.Phi.at(0), Df=plant.Psi.at(0), dt=plant.dt or 1.0
+        )
+        options, own_units = {**options, **_identities(PlantUnits.of(still).rounded(), options)}, True
         observer = observer_from_options(plant, options)
         facts = gain_schedule_summary(observer)
-    _require_contraction(observer, facts, given)
+    _require_contraction(observer, facts, () if own_units else missing)
     claims = {
         "condition": ranks.condition,
         "condition_k": float(ranks.condition_k),
@@ -110,7 +119,7 @@ def _of_varying(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) 
         {"L": facts.L, "K": facts.K},
         observer,
         Certificate({}, claims),
-        notes=tuple(_notes(observer, ranks, facts, missing, own_units=options is not given)),
+        notes=tuple(_notes(observer, ranks, facts, missing, own_units=own_units)),
         plant=plant,
     )
 
@@ -125,12 +134,8 @@ def _contracts(facts: GainScheduleSummary) -> bool:
     return facts.steps < STEPS_TO_CONTRACT or facts.contraction < 1.0
 
 
-def _identities(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> dict[str, FloatArray]:
-    """Return the covariances that are not given as identities in units in which a time-invariant plant is near one."""
-    still = DescriptorSystem(
-        plant.E.at(1), plant.A.at(0), C=plant.C.at(1), Bf=plant.Phi.at(0), Df=plant.Psi.at(0), dt=plant.dt or 1.0
-    )
-    units = PlantUnits.of(still).rounded()
+def _identities(units: PlantUnits, options: Mapping[str, Any]) -> dict[str, FloatArray]:
+    """Return the covariances that are not given as identities in units in which a plant is near one."""
     found = {"Q": 1.0 / units.equations, "R": 1.0 / units.outputs, "initial_covariance": units.states}
     found["initial_parameter_covariance"] = units.faults
     return {name: np.diag(size**2) for name, size in found.items() if name in options and options[name] is None}
@@ -145,7 +150,7 @@ def _has_steady_state(observer: RecursiveObserver) -> bool:
     return detectability_condition(observer.plant).holds and reached_condition(observer.plant, *roots).holds
 
 
-def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary, options: Mapping[str, Any]) -> None:
+def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary, identity: Sequence[str]) -> None:
     """Raise `PreconditionError` where errors do not decay along the horizon."""
     if _contracts(facts):
         return
@@ -156,7 +161,6 @@ def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary
         else "grows without bound"
     )
     if _has_steady_state(observer):
-        identity = _missing_noise(options)
         given = f" {' and '.join(identity)} taken as the identity weigh this plant in its units." if identity else ""
         raise PreconditionError(
             "Unclear: the horizon is too short to decide whether errors decay fast enough. The outputs observe every "
@@ -185,7 +189,7 @@ def _notes(
     own_units: bool,
 ) -> Iterator[str]:
     if missing:
-        units = ", in units in which the plant is near one (in those given errors do not decay along the horizon)"
+        units = ", in units in which the plant is near one (those given are far from these)"
         yield (
             f"No noise is stated: {' and '.join(missing)} taken as the identity{units if own_units else ''}, which "
             "sets gains and deviations."

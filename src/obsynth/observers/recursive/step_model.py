@@ -23,6 +23,7 @@ from obsynth.numerics.square_root_estimation import (
     noise_triangle,
     projected_step,
     projection_of,
+    row_sizes,
 )
 from obsynth.plants.time_varying import MatrixSequence, TimeVaryingDescriptorSystem
 
@@ -250,6 +251,7 @@ class PreparedStep:
     moved: FloatArray  # ``(rows, n)``: rotated A, empty without a projection
     # The transpose of the rotated noise ``(any, rows)``, empty without a projection; of many rows its triangle.
     known: FloatArray
+    sizes: FloatArray | None  # of the rows of H, see `row_sizes`
 
     @classmethod
     def of(cls, step: StepMatrices, last: PreparedStep | None) -> PreparedStep:
@@ -257,15 +259,18 @@ class PreparedStep:
         if last is not None and last.step is step:
             return last
         same = last if last is not None and last.step.H is step.H else None
-        projection = projection_of(step.H) if same is None else same.projection
+        # Once for a run: a varying H is in the same units at every step.
+        kept = last is not None and len(last.step.H) == len(step.H)
+        sizes = last.sizes if last is not None and kept else row_sizes(step.H)
+        projection = projection_of(step.H, sizes=sizes) if same is None else same.projection
         if projection is None:
-            return cls(step, None, step.A[:0], step.noise[:0])
+            return cls(step, None, step.A[:0], step.noise[:0], sizes)
         rotation = projection.rotation
         moved = rotation[:, : len(step.A)] @ step.A
         if same is not None and same.step.noise is step.noise:
-            return cls(step, projection, moved, same.known)
+            return cls(step, projection, moved, same.known, sizes)
         known = (rotation @ step.noise).T
-        return cls(step, projection, moved, known if len(rotation) < MANY_ROWS else noise_triangle(known))
+        return cls(step, projection, moved, known if len(rotation) < MANY_ROWS else noise_triangle(known), sizes)
 
     def taken(self, factor: FloatArray, right: FloatArray | None) -> LeastSquaresStep | None:
         """Take the step, or return ``None`` where a rank has to be decided; ``right`` is the identity by default."""

@@ -34,6 +34,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.matrix_equations import discrete_lyapunov
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.square_root_estimation import LeastSquaresStep, least_squares_step, rank_revealing_step
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.gain_schedule import GainStep, gains_once
@@ -386,11 +387,13 @@ def _record(observer: RecursiveObserver, samples: int) -> tuple[FloatArray, Floa
     plant, rng = observer.plant, np.random.default_rng(RECORD_SEED)
     y, u = rng.standard_normal((samples, plant.ny)), rng.standard_normal((samples, plant.nu))
     H, S, data = _problem(observer, y, u)
-    # Directions without noise, by two factorisations that cost a tenth of the singular values.
-    triangle = qr(np.hstack([H, S[:, S.any(axis=0)]]).T, mode="r")[0]
+    # Directions without noise, by two factorisations that cost a tenth of the singular values; in no unit.
+    rows = _row_sizes(observer, H, S)
+    moved = H * np.tile(natural_units(observer), samples)
+    triangle = qr((np.hstack([moved, S[:, S.any(axis=0)]]) / rows[:, None]).T, mode="r")[0]
     basis, kept, _ = qr(triangle[: len(H)].T, pivoting=True)
     sizes = np.abs(np.diagonal(kept))
-    perfect = basis[:, int(np.sum(sizes > RANK_TOLERANCE * sizes[0])) :]
+    perfect = basis[:, int(np.sum(sizes > RANK_TOLERANCE * sizes[0])) :] / rows[:, None]
     if not perfect.shape[1]:
         return y, u
     # The data are affine in the record: a column of the map is the difference that one sample makes.
@@ -402,6 +405,12 @@ def _record(observer: RecursiveObserver, samples: int) -> tuple[FloatArray, Floa
     return _split(flat - np.linalg.pinv(effect, rcond=RANK_TOLERANCE) @ (perfect.T @ data[:, 0]), y, u)
 
 
+def _row_sizes(observer: RecursiveObserver, H: FloatArray, S: FloatArray) -> FloatArray:
+    """Return the size of each row of ``[H S]`` with the states in natural units, a power of two."""
+    units = np.tile(natural_units(observer), H.shape[1] // len(natural_units(observer)))
+    return power_of_two_below(np.maximum(*(np.max(np.abs(part), axis=1, initial=0.0) for part in (H * units, S))))
+
+
 def _split(flat: FloatArray, y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
     return flat[: y.size].reshape(y.shape), flat[y.size :].reshape(u.shape)
 
@@ -410,6 +419,9 @@ def _solved(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> LeastS
     """Return the last state of the solution over all states at once; further columns belong to the parameters."""
     H, S, data = _problem(observer, y, u)
     n = H.shape[1] // len(y)
+    # A factorisation adds rows: in units in which they are alike, which are powers of two, none loses its digits.
+    rows = _row_sizes(observer, H, S)
+    H, S, data = (part / rows[:, None] for part in (H, S, data))
     found = least_squares_step(H, S, data) or rank_revealing_step(H, S, data, np.zeros((len(H), 0)))
     return LeastSquaresStep(found.estimate[-n:], found.factor[-n:], found.innovation, found.diffuse[-n:])
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import KNOWN_SHARE
+from obsynth.numerics.scaling import LogBalance
 from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.step_model import StepMatrices
@@ -99,7 +100,14 @@ def data_deviations(step: StepMatrices, factor: FloatArray) -> FloatArray:
 
 def state_terms(step: StepMatrices, sizes: FloatArray) -> FloatArray:
     """Return how large the terms are that make up the state after a step, for data of these sizes."""
-    return np.asarray(np.abs(np.linalg.pinv(step.H)) @ sizes)
+    rows, columns = step.H.shape
+    problem = LogBalance(rows + columns)
+    problem.add(step.H, range(rows), range(rows, rows + columns))
+    # In the units given a part of it may be less than what a pseudoinverse takes for zero.
+    units = np.exp2(np.round(problem.solve()))
+    left, own = units[:rows], units[rows:]
+    inverse = own[:, None] * np.linalg.pinv(left[:, None] * step.H * own) * left
+    return np.asarray(np.abs(inverse) @ sizes)
 
 
 def normalised(errors: FloatArray, root: FloatArray, terms: FloatArray) -> tuple[FloatArray, FloatArray]:
