@@ -32,13 +32,14 @@ class DescriptorKalman(Method):
         at once become states of the filter, and are estimated; the equations that the others enter are left out.
     Q : MatrixLike, optional
         Covariance ``(ne, ne)`` of mu(k): constant, stack, callable, or rows of expressions in ``k``; a number stands
-        for that multiple of the identity.  By default ``Bw Bw'`` of a DescriptorSystem with noise, else the identity.
+        for that multiple of the identity.  By default ``Bw Bw'`` of a DescriptorSystem with noise, else the identity (in
+        natural units where the plant's are far from these).
     R : MatrixLike, optional
         Covariance ``(ny, ny)`` of nu(k), likewise from ``Dw``.
     initial_state : array_like, optional
         Mean of x(0), ``(nx,)``; zeros by default.
     initial_covariance : array_like, optional
-        ``P_0 (nx, nx)``; the identity by default.
+        ``P_0 (nx, nx)``; by default the identity, as for Q.
     early_constraints : bool, optional
         Use the equations of step k + 1 in which x(k + 2) does not appear already for x(k + 1).  They need u(k + 1),
         which `step` has; Q must not couple them with the others.
