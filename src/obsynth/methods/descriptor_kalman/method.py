@@ -32,8 +32,8 @@ class DescriptorKalman(Method):
         at once become states of the filter, and are estimated; the equations that the others enter are left out.
     Q : MatrixLike, optional
         Covariance ``(ne, ne)`` of mu(k): constant, stack, callable, or rows of expressions in ``k``; a number stands
-        for that multiple of the identity.  By default ``Bw Bw'`` of a DescriptorSystem with noise, else the identity (in
-        natural units where the plant's are far from these).
+        for that multiple of the identity.  By default ``Bw Bw'`` of a DescriptorSystem with noise, else the identity
+        (in natural units where the plant's are far from these).
     R : MatrixLike, optional
         Covariance ``(ny, ny)`` of nu(k), likewise from ``Dw``.
     initial_state : array_like, optional
