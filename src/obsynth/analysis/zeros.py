@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -35,7 +36,7 @@ from obsynth.numerics.ranks import (
     NEGLIGIBLE_INPUT,
     RANK_TOLERANCE,
 )
-from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil, power_of_two_below
+from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
 
 
@@ -116,10 +117,15 @@ def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int,
     return False
 
 
+def size_of_point(value: complex) -> float:
+    """Return the largest power of two not above the modulus of a point, or 1."""
+    return math.ldexp(1.0, math.frexp(max(1.0, abs(value)))[1] - 1)
+
+
 def equilibrated_at(E: FloatArray, A: FloatArray, value: complex, *, nx: int) -> EquilibratedPencil:
     """Return the pencil in units that suit a point of this modulus: states in those that ``z x`` has.
     Beside a large ``z E`` the inputs and outputs would vanish."""
-    size = float(power_of_two_below(np.array(max(1.0, abs(value)))))
+    size = size_of_point(value)
     columns = np.where(np.arange(E.shape[1]) < nx, 1.0 / size, 1.0)
     # Scaled with the modulus at that point, then taken apart again, so that the factors are those of A - z E.
     scaled = equilibrate_pencil(size * columns * E, columns * A)

@@ -92,11 +92,11 @@ class _Exceeded:
         self.last: FloatArray | None = None
 
     def __call__(self, p: FloatArray) -> bool:
-        left, sizes = -(self.gap + self.b.T @ p @ self.b), np.diag(p)
-        if not np.all(np.isfinite(left)):
+        left, sizes = -(self.gap + self.b.T @ p @ self.b), p.diagonal()
+        if not np.isfinite(left).all():
             return False
         # Over more steps the solution grows: one that does not is behind a level that was exceeded in between.
-        shrunk = self.last is not None and np.any(sizes < self.last - REFUTED * np.max(self.last))
+        shrunk = self.last is not None and (sizes < self.last - REFUTED * self.last.max(initial=0.0)).any()
         self.last = sizes.copy()
         return bool(shrunk) or is_clearly_negative(left, self.b, p)
 

@@ -209,7 +209,7 @@ def doubled_riccati_solution(
     n = a.shape[0]
     if n == 0:
         return np.zeros((0, 0))
-    solved = np.linalg.solve(weight, np.hstack([h, cross.T]))
+    solved = np.linalg.solve(weight, np.concatenate([h, cross.T], axis=1))
     thin = ThinBack(h, weight)
     back = thin if thin.is_thin else h.T @ solved[:, :n]
     start = a - cross @ solved[:, :n], back, process - cross @ solved[:, n:]
@@ -304,7 +304,9 @@ def _added(back: FloatArray | ThinBack | None, added: FloatArray | ThinBack) -> 
 
 def symmetric(matrix: FloatArray) -> FloatArray:
     """Return the symmetric part ``(n, n)``."""
-    return np.asarray(0.5 * (matrix + matrix.T))
+    found = matrix + matrix.T
+    found *= 0.5
+    return np.asarray(found)
 
 
 def _doubled_once(
@@ -379,7 +381,7 @@ def _compared(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level:
 
 def is_clearly_negative(left: FloatArray, b: FloatArray, p: FloatArray) -> bool:
     """Return whether ``left``, which holds ``-B'PB``, is below zero by more than what rounding may have done to P."""
-    if not np.all(np.isfinite(left)) or is_positive(left):
+    if not np.isfinite(left).all() or is_positive(left):
         return False
     margin = REFUTED * float(np.linalg.norm(b)) ** 2 * float(np.linalg.norm(p))
     return bool(np.linalg.eigvalsh(left)[0] < -margin)

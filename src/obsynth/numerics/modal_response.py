@@ -64,7 +64,7 @@ class Modes(NamedTuple):
     @classmethod
     def of(cls, a: FloatArray) -> Modes:
         """Return those of ``a (n, n)``; of a matrix that is not finite, infinite ones."""
-        if not np.all(np.isfinite(a)):
+        if not np.isfinite(a).all():
             return cls(np.full(len(a), np.inf, dtype=np.complex128), np.eye(len(a), dtype=np.complex128))
         values, vectors = np.linalg.eig(a)
         return cls(np.asarray(values, dtype=np.complex128), np.asarray(vectors, dtype=np.complex128))
@@ -72,7 +72,7 @@ class Modes(NamedTuple):
     @property
     def radius(self) -> float:
         """Largest modulus of an eigenvalue; 0 for no states."""
-        return float(np.max(np.abs(self.values), initial=0.0))
+        return float(np.abs(self.values).max(initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ class ModalResponse:
             return None
         return (
             cls(modes.values, np.asarray(c @ modes.vectors, dtype=np.complex128), driven, d)
-            if np.all(np.isfinite(driven))
+            if np.isfinite(driven).all()
             else None
         )
 
@@ -108,7 +108,8 @@ class ModalResponse:
             sizes = self._by_gram_matrices(factors, roughly=roughly)
         else:
             sizes = self._by_power_iteration(factors, roughly=roughly)
-        return np.asarray(np.where(np.isfinite(sizes), sizes, 0.0))
+        there = np.isfinite(sizes)
+        return sizes if there.all() else np.asarray(np.where(there, sizes, 0.0))
 
     def _by_gram_matrices(self, factors: ComplexArray, *, roughly: bool) -> FloatArray:
         inner, outer, direct = self.shown, self.driven, self.direct
@@ -124,10 +125,10 @@ class ModalResponse:
                 gram = gram / unit
                 return np.asarray(np.sqrt(unit) * np.sum(np.abs(gram @ gram) ** 2, axis=(1, 2)) ** 0.125)
             return np.asarray(np.sqrt(np.linalg.eigvalsh(np.where(np.isfinite(gram), gram, 0.0))[:, -1]))
-        squares = np.sum(response.real**2 + response.imag**2, axis=2)
+        squares = (response.real**2 + response.imag**2).sum(axis=2)
         if len(direct) == 1:
             return np.asarray(np.sqrt(squares[:, 0]))
-        beside = np.abs(np.sum(response[:, 0] * response[:, 1].conj(), axis=1))
+        beside = np.abs((response[:, 0] * response[:, 1].conj()).sum(axis=1))
         middle, half = 0.5 * (squares[:, 0] + squares[:, 1]), 0.5 * (squares[:, 0] - squares[:, 1])
         return np.asarray(np.sqrt(middle + np.hypot(half, beside)))
 
@@ -157,7 +158,9 @@ class ModalResponse:
         """Return the highest peaks on a grid of so many points and the poles, the highest first: angles in [0, pi],
         how far they may be off, and sizes, at most the eighth root of a sum of eighth powers."""
         near = self.poles[(self.poles.imag >= 0.0) & (np.abs(self.poles) > NEAR)]
-        angles = np.concatenate([np.linspace(0.0, np.pi, points), np.angle(near)])
+        grid = np.arange(points) * (np.pi / (points - 1))
+        grid[-1] = np.pi
+        angles = np.concatenate([grid, np.arctan2(near.imag, near.real)])
         order = np.argsort(angles, kind="stable")
         angles = angles[order]
         sizes = self.gains(angles, roughly=True)
@@ -172,20 +175,26 @@ class ModalResponse:
 
     def refined(self, centres: FloatArray, widths: FloatArray) -> FloatArray:
         """Return the angles of peaks, refined from angles that may be off by the widths."""
-        steps, everyone = np.arange(-POINTS_BESIDE, POINTS_BESIDE + 1) / POINTS_BESIDE, np.arange(len(centres))
+        steps = np.arange(-POINTS_BESIDE, POINTS_BESIDE + 1) / POINTS_BESIDE
         for _ in range(MODE_REFINEMENTS):
             tried = np.minimum(np.maximum(centres[:, None] + widths[:, None] * steps, 0.0), np.pi)
-            found = self.gains(tried.ravel()).reshape(tried.shape)
-            best = np.argmax(found, axis=1)
-            centres, widths = tried[everyone, best], widths / POINTS_BESIDE
-            # A parabola through three points is close to the response once they are.
-            inner = np.minimum(np.maximum(best, 1), len(steps) - 2)
-            low, middle, high = (found[everyone, inner + i] for i in (-1, 0, 1))
-            bend = 2.0 * middle - low - high
-            shift = np.where(bend > 0.0, 0.5 * (high - low) / np.where(bend > 0.0, bend, 1.0), 0.0)
-            # The highest of three is less than one step from the top of its parabola.
-            centres = np.where(best == inner, tried[everyone, inner] + shift * widths, centres)
+            found: NDArray[Any] = self.gains(tried.ravel()).reshape(tried.shape)
+            widths = widths / POINTS_BESIDE
+            # Of a few peaks numbers are faster than arrays.
+            peaks = zip(tried.tolist(), found.tolist(), widths.tolist(), strict=True)
+            centres = np.array([_top(angles, sizes, step) for angles, sizes, step in peaks])
         return np.asarray(np.minimum(np.maximum(centres, 0.0), np.pi))
+
+
+def _top(angles: list[float], sizes: list[float], step: float) -> float:
+    """Return the angle of the largest of some sizes, or of the top of a parabola through three points next to it."""
+    best = sizes.index(max(sizes))
+    if not 0 < best < len(sizes) - 1:
+        return angles[best]
+    # Close to the response once the points are close to each other; less than one step away.
+    low, middle, high = sizes[best - 1 : best + 2]
+    bend = 2.0 * middle - low - high
+    return angles[best] + (0.5 * (high - low) / bend * step if bend > 0.0 else 0.0)
 
 
 #: Eigenvalues of the symplectic pencil this close to the unit circle are looked at as crossings: a false one costs

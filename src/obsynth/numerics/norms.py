@@ -70,7 +70,7 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, mod
     """
     if b.shape[1] == 0 or c.shape[0] == 0:
         return HinfNorm(0.0, 0.0, 0.0, np.inf)
-    if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
+    if not all(np.isfinite(part).all() for part in (a, b, c, d)):
         return HinfNorm(np.inf, np.inf, np.nan, 0.0)
     modes = Modes.of(a) if modes is None else modes
     if modes.radius >= 1.0:
@@ -105,7 +105,7 @@ def norm_is_at_most(
     """Return whether the H-infinity norm is at most ``level``: by a Riccati equation, else by the norm."""
     if a.shape[0] == 0 or b.shape[1] == 0 or c.shape[0] == 0:
         return hinf_norm(a, b, c, d).upper <= level
-    if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
+    if not all(np.isfinite(part).all() for part in (a, b, c, d)):
         return False
     modes = Modes.of(a) if modes is None else modes
     if modes.radius >= 1.0:
@@ -145,7 +145,7 @@ def largest_peak(
     modes = Modes.of(a) if modes is None else modes
     if modes.radius >= 1.0:
         return float("inf")
-    if all(part.size for part in (a, b, c)) and all(np.all(np.isfinite(part)) for part in (b, c, d)):
+    if all(part.size for part in (a, b, c)) and all(np.isfinite(part).all() for part in (b, c, d)):
         points = MANY_GRID_POINTS if a.shape[0] > STATES_OF_PENCIL else GRID_POINTS
         balanced = _balanced(a, b, c, modes)
         best, _ = _modal_peak(*balanced[:3], d, balanced[3], points=points, enough=enough)
@@ -183,7 +183,7 @@ def _modal_peak(
         if response is None:
             return np.inf, np.nan
         rough, widths, sizes = response.rough_peaks(points)
-        if np.any(sizes[:1] > enough):
+        if (sizes[:1] > enough).any():
             best, angle = _peak(a, b, c, d, rough[:1])
             if enough < best < np.inf:
                 return best, angle
@@ -230,7 +230,7 @@ def state_units(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
 def _peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, angles: FloatArray) -> tuple[float, float]:
     with np.errstate(over="ignore", invalid="ignore"):
         found = frequency_response(a, b, c, d, angles)
-    if not np.all(np.isfinite(found)):
+    if not np.isfinite(found).all():
         return np.inf, np.nan
     gains = np.linalg.svd(found, compute_uv=False)[:, 0]
     top = int(np.argmax(gains))

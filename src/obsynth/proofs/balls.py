@@ -143,7 +143,7 @@ class Ball:
     @property
     def is_exact(self) -> bool:
         """Whether there is one member alone."""
-        return not np.any(self.radius)
+        return not self.radius.any()
 
     def congruent(self, exponents: NDArray[np.int64]) -> Ball:
         """Return ``diag(2^k) X diag(2^k)``, k the ``exponents``: exact but for underflow."""

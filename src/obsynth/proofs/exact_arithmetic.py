@@ -196,8 +196,10 @@ def written_matrix(matrix: FloatArray) -> fmpq_mat:
     if any(len(decimals[value][0]) > LOSSLESS_DIGITS for value in _split_entries(matrix)[0]):
         return fmpq_mat(rows, columns, [fmpq(*_written(value)) for value in values])
     # Whole numbers of one power of ten.
-    least = min([0, *(power for _, power in decimals.values())])
-    whole = {value: int(digits) * 10 ** (power - least) for value, (digits, power) in decimals.items()}
+    powers = [0, *(power for _, power in decimals.values())]
+    least = min(powers)
+    tens = [10**power for power in range(max(powers) - least + 1)]
+    whole = {value: int(digits) * tens[power - least] for value, (digits, power) in decimals.items()}
     found: fmpq_mat = fmpq_mat(fmpz_mat(rows, columns, [whole[value] for value in values])) / fmpz(10) ** -least
     return found
 

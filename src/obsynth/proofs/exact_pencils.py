@@ -71,7 +71,8 @@ class ExactPencil:
         """Rank of ``A - s E`` at almost every s."""
         (e, a), least = self._plain_integers, 0
         for prime, point in [(prime, self._rng.randrange(prime)) for prime in _PRIMES]:
-            least = max(least, int((nmod_mat(a, prime) - nmod_mat(e, prime) * point).rank()))
+            moving, still = self._modulo if prime == _PRIMES[0] else (nmod_mat(e, prime), nmod_mat(a, prime))
+            least = max(least, int((still - moving * point).rank()))
             if least == min(self.shape):
                 return least
         e, a = self._integers
@@ -145,6 +146,12 @@ class ExactPencil:
         return over_one_denominator(self.E, self.A)
 
     @cached_property
+    def _modulo(self) -> tuple[nmod_mat, nmod_mat]:
+        """The same modulo the first prime."""
+        e, a = self._plain_integers
+        return nmod_mat(e, _PRIMES[0]), nmod_mat(a, _PRIMES[0])
+
+    @cached_property
     def _integers(self) -> tuple[fmpz_mat, fmpz_mat]:
         """E and A with rows and columns multiplied by rational numbers, so that all entries are small integers."""
         return with_integer_entries(self.E, self.A)
@@ -193,7 +200,7 @@ class ExactPencil:
     def _determinant_modulo(self, rank: int, shift: int) -> nmod_poly | None:
         """Return a multiple of ``det(A - (shift + t) E)`` of a compression modulo the first prime, or none."""
         prime = _PRIMES[0]
-        e, a = (nmod_mat(part, prime) for part in self._compressed(self._plain_integers, rank))
+        e, a = self._compressed(self._modulo, rank)
         start = a - e * shift
         if start.rank() < rank:
             return None
@@ -201,7 +208,7 @@ class ExactPencil:
         coefficients = start.solve(e).charpoly().coeffs()
         return nmod_poly([int(value) for value in coefficients[::-1]], prime)
 
-    def _compressed(self, whole: tuple[fmpz_mat, fmpz_mat], rank: int) -> tuple[fmpz_mat, fmpz_mat]:
+    def _compressed(self, whole: tuple[Any, Any], rank: int) -> tuple[Any, Any]:
         """Return both matrices with rows and columns compressed at random to the normal rank."""
         (e, a), (rows, columns) = whole, self.shape
         if rows > rank:

@@ -128,12 +128,11 @@ def _remainder(norm: float, power: int, factorial: int) -> float:
 
 def as_ball(content: flint.arb_mat) -> Ball:
     """Return a matrix of python-flint's balls as a `Ball`: midpoints rounded, radii rounded up."""
-    pairs = [
-        (float(entry.mid()), float(entry.rad())) if entry.is_finite() else (np.nan, np.inf)
-        for entry in content.entries()
-    ]
-    shape = int(content.nrows()), int(content.ncols())
-    midpoint, radius = np.array(pairs, dtype=np.float64).reshape(*shape, 2).transpose(2, 0, 1)
+    entries, shape = content.entries(), (int(content.nrows()), int(content.ncols()))
+    radii = [0.0 if entry.is_exact() else float(entry.rad()) for entry in entries]
+    midpoint, radius = (np.array(part, dtype=np.float64).reshape(shape) for part in ([*map(float, entries)], radii))
+    unknown = ~(np.isfinite(midpoint) & np.isfinite(radius))
+    midpoint[unknown], radius[unknown] = np.nan, np.inf
     # Both conversions round to nearest.
     return Ball(midpoint, radius * (1.0 + 4.0 * UNIT_ROUNDOFF) + UNIT_ROUNDOFF * np.abs(midpoint) + 2.0 * UNDERFLOW)
 

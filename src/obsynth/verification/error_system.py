@@ -434,6 +434,8 @@ def _as_ball(part: Ball | ExtendedBall) -> Ball:
     if isinstance(part, Ball):
         return part
     found = as_ball(part.content)
+    if found.midpoint.all():
+        return found
     nothing = np.reshape([entry.is_zero() for entry in part.content.entries()], found.shape)
     return Ball(np.where(nothing, 0.0, found.midpoint), np.where(nothing, 0.0, found.radius))
 

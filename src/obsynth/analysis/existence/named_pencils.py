@@ -30,12 +30,12 @@ from obsynth.analysis.existence.witnesses import (
     rational_matrices,
 )
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
-from obsynth.analysis.zeros import equilibrated_at
+from obsynth.analysis.zeros import equilibrated_at, size_of_point
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.lapack import eigenvalues
 from obsynth.numerics.modal_response import MOST_ENTRIES_AT_ONCE
 from obsynth.numerics.ranks import RANK_TOLERANCE
-from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
+from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
 from obsynth.proofs.exact_arithmetic import written_fraction
@@ -397,8 +397,7 @@ def relative_singular_values(
         return found
     groups: dict[tuple[float, bool], list[int]] = {}
     for place, point in enumerate(points):
-        size = float(power_of_two_below(np.array(max(1.0, abs(point)))))
-        groups.setdefault((size, point.imag != 0.0), []).append(place)
+        groups.setdefault((size_of_point(point), point.imag != 0.0), []).append(place)
     at_once = max(1, MOST_ENTRIES_AT_ONCE // A.size)
     for (size, turning), places in groups.items():
         pencil = equilibrated_at(E, A if sizes is None else sizes, complex(size), nx=nx)

@@ -96,7 +96,7 @@ class CentralEquation:
     def of(cls, problem: GainProblem, *, noise: float) -> CentralEquation:
         """Return the equation with artificial noise, relative to the disturbance."""
         size = largest_singular_value(problem.B)
-        if np.any(problem.D) or np.any(problem.Zd) or not 0 < problem.measured < problem.order or size == 0.0:
+        if problem.D.any() or problem.Zd.any() or not 0 < problem.measured < problem.order or size == 0.0:
             return cls._of_all_states(problem, noise, size)
         return cls._of_hidden_states(problem, noise * size)
 
@@ -156,7 +156,7 @@ class CentralEquation:
             found, left = self._gains(*self._sums(y, level))
         except np.linalg.LinAlgError:
             return None, 0.0
-        if found is None or not (np.all(np.isfinite(found.R)) and np.all(np.isfinite(found.V))):
+        if found is None or not (np.isfinite(found.R).all() and np.isfinite(found.V).all()):
             return None, 0.0
         return found, float(np.linalg.eigvalsh(left)[0]) / level**2
 
@@ -622,9 +622,9 @@ def _with_noise(problem: GainProblem, weight: float) -> GainProblem:
     """Return the problem with its noise, times a weight, as further disturbances."""
     return replace(
         problem,
-        B=np.hstack([problem.B, weight * problem.Bn]),
-        D=np.hstack([problem.D, weight * problem.Dn]),
-        Zd=np.hstack([problem.Zd, weight * problem.Zn]),
+        B=np.concatenate([problem.B, weight * problem.Bn], axis=1),
+        D=np.concatenate([problem.D, weight * problem.Dn], axis=1),
+        Zd=np.concatenate([problem.Zd, weight * problem.Zn], axis=1),
     )
 
 

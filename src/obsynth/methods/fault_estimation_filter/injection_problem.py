@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -99,12 +100,12 @@ class GainProblem:
         """Whether there is a V to choose at all."""
         return self.free_weight and self.measured > 0
 
-    @property
+    @cached_property
     def states_noise(self) -> bool:
         """Whether there is a noise model; without one the noise is a unit one on the free measurements alone."""
-        return bool(np.any(self.Bn) or np.any(self.Zn))
+        return bool(self.Bn.any() or self.Zn.any())
 
-    @property
+    @cached_property
     def disturbance_size(self) -> float:
         """What the disturbance could do to xi at most in one step, whatever cancels: the scale of a gain."""
         state, direct = np.vstack([self.B, self.D]), float(np.linalg.norm(self.Zd))
