@@ -13,7 +13,6 @@ implicit function theorem does the rest.  Machine code where a C compiler is the
 
 from __future__ import annotations
 
-import subprocess
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -32,7 +31,7 @@ from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.newton import largest_entries
 from obsynth.numerics.ranks import rounding_rank
-from obsynth.observers.dae.c_code import compiler
+from obsynth.observers.dae.c_code import compiler, shared_library
 from obsynth.plants.dae.functions import BUTCHER, DAEFunctions
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.symbols import symbolic_value, symbols_of
@@ -622,7 +621,7 @@ def compiled(functions: Sequence[Any]) -> list[Any]:
                 generator.dump(), tuple(function.name() for function in functions), (*command, *STRAIGHT_CODE_FLAGS)
             )
         )
-    except subprocess.CalledProcessError:
+    except SpecError:
         return list(functions)
 
 
@@ -630,9 +629,7 @@ def compiled(functions: Sequence[Any]) -> list[Any]:
 def _loaded(code: str, names: tuple[str, ...], command: tuple[str, ...]) -> tuple[Any, ...]:
     """Return functions of C code; the same code is compiled once."""
     with tempfile.TemporaryDirectory(prefix="obsynth-", ignore_cleanup_errors=True) as folder:
-        source, library = Path(folder) / "calibration.c", Path(folder) / "calibration.so"
-        source.write_text(code, encoding="utf-8", newline="\n")
-        subprocess.run([*command, str(source), "-o", str(library), "-lm"], capture_output=True, check=True)
+        library = shared_library(Path(folder), {"calibration.c": code}, command, path="calibrate")
         # What is loaded stays when the file is gone; Windows keeps the file.
         return tuple(ca.external(name, str(library)) for name in names)
 
