@@ -49,6 +49,9 @@ def test_what_was_found_reads_as_a_table_and_as_data(measured):
     assert data["log"]["digest"] == measured.box.digest
     figure = measured.plot()
     assert len(figure.axes) == 4
+    # Dollars in names are dollars.
+    names = [*figure.axes[0].get_yticklabels(), *(panel.yaxis.label for panel in figure.axes[1:])]
+    assert not any(text.get_parse_math() for text in names)
     import matplotlib.pyplot as plt
 
     plt.close(figure)

@@ -39,6 +39,7 @@ def test_a_calibrated_design_agrees_with_its_log(right):
     assert "agrees" in str(found)
     figure = found.plot()
     assert len(figure.axes) == 7
+    assert not any(panel.yaxis.label.get_parse_math() for panel in figure.axes)
     import matplotlib.pyplot as plt
 
     plt.close(figure)
@@ -116,6 +117,7 @@ def test_validity_along_the_log_is_that_of_the_reference():
     assert "deviations" in str(found[0])
     figure = found[0].plot()
     assert len(figure.axes) == 6
+    assert not any(panel.yaxis.label.get_parse_math() for panel in figure.axes)
     import matplotlib.pyplot as plt
 
     plt.close(figure)

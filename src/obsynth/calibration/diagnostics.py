@@ -18,6 +18,16 @@ from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.observers.estimates import BAND_WIDTH
+from obsynth.plotting.panels import (
+    BAND_STYLE,
+    ESTIMATE_STYLE,
+    RESIDUAL_STYLE,
+    TRUE_STYLE,
+    WIDTH,
+    legend_above,
+    stacked,
+    tidy,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -267,13 +277,9 @@ class Validation:
 
 def _figure(found: Validation) -> Figure:
     """Return measured and predicted signals, innovations in their band, and each estimate with its own."""
-    import matplotlib.pyplot as plt
-
     count = 2 * len(found.sensors) + len(found.estimates)
-    figure, panels = plt.subplots(
-        count, 1, layout="constrained", squeeze=False, sharex=True, figsize=(7.5, 0.6 + 1.5 * count)
-    )
-    draw_validation(found, list(panels[:, 0]))
+    figure, panels = stacked(count, size=(WIDTH, 0.6 + 1.5 * count))
+    draw_validation(found, panels)
     return figure
 
 
@@ -282,21 +288,21 @@ def draw_validation(found: Validation, panels: Sequence[Axes]) -> None:
     names, time = list(found.sensors), found.log["rows"][0] + np.arange(len(found.innovations))
     for i, name in enumerate(names):
         signals, said = panels[2 * i], panels[2 * i + 1]
-        signals.plot(time, found.measured[:, i], color="0.7", linewidth=3.0, label="measured")
-        signals.plot(time, found.predicted[:, i], color="black", linewidth=1.0, linestyle="--", label="predicted")
+        signals.plot(time, found.measured[:, i], label="measured", **TRUE_STYLE)
+        signals.plot(time, found.predicted[:, i], label="predicted", **ESTIMATE_STYLE)
         signals.set_ylabel(name)
-        signals.legend(fontsize=8, loc="upper left", frameon=False, ncols=2)
+        legend_above(signals)
         band = BAND_WIDTH * found.deviations[:, i]
-        said.fill_between(time, -band, band, color="tab:blue", alpha=0.15, linewidth=0.0)
+        said.fill_between(time, -band, band, **BAND_STYLE)
         said.plot(time, found.innovations[:, i], color="black", linewidth=0.8, marker=".", markersize=3)
         said.set_ylabel(f"innovation\nof {name}")
     for panel, (name, columns) in zip(panels[2 * len(names) :], found.estimates.items(), strict=True):
         value, band = columns[:, 0], BAND_WIDTH * columns[:, 1]
-        panel.fill_between(time, value - band, value + band, color="tab:blue", alpha=0.25, linewidth=0.0)
-        panel.plot(time, value, color="black", linewidth=1.1)
+        panel.fill_between(time, value - band, value + band, **BAND_STYLE)
+        panel.plot(time, value, **RESIDUAL_STYLE)
         panel.set_ylabel(name)
     for panel in panels:
-        panel.grid(True, color="0.9", linewidth=0.6)
+        tidy(panel)
     panels[-1].set_xlabel("row of the log")
 
 

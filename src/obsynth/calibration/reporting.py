@@ -37,6 +37,7 @@ from obsynth.plants.dae.functions import BUTCHER, DAEFunctions
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.step import ImplicitStep
 from obsynth.plants.noise_model import noise_state, noise_variance, offset_state
+from obsynth.plotting.panels import BAND_STYLE, WIDTH, stacked, tidy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -236,29 +237,19 @@ class Calibration:
 
 def _figure(found: Calibration) -> Figure:
     """Return each constant in its box, and the whitened innovations of each sensor."""
-    import matplotlib.pyplot as plt
-
-    sensors = len(found.output_names)
-    heights = [0.6 + 0.35 * len(found.names), *[1.7] * sensors]
-    figure, panels = plt.subplots(
-        sensors + 1,
-        1,
-        layout="constrained",
-        squeeze=False,
-        figsize=(7.5, 0.5 + sum(heights)),
-        gridspec_kw={"height_ratios": heights},
-    )
-    _boxes(panels[0, 0], found)
+    heights = [0.6 + 0.35 * len(found.names), *[1.7] * len(found.output_names)]
+    figure, panels = stacked(len(heights), size=(WIDTH, 0.5 + sum(heights)), heights=heights)
+    _boxes(panels[0], found)
     time = found.log["rows"][0] + np.arange(len(found.innovations))
-    for panel, name, column in zip(panels[1:, 0], found.output_names, found.innovations.T, strict=True):
-        panel.axhspan(-BAND_WIDTH, BAND_WIDTH, color="tab:blue", alpha=0.15, linewidth=0.0)
+    for panel, name, column in zip(panels[1:], found.output_names, found.innovations.T, strict=True):
+        panel.axhspan(-BAND_WIDTH, BAND_WIDTH, **BAND_STYLE)
         panel.plot(time, column, color="black", linewidth=0.8, marker=".", markersize=3)
         panel.set_ylabel(f"{name}\n(deviations)")
-        panel.grid(True, color="0.9", linewidth=0.6)
+        tidy(panel)
         if found.change is not None:
             panel.axvline(found.change, color="tab:red", linestyle="--", linewidth=1.2)
-    panels[1, 0].set_title("Innovations; 95 % lie in the band", fontsize=10, loc="left")
-    panels[-1, 0].set_xlabel("row of the log")
+    panels[1].set_title("Innovations; 95 % lie in the band", fontsize=10, loc="left")
+    panels[-1].set_xlabel("row of the log")
     return figure
 
 
@@ -273,11 +264,13 @@ def _boxes(panel: Axes, found: Calibration) -> None:
             marker = ("<" if side == "low" else ">") if (name, side) in opened else "|"
             panel.plot([end], [i], color="black", marker=marker, markersize=9, linestyle="none")
         panel.plot([0.0], [i], color="black", marker="o", markersize=4)
-    panel.set_yticks(range(len(found.nominal)), [f"{name} = {value:.4g}" for name, value in found.nominal.items()])
+    panel.set_yticks(
+        range(len(found.nominal)), [f"{name} = {value:.4g}" for name, value in found.nominal.items()], parse_math=False
+    )
     panel.set_ylim(len(found.nominal) - 0.5, -0.5)
     panel.set_xlabel("per cent of the value")
     panel.set_title(f"{100 * found.box.level:g} % box, all at once (arrows: open)", fontsize=10, loc="left")
-    panel.grid(True, axis="x", color="0.9", linewidth=0.6)
+    tidy(panel)
 
 
 #: A step whose error in an output exceeds this share of the sensor's deviation is not exact enough.

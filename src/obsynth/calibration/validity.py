@@ -19,6 +19,17 @@ from obsynth.observers.records import named_vector
 from obsynth.plants.dae.functions import BUTCHER
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plotting.panels import (
+    BAND_STYLE,
+    ESTIMATE_STYLE,
+    RESIDUAL_STYLE,
+    TRUE_STYLE,
+    WIDTH,
+    label_time,
+    legend_above,
+    stacked,
+    tidy,
+)
 from obsynth.simulation.dae import simulate_dae
 
 if TYPE_CHECKING:
@@ -192,22 +203,18 @@ def _linear_outputs(linear: DescriptorSystem, log: Log, start: FloatArray) -> Fl
 
 def _figure(found: Validity) -> Figure:
     """Return outputs of plant and linear model, and their difference in deviations of the sensor."""
-    import matplotlib.pyplot as plt
-
     names = list(found.by_sensor)
-    figure, panels = plt.subplots(
-        2 * len(names), 1, layout="constrained", squeeze=False, sharex=True, figsize=(7.5, 0.6 + 3.0 * len(names))
-    )
+    figure, panels = stacked(2 * len(names), size=(WIDTH, 0.6 + 3.0 * len(names)))
     for i, name in enumerate(names):
-        signals, apart = panels[2 * i, 0], panels[2 * i + 1, 0]
-        signals.plot(found.time, found.nonlinear[:, i], color="0.7", linewidth=3.0, label="nonlinear")
-        signals.plot(found.time, found.linear[:, i], color="black", linewidth=1.0, linestyle="--", label="linear")
+        signals, apart = panels[2 * i : 2 * i + 2]
+        signals.plot(found.time, found.nonlinear[:, i], label="nonlinear", **TRUE_STYLE)
+        signals.plot(found.time, found.linear[:, i], label="linear", **ESTIMATE_STYLE)
         signals.set_ylabel(name)
-        signals.legend(fontsize=8, loc="best", frameon=False, ncols=2)
-        apart.axhspan(-1.0, 1.0, color="tab:blue", alpha=0.15, linewidth=0.0)
-        apart.plot(found.time, (found.linear - found.nonlinear)[:, i] / found.deviations[name], color="black")
+        legend_above(signals)
+        apart.axhspan(-1.0, 1.0, **BAND_STYLE)
+        apart.plot(found.time, (found.linear - found.nonlinear)[:, i] / found.deviations[name], **RESIDUAL_STYLE)
         apart.set_ylabel(f"difference of\n{name} (deviations)")
-    for panel in panels[:, 0]:
-        panel.grid(True, color="0.9", linewidth=0.6)
-    panels[-1, 0].set_xlabel("time (s)")
+    for panel in panels:
+        tidy(panel)
+    label_time(panels[-1])
     return figure

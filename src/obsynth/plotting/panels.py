@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from datetime import tzinfo
 
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Inches: the width of every figure, and the height of one panel.
 WIDTH = 7.5
@@ -54,19 +55,25 @@ def new_panels(axes: Iterable[Axes] | None, count: int, *, size: tuple[float, fl
         if len(given) != count:
             raise SpecError(f"{len(given)} axes were given, but {count} are needed.", path="axes")
         return given
-    if count == 0:
-        return []
+    return stacked(count, size=size)[1] if count else []
+
+
+def stacked(
+    count: int, *, size: tuple[float, float] | None = None, heights: Sequence[float] | None = None
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure of panels one above the other, which share their horizontal axis unless heights are given."""
     import matplotlib.pyplot as plt
 
-    _, grid = plt.subplots(
+    figure, grid = plt.subplots(
         count,
         1,
-        sharex=True,
+        sharex=heights is None,
         squeeze=False,
         layout="constrained",
         figsize=size or (WIDTH, PANEL_HEIGHT * count + 0.8),
+        height_ratios=heights,
     )
-    return list(grid[:, 0])
+    return figure, list(grid[:, 0])
 
 
 def image_of(
