@@ -51,7 +51,10 @@ def test_pairs_and_numbers(places: tuple[Path, Path], tmp_path: Path) -> None:
     table = found.table()
     assert list(table["run"]) == names
     assert "alarm fhat[f1], s" in table
-    assert len(found.plot().axes) == 4
+    panels = found.plot().axes
+    assert len(panels) == 4
+    # Dollars in names are dollars.
+    assert not any(text.get_parse_math() for panel in panels for text in panel.get_legend().get_texts())
 
 
 @pytest.mark.long

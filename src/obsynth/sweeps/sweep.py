@@ -36,6 +36,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.progress import RunsProgress, as_they_come, progress_of_runs
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
+from obsynth.plotting.panels import tidy
 from obsynth.results.design import (
     ObserverDesign,
     require_verified,
@@ -686,10 +687,11 @@ class Fleet(ResultTable):
                 axis.plot(times, table[name], label=name, linewidth=0.9)
             for alarm in run.alarms.values():
                 axis.axvline(alarm, color="0.4", linestyle="--", linewidth=0.8)
-            axis.set_title(run.name, fontsize=9, loc="left")
+            axis.set_title(run.name, fontsize=9, loc="left", parse_math=False)
             if axis.get_legend_handles_labels()[0]:  # rows of warm-up alone show nothing
                 axis.legend(fontsize=7, loc="upper left")
             axis.tick_params(labelsize=8)
+            tidy(axis)
         axes[-1, 0].set_xlabel("time, s", fontsize=9)
         return figure
 
