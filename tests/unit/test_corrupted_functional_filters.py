@@ -138,10 +138,11 @@ TABLE = {
     "deviations, a little too small": (
         "both", matrix("deviations", lambda found: 0.99 * found), [NOISE_A, NOISE_B, ERROR_A, ERROR_B],
     ),
+    # The closest sums are 8 to 16 % below what is claimed, as processors round: that much less is still true.
     "claimed errors per unit, a little too small": (
-        "both", lambda d: matrix("state_error", lambda found: 0.9 * found)(
-            matrix("input_error", lambda found: 0.9 * found)(
-                matrix("disturbance_error", lambda found: 0.9 * found)(d))),
+        "both", lambda d: matrix("state_error", lambda found: 0.8 * found)(
+            matrix("input_error", lambda found: 0.8 * found)(
+                matrix("disturbance_error", lambda found: 0.8 * found)(d))),
         ["stored numbers: states", "stored numbers: inputs", "stored numbers: disturbances"],
     ),
     "a fault that nothing shows": (
