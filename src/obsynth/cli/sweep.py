@@ -195,19 +195,19 @@ def _value_list(text: str) -> tuple[str, list[Any]]:
 
 
 def _png_of(plot: Callable[[], Any]) -> bytes | None:
-    import io
-
     import matplotlib
+
+    from obsynth.plotting.panels import written
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, stream = plot(), io.BytesIO()
+    figure = plot()
     if figure is None:
         return None
-    figure.savefig(stream, format="png", dpi=150)
+    picture = written(figure)
     plt.close(figure)
-    return stream.getvalue()
+    return picture
 
 
 def _shown(found: Any, header: Sequence[str], rows: Iterable[Sequence[str]]) -> Any:

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +49,16 @@ from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
+from obsynth.plotting.panels import (
+    LINE_COLOURS,
+    TRUE_STYLE,
+    data_url,
+    label_time,
+    legend_above,
+    tidy,
+    with_unit,
+    written,
+)
 from obsynth.results.certificate_files import COMPARISON, SHOWN_DIGITS, result_text
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import design_as_dict
@@ -348,8 +357,6 @@ class Comparison:
         """
         from matplotlib.figure import Figure
 
-        from obsynth.plotting.panels import LINE_COLOURS, TRUE_STYLE, label_time, legend_above, tidy, with_unit
-
         shown = [entry for entry in self.methods if entry.faults]
         units = next((dict(entry.design.plant.units) for entry in shown if entry.design is not None), {})
         count = max(len(self.fault_names), 1)
@@ -408,18 +415,13 @@ class Comparison:
 
     def page(self) -> str:
         """Return a page of HTML that stands alone, with table, picture, refusals and recommendation."""
-        from base64 import b64encode
-
-        picture = BytesIO()
-        self.plot().savefig(picture, format="png", dpi=110)
-        encoded = b64encode(picture.getvalue()).decode("ascii")
         body = [
             f'<p class="verdict {"holds" if self.recommended else "fails"}">{escape(self.advice)}</p>',
             f"<p>{escape(self.setting)}</p>",
             f'<div class="scroll">{html_table(self.rows())}</div>',
             f'<p class="soft">{escape(self.meanings())}</p>',
             *(f"<p>{escape(text)}</p>" for text in self.refusals),
-            f'<figure><img alt="Estimates of each method" src="data:image/png;base64,{encoded}"></figure>',
+            f'<figure><img alt="Estimates of each method" src="{data_url(written(self.plot()))}"></figure>',
         ]
         return standing_page("Comparison of methods", body, generator="obsynth compare")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -80,14 +81,20 @@ def image_of(
     count: int, draw: Callable[[list[Axes]], Any], *, size: tuple[float, float] | None = None, kind: str = "png"
 ) -> bytes:
     """Return a picture of panels one above the other as it stands in a file; ``draw`` fills them, without a window."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     shown = max(count, 1)
     figure = Figure(figsize=size or (WIDTH, PANEL_HEIGHT * shown + 0.6), layout="constrained")
     axes = list(figure.subplots(shown, 1, sharex=True, squeeze=False)[:, 0])
     draw(axes[:count])
-    for panel in axes:
+    return written(figure, kind=kind)
+
+
+def written(figure: Figure, *, kind: str = "png") -> bytes:
+    """Return a figure as it stands in a file."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    for panel in figure.axes:
         names_as_they_are(panel)
     buffer = io.BytesIO()
     if kind == "png":
@@ -100,6 +107,11 @@ def image_of(
         undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
         figure.savefig(buffer, format=kind, dpi=RESOLUTION, metadata=undated)
     return buffer.getvalue()
+
+
+def data_url(picture: bytes) -> str:
+    """Return a picture of dots as a page holds it."""
+    return f"data:image/png;base64,{base64.b64encode(picture).decode('ascii')}"
 
 
 def tidy(panel: Axes) -> None:

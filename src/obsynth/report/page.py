@@ -11,7 +11,6 @@ A scenario that shows what a design does, made from the design alone: each fault
 
 from __future__ import annotations
 
-import base64
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -52,7 +51,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plotting.data import panel_count, plot_data
 from obsynth.plotting.estimates import plot_simulation, plot_states
 from obsynth.plotting.guaranteed import plot_hidden_course
-from obsynth.plotting.panels import image_of
+from obsynth.plotting.panels import data_url, image_of
 from obsynth.plotting.spectra import plot_gains, plot_poles
 from obsynth.report.designs import (
     delay_curves,
@@ -314,7 +313,7 @@ def stacked(title: str, text: str, panels: int, draw: Callable[[Sequence[Axes]],
 
 def drawn(size: tuple[float, float], panels: int, draw: Callable[[Sequence[Axes]], Any]) -> str:
     """Return what ``draw`` puts on panels one above the other, as a data URL."""
-    return "data:image/png;base64," + base64.b64encode(image_of(panels, draw, size=size)).decode("ascii")
+    return data_url(image_of(panels, draw, size=size))
 
 
 #: Prefix of a check's name -> heading of its group; the others are about the shipped observer.
