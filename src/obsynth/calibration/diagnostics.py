@@ -25,7 +25,7 @@ from obsynth.plotting.panels import (
     TRUE_STYLE,
     WIDTH,
     legend_above,
-    stacked,
+    new_figure,
     tidy,
 )
 
@@ -278,7 +278,7 @@ class Validation:
 def _figure(found: Validation) -> Figure:
     """Return measured and predicted signals, innovations in their band, and each estimate with its own."""
     count = 2 * len(found.sensors) + len(found.estimates)
-    figure, panels = stacked(count, size=(WIDTH, 0.6 + 1.5 * count))
+    figure, panels = new_figure(count, size=(WIDTH, 0.6 + 1.5 * count))
     draw_validation(found, panels)
     return figure
 

@@ -37,7 +37,7 @@ from obsynth.plants.dae.functions import BUTCHER, DAEFunctions
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.step import ImplicitStep
 from obsynth.plants.noise_model import noise_state, noise_variance, offset_state
-from obsynth.plotting.panels import BAND_STYLE, WIDTH, stacked, tidy
+from obsynth.plotting.panels import BAND_STYLE, WIDTH, new_figure, tidy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -238,7 +238,7 @@ class Calibration:
 def _figure(found: Calibration) -> Figure:
     """Return each constant in its box, and the whitened innovations of each sensor."""
     heights = [0.6 + 0.35 * len(found.names), *[1.7] * len(found.output_names)]
-    figure, panels = stacked(len(heights), size=(WIDTH, 0.5 + sum(heights)), heights=heights)
+    figure, panels = new_figure(len(heights), size=(WIDTH, 0.5 + sum(heights)), heights=heights)
     _boxes(panels[0], found)
     time = found.log["rows"][0] + np.arange(len(found.innovations))
     for panel, name, column in zip(panels[1:], found.output_names, found.innovations.T, strict=True):

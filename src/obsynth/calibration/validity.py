@@ -27,7 +27,7 @@ from obsynth.plotting.panels import (
     WIDTH,
     label_time,
     legend_above,
-    stacked,
+    new_figure,
     tidy,
 )
 from obsynth.simulation.dae import simulate_dae
@@ -204,7 +204,7 @@ def _linear_outputs(linear: DescriptorSystem, log: Log, start: FloatArray) -> Fl
 def _figure(found: Validity) -> Figure:
     """Return outputs of plant and linear model, and their difference in deviations of the sensor."""
     names = list(found.by_sensor)
-    figure, panels = stacked(2 * len(names), size=(WIDTH, 0.6 + 3.0 * len(names)))
+    figure, panels = new_figure(2 * len(names), size=(WIDTH, 0.6 + 3.0 * len(names)))
     for i, name in enumerate(names):
         signals, apart = panels[2 * i : 2 * i + 2]
         signals.plot(found.time, found.nonlinear[:, i], label="nonlinear", **TRUE_STYLE)

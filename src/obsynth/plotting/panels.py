@@ -56,10 +56,10 @@ def new_panels(axes: Iterable[Axes] | None, count: int, *, size: tuple[float, fl
         if len(given) != count:
             raise SpecError(f"{len(given)} axes were given, but {count} are needed.", path="axes")
         return given
-    return stacked(count, size=size)[1] if count else []
+    return new_figure(count, size=size)[1] if count else []
 
 
-def stacked(
+def new_figure(
     count: int, *, size: tuple[float, float] | None = None, heights: Sequence[float] | None = None
 ) -> tuple[Figure, list[Axes]]:
     """Return a figure of panels one above the other, which share their horizontal axis unless heights are given."""
