@@ -15,6 +15,8 @@ from test_dae_observer import matrices
 import obsynth
 from obsynth import SpecError, simulate_dae
 from obsynth.cli.main import main
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.running import changed
 from obsynth.plants.dae.functions import Compiled
 from obsynth.spec import load_spec
 
@@ -70,6 +72,12 @@ def run_c(
     return dict(zip(fields, np.split(table, np.cumsum(list(fields.values()))[:-1], axis=1), strict=True))
 
 
+def as_run(design: obsynth.ObserverDesign) -> DAEObserver:
+    """The observer as `run` has it: outliers are left out where the design says nothing of them."""
+    observer = design.nonlinear[1]
+    return changed(observer, outliers="gate") if observer.outliers == "none" else observer
+
+
 def assert_equal(found: dict[str, np.ndarray], expected: obsynth.types.Estimates) -> None:
     assert not found["returned"].any()
     for name in ("states", "state_deviations", "parameters", "parameter_deviations", "innovations"):
@@ -91,8 +99,9 @@ def test_the_heat_exchanger_with_gaps_and_a_start_off_its_constraint(form, tmp_p
     faults = np.column_stack([np.full(samples, 0.9), np.where(np.arange(samples) > 100, 2e3, 0.0)])
     y = np.array(simulate_dae(design.plant, u, dt=1.0, parameters=faults, R=design.observer.R, seed=1).outputs)
     y[50], y[60:90, 0] = np.nan, np.nan
-    expected = design.observer.run(y, u, compiled=False)
+    expected = as_run(design).run(y, u, compiled=False)
     assert expected.projection.any()
+    assert np.abs(expected.states - design.observer.run(y, u).states).max() > 0.0
     assert_equal(run_c(design, y, u, tmp_path, quick=form != "forgetting"), expected)
 
 
@@ -101,7 +110,7 @@ def test_a_pendulum_by_radau_without_inputs(tmp_path) -> None:
     design = designed("pendulum")
     u = np.zeros((200, 0))
     y = simulate_dae(design.plant, u, dt=0.01, parameters=[0.3, 0.02], R=design.observer.R).outputs
-    assert_equal(run_c(design, y, u, tmp_path, quick=True), design.observer.run(y, u, compiled=False))
+    assert_equal(run_c(design, y, u, tmp_path, quick=True), as_run(design).run(y, u, compiled=False))
 
 
 @pytest.mark.parametrize(("move", "least"), [(None, 1), (1.0, 10)])
@@ -110,7 +119,7 @@ def test_a_diode_whose_source_jumps_by_300_v(move, least, tmp_path) -> None:
     design = designed("diode_circuit", initial_state={"v": 0.0, "c": 0.0}, largest_move=move)
     u = np.where(np.arange(40) < 10, 0.0, 300.0)[:, None]
     y = simulate_dae(design.plant, u, dt=1e-3, initial_state=[0.0, 0.0], R=design.observer.R, seed=1).outputs
-    expected = design.observer.run(y, u, compiled=False)
+    expected = as_run(design).run(y, u, compiled=False)
     hard = expected.states[9], u[10], expected.parameters[9]
     assert Compiled(design.observer.graph.step.step)(*hard)[2] == 0.0
     assert design.observer.steps.implicit.solve(*hard, before=u[9]).subsolves >= least
@@ -124,7 +133,7 @@ def test_a_missing_input_is_taken_as_in_python_and_a_step_without_a_solution_lea
     u = np.tile(design.plant.nominal_input, (30, 1))
     u[:, 0] *= 1.0 + 0.001 * np.arange(30)
     y = np.array(simulate_dae(design.plant, u, dt=1.0, R=design.observer.R, seed=1).outputs)
-    spoiled, running = u.copy(), design.observer.start()
+    spoiled, running = u.copy(), as_run(design).start()
     spoiled[12, 0] = np.nan
     expected = np.array([running.step(*sample).states[0] for sample in zip(y, spoiled, strict=True)])
     spoiled = np.insert(spoiled, 20, [[1e3, 450.0, 15150.0, -1.0]], axis=0)

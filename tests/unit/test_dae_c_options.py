@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 import test_dae_c_export
-from test_dae_c_export import FLAGS, run_c
+from test_dae_c_export import FLAGS, as_run, run_c
 from test_validate import designed
 
 import obsynth
@@ -148,7 +148,7 @@ def test_each_option_in_c_does_what_it_does_in_python(form, name, tmp_path) -> N
     design, leak = tank_observer(form, OPTIONS[name]), np.where(np.arange(120) < 50, 0.0, 0.03)[:, None]
     u = np.tile(design.plant.nominal_input, (120, 1))
     y = np.array(simulate_dae(design.plant, u, dt=1.0, parameters=leak, R=design.observer.R, seed=3).outputs)
-    expected = design.observer.run(y, u)
+    expected = as_run(design).run(y, u)
     plain = replace(design.observer, outliers="none", reset=0.0, state_bounds=None, sensors=None)
     assert np.abs(plain.run(y, u).states - expected.states).max() > 1e-6
     assert_same(run_c(design, y, u, tmp_path), expected)
@@ -187,7 +187,7 @@ def test_floats_keep_near_doubles_and_say_how_near_they_were_measured(name, tmp_
     done = subprocess.run([tmp_path / "run"], input=given.tobytes(), capture_output=True, check=True)
     found = np.frombuffer(done.stdout, np.float32).reshape(len(y), 5).astype(float)
     exact = given.astype(float)
-    expected = design.observer.run(exact[:, 2:], exact[:, :2])
+    expected = as_run(design).run(exact[:, 2:], exact[:, :2])
     # Another record than those it was measured on, of which 1e6 and blanks are part: within some times as much.
     gaps = np.abs(found[:, :4] - np.hstack([expected.states, expected.faults])).max(axis=0)
     assert (gaps <= 30.0 * np.array(list(stated.values()))).all()
@@ -211,4 +211,4 @@ def test_bounds_that_many_states_break_at_once_and_one_that_is_known_exactly(tmp
     # Where h1 is known to be outside, at k = 0, no move keeps all bounds; later its deviation would be rounding alone.
     for observer, samples in ((design.observer, 19), (known, 1)):
         made = replace(design, observer=observer)
-        assert_same(run_c(made, y[:samples], u[:samples], tmp_path), observer.run(y[:samples], u[:samples]))
+        assert_same(run_c(made, y[:samples], u[:samples], tmp_path), as_run(made).run(y[:samples], u[:samples]))

@@ -15,7 +15,7 @@ from typing import Any, get_args
 import numpy as np
 import pandas as pd
 import pytest
-from test_dae_c_export import run_c
+from test_dae_c_export import as_run, run_c
 from test_export import start_of, through_c
 
 import obsynth
@@ -251,7 +251,7 @@ def test_c_says_what_python_says(method: str, tmp_path: Path) -> None:
     design = design_of(method)
     y, u = record_of(design)
     if isinstance(design.observer, DAEObserver):
-        said, run = run_c(design, y, u, tmp_path), design.observer.run(y, u)
+        said, run = run_c(design, y, u, tmp_path), as_run(design).run(y, u)
         for name in ("states", "parameters", "state_deviations", "parameter_deviations"):
             np.testing.assert_allclose(said[name], getattr(run, name), rtol=1e-9, atol=1e-12)
         return

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 import obsynth
+from obsynth.cli.main import main
 from obsynth.results.design import Certificate
 
 ROOT = Path(__file__).parents[2]
@@ -214,3 +215,9 @@ def test_the_cheapest_sensors_for_a_threshold() -> None:
         obsynth.sensor_sets(plant, below=0.25, **asked)
     with pytest.raises(obsynth.SpecError, match="needs fault"):
         obsynth.sensor_sets(plant, goal="threshold", noise=0.05)
+
+
+def test_sensors_of_a_plant_of_equations_say_how_to_make_it_linear(capsys: pytest.CaptureFixture[str]) -> None:
+    spec = Path(__file__).parents[2] / "designs" / "diode_circuit" / "spec.yaml"
+    assert main(["sensors", "--system", str(spec)]) == obsynth.SpecError.exit_code
+    assert "transform: {linearise: {at: equilibrium" in " ".join(capsys.readouterr().err.split())

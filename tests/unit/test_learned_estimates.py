@@ -17,6 +17,7 @@ from scipy.signal import lfilter
 import obsynth
 from obsynth.cli.data_commands import summary_of_run
 from obsynth.data.alarm_events import NOT_DISTINGUISHED_YET, alarm_rows
+from obsynth.data.online_monitor import learned_sizes
 from obsynth.experiments.monitors.learned_levels import (
     AGES,
     Scores,
@@ -60,6 +61,49 @@ def log(rows: int, seed: int, *, begin: int | None = None, size: float = 0.3) ->
         h = (h + DT * 10.0 * (1.0 - f) * u) / (1.0 + DT) + 0.01 * rng.standard_normal()
         found.append([k * DT, u, h + 0.1 * rng.standard_normal()])
     return pd.DataFrame(found, columns=["time", "u", "y"])
+
+
+def with_outliers(data: pd.DataFrame, low: float, high: float) -> pd.DataFrame:
+    """Return a log in which one sample of 100 is off by so many deviations of the sensor, on any side."""
+    rng, found = np.random.default_rng(4), data.copy()
+    wrong = rng.random(len(data)) < 0.01
+    found.loc[wrong, "y"] += 0.1 * rng.choice([-1.0, 1.0], wrong.sum()) * rng.uniform(low, high, wrong.sum())
+    return found
+
+
+@pytest.mark.parametrize(("low", "high", "least"), [(8.0, 30.0, 0.0), (19.0, 21.0, 1.5)])
+def test_how_far_off_outliers_are_is_learned_where_the_log_shows_another_size(
+    low: float, high: float, least: float, tmp_path: Path
+) -> None:
+    """A design from a log with two outliers far off believed nearer ones: they raised the levels ten times."""
+    design = pumped().replace(observer=replace(pumped().observer, outliers="gate", outlier_sizes={"y": 1.6}))
+    data = with_outliers(log(1_500, 0), low, high)
+    found = obsynth.learn_thresholds(design, data, false_alarms="1 per 500 rows")
+    clean = obsynth.learn_thresholds(design, log(1_500, 0), false_alarms="1 per 500 rows")
+    assert (found.levels < 1.5 * clean.levels).all()
+    assert clean.outlier_sizes is None
+    assert found.outlier_sizes is not None
+    # As near as the gate lets any sample be, where sizes differ; else as far as nearly none is nearer.
+    usual = 6.0 * float(obsynth.run_on_data(design, log(1_500, 0)).table["r[y]"].std())
+    assert (
+        found.outlier_sizes[0] == pytest.approx(usual, rel=0.1) if not least else least < found.outlier_sizes[0] < 1.9
+    )
+    file = found.save(tmp_path / "t.json")
+    np.testing.assert_array_equal(obsynth.load_thresholds(file).outlier_sizes, found.outlier_sizes)
+    run = obsynth.run_on_data(design, data, monitor=obsynth.online_monitor(design, "learned", normal=found))
+    sized = replace(design.observer, outlier_sizes=found.outlier_sizes)
+    assert run.outliers == obsynth.run_on_data(design.replace(observer=sized), data).outliers
+    assert np.isclose(obsynth.run_on_data(design, data).outliers["y"], run.outliers["y"]) == bool(least)
+    monitor = obsynth.online_monitor(design, "learned", normal=found)
+    source, _ = obsynth.export(design, tmp_path / "tank.c", monitor=monitor)
+    table = source.read_text().split("OUTLIER_SIZES[1] = {")[1].split("}")[0]
+    assert float(table) == found.outlier_sizes[0]
+
+
+def test_few_outliers_change_nothing_unless_they_are_nearer_than_stated() -> None:
+    usual, stated = np.full(4, 0.6), np.array([1.0, 1.0, 1.0, 0.0])
+    wrong = [np.array([1.5, 2.0]), np.array([0.8]), np.zeros(0), np.array([3.0, 3.0, 3.0])]
+    np.testing.assert_array_equal(learned_sizes(wrong, usual, stated), [1.0, 0.6, 1.0, 0.0])
 
 
 @functools.cache

@@ -104,8 +104,7 @@ class Clock:
         if time == last:
             raise SpecError(f"Row {row} repeats the time {time:.17g} s of the row before.", path=f"row {row}")
         if time < last:
-            known = "; the run went on from a saved state, which has the rows up to there" if self.is_resumed else ""
-            raise SpecError(f"Row {row}: the time falls from {last:.17g} to {time:.17g} s{known}.", path=f"row {row}")
+            raise SpecError(f"Row {row}: the time falls from {last:.17g} to {time:.17g} s.", path=f"row {row}")
         step = interval(last, time)
         missing = self._sampled(step, row) if self.dt > 0.0 else self._continuous(step, row)
         self.last = time
@@ -120,9 +119,10 @@ class Clock:
         return step, missing
 
     def stale(self, time: float) -> str:
-        """Return the status of a row whose stamp does not rise, which is left out; empty for others."""
+        """Return the status of a row whose stamp does not rise, which is left out; empty for others. A run that goes on
+        from a saved state may begin with the rows that the state has, however many they are."""
         last = self.last
-        if last is None or not math.isfinite(time) or self.left_out >= MOST_STALE:
+        if last is None or not math.isfinite(time) or (self.left_out >= MOST_STALE and not self.is_resumed):
             return ""
         # Of a sampled design the last sample may be told a little later than its stamp.
         before = max(self.stamp, last - STAMP_SHARE * self.dt) if self.dt > 0.0 else last

@@ -20,6 +20,7 @@ from obsynth.data.linear_log import log_observer
 from obsynth.data.log_estimator import DECIDING, RECOVERING, STALE, Clock, LogObserver, Row
 from obsynth.data.signals import TIME_HEADER, Signals, Stamps
 from obsynth.errors import ObsynthError, SpecError
+from obsynth.experiments.monitors.learned import LearnedRule, as_learned
 from obsynth.experiments.monitors.monitor import LinearSample, Monitor, Sample
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
@@ -201,6 +202,8 @@ class LogRun:
         recovered: str | Sequence[str] | None = "none",
         stamps: Stamps | None = None,
     ) -> None:
+        if monitor is not None and isinstance(monitor.rule, LearnedRule):
+            design = design.replace(observer=as_learned(design.observer, monitor.rule.learned))
         self.observer = observer = log_observer(design, gap=gap, warm_up=warm_up, outliers=outliers)
         self.clock, self.signals = Clock(observer.dt, gap), Signals.of(observer, columns, scales)
         self.stamps, self.monitor = stamps, monitor

@@ -38,6 +38,7 @@ from obsynth.experiments.monitors.learned import (
     NO_PAIRS,
     LearnedThresholds,
     WrongPairs,
+    has_innovations_by_sensor,
     learned_monitor,
     load_thresholds,
     rows_per_alarm,
@@ -73,7 +74,9 @@ from obsynth.numerics.arguments import Seed, arguments_checked, is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.outliers import checked_limit
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.running import changed
 from obsynth.plants.constants import shown
 from obsynth.results.design import (
     ObserverDesign,
@@ -83,12 +86,14 @@ from obsynth.simulation.scenario import Scenario
 
 #: Probability below which so many pairs are no chance: wrong samples, or something else, come in a row here.
 CHANCE = 0.01
+#: Probability with which an outlier is nearer than what is taken as their least size, and how many show that.
+NEARER, LEAST_WRONG = 1e-3, 4
 #: Pairs may take this share of the rate of false alarms; where they would take more the levels are to hold with them.
 MOST_OF_RATE = 0.5
 
 
 class Pair(NamedTuple):
-    """Two samples of one output: rows, and which output."""
+    """Samples of one output: the first and the last of their rows, and which output."""
 
     first: int
     second: int
@@ -96,14 +101,14 @@ class Pair(NamedTuple):
 
 
 def believed_pairs(refused: Sequence[FloatArray], y: FloatArray) -> list[Pair]:
-    """Return the samples that a gate believed as the second in a row, with the first, which it left out: from its
+    """Return the samples that a gate believed after those before them in a row, which it left out, with these: from its
     memory after each row ``(4, ny)``, and what was measured ``(n, ny)``."""
-    found, latest = [], np.full(y.shape[1], -1)
+    found, begun = [], np.full(y.shape[1], -1)
     for k, (memory, seen) in enumerate(zip(refused, np.isfinite(y), strict=True)):
         before = refused[k - 1] if k else np.zeros_like(memory)
-        believed = seen & (np.abs(memory[0]) == 2.0) & (memory[1] == before[1]) & (latest >= 0)
-        found += [Pair(int(latest[i]), k, int(i)) for i in np.flatnonzero(believed)]
-        latest[seen] = k
+        begun[seen & (np.abs(memory[0]) == 1.0)] = k
+        believed = seen & (np.abs(memory[0]) >= 2.0) & (memory[3] != 0.0) & (before[3] == 0.0)
+        found += [Pair(int(begun[i]), k, int(i)) for i in np.flatnonzero(believed)]
     return found
 
 
@@ -111,7 +116,7 @@ def without(y: FloatArray, pairs: Sequence[Pair]) -> FloatArray:
     """Return what was measured ``(n, ny)`` without these pairs."""
     left = y.copy()
     for pair in pairs:
-        left[[pair.first, pair.second], pair.output] = np.nan
+        left[pair.first : pair.second + 1, pair.output] = np.nan
     return left
 
 
@@ -204,8 +209,9 @@ def learn_thresholds(
     if time_column is not None:
         columns = {**(columns or {}), TIME_HEADER: time_column}
 
-    def started() -> LogRun:
-        return LogRun(design, columns, scales, gap=gap, warm_up=warm_up)
+    def started(sizes: FloatArray | None = None) -> LogRun:
+        known = design if sizes is None else design.replace(observer=changed(design.observer, outlier_sizes=sizes))
+        return LogRun(known, columns, scales, gap=gap, warm_up=warm_up)
 
     first_run = started()
     log = np.vstack(
@@ -213,10 +219,10 @@ def learn_thresholds(
     )
     if len(log) < LEAST_NORMAL:
         raise SpecError(f"The log has {len(log)} rows: give {LEAST_NORMAL} and more.", path="normal")
-    said = _said(design, first_run, log)
+    said, sizes = _sized(design, started, log)
     dt = design.observer.dt or float(np.median(np.diff(said.times)))
     every = rows_per_alarm(false_alarms, dt)
-    said, pairs = _without_pairs(design, started, log, said, every)
+    said, pairs = _without_pairs(design, lambda: started(sizes), log, said, every)
     first, last = parsed_rows(rows, int(said.numbers[-1]) + 1)
     chosen = (first <= said.numbers) & (said.numbers < last)
     dt = design.observer.dt or float(np.median(np.diff(said.times[chosen])))
@@ -229,7 +235,66 @@ def learn_thresholds(
         pairs=pairs,
         innovation=_usual_innovation(said.squares[chosen]),
         scores=None if said.scores is None else said.scores.chosen(chosen),
+        outlier_sizes=sizes,
     )
+
+
+def _sized(
+    design: ObserverDesign, started: Callable[[FloatArray | None], LogRun], log: FloatArray
+) -> tuple[_Said, FloatArray | None]:
+    """Return what a design says of rows without faults, and how far off outliers are by these rows ``(ny,)``; `None`
+    where that is what the design says."""
+    run = started(None)
+    if not (isinstance(run.observer, SteppingLogObserver) and run.observer.gates
+            and has_innovations_by_sensor(design.observer)):  # fmt: skip
+        return _said(design, run, log), None
+    ny = len(run.observer.output_names)
+    stated = run.observer.observer.outlier_sizes
+    whole = _said(design, started(np.zeros(ny)), log)
+    usual = checked_limit("gate", run.observer.observer.outlier_limit) * np.sqrt(
+        np.nanmean(whole.watched[:, -ny:] ** 2, axis=0)
+    )
+    inputs = np.asarray(np.isfinite(log[:, 1:-ny]).all(axis=1))
+    sizes = learned_sizes(wrong_samples(whole.refused, inputs), usual, np.zeros(ny) if stated is None else stated)
+    if not sizes.any():
+        return (whole, None) if stated is None else (whole, sizes)
+    return _said(design, started(sizes), log), None if stated is not None and np.array_equal(sizes, stated) else sizes
+
+
+def wrong_samples(refused: Sequence[FloatArray], known: NDArray[np.bool_]) -> list[FloatArray]:
+    """Return how far off the samples of each output were that a gate left out, and none of which it believed later, by
+    its memory after each row ``(4, ny)``; ``known (n,)``: whether the inputs of the row were."""
+    memory = np.array(refused)
+    found = []
+    for row, total, left, believed in np.moveaxis(memory, 2, 0).transpose(0, 2, 1):
+        gone, count = np.diff(total, prepend=0.0) > 0.0, np.abs(row)
+        # A run of samples that are far ends where the next one is near.
+        run = np.cumsum((count == 0.0) | ((count == 1.0) & (np.concatenate([[0.0], count[:-1]]) != 1.0)))
+        moved = np.isin(run, run[believed != 0.0])
+        found.append(np.abs(left[gone & ~moved & known & (left != 0.0)]))
+    return found
+
+
+def learned_sizes(wrong: Sequence[FloatArray], usual: FloatArray, stated: FloatArray) -> FloatArray:
+    """Return how far off outliers of each output are at least ``(ny,)``, of which some were so far off ``wrong``: what
+    is ``stated`` where these are few and further off.
+
+    Their logarithms are taken as normal: one more is nearer with the probability `NEARER`, as its distance from their
+    mean in units of their deviation follows Student's t. Where that is within what any sample reaches (``usual``), it
+    says nothing of a sample that it is further off: the gate alone judges then.
+    """
+    from scipy.special import stdtrit
+
+    found = stated.copy()
+    for i, sizes in enumerate(wrong):
+        n = len(sizes)
+        if n >= LEAST_WRONG:
+            logarithms = np.log(sizes)
+            reach = float(stdtrit(n - 1, 1.0 - NEARER)) * np.sqrt(1.0 + 1.0 / n) * float(logarithms.std(ddof=1))
+            found[i] = max(float(np.exp(logarithms.mean() - reach)), usual[i])
+        elif n and sizes.min() < stated[i]:
+            found[i] = usual[i]
+    return found
 
 
 def _usual_innovation(squares: FloatArray) -> float:

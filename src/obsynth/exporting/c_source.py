@@ -22,7 +22,7 @@ import numpy as np
 
 from obsynth.data.log_estimator import SETTLING_SLACK
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.experiments.monitors.learned import LearnedThresholds, watched_names
+from obsynth.experiments.monitors.learned import LearnedThresholds, as_learned, watched_names
 from obsynth.experiments.monitors.learned_levels import (
     AGES,
     DISTINGUISHED,
@@ -667,25 +667,27 @@ def dae_alarms(
     thresholds: Mapping[str, float] | None,
     warm_up: float | None,
     learned: LearnedThresholds | None,
-) -> tuple[ObserverDesign, Alarms]:
-    """Return the alarms of a nonlinear design, and the design as these want it: thresholds were learned from a run,
-    which leaves outliers out where the design says nothing of them."""
+) -> Alarms:
+    """Return the alarms of a nonlinear design."""
     model, observer = design.nonlinear
-    if learned is not None and observer.outliers == "none":
-        design = design.replace(observer=changed(observer, outliers="gate"))
     columns = (*(f"fhat[{name}]" for name in model.parameter_names), *(f"r[{name}]" for name in model.output_names))
     seconds = checked_warm_up(warm_up, 0.0)
     found = Alarms.of(columns, model.parameter_names, thresholds, seconds, learned, more=("nis",))
     if learned is not None:
         # A run numbers innovations of any kind.
         found = replace(found, columns=watched_names(design), walk=parameter_walk(observer))
-    return design, found
+    return found
 
 
 def dae_c_texts(design: ObserverDesign, prefix: str, header: str, alarms: Alarms) -> tuple[str, str, str]:
-    """Return source, header and the digest of the gain set."""
+    """Return source, header and the digest of the gain set. Outliers are left out where the design says nothing of
+    them, as `run` leaves them out."""
     model, observer = design.nonlinear
-    digest = alarms.learned.gains if alarms.learned is not None else gain_set_digest(design)
+    digest = gain_set_digest(design)
+    if observer.outliers == "none":
+        observer = changed(observer, outliers="gate")
+    if alarms.learned is not None:
+        observer = as_learned(observer, alarms.learned)
     inner = f"{prefix}_observer" if observer.timing.is_plain else f"{prefix}_observer_memory"
     source = "\n".join(
         [

@@ -412,8 +412,7 @@ def export(
     if isinstance(design, ObserverDesign) and isinstance(design.observer, DAEObserver):
         if monitor is not None and learned is None:
             raise SpecError("Of nonlinear designs, learned monitors are written as C.", path="monitor")
-        shipped, alarms = dae_alarms(design, thresholds, warm_up, learned)
-        return write_dae_c(shipped, target, sample_time, alarms, numbers)
+        return write_dae_c(design, target, sample_time, dae_alarms(design, thresholds, warm_up, learned), numbers)
     found = Realisation.of(design, sample_time, numbers)
     if suffix != ".c":
         return (write_atomically(target, _as_arrays(found, design, suffix)),)

@@ -110,7 +110,10 @@ def robust_advance(
         least, u_taken = (least, u) if held is None else (np.zeros(len(y)), held)
         mean, reach, far = _judged(limit, least, predicted, state, y, u_taken)
         if wary is not None:
-            reach = np.where(wary & np.isfinite(reach), least, reach)
+            # A second that is where the first was, and no further than it may be, goes on with it at once.
+            again = (np.abs(y - mean) <= reach) & (np.abs(y - mean - state.refused[2]) <= least)
+            wary &= np.isfinite(reach) & ~(again & (state.refused[2] != 0.0))
+            reach = np.where(wary, least, reach)
             far |= wary & (np.abs(y - mean) > reach)
     off, gone = np.where(far, y - mean, 0.0), far
     if kind == "gate":

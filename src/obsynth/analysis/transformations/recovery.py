@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.zeros import leading_names
-from obsynth.errors import PreconditionError
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, NEGLIGIBLE_INPUT, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.numerics.sparse import MEAN_FACTOR, SIZE_SAMPLES, SolutionBounds, SparseFactor, csr, sparse_factor
+from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import Uncertainty, matrices_of
 from obsynth.plants.validation import index_of
@@ -262,6 +263,12 @@ def plant_and_recovery(given: Any, recovery: StateRecovery | None = None) -> tup
 def linear_plant(given: Any) -> DescriptorSystem:
     """Return a linear plant, of a transformation the transformed one; raise `SpecError` for anything else."""
     plant = given.plant if isinstance(given, Transformation) else given
+    if isinstance(plant, DAEModel):
+        raise SpecError(
+            "This is for linear plants; of a plant of equations give the linear one that its spec makes with "
+            "transform: {linearise: {at: equilibrium, faults: [...]}}, or obsynth.linearise.",
+            path="plant",
+        )
     require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
     found: DescriptorSystem = plant
     return found

@@ -38,13 +38,14 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.running import changed
 from obsynth.observers.windows import WindowObserver
 from obsynth.results.certificate_files import opened, sealed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
 
 LEARNED_KIND = "obsynth learned thresholds"
-LEARNED_VERSION = 6
+LEARNED_VERSION = 7
 LEARNED = FileKind("learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"')
 #: Columns that are watched at most, and the least share of a column's variance that others leave unexplained.
 MOST_WATCHED, LEAST_NEW = 8, 1e-6
@@ -137,6 +138,9 @@ class LearnedThresholds:
         Pairs of wrong samples in a row that count as not measured.
     innovation : float
         Root mean square of the innovations in the observer's own deviations: one where its covariances are right.
+    outlier_sizes : FloatArray, optional
+        ``(ny,)``: how far off the outliers of each output are at least, by these rows, in place of what the design
+        says; without them, what it says agrees with these rows.
     """
 
     columns: tuple[str, ...]
@@ -154,6 +158,7 @@ class LearnedThresholds:
     settling: int = 0
     pairs: WrongPairs = NO_PAIRS
     innovation: float = 1.0
+    outlier_sizes: FloatArray | None = None
 
     @property
     def holds(self) -> bool:
@@ -221,6 +226,7 @@ class LearnedThresholds:
             "pairs": {"number": self.pairs.number, "chance": self.pairs.chance},
             "innovation": self.innovation,
             "estimates": list(self.statistics.estimates),
+            "outlier_sizes": self.outlier_sizes,
         }
 
     def save(self, path: str | Path) -> Path:
@@ -309,7 +315,14 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         int(data["settling"]),
         WrongPairs(int(data["pairs"]["number"]), float(data["pairs"]["chance"])),
         float(data["innovation"]),
+        None if data["outlier_sizes"] is None else read_only(np.asarray(data["outlier_sizes"], dtype=np.float64)),
     )
+
+
+def as_learned(observer: Any, learned: LearnedThresholds) -> Any:
+    """Return an observer as the one from which thresholds were learned judged outliers."""
+    sizes = learned.outlier_sizes
+    return observer if sizes is None else changed(observer, outlier_sizes=sizes)
 
 
 def watched_names(design: ObserverDesign) -> tuple[str, ...]:
@@ -365,10 +378,12 @@ def thresholds_from_rows(
     pairs: WrongPairs = NO_PAIRS,
     innovation: float = 1.0,
     scores: Scores | None = None,
+    outlier_sizes: FloatArray | None = None,
 ) -> LearnedThresholds:
     """Return thresholds from ``rows (n, m)`` of all that may be watched, NaN where nothing is known; ``pairs``: what
     does not stand in them, but alarms; ``innovation``: how large innovations are in the observer's own deviations;
-    ``scores``: what these rows say of faults, where that is known.
+    ``scores``: what these rows say of faults, where that is known; ``outlier_sizes``: what the design is to say
+    instead.
 
     Where the fault estimates remember more than the rows can tell, or nearly follow from the residuals (the gains of a
     filter move them, and what is left is how these change with the inputs), the residuals alone are watched.  A fault
@@ -424,6 +439,7 @@ def thresholds_from_rows(
         settling_rows(design),
         pairs,
         innovation,
+        outlier_sizes,
     )
 
 

@@ -347,8 +347,8 @@ def _contents(
     header = f"{_PREFIX}.h"
     if isinstance(design.observer, DAEObserver):
         require_no_sample_time(design, sample_time)
-        shipped, alarms = dae_alarms(design, thresholds, warm_up, learned)
-        text, declared, digest = dae_c_texts(shipped, _PREFIX, header, alarms)
+        alarms = dae_alarms(design, thresholds, warm_up, learned)
+        text, declared, digest = dae_c_texts(design, _PREFIX, header, alarms)
         return signals_of_dae(design, alarms), (text, declared), digest
     found = Realisation.of(design, sample_time)
     if found.observer.dt == 0.0:

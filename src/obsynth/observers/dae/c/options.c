@@ -146,7 +146,10 @@ static int robust(const struct observer *state, const double *u, const double *v
         double most = OUTLIER_LIMIT * deviation[i];
         double reach = most < OUTLIER_SIZES[i] && !is_missing ? OUTLIER_SIZES[i] : most;
         double pulled;
-        reach = wary[i] ? OUTLIER_SIZES[i] : reach;
+        /* A second that is where the first was, and no further than it may be, goes on with it at once. */
+        int again = state->left_out[i] != 0.0 && fabs(y[i] - mean[i]) <= reach
+                    && fabs(y[i] - mean[i] - state->left_out[i]) <= OUTLIER_SIZES[i];
+        reach = wary[i] && !again ? OUTLIER_SIZES[i] : reach;
         pulled = mean[i] + reach * (y[i] > mean[i] ? 1.0 : -1.0);
         far[i] = fabs(y[i] - mean[i]) > reach || huge;
         off[i] = y[i] - mean[i];
