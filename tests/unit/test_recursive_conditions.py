@@ -36,7 +36,7 @@ class TestDetectability:
         A = np.zeros((4, 4))
         A[0, 0], A[1, 2], A[2, 1], A[3, 3] = 0.5, 1.1, -1.1, 1.0
         error = refusal(sampled(A, [[1.0, 0, 0, 0]]))
-        assert "z = 0 +/- 1.1j of the states 'x2', 'x3'" in str(error)
+        assert "z = 0 +- 1.1j of the states 'x2', 'x3'" in str(error)
         assert "(as the modes 1)" in str(error)
 
     def test_of_a_descriptor_plant(self) -> None:

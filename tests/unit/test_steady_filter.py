@@ -107,7 +107,7 @@ def test_random_plants_with_singular_noise(seed: int) -> None:
 
 @pytest.mark.parametrize(
     ("A", "mode", "text"),
-    [(np.diag([1.0, 0.5]), 1.0, "at z = 1 the noise"), ([[0.0, 1], [-1, 0]], 1j, "at z = 0 +/- 1j the noise")],
+    [(np.diag([1.0, 0.5]), 1.0, "at z = 1 the noise"), ([[0.0, 1], [-1, 0]], 1j, "at z = 0 +- 1j the noise")],
 )
 def test_a_mode_on_the_unit_circle_that_no_noise_reaches(A, mode: complex, text: str) -> None:
     """The filter exists, and converges like 1 / k: there is no steady state, and the design says so."""

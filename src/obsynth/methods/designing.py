@@ -15,7 +15,7 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import StateRecovery, Transformation, plant_and_recovery
 from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
-from obsynth.methods.method import Method, Synthesis
+from obsynth.methods.method import Method, Synthesis, silent
 from obsynth.methods.refusals import require_above_rounding, with_advice
 from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_class
 from obsynth.methods.verifying import verify
@@ -34,10 +34,6 @@ from obsynth.simulation.scenario import Scenario
 from obsynth.verification.claims import before_the_mean
 from obsynth.verification.plant import condition_rows
 from obsynth.verification.stored_numbers import StoredErrors
-
-
-def _silent(_: str) -> None:
-    """Progress that does nothing (no-op)."""
 
 
 @arguments_checked
@@ -92,7 +88,7 @@ def design(
     VerificationError
         Gains were found, but the shipped realisation fails a check.
     """
-    report_stage = progress or _silent
+    report_stage = progress or silent
     own: Plant
     own, recovery = plant_and_recovery(plant, recovery)
 
@@ -190,7 +186,7 @@ def check(
     kind_of(own)
     try:
         with failed_computations(), one_thread_if_small(own.nx):
-            return _checked(_with_arrays(own, None, _silent)[0], options or {})
+            return _checked(_with_arrays(own, None, silent)[0], options or {})
     except PreconditionError as error:
         # The sparse plant as written has no reduced form for any method.
         row = Condition(

@@ -197,3 +197,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.tolist()
     return [plain(part) for part in value] if isinstance(value, (list, tuple)) else value
+
+
+def silent(_: str) -> None:
+    """Progress that does nothing (no-op)."""

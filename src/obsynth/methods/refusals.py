@@ -17,6 +17,7 @@ from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.method import Method
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.spectra import pole_text
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
@@ -159,7 +160,7 @@ def _doubt(plant: DescriptorSystem, observer: LinearObserver, fault: int) -> Unc
         default=None,
     )
     size, place = (0.0, 0j) if found is None else (found.size, found.point or 0j)
-    where = f"{place.real:.4g}" if place.imag == 0.0 else f"{place:.4g}"
+    where = pole_text(place)
     return Unclear(
         UNIT_ROUNDOFF,
         found,

@@ -27,6 +27,13 @@ LARGEST_WHOLE = 2**53
 ROUNDING_OF_EIGENVALUES = 10.0
 
 
+def pole_text(value: complex, digits: int = 4, *, pair: bool = False) -> str:
+    """Return a pole, a zero or an eigenvalue as text, a conjugate ``pair`` as one."""
+    if value.imag == 0.0:
+        return f"{value.real:.{digits}g}"
+    return f"{value.real:.{digits}g} +- {abs(value.imag):.{digits}g}j" if pair else f"{value:.{digits}g}"
+
+
 def eigenvalues(matrix: FloatArray) -> ComplexArray:
     """Return the eigenvalues of ``matrix (n, n)``; none of an empty one."""
     values = np.linalg.eigvals(matrix) if matrix.size else np.zeros(0)

@@ -31,6 +31,7 @@ from obsynth.analysis.zeros import are_outside, is_outside, system_zeros
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, RankDecision, decide_rank, rank_in_any_units
+from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
@@ -352,7 +353,7 @@ class Evaluator:
         if distance is None:
             return found
         if verdict.answer == "yes":
-            where = f"{distance.point.real:.4g}" if distance.point.imag == 0.0 else f"{distance.point:.4g}"
+            where = pole_text(distance.point)
             least = f"least singular value {distance.value:.2g} of the scaled pencil outside (near {where})"
             return replace(found, detail=f"{found.detail}; {least}, {verdict.means}")
         detail = (
@@ -370,7 +371,7 @@ class Evaluator:
     def _zero_doubt(self, said: NoZeroOutside, found: Distance, what: str) -> Unclear:
         """Return why it is unclear whether a pencil has a zero outside."""
         point = found.point
-        where = f"{point.real:.6g}" if point.imag == 0.0 else f"{point:.6g}"
+        where = pole_text(point, 6)
         return self.doubt(
             self.named(said.at_zero),
             f"has a zero at {where}, and no {what}",

@@ -19,6 +19,7 @@ from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
 from obsynth.numerics.sparse import dense
+from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem, note_source
 from obsynth.plants.uncertainty import SAMPLED
 from obsynth.proofs.extended_balls import arb_matrix
@@ -136,9 +137,9 @@ def sampling_zero_warnings(plant: DescriptorSystem) -> tuple[str, ...]:
     zeros, outside = fault_zeros(plant)
     inside = [zero.value for zero in zeros if not any(zero is other for other in outside)]
     texts = [
-        f"Fault zero at {_number(value)} (modulus {abs(value):.6g}): errors of a fault estimate decay there with a "
-        f"time constant of {-plant.dt / math.log(abs(value)):.3g} s. Sample more slowly, or measure a signal nearer to "
-        "the fault."
+        f"Fault zero at {pole_text(value, 6, pair=True)} (modulus {abs(value):.6g}): errors of a fault estimate decay "
+        f"there with a time constant of {-plant.dt / math.log(abs(value)):.3g} s. Sample more slowly, or measure a "
+        "signal nearer to the fault."
         for value in inside
         if value.imag >= 0.0 and SLOW_ZERO_RADIUS < abs(value) < 1.0
     ]
@@ -169,7 +170,3 @@ def _noise_factor(A: FloatArray, noise: FloatArray, step: float) -> FloatArray:
     sizes, directions = np.linalg.eigh((correlation + correlation.T) / 2.0)
     kept = sizes > CANCELLATION_TOLERANCE * sizes[-1]
     return np.asarray((scale * spread)[:, None] * directions[:, kept] * np.sqrt(sizes[kept]))
-
-
-def _number(value: complex) -> str:
-    return f"{value.real:.6g}" if value.imag == 0.0 else f"{value.real:.6g} +- {abs(value.imag):.6g}j"

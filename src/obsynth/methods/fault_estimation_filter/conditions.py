@@ -32,6 +32,7 @@ from obsynth.methods.fault_estimation_filter.detectability_indexes import (
 )
 from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare, with_sensor_faults_as_states
 from obsynth.numerics.arrays import FloatArray, remembered
+from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import blocks, picked_columns, pivot_columns, zeros_matrix
 
@@ -302,7 +303,7 @@ def _zero_condition(judge: Evaluator) -> Condition:
 
 
 def _zero_failure(plant: DescriptorSystem, zero: Zero) -> Condition:
-    value = f"{zero.value.real:.6g}" if zero.value.imag == 0.0 else f"{zero.value:.6g}"
+    value = pole_text(zero.value, 6)
     if zero.is_unobservable_mode:
         signals = leading_names(np.abs(zero.state_direction), plant.state_names, most=MOST_NAMES)
         detail = (

@@ -18,6 +18,7 @@ from obsynth.analysis.existence.statements import Evaluator, FullRank
 from obsynth.errors import SpecError
 from obsynth.methods.method import OPTIONS_PATH
 from obsynth.numerics.arrays import remembered
+from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
 
@@ -107,9 +108,9 @@ def _in_doubt(condition: Condition, plant: DescriptorSystem, asked: Question, po
     """Return the condition as one that rounding of the data could change."""
     named, name = _named(plant, asked), plant.fault_names[asked.number]
     share = named.last_share(point)
-    other = f"hides {name} at {'z' if plant.dt > 0.0 else 's'} = {_place(point)}, and no filter estimates it"
+    other = f"hides {name} at {'z' if plant.dt > 0.0 else 's'} = {pole_text(point)}, and no filter estimates it"
     doubt = Evaluator(plant).doubt(named, other, point=point, tolerance=max(ROUNDING_LEVEL, share), last=True)
-    detail = f"{share:.1g} of {name} reaches the outputs at {_place(point)}: rounding of the data is as large."
+    detail = f"{share:.1g} of {name} reaches the outputs at {pole_text(point)}: rounding of the data is as large."
     return replace(condition, detail=detail, mode=point, signals=(name,)).in_doubt(doubt, plant)
 
 
@@ -155,11 +156,7 @@ def _hidden(plant: DescriptorSystem, asked: Question, point: complex) -> str:
     motion = hidden_motion(plant, asked.number, point, asked.removed)
     if motion is None:
         return "no output responds to it."
-    return f"{motion} ({'z' if plant.dt > 0.0 else 's'} = {_place(point)})."
-
-
-def _place(point: complex) -> str:
-    return f"{point.real:.4g}{f'{point.imag:+.4g}j' if point.imag else ''}"
+    return f"{motion} ({'z' if plant.dt > 0.0 else 's'} = {pole_text(point)})."
 
 
 def chosen_faults(faults: Any, plant: DescriptorSystem) -> list[int]:

@@ -27,7 +27,7 @@ from obsynth.methods.guaranteed_test.bank import (
 from obsynth.methods.guaranteed_test.conditions import conditions, told
 from obsynth.methods.guaranteed_test.problem import problem_of
 from obsynth.methods.guaranteed_test.synthesis import TRADE_OFF, chosen_samples, padded, synthesise
-from obsynth.methods.method import Synthesis
+from obsynth.methods.method import Synthesis, silent
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
@@ -47,7 +47,7 @@ def synthesise_bank(plant: DescriptorSystem, asked: Any, *, progress: Callable[[
     samples = max(samples for samples, _ in tables)
     asked = replace(asked, samples=samples)
     progress(f"proving the thresholds on {samples} samples")
-    made = [synthesise(plant, replace(test, samples=samples, lag=asked.lag), progress=_silent) for test in tests]
+    made = [synthesise(plant, replace(test, samples=samples, lag=asked.lag), progress=silent) for test in tests]
     pairs = _pairs(plant, asked)
     matrices = _stacked([dict(test.certificate.matrices) for test in made]) | pairs
     matrices |= {
@@ -68,10 +68,6 @@ def synthesise_bank(plant: DescriptorSystem, asked: Any, *, progress: Callable[[
     observer = joined([test.observer for test in made], plant.fault_names)  # type: ignore[misc]
     notes = tuple(_notes(plant, groups, reasons, claims, matrices[BANK_PAIRS]))
     return Synthesis(options, gains, observer, Certificate(matrices, claims), notes=notes)
-
-
-def _silent(_: str) -> None:
-    """Report no progress of the tests one by one (no-op)."""
 
 
 def _smallest(plant: DescriptorSystem, asked: Any, fault: int) -> tuple[tuple[int, ...], int, str]:
@@ -121,7 +117,7 @@ def _pairs(plant: DescriptorSystem, asked: Any) -> dict[str, FloatArray]:
         own = blind_to_one(asked, plant, one, other)
         condition, _ = told(problem_of(plant, own), own)
         if condition.holds:
-            made = synthesise(plant, own, progress=_silent)
+            made = synthesise(plant, own, progress=silent)
             table[one, other] = made.certificate.claims["threshold"]
             proofs.append(made.certificate.matrices)
         else:

@@ -21,6 +21,7 @@ from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.extended_balls import arb_matrix
 
 #: Bits of the balls: far more than any window that double precision solves loses.
 CONDENSED_BITS = 512
@@ -38,11 +39,6 @@ def many_bits() -> Iterator[None]:
         yield
     finally:
         ctx.prec = before
-
-
-def _balls(matrix: FloatArray) -> Any:
-    rows, columns = matrix.shape
-    return arb_mat(rows, columns, [arb(value) for value in matrix.ravel().tolist()])
 
 
 def _middles(matrix: Any) -> FloatArray:
@@ -79,7 +75,7 @@ class Condensed:
     @cached_property
     def _inverse(self) -> Any:
         e = self.window.plant.E
-        return None if np.array_equal(e, np.eye(len(e))) else _balls(e).inv()
+        return None if np.array_equal(e, np.eye(len(e))) else arb_matrix(e).inv()
 
     def _over_e(self, matrix: Any) -> Any:
         return matrix if self._inverse is None else self._inverse * matrix
@@ -103,15 +99,15 @@ class Condensed:
         window, plant = self.window, self.window.plant
         free = [k for k in self._others.tolist() if k and window.free[k]]
         equations, outputs = self._parts(np.array([*free, 0]))
-        a, c = self._over_e(_balls(plant.A)), _balls(plant.C)
-        seen, state, found = c, _balls(np.zeros((plant.nx, len(free) + 1))), []
+        a, c = self._over_e(arb_matrix(plant.A)), arb_matrix(plant.C)
+        seen, state, found = c, arb_matrix(np.zeros((plant.nx, len(free) + 1))), []
         for k, output in enumerate(outputs):
-            here = c * state + _balls(output)
+            here = c * state + arb_matrix(output)
             rows = [seen.tolist(), here.tolist()]
             found += [first + others for first, others in zip(*rows, strict=True)]
             seen = seen * a
             if k < window.equations:
-                state = a * state - self._over_e(_balls(equations[k]))
+                state = a * state - self._over_e(arb_matrix(equations[k]))
         return arb_mat(found)
 
     @many_bits()
@@ -145,7 +141,7 @@ class Condensed:
         target = arb_mat(count, 1, [arb(0)] * (count - 1) + [arb(1)])
         exact: Any = None
         for _ in range(3 if refine else 1):
-            exact = _balls(weights[:, None])
+            exact = arb_matrix(weights[:, None])
             try:
                 step = square.solve(target - responses.transpose() * exact)
             except ZeroDivisionError:
@@ -180,8 +176,8 @@ class Condensed:
     def _equations(self, weights: Any) -> Any:
         """Return the multipliers of all equations that belong to weights of the outputs, in balls."""
         window, plant = self.window, self.window.plant
-        a, c = _balls(plant.A.T), _balls(plant.C.T)
-        later, found = _balls(np.zeros((plant.nx, 1))), []
+        a, c = arb_matrix(plant.A.T), arb_matrix(plant.C.T)
+        later, found = arb_matrix(np.zeros((plant.nx, 1))), []
         entries = weights.entries()
         for k in range(window.equations - 1, -1, -1):
             part = arb_mat(plant.ny, 1, entries[(k + 1) * plant.ny : (k + 2) * plant.ny])
@@ -202,18 +198,18 @@ class Condensed:
             return None
         kept = np.array([k for k in self._others if k not in set(absorbing.ravel().tolist())])
         equations, outputs = self._parts(kept)
-        others = _balls(values[kept][:, None])
-        a, c = self._over_e(_balls(plant.A)), _balls(plant.C)
+        others = arb_matrix(values[kept][:, None])
+        a, c = self._over_e(arb_matrix(plant.A)), arb_matrix(plant.C)
         labels = {label: k for k, label in enumerate(window.labels)}
-        state = _balls(np.array([[values[labels["x", 0, i]]] for i in range(plant.nx)]))
+        state = arb_matrix(np.array([[values[labels["x", 0, i]]] for i in range(plant.nx)]))
         noise = window.bounds.noise_output[:, self._noise_columns]
-        back = _balls(noise).inv()
+        back = arb_matrix(noise).inv()
         found, distance = np.array(values), np.zeros(len(values))
         for k in range(window.question.samples):
-            left = back * (c * state + _balls(outputs[k]) * others)
+            left = back * (c * state + arb_matrix(outputs[k]) * others)
             self._put(found, distance, absorbing[k], -left)
             if k < window.equations:
-                state = a * state - self._over_e(_balls(equations[k]) * others)
+                state = a * state - self._over_e(arb_matrix(equations[k]) * others)
                 self._put(found, distance, np.array([labels["x", k + 1, i] for i in range(plant.nx)]), state)
         return found, distance
 

@@ -19,6 +19,7 @@ from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.analysis.zeros import MOST_NAMES, equilibrated_at, leading_names, structure_of
 from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.ranks import equilibrate
+from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import holds_computed
 from obsynth.proofs.exact_pencils import ExactPencil
@@ -171,7 +172,7 @@ def _detectable(facts: SystemFacts) -> Condition:
 def _hidden_mode(plant: DescriptorSystem, hidden: Sequence[complex]) -> Condition:
     mode = max(hidden, key=lambda value: value.real)
     signals = leading_names(_hidden_direction(plant, mode), plant.state_names, most=MOST_NAMES)
-    value = f"{mode.real:.6g}" if mode.imag == 0.0 else f"{mode:.6g}"
+    value = pole_text(mode, 6)
     detail = (
         f"the mode s = {value} (states {', '.join(map(repr, signals))}) is undetectable: no output responds to it, "
         "and it does not decay. Measure something that it moves."

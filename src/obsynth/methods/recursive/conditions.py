@@ -36,6 +36,7 @@ from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, RankDecision, decide_rank, real_but_rounding
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
+from obsynth.numerics.spectra import pole_text
 from obsynth.numerics.square_root_estimation import OUTGROWN, least_squares_step, rank_revealing_step
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -389,8 +390,7 @@ def _open_states(
 
 def described_mode(value: complex) -> str:
     """Return an eigenvalue as a text, a pair as one."""
-    real = real_but_rounding(value)
-    return f"{real:.6g}" if value.imag == 0.0 else f"{real:.6g} +/- {abs(value.imag):.6g}j"
+    return pole_text(complex(real_but_rounding(value), value.imag), 6, pair=True)
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -14,6 +14,7 @@ from obsynth.analysis.existence.statements import Evaluator
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank, real_but_rounding
 from obsynth.numerics.scaling import equilibrating_factors
+from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
 from obsynth.proofs.exact_arithmetic import blocks, identity, primitive, written_matrix, zeros_matrix
@@ -24,8 +25,8 @@ UNSEEN = 5e-7
 
 def number(value: complex) -> str:
     """Return a real or complex eigenvalue as text, a pair by its upper half; a real part of rounding is none."""
-    real = real_but_rounding(value)
-    return f"{real:.6g}" if _looks_real(value) else f"{real:.6g} +- {abs(value.imag):.6g}j"
+    imaginary = 0.0 if _looks_real(value) else value.imag
+    return pole_text(complex(real_but_rounding(value), imaginary), 6, pair=True)
 
 
 def numbers(values: Iterable[complex]) -> list[str]:

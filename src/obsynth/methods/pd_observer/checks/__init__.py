@@ -19,7 +19,7 @@ from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.norms import HinfNorm
 from obsynth.numerics.ranks import RANK_TOLERANCE, rounding_rank
 from obsynth.numerics.scaling import balanced_matrix
-from obsynth.numerics.spectra import eigenvalues
+from obsynth.numerics.spectra import eigenvalues, pole_text
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import listed
@@ -208,7 +208,7 @@ def spectrum_text(values: ComplexArray) -> str:
     if np.any(np.isnan(values)):
         return "not finite"
     ordered = sorted((complex(value) for value in values), key=lambda v: (-v.real, v.imag))
-    shown = [f"{v.real:.4g}" if v.imag == 0.0 else f"{v.real:.4g} +- {v.imag:.4g}j" for v in ordered if v.imag >= 0.0]
+    shown = [pole_text(value, pair=True) for value in ordered if value.imag >= 0.0]
     return listed(shown, most=LISTED_EIGENVALUES)
 
 
