@@ -78,6 +78,9 @@ class StoredErrors:
         if contraction is None:
             return None
         bounds = model.remainder.errors_per_unit(model.observer, contraction)
+        if contraction.roundings > MOST_ROOM:
+            # Which rate is proved is a matter of rounding: what is claimed holds by any.
+            bounds = cls(model.remainder, bounds, np.ones(1))._by_all(model.observer, np.fmax).bounds
         if not all(np.all(np.isfinite(bound)) for bound in bounds):
             return None
         room = np.full((len(model.observer.Cz), 1), 1.0 + min(contraction.roundings, MOST_ROOM))
@@ -97,12 +100,15 @@ class StoredErrors:
     def least(self, observer: LinearObserver) -> StoredErrors:
         """Return the least bounds by all contractions that are found, by the first with a sum of each: any of them is a
         proof."""
+        return self._by_all(observer, np.fmin, closely=observer.order <= MOST_STATES_CLOSELY)
+
+    def _by_all(self, observer: LinearObserver, chosen: np.ufunc, *, closely: bool = False) -> StoredErrors:
         bounds = self.bounds
         found = proved_contractions(observer.Az, discrete=observer.dt > 0.0, poles=poles_of(observer))
         for i, contraction in enumerate(found):
-            closely = not i and observer.order <= MOST_STATES_CLOSELY
-            others = self.channel.errors_per_unit(observer, contraction, closely=closely)
-            bounds = tuple(np.fmin(one, other) for one, other in zip(bounds, others, strict=True))
+            others = self.channel.errors_per_unit(observer, contraction, closely=closely and not i)
+            known = (np.where(np.isfinite(other), other, np.nan) for other in others)
+            bounds = tuple(chosen(one, other) for one, other in zip(bounds, known, strict=True))
         return replace(self, bounds=bounds)
 
 
