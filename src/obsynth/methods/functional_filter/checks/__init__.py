@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.functional_filter.conditions import conditions, residual_sets
 from obsynth.methods.functional_filter.tracking import estimate_deviations, wanted_faults
 from obsynth.methods.ui_pi_observer.augmented_plant import shipped_model
@@ -255,15 +256,27 @@ def _tracking(
     if not observer.fault_names:
         return
     wanted = wanted_faults(plant, observer, matrices, mean=int(design.options.get("mean", 1)))[observer.fault_rows]
-    rows = observer.fault_rows
+    rows, units = observer.fault_rows, _model_units(plant, phi, cw)
+    # How large each state is that the faults move, in the natural unit of each of these.
+    moved = np.max(np.abs(pi) * units, axis=1, initial=0.0, keepdims=True) / units
     yield (
         "fault models",
         "the gain of each estimate for its own fault model is one, for all others zero",
         Identity(
             (observer.Cz[rows] @ pi, direct[rows] @ cw, -wanted),
-            ((observer.Cz[rows], largest), (np.abs(direct[rows]), cw)),
+            ((observer.Cz[rows], moved), (np.abs(direct[rows]), cw)),
+            units,
         ),
     )
+
+
+def _model_units(plant: DescriptorSystem, phi: FloatArray, cw: FloatArray) -> FloatArray:
+    """Return natural units of the states of the fault models ``(nw,)``: those of the faults that they make."""
+    made = cw != 0.0
+    for _ in range(len(phi)):
+        made = made | (made.astype(float) @ (phi != 0.0) > 0.0)
+    found = np.max(np.where(made, PlantUnits.of(plant).rounded().faults[:, None], 0.0), axis=0, initial=0.0)
+    return np.where(found > 0.0, found, 1.0)
 
 
 def _claimed(design: ObserverDesign) -> Iterator[Check]:
