@@ -270,6 +270,30 @@ def test_a_continuous_design_on_a_log(machine):
         obsynth.online_monitor(machine, "pointwise", disturbance_bounds={"load": 0.5}, noise_bound=5.0)
 
 
+@pytest.mark.parametrize("kind", ["chi-square", "cusum"])
+def test_stamps_that_jitter_are_decided_by_as_regular_ones_are(kind):
+    """From 2 % of the interval on nothing was decided; intervals that are all another one are still told apart."""
+    plant = obsynth.DescriptorSystem(
+        A=[[-0.5, 1.0], [0.0, -1.0]], B=[[0.0], [1.0]], C=np.eye(2), Bf=[[1.0], [0.0]], fault_names=["f"],
+        input_names=["u"], output_names=["a", "b"], state_names=["x", "z"], sensor_noise={"a": 0.1, "b": 0.1},
+    )  # fmt: skip
+    design = obsynth.ui_pi_observer(plant, poles=[-1.0, -1.5, -2.0])
+    monitor = obsynth.online_monitor(design, kind, sample_time=0.1, false_alarms=0.01)
+    assert "jitter by up to a fifth" in monitor.statement
+    rng, rows = np.random.default_rng(1), 300
+    log = pd.DataFrame(0.1 * rng.standard_normal((rows, 2)), columns=["a", "b"]).assign(u=0.0)
+    regular, jitter = 0.1 * np.arange(rows), 0.1 * rng.uniform(-1.0, 1.0, rows)
+    decided = {}
+    for name, time in {"regular": regular, "jitter": regular + 0.2 * jitter, "longer": 1.05 * regular}.items():
+        run = run_on_data(design, log.assign(time=time), monitor=monitor)
+        decided[name] = int(run.table["statistic"].notna().sum())
+        assert not run.events
+    assert decided["jitter"] >= decided["regular"] - 2 > 200
+    assert decided["longer"] == 0
+    moved = log.assign(time=regular + 0.2 * jitter, a=log["a"] + 1.0 * (np.arange(rows) >= 200))
+    assert run_on_data(design, moved, monitor=monitor).events[0].first_row in range(201, 211)
+
+
 @pytest.mark.long
 def test_cumulative_sums_of_a_residual_that_a_window_does_not_whiten(machine):
     """A load of white noise leaves a residual that remembers for seconds: a window of one sample predicts nothing."""

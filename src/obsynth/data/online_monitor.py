@@ -396,6 +396,7 @@ _FROM_THE_FIRST = "; from the first row on; after a gap, once settled"
 _GROWS = "; after missing outputs it is larger by the possible error of the plant's model"
 _WAITS = "; until the effect of a gap has settled nothing is decided, as {reason}"
 _NOT_CLOSER = "; rows are no closer than {dt} s"
+_JITTERING = "; stamps that jitter by up to a fifth of the interval are taken as regular"
 _REGULAR = "; no row is further than {dt} s from the last"
 
 
@@ -535,7 +536,7 @@ def online_monitor(
         ending += _WAITS.format(reason=gaps) if isinstance(gaps, str) and gaps else _GROWS * bool(gaps)
     else:
         rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
-        ending = ANY_LENGTH
+        ending = ANY_LENGTH + (_JITTERING if model.continuous is not None else "")
     numbers = {"window": window, "false_alarms": false_alarms, "change": change, "dt": dt}
     assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=initial_error) if limited else None
     return made(statement_of(kind, model, assumed, estimates=estimates, **numbers) + ending + NO_TOLERANCE, rule)

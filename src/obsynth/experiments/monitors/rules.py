@@ -198,6 +198,9 @@ def gap_growth(model: ResidualModel, bounds: FloatArray, noise_bound: float | No
 
 #: Share of an interval by which the data's sampling may differ from the one that a threshold is for.
 FITTING_SHARE = 0.01
+#: How far stamps may be off regular ones, in intervals, for the statistics of these: two of them may be off by a fifth
+#: each. Intervals that are all longer or shorter by `FITTING_SHARE` get no further away.
+LARGEST_AWAY = 0.4
 #: Share of an interval within which two of them are the same: stamps are rounded.
 SAME_INTERVAL = 1e-6
 #: What rounding may take from a number of samples, as a share of it.
@@ -341,6 +344,7 @@ class WindowState(NamedTuple):
     filled: int = 0  # rows since the start
     looks: int = 0
     last: float | None = None
+    away: float = 0.0  # of the last stamp from regular ones, in intervals
 
 
 class WhitenedRule(Rule):
@@ -385,9 +389,11 @@ class WhitenedRule(Rule):
         return state._replace(levels=levels), levels.max(axis=-1)
 
     def step(self, state: WindowState, sample: Sample) -> tuple[WindowState, Judged]:
-        """Return the state after a sample, statistic and threshold."""
-        if state.last is not None and abs(sample.time - state.last - self._dt) > FITTING_SHARE * self._dt:
-            state = self.restart(state)
+        """Return the state after a sample, statistic and threshold. Stamps that jitter are those of the regular samples
+        that they are nearest to."""
+        if state.last is not None:
+            away = state.away * (1.0 - FITTING_SHARE / LARGEST_AWAY) + (sample.time - state.last) / self._dt - 1.0
+            state = state._replace(away=away) if abs(away) <= LARGEST_AWAY else self.restart(state)
         state = state._replace(last=sample.time)
         if not sample.deciding:
             return state, NOT_DECIDED
