@@ -274,6 +274,28 @@ def test_rounding_raises_no_alarm(wang) -> None:
     assert seen.fault == ""
 
 
+def decoupled(**more) -> obsynth.ObserverDesign:
+    """An observer whose fault estimates, which it takes from its states alone, an unknown input does not reach."""
+    plant = obsynth.DescriptorSystem(
+        None, [[0.5, 0.1, 0.0], [0.2, 0.3, 0.0], [0.0, 0.3, 0.2]], dt=0.1, **more,
+        Bf=[[0.37], [0.19], [0.0]], Bd=[[0.1], [0.3], [0.7]],
+    )  # fmt: skip
+    return obsynth.ui_pi_observer(plant)
+
+
+@pytest.mark.parametrize(
+    "C", [[[0.7, 0.1, 0.0], [0.3, 0.9, 0.0]], [[0.7, 0.1, 0.2], [0.3, 0.9, -0.4], [0.0, 0.0, 1.0]]]
+)
+def test_rounding_of_what_cancels_raises_no_alarm(C) -> None:
+    design = decoupled(C=C)
+    expected = obsynth.Scenario(horizon=5.0, disturbances={"d1": obsynth.Uniform(low=-5.0, high=5.0)})
+    watched = obsynth.monitor(design, expected, "pointwise")
+    assert obsynth.evaluate(design, expected, runs=10, monitor=watched).false_alarm_rate.value == 0.0
+    assert watched.floor < 1e-6
+    with pytest.raises(SpecError, match="its bound would be zero but for rounding"):
+        obsynth.online_monitor(design, "pointwise", disturbance_bounds={"d1": 5.0})
+
+
 @pytest.mark.parametrize(
     ("kind", "options", "path"),
     [

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.plotting.spectra import _state_response
+from obsynth.plotting.spectra import _state_response, fault_gains
 from obsynth.report.designs import design_warnings, followed_steps, summary
 
 DESIGNS = Path(__file__).parents[2] / "designs"
@@ -198,3 +199,30 @@ def test_what_rounding_leaves_of_errors_is_not_printed() -> None:
     plant = obsynth.TimeVaryingDescriptorSystem(None, [[0.0, 1.0], [0.0, 0.0]], C=np.eye(2), dt=1.0, horizon=30)
     told = str(obsynth.descriptor_kalman(plant, Q=1e-3 * np.eye(2), R=1e-20 * np.eye(2)))
     assert "errors shrink to less than 0.0001 % per step on average" in " ".join(told.split())
+
+
+def test_the_time_to_90_percent_is_the_observer_s_not_of_the_clock_of_a_slow_plant():
+    # With the poles -40 and -50 the estimate of a unit step is 1 - 5 exp(-40 t) + 4 exp(-50 t).
+    plant = obsynth.DescriptorSystem(None, [[-0.01]], C=[[1.0]], Bf=[[1.0]])
+    design = obsynth.ui_pi_observer(plant, poles=[-40.0, -50.0])
+    passed = brentq(lambda t: 1.0 - 5.0 * np.exp(-40.0 * t) + 4.0 * np.exp(-50.0 * t) - 0.9, 1e-3, 1.0)
+    assert followed_steps(design)["f1"].most == pytest.approx(passed, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("A", "fault", "unknown"),
+    [
+        ([[0, 1, 0], [-144, -2.4, 1], [0, 0, -2]], [0, 1, 0], [0, 0, 1]),  # the largest gain is that at rest
+        ([[-1, -3, 2], [2, -4, -5], [1, -3, -3]], [0, 0, 1], [1, 0, 0]),  # it lies between two frequencies of the grid
+    ],
+)
+def test_the_largest_gain_is_that_of_its_peak(A, fault, unknown):
+    plant = obsynth.DescriptorSystem(None, A, C=np.eye(3)[:2], Bf=np.c_[fault], Bd=np.c_[unknown])
+    design = obsynth.pd_observer(plant)
+    observer, row = design.observer, design.observer.fault_rows
+    gains = []
+    for point in 1j * np.geomspace(1e-4, 1e3, 20001):
+        seen = plant.C @ np.linalg.solve(point * np.eye(3) - plant.A, plant.Bd)
+        moved = np.linalg.solve(point * np.eye(observer.order) - observer.Az, observer.By @ seen)
+        gains.append(abs((observer.Cz[row] @ moved + observer.Dy[row] @ seen).item()))
+    assert fault_gains(design).disturbance_gains.item() == pytest.approx(max(gains), rel=2e-5)

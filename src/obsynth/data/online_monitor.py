@@ -61,7 +61,7 @@ from obsynth.experiments.monitors.residual_model import (
     watches_estimates,
     whitened,
 )
-from obsynth.experiments.monitors.residual_monitor import bounds_of
+from obsynth.experiments.monitors.residual_monitor import RESIDUAL_ROUNDING_SHARE, bounds_of
 from obsynth.experiments.monitors.rules import (
     ANY_LENGTH,
     GapGrowth,
@@ -529,7 +529,7 @@ def online_monitor(
             rule, told = over_box(noisy, norm, bounds, noise_bound, initial_error, initial_set, sample_time=dt)
             first = _AFTER_WARM_UP if initial_error is None else _AFTER_A_GAP
             return made(told + (first if initial_set is None else _FROM_THE_FIRST), rule)
-        _require_above_zero(limit)
+        _require_above_rounding(limit, model, bounds)
         gaps = gap_growth(model, bounds, noise_bound) if kind == "pointwise" else ""
         rule = norm.over_gaps(gaps) if isinstance(gaps, GapGrowth) else norm
         ending = (_AFTER_WARM_UP if initial_error is None else _AFTER_A_GAP) + _more_words(kind, model, limit, dt)
@@ -589,11 +589,16 @@ def _require_noise(model: ResidualModel, noise_bound: float | None) -> None:
         )
 
 
-def _require_above_zero(limit: float) -> None:
-    if not limit > 0.0:
+def _require_above_rounding(limit: float, model: ResidualModel, bounds: FloatArray) -> None:
+    """Refuse a bound that rounding of what it is made of would pass: of disturbances that cancel."""
+    plant = model.errors.plant
+    # They come by the states, of which a row may show others than those that they enter.
+    entering = np.abs(model.errors.own) @ np.abs(plant.Bd) @ np.where(np.isfinite(bounds), bounds, 0.0)
+    size = float(np.linalg.norm(model.C, 2) * np.linalg.norm(entering))
+    if not limit > RESIDUAL_ROUNDING_SHARE * size:
         raise SpecError(
-            "As stated, no disturbance and no noise reaches the residual: its bound would be zero, which rounding "
-            "errors exceed. State noise (noise_bound, sensor_noise of the plant), or give a threshold yourself "
+            "As stated, no disturbance and no noise reaches the residual: its bound would be zero but for rounding, "
+            "which exceeds it. State noise (noise_bound, sensor_noise of the plant), or give a threshold yourself "
             "(thresholds).",
             path="noise_bound",
         )

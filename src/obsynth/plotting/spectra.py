@@ -21,7 +21,7 @@ from obsynth.numerics.modal_response import resolved
 from obsynth.numerics.norms import response
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.spectra import boundary_points, eigenvalues
-from obsynth.observers.linear.derived import frequency_grid
+from obsynth.observers.linear.derived import GRID_REACH, frequency_grid
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plotting.panels import WIDTH, new_panels, plain_decades, tidy
@@ -184,6 +184,8 @@ def _grid(scale: Any, limits: tuple[float, float]) -> FloatArray:
 
 #: A gain below this share of what is subtracted from one another in it is rounding: zero gain.
 GAIN_ROUNDING_SHARE = 1e-9
+#: Frequencies between the neighbours of a largest gain: a peak that was missed by 1 % is missed by 1e-5 then.
+POINTS_OF_A_PEAK = 33
 #: The least singular value is drawn where it is below this share of the largest one somewhere.
 VISIBLE_SHARE = 0.99
 TARGETS = {"faults": "fault estimates", "states": "errors of the states", "residuals": "residual"}
@@ -265,22 +267,41 @@ class FaultGains:
 def fault_gains(design: ObserverDesign) -> FaultGains:
     """Return what reaches each fault estimate of a linear design that estimates faults."""
     plant, observer = design.linear
-    _, points, to_estimate = _over_frequencies(observer, observer.fault_rows)
+    frequencies, points, to_estimate = _over_frequencies(observer, observer.fault_rows)
     disturbance_gains = np.zeros((len(observer.fault_names), plant.nd))
     if plant.nd:
-        _, found, terms = _seen(plant, plant.Bd, plant.Dd, points, to_estimate)
-        disturbance_gains = _above_rounding(np.abs(found), terms[:, None, None]).max(axis=0)
+        found = _disturbance_gains(plant, points, to_estimate)
+        # A peak lies between the frequencies of the grid: beside the largest gains they are looked at closely.
+        top = frequencies[-1] * (GRID_REACH if observer.dt == 0.0 else 1.0)
+        sides = np.concatenate([frequencies[:1] / GRID_REACH, frequencies, [top]])
+        peaks = np.unique(found.argmax(axis=0))
+        near = np.concatenate([np.geomspace(sides[k], sides[k + 2], POINTS_OF_A_PEAK) for k in peaks])
+        closely = _disturbance_gains(plant, *_at_frequencies(observer, observer.fault_rows, near))
+        disturbance_gains = np.maximum(found.max(axis=0), closely.max(axis=0))
     own = [plant.fault_names.index(name) for name in observer.fault_names]
     _, slowest, _ = _seen(plant, plant.Bf, plant.Df, points, to_estimate)
     steady = slowest[0].real[np.arange(len(own)), own]
     return FaultGains(disturbance_gains, np.asarray(steady))
 
 
+def _disturbance_gains(plant: DescriptorSystem, points: ComplexArray, to_estimate: ComplexArray) -> FloatArray:
+    """Return gains from each unknown input to each fault estimate ``(k, nf, nd)``."""
+    _, found, terms = _seen(plant, plant.Bd, plant.Dd, points, to_estimate)
+    return _above_rounding(np.abs(found), terms[:, None, None])
+
+
 def _over_frequencies(observer: LinearObserver, rows: slice) -> tuple[FloatArray, ComplexArray, ComplexArray]:
     """Return frequencies (rad/s), their points on the boundary, and what some outputs make of y there."""
     frequencies = frequency_grid(observer)[1:]
+    return frequencies, *_at_frequencies(observer, rows, frequencies)
+
+
+def _at_frequencies(
+    observer: LinearObserver, rows: slice, frequencies: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return the points on the boundary of some frequencies (rad/s), and what some outputs make of y there."""
     points = boundary_points(frequencies, observer.dt)
-    return frequencies, points, response(observer.Az, observer.By, observer.Cz[rows], observer.Dy[rows], points)
+    return points, response(observer.Az, observer.By, observer.Cz[rows], observer.Dy[rows], points)
 
 
 def _seen(

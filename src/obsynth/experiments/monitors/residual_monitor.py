@@ -35,12 +35,13 @@ from obsynth.experiments.simulation import Bench, make_bench
 from obsynth.numerics.arguments import arguments_checked, chosen, real_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
 from obsynth.results.design import (
     ObserverDesign,
     require_verified,
 )
-from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.scenario import Scenario, observer_start
 
 #: What rounding may add to a residual, relative to the terms it is made of.
 RESIDUAL_ROUNDING_SHARE = 1e-10
@@ -172,7 +173,7 @@ def monitor(
         fault_scales=model.fault_scales(),
         horizon=model.steps,
         dt=bench.signals.dt,
-        floor=_floor(bench, scenario, rows),
+        floor=_floor(bench, design.linear[0], scenario, rows),
         isolation_delay=isolation_delay,
         watches_estimates=estimates,
     )
@@ -250,10 +251,17 @@ def _statistical(
     return threshold
 
 
-def _floor(bench: Bench, scenario: Scenario, rows: slice) -> float:
+def _floor(bench: Bench, plant: DescriptorSystem, scenario: Scenario, rows: slice) -> float:
     """Return what rounding may add to the norm of the residual, from the size of what it is made of."""
     runs, observer = bench.run([scenario.seed]), cast(LinearObserver, bench.observer)
-    size = np.abs(runs.outputs) @ np.abs(observer.Dy[rows]).T + np.abs(runs.inputs) @ np.abs(observer.Du[rows]).T
+    # Of an unknown input that no output shows, the outputs themselves are rounding of what the states add up to.
+    outputs = np.abs(runs.outputs) + np.abs(runs.states) @ np.abs(plant.C).T
+    size = outputs @ np.abs(observer.Dy[rows]).T + np.abs(runs.inputs) @ np.abs(observer.Du[rows]).T
+    # Where no output enters directly, its rounding comes by the states.
+    state = observer.init(observer_start(scenario, observer.order))
+    for k, (y, u) in enumerate(zip(runs.outputs[:, 0], runs.inputs[:, 0], strict=True)):
+        size[k] += np.abs(observer.Cz[rows]) @ (np.abs(state.z) + np.abs(observer.By) @ outputs[max(k - 1, 0), 0])
+        state, _ = observer.advance(state, y, u)
     return RESIDUAL_ROUNDING_SHARE * float(np.max(np.linalg.norm(size, axis=2)))
 
 
