@@ -227,10 +227,12 @@ def test_a_zero_on_the_axis_is_refused_by_name() -> None:
     system = obsynth.DescriptorSystem(None, [[-2.0]], None, [[1.0]], Bf=[[-1.0]], Df=[[1.0]], Bd=[[-2.0]], Dd=[[1.0]])
     with pytest.raises(obsynth.PreconditionError, match="zeros of the unknown inputs"):
         obsynth.detection_filter(system)
-    # Numbers that were computed are decided by the Riccati equation.
-    computed = system.replace(Bd=[[-2.0 * (1.0 + 2**-50)]], A=[[-2.0 * (1.0 + 2**-50)]])
+    # Numbers that were computed: where there is none of theirs on the axis, the Riccati equation decides.
+    both = system.replace(Bd=[[-2.0 * (1.0 + 2**-50)]], A=[[-2.0 * (1.0 + 2**-50)]])
+    with pytest.raises(obsynth.PreconditionError, match="zeros of the unknown inputs"):
+        obsynth.detection_filter(both)
     with pytest.raises(obsynth.SolverError, match="imaginary axis"):
-        obsynth.detection_filter(computed)
+        obsynth.detection_filter(system.replace(Bd=[[-2.0 * (1.0 + 2**-50)]]))
 
 
 def test_sensitivity_is_refuted_between_the_points_of_a_grid() -> None:

@@ -220,3 +220,13 @@ def test_a_sampling_time_is_a_positive_number(dt):
     )
     with pytest.raises(SpecError, match="dt is"):
         obsynth.sample_observer(continuous, dt)
+
+
+def test_gains_whose_last_digits_go_to_and_fro_have_settled() -> None:
+    # After a thousand steps some entries moved by 8e-15 for ever, in other units of the states by nothing.
+    plant = obsynth.DescriptorSystem(
+        np.diag([1.0, 1.0, 0.0]), np.diag([0.0, -0.5, -0.95]),
+        C=[[-0.23, -0.16, -0.49], [-1.02, 1.09, -1.39], [-0.18, -0.26, 1.56]],
+        Bf=[[0.5, 2.3], [0.8, -0.5], [0.5, 1.1]], Dw=np.diag([0.01, 0.6, 0.01]), dt=0.1,
+    )  # fmt: skip
+    assert steady_observer(obsynth.adaptive_observer(plant).observer).steps < 3000

@@ -124,3 +124,17 @@ def test_a_fault_in_thousands_beside_one_in_millionths(dt: float) -> None:
         Dw=0.1 * np.eye(3), dt=dt,
     )  # fmt: skip
     assert obsynth.functional_filter(plant).report.passed
+
+
+def test_an_integrator_that_no_noise_drives_is_named_in_any_unit() -> None:
+    # Of numbers that nobody wrote so the zero was left to the Riccati equation, which ended in an error of the solver.
+    plant = obsynth.DescriptorSystem(
+        None, [[0.0, -0.83, 0.0], [0.0, -1.2, 0.3], [0.0, 0.76, -1.0]], C=[[-1.27, 0.14, 1.36], [0.24, -1.64, 1.22]],
+        Bf=[[1.0], [0.5], [0.2]], Dw=np.diag([0.3, 0.02]),
+    )  # fmt: skip
+    states = 2.0 ** np.array([13, -7, 4])
+    other = plant.replace(E=np.diag(states), A=plant.A * states, C=plant.C * states)
+    for given in (plant, other, plant.replace(A=plant.A / 3.0)):
+        with pytest.raises(obsynth.PreconditionError) as caught:
+            obsynth.detection_filter(given)
+        assert (caught.value.condition, caught.value.mode) == ("zeros of the unknown inputs", 0.0)

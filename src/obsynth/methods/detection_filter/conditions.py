@@ -16,6 +16,8 @@ from obsynth.proofs.exact_pencils import ExactPencil
 
 #: The zeros of pencils with more columns are left to the Riccati equation.
 MOST_PENCIL_COLUMNS = 70
+#: The same of computed numbers, whose fractions are long; a zero of them on the axis is one, and others may be.
+MOST_COMPUTED_COLUMNS = 20
 _SOURCE = "Ding et al. 2000"
 
 
@@ -102,12 +104,15 @@ def _no_zero_on_the_axis(plant: DescriptorSystem) -> tuple[Condition, ...]:
     """Return whether ``[A - sE, B; C, D]`` of the unknown inputs keeps its rank on the axis, where that is decided."""
     b, d = unknown_inputs(plant)
     a = np.block([[plant.A, b], [plant.C, d]])
-    if a.shape[1] > MOST_PENCIL_COLUMNS or holds_computed(a) or holds_computed(plant.E):
+    computed = holds_computed(a) or holds_computed(plant.E)
+    if a.shape[1] > (MOST_COMPUTED_COLUMNS if computed else MOST_PENCIL_COLUMNS):
         return ()
     e = np.zeros_like(a)
     e[: plant.nx, : plant.nx] = plant.E
     zeros = ExactPencil.written(e, a).zeros(discrete=False)
     found = [complex(root.value) for root in zeros if root.side == "boundary"]
+    if computed and not found:
+        return ()
     detail = (
         "none, exactly"
         if not found

@@ -156,6 +156,8 @@ SETTLED_GAINS = 1e-13
 MOST_SETTLING_STEPS = 20_000
 #: Steps in a row that must have settled: at a turning point gains stand still, too.
 STILL_STEPS = 5
+#: Gains that are where they were so many steps before have settled, although their last digits go to and fro.
+STILL_FOR_LONG = 256
 
 
 class SteadyObserver(NamedTuple):
@@ -203,11 +205,16 @@ def _require_constant(observer: RecursiveObserver) -> None:
 def _settled(observer: RecursiveObserver) -> tuple[GainStep, int]:
     """Return the first step whose gains have settled."""
     last: GainStep | None = None
+    early: GainStep | None = None
     still, before = 0, np.inf
     for k, found in enumerate(gain_steps(observer, MOST_SETTLING_STEPS)):
+        if not k % STILL_FOR_LONG:
+            if early is not None and _moved(found, early) <= SETTLED_GAINS:
+                return found, k
+            early = found
         # The correction of the start, which comes first with early constraints, has other rows.
         if last is not None and last.gain.shape == found.gain.shape:
-            moved = max(_distance(now, then) for now, then in zip(_parts(found), _parts(last), strict=True))
+            moved = _moved(found, last)
             # What is left of a geometric series, from two of its terms.
             rate = min(moved / before, 1.0) if 0.0 < before < np.inf else 1.0
             left = moved / max(1.0 - rate, np.finfo(np.float64).eps) * rate
@@ -225,6 +232,13 @@ def _settled(observer: RecursiveObserver) -> tuple[GainStep, int]:
         "process noise. Run the recursion itself (obsynth run), or state more noise in Q.",
         record={"steps": MOST_SETTLING_STEPS},
     )
+
+
+def _moved(now: GainStep, then: GainStep) -> float:
+    """Return the largest relative distance between two gains; infinite for those of other rows."""
+    if now.gain.shape != then.gain.shape:
+        return np.inf
+    return max(_distance(one, other) for one, other in zip(_parts(now), _parts(then), strict=True))
 
 
 def _parts(found: GainStep) -> tuple[FloatArray, ...]:
