@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from fractions import Fraction
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -414,3 +416,29 @@ def test_means_have_students_interval() -> None:
     low, high = stats.t.interval(0.95, 3, loc=known.mean(), scale=stats.sem(known))
     assert (found.value, found.count) == (known.mean(), 4)
     assert (found.low, found.high) == (pytest.approx(low), pytest.approx(high))
+
+
+def test_no_noise_within_its_bound_passes_the_threshold_where_powers_of_the_observer_lose_digits() -> None:
+    # The coordinates are such that entries of the observer's matrix, up to 1e5, cancel.
+    turn = np.array([[1.0, 0.0, 0.0], [300.0, 1.0, 0.0], [-200.0, 400.0, 1.0]])
+    A = turn @ np.array([[0.9, 0.2, 0.0], [-0.2, 0.9, 0.1], [0.0, 0.0, 0.8]]) @ np.linalg.inv(turn)
+    plant = obsynth.DescriptorSystem(
+        None, A, C=[[1.0, 0.0, 0.0]] @ np.linalg.inv(turn), Bf=turn @ [[0.0], [0.0], [1.0]], sensor_noise={"y1": 0.01},
+        dt=0.1,
+    )  # fmt: skip
+    design = obsynth.ui_pi_observer(plant, poles=[0.80, 0.81, 0.82, 0.83])
+    watched = obsynth.monitor(design, obsynth.Scenario(horizon=6.0, noise=1.0), "pointwise", noise_bound=3.0)
+    observer = design.observer
+    # The answer to an impulse in rational numbers: what floating point makes of it is the question.
+    exact = [[Fraction(entry) for entry in row] for row in observer.Az]
+    state, answers = (
+        [Fraction(entry) for entry in observer.By[:, 0]],
+        [abs(Fraction(observer.Dy[observer.fault_rows].item()))],
+    )
+    shown = [Fraction(entry) for entry in observer.Cz[observer.fault_rows][0]]
+    for _ in range(watched.horizon - 1):
+        answers.append(abs(sum(c * z for c, z in zip(shown, state, strict=True))))
+        state = [sum(a * z for a, z in zip(row, state, strict=True)) for row in exact]
+    worst = np.array([float(total) for total in itertools.accumulate(answers)]) * 0.03
+    assert np.all(worst <= watched.threshold)
+    assert watched.threshold[-1] == pytest.approx(worst[-1], rel=1e-2)

@@ -12,6 +12,7 @@ The covariance of a window of residuals, and what whitens it: only innovations a
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,7 +28,7 @@ from obsynth.methods.registry import error_model
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.continuous import first_order_hold, peak_gain
 from obsynth.numerics.matrix_equations import continuous_lyapunov
-from obsynth.numerics.norms import hinf_norm, output_covariance, spectral_radius
+from obsynth.numerics.norms import hinf_norm, output_covariance, spectral_radius, state_units
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
@@ -346,11 +347,34 @@ def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: flo
 def pointwise_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: float) -> FloatArray:
     """Return what the norm of the residual never passes: exact initial-error term and l1 (peak) gains of each input.
     Larger by more than rounding of these sums and of the residual: noise may be at its bounds with the worst signs."""
-    shown = [model.C @ power for power in model.powers()]
+    powers = model.powers()
+    shown = [model.C @ power for power in powers]
     start = np.array([np.linalg.norm(c, 2) for c in shown]) * initial_error
     start += np.array([_columns(c @ inputs.start) for c in shown])
-    earlier = np.concatenate([[0.0], np.cumsum([_columns(c @ inputs.B) for c in shown])[:-1]])
+    start += _left_of_powers(model, powers, np.hstack([inputs.start, initial_error * np.eye(len(model.A))]))
+    seen = np.array([_columns(c @ inputs.B) for c in shown]) + _left_of_powers(model, powers, inputs.B)
+    earlier = np.concatenate([[0.0], np.cumsum(seen)[:-1]])
     return np.asarray((start + earlier + _columns(inputs.D) + inputs.between) * OUTWARD)
+
+
+def _left_of_powers(model: ResidualModel, powers: list[FloatArray], entering: FloatArray) -> FloatArray:
+    """Return what rounding of the powers may hide of columns ``(n, m)`` at each sample, to the first order.
+
+    Where entries of A cancel, powers keep half of their digits.  What ``C A^k`` misses by from one sample to the next
+    is found, and moves on by A as everything does.
+    """
+    if not entering.any():
+        return np.zeros(len(powers))
+    # In these units what is added up has one size.
+    units = state_units(model.A, entering, model.C)
+    a, shown = model.A * units / units[:, None], [model.C @ power * units for power in powers]
+    share = len(a) * np.finfo(float).eps
+    missed = [
+        np.linalg.norm(after - before @ a) + share * np.linalg.norm(np.abs(before) @ np.abs(a))
+        for before, after in itertools.pairwise(shown)
+    ]
+    sizes = [_columns(power @ entering / units[:, None]) for power in powers[:-1]]
+    return np.concatenate([[0.0], np.convolve(missed, sizes)[: len(missed)]]) if missed else np.zeros(1)
 
 
 def _columns(matrix: FloatArray) -> float:
