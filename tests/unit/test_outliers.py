@@ -205,8 +205,13 @@ def test_a_sample_nearer_than_outliers_are_is_believed_at_once(kind):
 
 @pytest.mark.parametrize("kind", ["recursive", "nonlinear"])
 def test_of_a_sensor_whose_outliers_are_known_two_in_a_row_are_left_out(kind):
-    """Two wrong samples on one side may come together; three are a sensor, or a plant, that has moved."""
+    """Two wrong samples on one side may come together; three are a sensor, or a plant, that has moved. Of outliers that
+    are no further off than samples may be the second is believed."""
     design, y, u, at, size, _ = gated(kind)
+    near = replace(design.observer, outlier_sizes={design.plant.output_names[0]: 0.01 * size})
+    moved = y.copy()
+    moved[at : at + 2, 0] += 2.0 * size
+    assert np.diff(gate_counts(near, moved[: at + 2], u[: at + 2])[0][at - 1 : at + 2, 0]).tolist() == [1.0, 0.0]
     observer = replace(design.observer, outlier_sizes={design.plant.output_names[0]: 1.5 * size})
     for count, lost in ((2, [1.0, 1.0, 0.0, 0.0]), (4, [1.0, 1.0, 0.0, 0.0])):
         moved = y.copy()

@@ -27,9 +27,13 @@ OUTLIER_KINDS = ("none", "gate", "huber")
 LIMITS = {"gate": 6.0, "huber": 3.0}
 #: What is larger has no square: it is no measurement, whatever the model says.
 NO_SQUARE = 1e150
-#: Samples of one sensor in a row that are left out where their sides change, or where its outliers are known, so that
-#: two may come together; else the second on one side is believed. So are those that follow it there, unless wild.
+#: Samples of one sensor in a row that are left out where their sides change, or where its outliers are known to be far
+#: off, so that two may come together; else the second on one side is believed. So are those that follow it there,
+#: unless they are wild.
 LONGEST_LEFT_OUT = 2
+#: How many times further off than its limit outliers of a sensor must be so that of two in a row both are left out: of
+#: nearer ones a sample says nothing by its distance, and a fault would wait a row for what is rare.
+FAR_OUT = 1.5
 #: How many times further off than the one before it a sample may be that is believed for it: at the onset of a fault
 #: that grows with the square of time the second is 4 times further off, and noise moves both.
 COMPARABLE = 5.0
@@ -90,7 +94,7 @@ def robust_advance(
     ``held (nu,)``, where inputs are missing: as they last were. What these exclude, by deviations alone, may be wrong,
     or the inputs have moved: it counts once the next sample goes on with it. So does what is as far off as outliers of
     its sensor are once inputs are known again, until a sample is nearer or goes on with those before."""
-    failed, mean, reach, far = False, y, y, np.zeros(len(y), dtype=bool)
+    failed, mean, usual, reach, far = False, y, y, y, np.zeros(len(y), dtype=bool)
     least = np.zeros(len(y)) if sizes is None else sizes
     wary = None if sizes is None or kind != "gate" or held is not None else _wary(state, sizes)
     try:
@@ -99,7 +103,8 @@ def robust_advance(
             passes = float(row.nis) <= limit**2 and held is None and wary is None
             if passes and predicted_outputs is not None:
                 mean, deviation = predicted_outputs(state, u)
-                reach = np.maximum(limit * deviation, least)
+                usual = limit * deviation
+                reach = np.maximum(usual, least)
                 far = np.abs(y - mean) > BLIND * reach + PREDICTION_ROUNDING * (np.abs(y) + np.abs(mean).max())
         if passes and not far.any():
             return after._replace(refused=_remembered(state.refused, y, far, far, y)), row
@@ -108,7 +113,7 @@ def robust_advance(
     if not far.any():
         # Beside a missing input nearer samples wait for the next one as well: no fault is told of in this row.
         least, u_taken = (least, u) if held is None else (np.zeros(len(y)), held)
-        mean, reach, far = _judged(limit, least, predicted, state, y, u_taken)
+        mean, usual, reach, far = _judged(limit, least, predicted, state, y, u_taken)
         if wary is not None:
             # A second that is where the first was, and no further than it may be, goes on with it at once.
             again = (np.abs(y - mean) <= reach) & (np.abs(y - mean - state.refused[2]) <= least)
@@ -118,7 +123,7 @@ def robust_advance(
     off, gone = np.where(far, y - mean, 0.0), far
     if kind == "gate":
         # A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off.
-        known = np.zeros(len(y), dtype=bool) if sizes is None else sizes > 0.0
+        known = np.zeros(len(y), dtype=bool) if sizes is None else sizes > FAR_OUT * usual
         gone = far & (~_follows(state.refused, off, known) | (np.abs(y) > NO_SQUARE))
         received = np.where(gone, np.nan, y)
     else:
@@ -146,7 +151,7 @@ def _wary(state: Any, sizes: FloatArray) -> BoolArray | None:
 def _follows(refused: FloatArray, off: FloatArray, known: BoolArray) -> BoolArray:
     """Return which samples ``off (ny,)`` their prediction go on with what was off before: with what was believed, or as
     far as the one that was left out: after `LONGEST_LEFT_OUT` of them, or on its side where the sensor's outliers are
-    not ``known (ny,)``."""
+    not ``known (ny,)`` to be further off than any sample."""
     row, _, left, believed = refused
     sizes, others = np.abs(off), np.abs(left)
     with np.errstate(over="ignore"):
@@ -172,12 +177,13 @@ def _judged(
     state: State,
     y: FloatArray,
     u: FloatArray,
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return the mean of each output, how far from it a sample may be, and which are further. Where the model alone
-    predicts nothing of an output, the others of the same sample do."""
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Return the mean of each output, how far from it a sample may be by its deviation and at all, and which are
+    further. Where the model alone predicts nothing of an output, the others of the same sample do."""
     with np.errstate(all="ignore"):
         mean, deviation = predicted(state, np.full(len(y), np.nan), u)
-        reach = np.maximum(limit * deviation, least)
+        usual = limit * deviation
+        reach = np.maximum(usual, least)
         far = (np.abs(y - mean) > reach) | (np.abs(y) > NO_SQUARE)
         ratios = np.zeros(len(y))
         for i in np.flatnonzero(np.isinf(deviation) & ~np.isnan(y) & ~far):
@@ -191,7 +197,7 @@ def _judged(
         # Of those that accuse each other, the worst alone.
         worst = int(np.argmax(ratios))
         far[worst] |= bool(ratios[worst] > 1.0)
-    return mean, reach, far
+    return mean, usual, reach, far
 
 
 def checked_state_bounds(value: Any, names: Sequence[str]) -> FloatArray | None:

@@ -29,7 +29,7 @@ from obsynth.numerics.ranks import DEPENDENT_BOUND
 from obsynth.observers.dae.settings import initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import Steps
-from obsynth.observers.outliers import COMPARABLE, LONGEST_LEFT_OUT, NO_SQUARE, RESET_WINDOW, chi_square_limit
+from obsynth.observers.outliers import COMPARABLE, FAR_OUT, LONGEST_LEFT_OUT, NO_SQUARE, RESET_WINDOW, chi_square_limit
 from obsynth.plants.dae import step as implicit_step
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step import PROJECTION_NOTICE, PROJECTION_SHARE, step_graph
@@ -170,6 +170,7 @@ def _option_constants(steps: Steps) -> list[str]:
         "OVERFLOW_LIMIT": NO_SQUARE,
         "LONGEST_REFUSAL": LONGEST_LEFT_OUT,
         "COMPARABLE": COMPARABLE,
+        "FAR_OUT": FAR_OUT,
         "RESETS": int(bool(settings.reset)),
         "RESET_WINDOW": RESET_WINDOW,
         "BOUNDS": len(ends),

@@ -75,8 +75,9 @@ static int forecasted(const struct observer *state, const double *u, const doubl
 }
 
 /* Whether a sample goes on with what was off before: with what was believed, or as far as the one that was left out:
-   after LONGEST_REFUSAL of them, or on its side where the sensor's outliers are not known. */
-static int follows(const struct observer *state, int i, double off)
+   after LONGEST_REFUSAL of them, or on its side where the sensor's outliers are not known to be further off than `most`,
+   which is as far as any sample is. */
+static int follows(const struct observer *state, int i, double off, double most)
 {
     double size = fabs(off);
     double left = state->left_out[i];
@@ -85,7 +86,7 @@ static int follows(const struct observer *state, int i, double off)
     int in_a_row = state->in_a_row[i] < 0 ? -state->in_a_row[i] : state->in_a_row[i];
     int on = (believed > 0.0 ? off : -off) > 0.0 && size <= COMPARABLE * fabs(believed);
     int like = other > 0.0 && size <= COMPARABLE * other && other <= COMPARABLE * size;
-    int on_its_side = (left > 0.0 ? off : -off) > 0.0 && !(OUTLIER_SIZES[i] > 0.0);
+    int on_its_side = (left > 0.0 ? off : -off) > 0.0 && !(OUTLIER_SIZES[i] > FAR_OUT * most);
     return on || (like && (on_its_side || in_a_row >= LONGEST_REFUSAL));
 }
 
@@ -154,7 +155,7 @@ static int robust(const struct observer *state, const double *u, const double *v
         far[i] = fabs(y[i] - mean[i]) > reach || huge;
         off[i] = y[i] - mean[i];
         /* A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off. */
-        gone[i] = far[i] && (!GATE || !follows(state, i, off[i]) || huge);
+        gone[i] = far[i] && (!GATE || !follows(state, i, off[i], most) || huge);
         if (gone[i]) {
             received[i] = !GATE && isfinite(pulled) ? pulled : NAN;
         }
