@@ -71,29 +71,28 @@ def with_outliers(data: pd.DataFrame, low: float, high: float) -> pd.DataFrame:
     return found
 
 
-@pytest.mark.parametrize(("low", "high", "least"), [(8.0, 30.0, 0.0), (19.0, 21.0, 1.5)])
+@pytest.mark.parametrize(("low", "high", "stated"), [(8.0, 30.0, 1.6), (19.0, 21.0, None)])
 def test_how_far_off_outliers_are_is_learned_where_the_log_shows_another_size(
-    low: float, high: float, least: float, tmp_path: Path
+    low: float, high: float, stated: float | None, tmp_path: Path
 ) -> None:
     """A design from a log with two outliers far off believed nearer ones: they raised the levels ten times."""
-    design = pumped().replace(observer=replace(pumped().observer, outliers="gate", outlier_sizes={"y": 1.6}))
+    sizes = None if stated is None else {"y": stated}
+    design = pumped().replace(observer=replace(pumped().observer, outliers="gate", outlier_sizes=sizes))
     data = with_outliers(log(1_500, 0), low, high)
     found = obsynth.learn_thresholds(design, data, false_alarms="1 per 500 rows")
     clean = obsynth.learn_thresholds(design, log(1_500, 0), false_alarms="1 per 500 rows")
     assert (found.levels < 1.5 * clean.levels).all()
     assert clean.outlier_sizes is None
     assert found.outlier_sizes is not None
-    # As near as the gate lets any sample be, where sizes differ; else as far as nearly none is nearer.
+    # As near as the gate lets any sample be, where sizes differ; else half the way from there to the nearest.
     usual = 6.0 * float(obsynth.run_on_data(design, log(1_500, 0)).table["r[y]"].std())
-    assert (
-        found.outlier_sizes[0] == pytest.approx(usual, rel=0.1) if not least else least < found.outlier_sizes[0] < 1.9
-    )
+    assert found.outlier_sizes[0] == pytest.approx(usual if stated else np.sqrt(usual * 1.7), rel=0.1)
     file = found.save(tmp_path / "t.json")
     np.testing.assert_array_equal(obsynth.load_thresholds(file).outlier_sizes, found.outlier_sizes)
     run = obsynth.run_on_data(design, data, monitor=obsynth.online_monitor(design, "learned", normal=found))
     sized = replace(design.observer, outlier_sizes=found.outlier_sizes)
     assert run.outliers == obsynth.run_on_data(design.replace(observer=sized), data).outliers
-    assert np.isclose(obsynth.run_on_data(design, data).outliers["y"], run.outliers["y"]) == bool(least)
+    assert np.isclose(obsynth.run_on_data(design, data).outliers["y"], run.outliers["y"]) == (stated is None)
     monitor = obsynth.online_monitor(design, "learned", normal=found)
     source, _ = obsynth.export(design, tmp_path / "tank.c", monitor=monitor)
     table = source.read_text().split("OUTLIER_SIZES[1] = {")[1].split("}")[0]
@@ -104,6 +103,10 @@ def test_few_outliers_change_nothing_unless_they_are_nearer_than_stated() -> Non
     usual, stated = np.full(4, 0.6), np.array([1.0, 1.0, 1.0, 0.0])
     wrong = [np.array([1.5, 2.0]), np.array([0.8]), np.zeros(0), np.array([3.0, 3.0, 3.0])]
     np.testing.assert_array_equal(learned_sizes(wrong, usual, stated), [1.0, 0.6, 1.0, 0.0])
+    # What is stated is not raised, however many are further off.
+    many = [np.full(20, 3.0)]
+    np.testing.assert_allclose(learned_sizes(many, usual[:1], np.array([1.0])), [1.0])
+    np.testing.assert_allclose(learned_sizes(many, usual[:1], np.array([0.0])), [np.sqrt(0.6 * 3.0)])
 
 
 @functools.cache
