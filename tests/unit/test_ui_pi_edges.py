@@ -219,3 +219,13 @@ def test_no_filter_is_told_to_be_quieter_than_that_without_a_rate(monkeypatch: p
 
     monkeypatch.setattr(KalmanProblem, "deviations", rounded)
     assert ui_pi_observer(PAPER).certificate.claims["noise_price"] == 1.0
+
+
+def test_where_the_quietest_filter_is_lost_in_rounding_that_of_a_rate_is_taken() -> None:
+    """Three integrators, of which two are seen from almost one side: on some processors their filter has no equation."""
+    plant = DescriptorSystem(
+        None, np.eye(2), C=[[64.0 + 2.0**-13, 4.0 + 2.0**-18], [-1024.0, -64.0]], Bf=[[-(2.0**-8)], [0.0625]], dt=1.0
+    )
+    design = ui_pi_observer(plant)
+    assert design.report.passed
+    assert 1.0 <= design.certificate.claims["noise_price"] <= 10.0

@@ -151,16 +151,11 @@ def _chosen(
         gain, record = _in_region(kalman, region.in_time(time), problem.rate, asked)
         runs = (record,)
     elif asked.decay is not None:
-        found = kalman.gain(time * asked.decay, persistent=True)
-        if found is None:
-            # Near the fastest rate, rounding ends the equation on one processor and not on another.
-            found = _placed_for_decay(problem, asked.decay, asked.objective, dt)
-        gain = found
-    else:
-        fair = compromise(kalman, problem.rate)
-        if fair is None:
-            raise SolverError("The Riccati equation has no usable solution: give poles= or a slow decay=.")
+        gain = _for_decay(problem, kalman, asked.decay, asked.objective, dt)
+    elif (fair := compromise(kalman, problem.rate)) is not None:
         gain, claims = fair[0], {"noise_price": fair[2]}
+    else:
+        gain = _for_decay(problem, kalman, problem.rate / time, asked.objective, dt)
     return gain, None, claims, runs
 
 
@@ -168,8 +163,15 @@ def _chosen(
 LEAST_RATE, RATE_SPREAD = 1.1, 1.0
 
 
-def _placed_for_decay(problem: PlacementProblem, decay: float, objective: str, dt: float) -> FloatArray:
-    """Return a gain ``(n, ny)`` whose poles all decay faster than ``decay`` (1/s), without a Riccati equation."""
+def _for_decay(
+    problem: PlacementProblem, kalman: KalmanProblem, decay: float, objective: str, dt: float
+) -> FloatArray:
+    """Return a gain ``(n, ny)`` whose poles all decay faster than ``decay`` (1/s): a Kalman filter's, or placed ones.
+
+    Near the fastest rate, rounding ends the filter's equation on one processor and not on another."""
+    found = kalman.gain(problem.units.time * decay, persistent=True)
+    if found is not None:
+        return found
     order = problem.split.order
     rates = decay * (LEAST_RATE + RATE_SPREAD * np.arange(order) / max(order, 1))
     poles = np.exp(-rates * dt) if dt > 0.0 else -rates
