@@ -163,9 +163,7 @@ def _chosen(
 LEAST_RATE, RATE_SPREAD = 1.1, 1.0
 
 
-def _for_decay(
-    problem: PlacementProblem, kalman: KalmanProblem, decay: float, objective: str, dt: float
-) -> FloatArray:
+def _for_decay(problem: PlacementProblem, kalman: KalmanProblem, decay: float, objective: str, dt: float) -> FloatArray:
     """Return a gain ``(n, ny)`` whose poles all decay faster than ``decay`` (1/s): a Kalman filter's, or placed ones.
 
     Near the fastest rate, rounding ends the filter's equation on one processor and not on another."""
