@@ -208,10 +208,10 @@ def test_levels_are_as_many_times_higher_as_faults_are_less_certain_after_missin
     gaps = [range(first, first + int(rng.integers(1, 5))) for first in range(40, 590, 14)]
     for i, gap in enumerate(gaps):
         data.loc[[*gap], "u" if i % 2 else "y"] = np.nan
-    table = obsynth.run_on_data(lag(), data, outliers="none").table
+    table = obsynth.run_on_data(lag(), data).table
     assert table is not None
     level = float(table["fhat[f]"].abs().median())
-    whole = obsynth.run_on_data(lag(), data, thresholds={"fhat[f]": level}, outliers="none").table
+    whole = obsynth.run_on_data(lag(), data, thresholds={"fhat[f]": level}).table
     # What is expected, from the columns of the table alone.
     wanted, grown, usual, before = [], 0, 0.0, 0.0
     for status, size, spread in zip(table["status"], table["fhat[f]"].abs(), table["sd fhat[f]"], strict=True):
@@ -226,6 +226,6 @@ def test_levels_are_as_many_times_higher_as_faults_are_less_certain_after_missin
     assert whole["alarm"].tolist() == wanted
     assert alarms_in_c(data, level, tmp_path).tolist() == [bool(text) for text in wanted]
     state = tmp_path / "state.json"
-    parts = [obsynth.run_on_data(lag(), part, thresholds={"fhat[f]": level}, outliers="none", state=state).table
+    parts = [obsynth.run_on_data(lag(), part, thresholds={"fhat[f]": level}, state=state).table
              for part in (data[:41], data[41:62], data[62:])]  # fmt: skip
     pd.testing.assert_frame_equal(whole, pd.concat(parts, ignore_index=True))

@@ -222,7 +222,7 @@ def test_no_filter_is_told_to_be_quieter_than_that_without_a_rate(monkeypatch: p
 
 
 def test_where_the_quietest_filter_is_lost_in_rounding_that_of_a_rate_is_taken() -> None:
-    """Three integrators, of which two are seen from almost one side: on some processors their filter has no equation."""
+    """Three integrators, two of them seen from almost one side: on some processors their filter has no equation."""
     plant = DescriptorSystem(
         None, np.eye(2), C=[[64.0 + 2.0**-13, 4.0 + 2.0**-18], [-1024.0, -64.0]], Bf=[[-(2.0**-8)], [0.0625]], dt=1.0
     )
