@@ -31,9 +31,9 @@ NO_SQUARE = 1e150
 #: off, so that two may come together; else the second on one side is believed. So are those that follow it there,
 #: unless they are wild.
 LONGEST_LEFT_OUT = 2
-#: How many times further off than its limit outliers of a sensor must be so that of two in a row both are left out: of
-#: nearer ones a sample says nothing by its distance, and a fault would wait a row for what is rare.
-FAR_OUT = 1.5
+#: Share of its limit that the least size of a sensor's outliers must be so that of two in a row both are left out:
+#: where what inputs may have been widens the limit beyond that, the second is believed.
+FAR_OUT = 0.5
 #: How many times further off than the one before it a sample may be that is believed for it: at the onset of a fault
 #: that grows with the square of time the second is 4 times further off, and noise moves both.
 COMPARABLE = 5.0

@@ -50,8 +50,8 @@ class DescriptorKalman(Method):
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
     outlier_sizes : array_like or mapping, optional
         ``(ny,)``, or values by name, in units of the sensors: a sample that is nearer than this to its prediction is no
-        outlier, however many deviations it is off. `calibrate` finds them where a log has outliers. Where that is
-        half as far again as the gate, two outliers in a row are left out, too.
+        outlier, however many deviations it is off. `calibrate` finds them where a log has outliers. Of these sensors
+        two outliers in a row are left out, too.
     sensors : mapping, optional
         ``{name: {"every": N, "delay": D}}``: a sensor that is sampled every N rows (k = 0, N, 2 N, ...; what a log
         holds in the other rows is not used), or whose values are delayed by D rows: the value in row k is then that of
