@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from obsynth.analysis.transformations.linearisation import DRIFT
 from obsynth.calibration.logs import EVEN, Log, LogData, quantum, read_log
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import arguments_checked, require_kind
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.records import named_vector
 from obsynth.plants.dae.functions import BUTCHER
@@ -132,8 +132,6 @@ def validity(
     SolverError
         The plant has no solution along the log's inputs.
     """
-    require_kind(model, DAEModel, "model", "a DAEModel")
-    require_kind(linear, DescriptorSystem, "linear", "what obsynth.linearise returns")
     names = {*linear.input_names, *linear.disturbance_names} - {DRIFT}
     if names != set(model.input_names) or linear.output_names != model.output_names or linear.is_discrete:
         raise SpecError(

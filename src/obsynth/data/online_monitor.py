@@ -202,7 +202,6 @@ def learn_thresholds(
     ----------
     Alwan & Roberts (1988), Lowry et al. (1992), Willsky & Jones (1976), Politis & Romano (1994), Gandy & Kvaloy (2013).
     """
-    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     # Both are refused before the log is read.
     watched_names(design)
     rows_per_alarm(false_alarms, 1.0 if design.observer.dt == 0.0 else design.observer.dt)
@@ -485,7 +484,6 @@ def online_monitor(
     VerificationError
         The report of the design fails.
     """
-    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     require_verified(design, unverified=unverified)
     if scenario is not None:
         require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")

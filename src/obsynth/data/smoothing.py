@@ -15,7 +15,7 @@ from obsynth.data.signals import TIME_HEADER
 from obsynth.data.sources import samples
 from obsynth.data.step_log import SteppingLogObserver
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import arguments_checked, require_kind
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
@@ -165,7 +165,6 @@ def smooth(
        transformations, SIAM Journal on Numerical Analysis 14 (2), 180-193: the square-root form; ours keeps the way
        back of each step instead of one large factorisation, and lets E be singular.
     """
-    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     waited = checked_lag(lag)
     if isinstance(design.observer, LinearObserver):
         # The same refusal as on logs.

@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.simulation import Bench, Runs, aligned_errors, bench_of, make_bench
-from obsynth.numerics.arguments import OpenUnitInterval, arguments_checked, checked_value, require_kind, whole_number
+from obsynth.numerics.arguments import OpenUnitInterval, arguments_checked, checked_value, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import ParameterMonitor
@@ -200,8 +200,6 @@ def evaluate(
     PreconditionError
         As for `simulate`.
     """
-    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
-    require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
     checked_value(confidence, "confidence", OpenUnitInterval)
     runs = max(whole_number(runs, "runs"), 1 if plants is None else whole_number(plants, "plants"))
     seeds = range(scenario.seed, scenario.seed + runs)

@@ -16,7 +16,7 @@ from obsynth.experiments.simulation import Runs, make_bench
 from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import text_table
 from obsynth.methods.verifying import verify
-from obsynth.numerics.arguments import arguments_checked, require_kind, whole_number
+from obsynth.numerics.arguments import arguments_checked, whole_number
 from obsynth.numerics.arrays import FloatArray, freeze
 from obsynth.plants.constants import deviations_told, shown, tolerance_share
 from obsynth.plants.descriptor import DescriptorSystem
@@ -218,8 +218,6 @@ def tolerance_study(
     PreconditionError
         No bound exists over some of the tolerances.
     """
-    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
-    require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
     whole_number(runs, "runs")
     plant, observer = design.linear
     known = _tolerance_of(plant)

@@ -375,7 +375,6 @@ def export(
     the model of the plant stands in for the sensors, faults are held and residuals are NaN; nonlinear ones predict.
     ``status`` says what a row was, and alarms are raised in rows that are ``OK`` or ``PARTIAL``.
     """
-    require_kind(path, (str, Path), "path", "the name of a file")
     target = Path(path)
     suffix = target.suffix.lower()
     if suffix not in EXPORT_SUFFIXES:

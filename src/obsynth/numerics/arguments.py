@@ -366,21 +366,30 @@ def _argument_kinds(function: Callable[..., Any]) -> dict[str, Any]:
 
 def arguments_checked(function: Callable[Given, Returned]) -> Callable[Given, Returned]:
     """Make a public function raise `SpecError` for arguments that are not of the kinds that its annotations say."""
-    stated = signature(function)
+    return arguments_worded()(function)
 
-    @wraps(function)
-    def called(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
-        kinds = _argument_kinds(function)
-        given = dict(zip(stated.parameters, args, strict=False)) | kwargs
-        wrong = {
-            name: text
-            for name, value in given.items()
-            if name in kinds and (text := problem_with(value, name, kinds[name]))
-        }
-        if wrong:
-            first = next(iter(wrong))
-            message = wrong[first] if len(wrong) == 1 else f"Arguments of {function.__name__}:"
-            raise SpecError(message, path=first, problems=tuple(wrong.values()) if len(wrong) > 1 else ())
-        return function(*args, **kwargs)
 
-    return called
+def arguments_worded(**words: str) -> Callable[[Callable[Given, Returned]], Callable[Given, Returned]]:
+    """Return `arguments_checked` with what to give for some arguments in words of the function's own."""
+
+    def checked(function: Callable[Given, Returned]) -> Callable[Given, Returned]:
+        stated = signature(function)
+
+        @wraps(function)
+        def called(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
+            kinds = _argument_kinds(function)
+            given = dict(zip(stated.parameters, args, strict=False)) | kwargs
+            wrong = {
+                name: f"{name} is {a_kind(value)}: give {words[name]}." if name in words else text
+                for name, value in given.items()
+                if name in kinds and (text := problem_with(value, name, kinds[name]))
+            }
+            if wrong:
+                first = next(iter(wrong))
+                message = wrong[first] if len(wrong) == 1 else f"Arguments of {function.__name__}:"
+                raise SpecError(message, path=first, problems=tuple(wrong.values()) if len(wrong) > 1 else ())
+            return function(*args, **kwargs)
+
+        return called
+
+    return checked

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arguments import arguments_checked, require_kind
+from obsynth.numerics.arguments import arguments_worded
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.c_code import BATCH_PARTS, compiler
 from obsynth.observers.dae.estimates import DAERow
@@ -110,7 +110,7 @@ def _one(observer: DAEObserver, y: FloatArray, u: FloatArray, trial: int) -> dic
     return {name: np.concatenate([row.several.part(name) for row in rows]) for name in BATCH_PARTS}
 
 
-@arguments_checked
+@arguments_worded(observer="the observer of a design (design.observer), not a guaranteed test's")
 def run_batch(
     observer: LinearObserver | RecursiveObserver | DAEObserver,
     y: ArrayLike,
@@ -149,8 +149,6 @@ def run_batch(
     SolverError
         A step of a DAE has no solution; the trial, k and the worst equation are named.
     """
-    kinds = (LinearObserver, RecursiveObserver, DAEObserver)
-    require_kind(observer, kinds, "observer", "the observer of a design (design.observer), not a guaranteed test's")
     if isinstance(observer, LinearObserver):
         if options:
             raise SpecError(f"A linear observer has no {', '.join(options)}: leave it out.", path=min(options))

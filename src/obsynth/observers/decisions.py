@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import arguments_checked, chosen, real_array, real_number, real_vector, require_kind
+from obsynth.numerics.arguments import arguments_worded, chosen, real_array, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
@@ -182,7 +182,11 @@ NIS_WINDOW = 20
 NIS_LOOKS = 1.0 / 2.0
 
 
-@arguments_checked
+@arguments_worded(
+    observer="the recursive or nonlinear observer of a design (design.observer). Linear designs and guaranteed tests "
+    "are monitored by their residual: obsynth.monitor(design, scenario) for a record, obsynth.online_monitor(design, "
+    "...) for data of any length"
+)
 def decide(
     observer: RecursiveObserver | DAEObserver,
     estimates: Estimates,
@@ -223,15 +227,6 @@ def decide(
         It is no such observer, the statistic is unknown or does not go with the observer's form, an option is out of
         range, or the estimates are of another observer.
     """
-    require_kind(
-        observer,
-        (RecursiveObserver, DAEObserver),
-        "observer",
-        "the recursive or nonlinear observer of a design (design.observer). Linear designs and guaranteed tests are "
-        "monitored by their residual: obsynth.monitor(design, scenario) for a record, obsynth.online_monitor(design, "
-        "...) for data of any length",
-    )
-    require_kind(estimates, Estimates, "estimates", "the Estimates of a whole run, such as observer.run(y, u)")
     chosen(statistic, "statistic", STATISTICS)
     theta, size = _asked(observer, statistic, nominal, false_alarms, change)
     nq, false_alarms = len(theta), float(false_alarms)

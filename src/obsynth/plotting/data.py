@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.data.log_estimator import DECIDING
 from obsynth.data.run import DataRun
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import arguments_checked, require_kind
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.observers.estimates import BAND_WIDTH
 from obsynth.plotting.estimates import MODEL_BAND
 from obsynth.plotting.panels import (
@@ -87,7 +87,6 @@ def plot_data(
     SpecError
         The run holds no table, ``show`` names something else, or there are too few or too many axes.
     """
-    require_kind(run, DataRun, "run", "what obsynth.run_on_data returns")
     if run.table is None or run.measured is None:
         raise SpecError("The run holds no table, since it was written to a file: run it without out.", path="run")
     unknown = [part for part in show if part not in PANELS]

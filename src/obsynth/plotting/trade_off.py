@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.tolerance_study import ADAPTIVE, FIXED, ToleranceStudy
-from obsynth.numerics.arguments import arguments_checked, is_number, require_kind
+from obsynth.numerics.arguments import arguments_checked, is_number
 from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH, legend_above, new_panels, plain_decades, tidy
 from obsynth.results.design import ObserverDesign
 
@@ -112,7 +112,6 @@ def plot_tolerances(study: ToleranceStudy, *, axes: Iterable[Axes] | None = None
     SpecError
         The argument is something else, or there are too few or too many axes.
     """
-    require_kind(study, ToleranceStudy, "study", "what obsynth.tolerance_study returns")
     panels = new_panels(axes, 2, size=(WIDTH, 2.0 * PANEL_HEIGHT + 0.8))
     unit = f" ({study.unit})" if study.unit else ""
     labels = ("runs with a\nfalse alarm (%)", f"least {study.fault}\nfound in every run{unit}")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arguments import arguments_checked, chosen, real_number, require_kind
+from obsynth.numerics.arguments import arguments_checked, chosen, real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import parse_expression
 from obsynth.numerics.ranks import JACOBIAN_RANK_TOLERANCE
@@ -590,7 +590,6 @@ def linearise(
     .. [CampbellLinearisation1995] S. L. Campbell, "Linearization of DAEs along trajectories", ZAMP 46, 1995; at a
        moving point we keep E x' as an input, which is exact to first order.
     """
-    require_kind(model, DAEModel, "model", "a DAEModel")
     chosen(at, "at", ("equilibrium", "point"))
     values, freed = dict(given or {}), _names(free, "free")
     for name, bounds in free.items() if isinstance(free, Mapping) else ():

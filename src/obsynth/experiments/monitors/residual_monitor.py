@@ -32,7 +32,7 @@ from obsynth.experiments.monitors.residual_model import (
 )
 from obsynth.experiments.monitors.rules import NormRule, WhitenedRule
 from obsynth.experiments.simulation import Bench, make_bench
-from obsynth.numerics.arguments import arguments_checked, chosen, real_number, require_kind, require_mapping
+from obsynth.numerics.arguments import arguments_checked, chosen, real_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -125,9 +125,7 @@ def monitor(
     are modelled (``ui-pi-observer``), ``pointwise`` and ``window`` are of the fault estimates.  The statistical kinds
     use disturbances that are held between samples, and exact covariances of the noise.
     """
-    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     require_verified(design, unverified=unverified)
-    require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
     require_mapping(disturbance_bounds, "disturbance_bounds")
     chosen(kind, "kind", MONITOR_KINDS)
     given = {

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import arguments_checked, real_number, require_kind
+from obsynth.numerics.arguments import arguments_checked, real_number
 from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.modal_response import Modes
@@ -78,7 +78,6 @@ def sample_observer(observer: LinearObserver, dt: float) -> LinearObserver:
     SpecError
         The observer is discrete in time already, or ``dt`` is not positive and finite.
     """
-    require_kind(observer, LinearObserver, "observer", "the LinearObserver of a continuous design")
     if observer.dt > 0.0:
         raise SpecError(f"The observer is discrete in time already (dt = {observer.dt:g} s).", path="dt")
     real_number(dt, "dt", "the seconds between two samples, a positive number", above=0.0)
