@@ -348,7 +348,10 @@ def test_units_do_not_decide_whether_there_is_an_observer() -> None:
         [[1e-5], [2e-6], [-1e-9], [0.0]],
     )
     given = obsynth.DescriptorSystem(e, a, C=c, Bf=faults, dt=0.5)
-    natural = obsynth.DescriptorSystem(e * sizes, a * sizes, C=shown[:, None] * c * sizes, Bf=faults, dt=0.5)
+    rows = np.array([[3e2], [2e3], [1e6], [6e-5]])
+    natural = obsynth.DescriptorSystem(
+        rows * e * sizes, rows * a * sizes, C=shown[:, None] * c * sizes, Bf=rows * faults * 1e2, dt=0.5
+    )
     design = obsynth.adaptive_observer(given)
     assert design.report.passed
     assert any("in units in which the plant is near one" in note for note in design.notes)
