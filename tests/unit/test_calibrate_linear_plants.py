@@ -162,6 +162,23 @@ def test_a_constant_sensor_fault_is_found_and_unknown_inputs_are_told():
     assert any("unknown inputs" in sentence for sentence in found.verdict)
 
 
+def test_an_unknown_input_that_is_asked_to_walk_does_so():
+    """The load walks by 0.05 a sample, and moves the state by a tenth of that."""
+    plant = uncertain_system(
+        {"A": [["a"]], "B": [[0.1]], "Bd": [[0.1]], "C": [[1.0]], "dt": 1.0, "disturbance_names": ["load"]},
+        {"a": {"nominal": 0.88, "range": [0.8, 0.95]}},
+    )
+    rng, u = np.random.default_rng(0), np.sin(np.arange(200) / 5.0)
+    load, x, y = np.cumsum(0.05 * rng.standard_normal(200)), 0.0, np.zeros(200)
+    for k in range(200):
+        y[k] = x + 0.1 * rng.standard_normal()
+        x = 0.9 * x + 0.1 * u[k] + 0.1 * load[k]
+    log = {"time": np.arange(200.0), "u1": u, "y1": y}
+    found = calibrate(plant, log, {"a": (0.8, 0.95)}, walks=["load"], **QUICK)
+    assert found.box.holds({"a": 0.9})
+    assert found.walks["load"] == pytest.approx(0.05, rel=0.5)
+
+
 @pytest.mark.parametrize(
     ("plant", "arguments", "told"),
     [

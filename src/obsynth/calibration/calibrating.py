@@ -479,8 +479,10 @@ def calibrate(
 
 def _loads_as_parameters(model: Any, walks: Mapping[str, Any] | Sequence[str] | None) -> Any:
     """Return a nonlinear plant whose inputs that walk are parameters: no log holds them."""
-    loads = [name for name in (() if walks is None else walks) if name in model.inputs]
-    if not isinstance(model, DAEModel) or not loads:
+    if not isinstance(model, DAEModel) or walks is None:
+        return model
+    loads = [name for name in walks if name in model.inputs]
+    if not loads:
         return model
     inputs = {name: value for name, value in model.inputs.items() if name not in loads}
     return model.replace(inputs=inputs, parameters={**model.parameters, **{name: model.inputs[name] for name in loads}})
