@@ -34,15 +34,12 @@ from obsynth.experiments.monitors.options import WINDOW
 from obsynth.files.inputs import path_of
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.verifying import verify
-from obsynth.numerics.arguments import arguments_checked, is_whole, require_mapping, whole_number
+from obsynth.numerics.arguments import arguments_checked, is_whole, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.windows import WindowObserver
 from obsynth.results.certificate_files import SHOWN_DIGITS, opened
 from obsynth.results.checks import Check, information
-from obsynth.results.design import (
-    ObserverDesign,
-    VerificationReport,
-)
+from obsynth.results.design import ObserverDesign, VerificationReport
 from obsynth.results.gain_sets import loaded, restored
 
 
@@ -109,8 +106,6 @@ def prove_alarm(
     A. Neumaier and O. Shcherbina, "Safe bounds in linear and mixed-integer linear programming", Math. Programming 99,
     2004; G. McCormick, "Computability of global solutions to factorable nonconvex programs", 1976.
     """
-    for name, value in (("columns", columns), ("scales", scales)):
-        require_mapping(value, name)
     whole_number(row, "row", "the number of a row", least=2)
     if isinstance(design.observer, WindowObserver):
         raise SpecError(

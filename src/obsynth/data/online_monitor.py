@@ -70,7 +70,7 @@ from obsynth.experiments.monitors.rules import (
     gap_growth,
     parameter_monitor,
 )
-from obsynth.numerics.arguments import Seed, arguments_checked, is_finite_number, require_kind, require_mapping
+from obsynth.numerics.arguments import Seed, arguments_checked, is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
@@ -78,10 +78,7 @@ from obsynth.observers.outliers import checked_limit
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import changed
 from obsynth.plants.constants import shown
-from obsynth.results.design import (
-    ObserverDesign,
-    require_verified,
-)
+from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.simulation.scenario import Scenario
 
 #: Probability below which so many pairs are no chance: wrong samples, or something else, come in a row here.
@@ -485,10 +482,6 @@ def online_monitor(
         The report of the design fails.
     """
     require_verified(design, unverified=unverified)
-    if scenario is not None:
-        require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
-    for name, mapping in (("disturbance_bounds", disturbance_bounds), ("nominal", nominal)):
-        require_mapping(mapping, name)
     recursive = isinstance(design.observer, (RecursiveObserver, DAEObserver))
     given = {
         "scenario": scenario, "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound,

@@ -27,7 +27,7 @@ from obsynth.files.tables import table_writer
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.tolerant import rows_before
-from obsynth.numerics.arguments import arguments_checked, require_kind, require_mapping, truth, whole_number
+from obsynth.numerics.arguments import arguments_checked, require_kind, truth, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
@@ -347,9 +347,9 @@ def run_on_data(
     ``recovering`` until the warm-up is over.  ``r`` is the innovation at the parameters estimated one sample before
     (whitened, for recursive designs).
     """
-    mappings = {"columns": columns, "scales": scales, "thresholds": thresholds}
-    counts = {"chunk_rows": chunk_rows, "state_every": state_every}
-    _require_arguments(design, mappings, counts, monitor=monitor, state=state, out=out, data=data)
+    whole_number(chunk_rows, "chunk_rows")
+    whole_number(state_every, "state_every")
+    _require_files(state=state, out=out, data=data)
     if time_column is not None:
         require_kind(time_column, str, "time_column", "the name of a column")
         columns = {**(columns or {}), TIME_HEADER: time_column}
@@ -409,28 +409,10 @@ def run_on_data(
     )
 
 
-def _require_arguments(
-    design: object,
-    mappings: Mapping[str, Any],
-    counts: Mapping[str, int],
-    *,
-    monitor: object,
-    state: Any,
-    out: Any,
-    data: object,
-) -> None:
-    """Refuse arguments of `run_on_data` of the wrong kind, and files that are one."""
-    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
-    for name, value in mappings.items():
-        require_mapping(value, name)
-    if monitor is not None:
-        require_kind(monitor, Monitor, "monitor", "what obsynth.online_monitor returns")
-    if state is not None:
-        require_kind(state, (str, Path), "state", "the name of a file")
+def _require_files(*, state: Any, out: Any, data: object) -> None:
+    """Refuse files of `run_on_data` that are one, or cannot be written."""
     if out is not None and not hasattr(out, "write"):
         require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
-    for name, count in counts.items():
-        whole_number(count, name)
     require_distinct(
         {
             "state": state,

@@ -22,7 +22,7 @@ import numpy as np
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.files.inputs import path_of
 from obsynth.importing.python_objects import plant_of
-from obsynth.numerics.arguments import arguments_checked, real_number, require_mapping
+from obsynth.numerics.arguments import arguments_checked, real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import imported
 from obsynth.plants.descriptor import DescriptorSystem
@@ -268,7 +268,6 @@ def from_fmu(
     PreconditionError
         The operating point is no equilibrium (a linear model of deviations would not be one), or none is found.
     """
-    require_mapping(at, "at")
     for name, value in (at or {}).items():
         real_number(value, f"at[{name!r}]", "a finite number", path="at")
     with _instance(path_of(path)) as instance:

@@ -22,7 +22,6 @@ from obsynth.numerics.arguments import (
     arguments_checked,
     is_finite_number,
     require_kind,
-    require_mapping,
     require_shape,
     shown,
 )
@@ -267,7 +266,6 @@ def from_sympy(
         A symbol has no value, a value has no symbol, an entry is no real number, or sympy is not installed.
     """
     sympy = imported("sympy", extra="sympy")
-    require_mapping(parameters, "parameters")
     given = {"A": A, "B": B, "C": C, **plant}
     symbolic = {name: sympy.Matrix(given[name]) for name in ALL_MATRICES if _is_symbolic(given.get(name), sympy)}
     free = {str(symbol) for matrix in symbolic.values() for symbol in matrix.free_symbols}
@@ -403,8 +401,6 @@ def from_casadi(
        Math. Prog. Comp. 11 (1), 2019.
     """
     casadi = imported("casadi", extra="nonlinear", what="A plant of CasADi")
-    for given, name in ((states, "states"), (inputs, "inputs"), (parameters, "parameters")):
-        require_mapping(given, name)
     function = _function(casadi, system)
     taken = {name: function.size1_in(name) if name in function.name_in() else 0 for name in INTEGRATOR_INPUTS}
     made = {name: function.size1_out(name) if name in function.name_out() else 0 for name in OUTPUTS}

@@ -32,15 +32,12 @@ from obsynth.experiments.monitors.residual_model import (
 )
 from obsynth.experiments.monitors.rules import NormRule, WhitenedRule
 from obsynth.experiments.simulation import Bench, make_bench
-from obsynth.numerics.arguments import arguments_checked, chosen, real_number, require_mapping
+from obsynth.numerics.arguments import arguments_checked, chosen, real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
-from obsynth.results.design import (
-    ObserverDesign,
-    require_verified,
-)
+from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.simulation.scenario import Scenario, observer_start
 
 #: What rounding may add to a residual, relative to the terms it is made of.
@@ -126,7 +123,6 @@ def monitor(
     use disturbances that are held between samples, and exact covariances of the noise.
     """
     require_verified(design, unverified=unverified)
-    require_mapping(disturbance_bounds, "disturbance_bounds")
     chosen(kind, "kind", MONITOR_KINDS)
     given = {
         "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound, "initial_error": initial_error,
