@@ -13,7 +13,7 @@ from obsynth.experiments.monitors.monitor import Evidence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.running import changed
+from obsynth.observers.running import as_run
 from obsynth.observers.smoothing import Chain
 from obsynth.results.design import ObserverDesign
 
@@ -27,10 +27,7 @@ class SteppingLogObserver(LogObserver):
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:
         observer: Any = design.observer
-        wanted = outliers or ("gate" if observer.outliers == "none" else observer.outliers)
-        self.observer: RecursiveObserver | DAEObserver = observer
-        if wanted != observer.outliers:
-            self.observer = changed(observer, outliers=wanted)
+        self.observer: RecursiveObserver | DAEObserver = as_run(observer, outliers)
         plant = design.plant
         super().__init__(self.observer, warm_up, 0.0)
         self.input_names, self.output_names = plant.input_names, plant.output_names

@@ -38,7 +38,7 @@ from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.observers.dae.c_code import FLAGS, compiler, in_lines, observer_code, observer_struct, shared_library
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.derived import checked_warm_up
-from obsynth.observers.running import changed
+from obsynth.observers.running import as_run
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
@@ -684,8 +684,7 @@ def dae_c_texts(design: ObserverDesign, prefix: str, header: str, alarms: Alarms
     them, as `run` leaves them out."""
     model, observer = design.nonlinear
     digest = gain_set_digest(design)
-    if observer.outliers == "none":
-        observer = changed(observer, outliers="gate")
+    observer = as_run(observer)
     if alarms.learned is not None:
         observer = as_learned(observer, alarms.learned)
     inner = f"{prefix}_observer" if observer.timing.is_plain else f"{prefix}_observer_memory"

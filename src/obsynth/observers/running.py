@@ -250,6 +250,12 @@ def changed(observer: Robust, **options: Any) -> Robust:
     return found
 
 
+def as_run(observer: Robust, outliers: str | None = None) -> Robust:
+    """Return the observer as a run on data has it: outliers are left out where nothing else is said of them."""
+    wanted = outliers or ("gate" if observer.outliers == "none" else observer.outliers)
+    return observer if wanted == observer.outliers else changed(observer, outliers=wanted)
+
+
 def plain_recursion(observer: Robust) -> Robust:
     """Return the recursion itself: every sensor at each row, at once, taken as it is, and no bounds on states."""
     return changed(observer, outliers="none", sensors=None, state_bounds=None)
