@@ -131,3 +131,15 @@ def as_matrix(value: Any, name: str) -> FloatArray:
         entry = matrix[row - 1, column - 1]
         raise SpecError(f"{name} has {entry} in row {row}, column {column}: every entry must be finite.", path=name)
     return read_only(matrix)
+
+
+def reachable(matrix: FloatArray) -> NDArray[np.bool_]:
+    """Return which entries some power of a matrix ``(n, n)`` may have, by its pattern alone; the power zero counts."""
+    found: NDArray[np.bool_] = np.eye(len(matrix), dtype=bool) | (matrix != 0.0)
+    while not found.all():
+        # Paths of twice the length.
+        further = found.astype(np.float64) @ found > 0.0
+        if np.array_equal(further, found):
+            break
+        found = further
+    return found

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arrays import FloatArray, largest_singular_value, reachable
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import HinfNorm, hinf_norm
@@ -171,14 +171,7 @@ def _exponential(block: FloatArray, step: float) -> FloatArray:
     """Return ``exp(A h)`` without what rounding leaves where no power of A has an entry."""
     from scipy.linalg import expm
 
-    reached = np.eye(len(block), dtype=bool) | (block != 0.0)
-    while not reached.all():
-        # Paths of twice the length.
-        further = reached.astype(np.float64) @ reached > 0.0
-        if np.array_equal(further, reached):
-            break
-        reached = further
-    return np.where(reached, np.asarray(expm(block * step), dtype=np.float64), 0.0)
+    return np.where(reachable(block), np.asarray(expm(block * step), dtype=np.float64), 0.0)
 
 
 def _in_like_sizes(a: FloatArray, inputs: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

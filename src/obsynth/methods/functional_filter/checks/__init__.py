@@ -11,7 +11,7 @@ from obsynth.methods.functional_filter.conditions import conditions, residual_se
 from obsynth.methods.functional_filter.tracking import estimate_deviations, wanted_faults
 from obsynth.methods.ui_pi_observer.augmented_plant import shipped_model
 from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norms
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, reachable
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
@@ -272,9 +272,7 @@ def _tracking(
 
 def _model_units(plant: DescriptorSystem, phi: FloatArray, cw: FloatArray) -> FloatArray:
     """Return natural units of the states of the fault models ``(nw,)``: those of the faults that they make."""
-    made = cw != 0.0
-    for _ in range(len(phi)):
-        made = made | (made.astype(float) @ (phi != 0.0) > 0.0)
+    made = (cw != 0.0).astype(np.float64) @ reachable(phi) > 0.0
     found = np.max(np.where(made, PlantUnits.of(plant).rounded().faults[:, None], 0.0), axis=0, initial=0.0)
     return np.where(found > 0.0, found, 1.0)
 
