@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from uncertain_plants import DRIVE, drive
+from uncertain_plants import DRIVE, drive, two_masses
 
 import obsynth
 from obsynth.experiments.alarm_proof import assumptions_of, window_data
@@ -59,15 +59,7 @@ def test_states_of_every_plant_stay_between_the_bounds_of_a_replay(variation: st
 
 def test_stated_bounds_are_those_of_states_in_coordinates_that_no_constant_touches() -> None:
     """Two masses in absolute positions: one of the coordinates is the position of both."""
-    plant = obsynth.uncertain_system(
-        {
-            "E": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, "m", 0], [0, 0, 0, 1]],
-            "A": [[0, 0, 1, 0], [0, 0, 0, 1], ["-k", "k", -1, 0], ["k", "-k", 0, -1]],
-            "C": [[1, 0, 0, 0], [0, 1, 0, 0]], "Bf": [[0], [0], [1], [0]],
-        },
-        {"k": {"nominal": 10.0, "tolerance": "5 %"}, "m": {"nominal": 1.0, "tolerance": "5 %"}},
-    )  # fmt: skip
-    design = obsynth.fault_estimation_filter(obsynth.discretise(plant, 0.05).plant)
+    design = obsynth.fault_estimation_filter(two_masses())
     sizes = dict(zip(design.plant.state_names, (1.0, 3.0, 0.5, 2.0), strict=True))
     assumed = assumptions_of(design, {}, 0.0, None, sizes, WINDOW)
     affine, data, origin = window_data(design, assumed, WINDOW, np.zeros((STEPS, 0)), np.zeros((STEPS, 2)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from uncertain_plants import drive, wang
+from uncertain_plants import drive, two_masses, wang
 
 import obsynth
 from obsynth.analysis.transformations.uncertain_plant import affine_plant
@@ -74,15 +74,7 @@ def test_an_unstable_corner_is_named() -> None:
 
 def test_untouched_directions_stay_untouched_through_sampling() -> None:
     """Two masses in absolute positions: no constant acts on the position of both, however far they drift."""
-    plant = obsynth.uncertain_system(
-        {
-            "E": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, "m", 0], [0, 0, 0, 1]],
-            "A": [[0, 0, 1, 0], [0, 0, 0, 1], ["-k", "k", -1, 0], ["k", "-k", 0, -1]],
-            "C": [[1, 0, 0, 0], [0, 1, 0, 0]], "Bf": [[0], [0], [1], [0]],
-        },
-        {"k": {"nominal": 10.0, "tolerance": "5 %"}, "m": {"nominal": 1.0, "tolerance": "5 %"}},
-    )  # fmt: skip
-    family = affine_plant(obsynth.discretise(plant, 0.05).plant)
+    family = affine_plant(two_masses())
     assert not np.array_equal(family.coordinates, np.eye(4))
     both = np.linalg.solve(family.coordinates, [1.0, 1.0, 0.0, 0.0])
     assert np.abs(family.A.parts @ both).max() < 1e-14

@@ -35,3 +35,16 @@ def wang(share: str = "2 %", **options: Any) -> obsynth.DescriptorSystem:
     """Return the plant of Wang et al. 2015 with a tolerance of each entry of A."""
     plant = load_spec(DESIGNS / "wang2015" / "spec.yaml").plant
     return obsynth.uncertain_system(plant.replace(uncertainty=None), tolerance={"A": share}, **options)
+
+
+def two_masses() -> obsynth.DescriptorSystem:
+    """Return two masses in absolute positions, sampled: no constant acts on the position of both."""
+    plant = obsynth.uncertain_system(
+        {
+            "E": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, "m", 0], [0, 0, 0, 1]],
+            "A": [[0, 0, 1, 0], [0, 0, 0, 1], ["-k", "k", -1, 0], ["k", "-k", 0, -1]],
+            "C": [[1, 0, 0, 0], [0, 1, 0, 0]], "Bf": [[0], [0], [1], [0]],
+        },
+        {"k": {"nominal": 10.0, "tolerance": "5 %"}, "m": {"nominal": 1.0, "tolerance": "5 %"}},
+    )  # fmt: skip
+    return obsynth.discretise(plant, 0.05).plant

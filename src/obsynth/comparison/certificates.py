@@ -29,10 +29,7 @@ from obsynth.results.certificate_files import (
     verify_calibration,
 )
 from obsynth.results.checks import Check, information, nothing_wrong
-from obsynth.results.design import (
-    ObserverDesign,
-    VerificationReport,
-)
+from obsynth.results.design import ObserverDesign, VerificationReport
 from obsynth.results.gain_sets import loaded
 from obsynth.simulation.scenario import scenario_from
 from obsynth.tolerances.robustness import robustness, robustness_statement

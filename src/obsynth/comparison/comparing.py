@@ -799,27 +799,28 @@ def side_by_side(
     sampled = on_the_clock(plant, dt)
     happening = _scenario(plant, scenario, dt, disturbance)
     steps = int(min(happening.horizon / dt, MOST_SCENARIO_SAMPLES)) + 1
-    kept = held(sampled, steps)
-    if kept[0] < steps:
-        steps, happening = kept[0], happening.replace(horizon=kept[0] * dt)
+    followed, feedback = held(sampled, steps)
+    if followed < steps:
+        steps, happening = followed, happening.replace(horizon=followed * dt)
     found = []
     for method in methods:
         report_stage(f"designing by {method}")
         found.append(candidate(method, plant, sampled, steps, maker, (options or {}).get(method, {})))
     report_stage("running the scenario")
     faulty, healthy = drawn_runs(
-        plant, sampled, happening, runs=runs, tolerance=tolerance, seed=COMPARISON_SEED, feedback=kept[1]
+        plant, sampled, happening, runs=runs, tolerance=tolerance, seed=COMPARISON_SEED, feedback=feedback
     )
     log = None if data is None else _log(data, sampled, columns, scales, input_delay)
     limit = within if within is not None else settling_time(plant)
-    bounds = largest_disturbances(happening, sampled.disturbance_names, kept[0], dt)
+    bounds = largest_disturbances(happening, sampled.disturbance_names, followed, dt)
+    kept = followed, feedback
     compared = [_compared(entry, sampled, faulty, healthy, log, kept, limit, false_alarms, bounds) for entry in found]
     compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.rms))
     setting = (
         f"{runs} runs of {happening.horizon:g} s, sampled every {dt:g} s, disturbances and noise drawn"
         + (", constants within their tolerances" if plant.uncertainty is not None else "")
         + (f", parameters off by up to {tolerance:.0%}" if tolerance else "")
-        + (", a state feedback stabilises the plant" if kept[1].any() else "")
+        + (", a state feedback stabilises the plant" if feedback.any() else "")
         + f"; 90 % of a step to be reached within {limit:.3g} s"
     )
     shown = faulty if log is None else log

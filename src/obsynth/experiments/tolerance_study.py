@@ -21,10 +21,7 @@ from obsynth.numerics.arrays import FloatArray, freeze
 from obsynth.plants.constants import deviations_told, shown, tolerance_share
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.certificate_files import SHOWN_DIGITS, STUDY, result_text
-from obsynth.results.design import (
-    ObserverDesign,
-    require_verified,
-)
+from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.results.gain_sets import design_as_dict
 from obsynth.simulation.scenario import Scenario, Step
 from obsynth.tolerances.exact_plant import drawn_points, plant_at

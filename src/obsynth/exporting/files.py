@@ -42,10 +42,7 @@ from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.sensor_timing import require_plain
 from obsynth.observers.windows import WindowObserver
-from obsynth.results.design import (
-    ObserverDesign,
-    require_verified,
-)
+from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.results.gain_sets import gain_set_digest
 from obsynth.verification.adaptive_bound import AdaptiveBound
 

@@ -28,10 +28,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.results.design import (
-    ObserverDesign,
-    unverified_mark,
-)
+from obsynth.results.design import ObserverDesign, unverified_mark
 from obsynth.results.gain_sets import gain_set_digest
 
 #: What a file says about the steady state of a recursion.

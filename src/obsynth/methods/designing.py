@@ -24,12 +24,7 @@ from obsynth.numerics.libraries import failed_computations, failure_of, one_thre
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
-from obsynth.results.design import (
-    Certificate,
-    ObserverDesign,
-    VerificationReport,
-    source_of,
-)
+from obsynth.results.design import Certificate, ObserverDesign, VerificationReport, source_of
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.claims import before_the_mean
 from obsynth.verification.plant import condition_rows

@@ -14,12 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import (
-    arguments_checked,
-    real_number,
-    require_mapping,
-    whole_number,
-)
+from obsynth.numerics.arguments import arguments_checked, real_number, require_mapping, whole_number
 from obsynth.numerics.arrays import FloatArray, as_given, as_matrix, read_only
 from obsynth.numerics.expressions import NAMED_NUMBERS, Expression, parse_expression
 from obsynth.plants.descriptor import DescriptorSystem

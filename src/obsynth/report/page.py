@@ -65,10 +65,7 @@ from obsynth.report.designs import (
     tolerance_facts,
 )
 from obsynth.results.checks import FITS, Check, CheckKind, Status
-from obsynth.results.design import (
-    ObserverDesign,
-    VerificationReport,
-)
+from obsynth.results.design import ObserverDesign, VerificationReport
 from obsynth.results.gain_sets import gain_set_digest
 from obsynth.results.layout import headed_table, number, verdict, verdict_line, worth
 from obsynth.simulation.scenario import Scenario, Step

@@ -20,12 +20,7 @@ from obsynth.files.inputs import input_file, json_data, path_of, read_json
 from obsynth.numerics.arguments import arguments_checked, is_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.design import (
-    Certificate,
-    ObserverDesign,
-    PlantSource,
-    VerificationReport,
-)
+from obsynth.results.design import Certificate, ObserverDesign, PlantSource, VerificationReport
 from obsynth.results.gain_set_writing import (
     ARRAYS,
     DESIGN_KINDS,

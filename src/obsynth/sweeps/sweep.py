@@ -37,10 +37,7 @@ from obsynth.observers.progress import RunsProgress, as_they_come, progress_of_r
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
 from obsynth.plotting.panels import tidy
-from obsynth.results.design import (
-    ObserverDesign,
-    require_verified,
-)
+from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain, restored
 from obsynth.spec.documents import read_yaml
 from obsynth.spec.loader import changed_document, design_of_spec, spec_of
@@ -524,7 +521,6 @@ def sweep(
 
 
 def _cases(cases: Any, parameters: Mapping[str, Sequence[Any]], method: str | None) -> list[Work]:
-
     if not isinstance(parameters, Mapping):
         raise SpecError("parameters must be a mapping of names to lists of values.", path="parameters")
     if isinstance(cases, _PLANT_TYPES):

@@ -32,10 +32,7 @@ from obsynth.plants.uncertain_system import uncertain_system
 from obsynth.plants.uncertainty import Uncertainty, as_written
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.certificate_files import ROBUSTNESS, SHOWN_DIGITS, result_text
-from obsynth.results.design import (
-    ObserverDesign,
-    require_verified,
-)
+from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.results.gain_sets import design_as_dict
 from obsynth.tolerances.exact_plant import acting_like_faults, is_sampled, moving_at, vertex_gains
 from obsynth.tolerances.subdivision import MOST_BOXES, BoxVerdict, index_one_on_box, proved_stable, values_at

@@ -120,7 +120,6 @@ def everything_active(plant: DescriptorSystem) -> ActiveVariables:
 
 def active_part(plant: DescriptorSystem, found: ActiveVariables) -> DescriptorSystem:
     """Return the plant without idle variables."""
-
     if not found.dropped:
         return plant
     rows, columns = found.rows, found.columns

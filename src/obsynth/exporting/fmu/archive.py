@@ -37,10 +37,7 @@ from obsynth.files.outputs import write_atomically
 from obsynth.numerics.arguments import chosen
 from obsynth.observers.dae.c_code import FLAGS, compiler, shared_library
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.results.design import (
-    ObserverDesign,
-    unverified_mark,
-)
+from obsynth.results.design import ObserverDesign, unverified_mark
 
 
 @dataclass(frozen=True)

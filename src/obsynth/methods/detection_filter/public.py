@@ -8,10 +8,7 @@ from obsynth.methods.detection_filter.checks import TOGETHER
 from obsynth.methods.detection_filter.method import DetectionFilterMethod
 from obsynth.methods.functions import design_function
 from obsynth.methods.verifying import verify
-from obsynth.results.design import (
-    ObserverDesign,
-    VerificationReport,
-)
+from obsynth.results.design import ObserverDesign, VerificationReport
 
 
 @dataclass(frozen=True, repr=False)
@@ -55,7 +52,6 @@ class DetectionFilter(ObserverDesign):
 
     def verify(self) -> VerificationReport:
         """Prove both norms again, from the plant and the shipped filter alone."""
-
         return verify(self)
 
 

@@ -174,11 +174,11 @@ def compromise(problem: KalmanProblem, rate: float) -> tuple[FloatArray, float, 
     (1/s), and the largest deviation of an estimate over that of the Kalman gain without a rate."""
     start = np.eye(problem.F.shape[0])
     plain, change = problem.solved(0.0, start)
-    slowest = rate * 2.0**-MOST_RATE_HALVINGS
-    while plain is None and slowest <= rate:
+    slow = rate * 2.0**-MOST_RATE_HALVINGS
+    while plain is None and slow <= rate:
         # The quietest filter may be so slow that its equation is lost in rounding: that of some rate is not.
-        plain, change = problem.solved(slowest, start)
-        slowest *= 2.0
+        plain, change = problem.solved(slow, start)
+        slow *= 2.0
     if plain is None:
         return None
     # Each estimate by itself: they have units of their own.
