@@ -418,15 +418,19 @@ def test_means_have_students_interval() -> None:
     assert (found.low, found.high) == (pytest.approx(low), pytest.approx(high))
 
 
-def test_no_noise_within_its_bound_passes_the_threshold_where_powers_of_the_observer_lose_digits() -> None:
-    # The coordinates are such that entries of the observer's matrix, up to 1e5, cancel.
+def losing_digits() -> obsynth.ObserverDesign:
+    """Return a design in coordinates such that entries of the observer's matrix, up to 1e5, cancel."""
     turn = np.array([[1.0, 0.0, 0.0], [300.0, 1.0, 0.0], [-200.0, 400.0, 1.0]])
     A = turn @ np.array([[0.9, 0.2, 0.0], [-0.2, 0.9, 0.1], [0.0, 0.0, 0.8]]) @ np.linalg.inv(turn)
     plant = obsynth.DescriptorSystem(
         None, A, C=[[1.0, 0.0, 0.0]] @ np.linalg.inv(turn), Bf=turn @ [[0.0], [0.0], [1.0]], sensor_noise={"y1": 0.01},
         dt=0.1,
     )  # fmt: skip
-    design = obsynth.ui_pi_observer(plant, poles=[0.70, 0.75, 0.80, 0.85])
+    return obsynth.ui_pi_observer(plant, poles=[0.70, 0.75, 0.80, 0.85])
+
+
+def test_no_noise_within_its_bound_passes_the_threshold_where_powers_of_the_observer_lose_digits() -> None:
+    design = losing_digits()
     watched = obsynth.monitor(design, obsynth.Scenario(horizon=6.0, noise=1.0), "pointwise", noise_bound=3.0)
     observer = design.observer
     # The answer to an impulse in rational numbers: what floating point makes of it is the question.
@@ -442,3 +446,24 @@ def test_no_noise_within_its_bound_passes_the_threshold_where_powers_of_the_obse
     worst = np.array([float(total) for total in itertools.accumulate(answers)]) * 0.03
     assert np.all(worst <= watched.threshold)
     assert watched.threshold[-1] == pytest.approx(worst[-1], rel=1e-2)
+
+
+@pytest.mark.parametrize("window", [1, 5])
+def test_no_start_within_its_bound_passes_the_window_threshold_where_powers_of_the_observer_lose_digits(
+    window: int,
+) -> None:
+    design = losing_digits()
+    watched = obsynth.monitor(design, obsynth.Scenario(horizon=6.0), "window", window=window, initial_error=1.0)
+    observer = design.observer
+    exact = [[Fraction(entry) for entry in row] for row in observer.Az]
+    shown = [[Fraction(entry) for entry in observer.Cz[observer.fault_rows][0]]]
+    for _ in range(watched.horizon - 1):
+        shown.append([sum(c * row[j] for c, row in zip(shown[-1], exact, strict=True)) for j in range(len(exact))])
+    for k, bound in enumerate(watched.threshold):
+        rows = shown[max(k - window + 1, 0) : k + 1]
+        # Any start is a lower bound of the worst one: this one is the worst but for rounding.
+        start = [Fraction(entry) for entry in np.linalg.svd(np.array(rows, dtype=float))[2][0]]
+        energy = sum(sum(c * z for c, z in zip(row, start, strict=True)) ** 2 for row in rows)
+        worst = float(energy / sum(z * z for z in start)) ** 0.5
+        assert worst <= bound
+        assert bound == pytest.approx(worst, rel=1e-2)

@@ -19,6 +19,7 @@ from functools import cached_property
 from typing import Any, NamedTuple, cast
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from obsynth.analysis.transformations.sampling import discretise
@@ -382,15 +383,27 @@ def _columns(matrix: FloatArray) -> float:
     return float(np.sum(np.linalg.norm(matrix, axis=0)))
 
 
-def _energy_roots(model: ResidualModel, powers: list[FloatArray]) -> list[FloatArray]:
-    """Return R with ``R'R = sum (C A^k)' C A^k`` for sums of one sample and more: what an error shows in these."""
-    energy, roots = np.zeros_like(model.A), []
-    for power in powers:
-        shown = model.C @ power
-        energy = energy + shown.T @ shown
-        values, vectors = np.linalg.eigh((energy + energy.T) / 2.0)
-        roots.append(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
-    return roots
+def _stacked_norms(shown: list[FloatArray], window: int) -> FloatArray:
+    """Return the spectral norm of every ``window`` successive matrices ``(nr, n)``, one above the other."""
+    rows = np.array(shown)
+    squares = rows.transpose(0, 2, 1) @ rows
+    count = len(squares) - window + 1
+    # Added up anew for each window: late ones are far smaller than those before.
+    energy = np.sum([squares[j : j + count] for j in range(window)], axis=0)
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(energy)[:, -1], 0.0))) if rows.size else np.zeros(count)
+
+
+def _windowed_sums(values: FloatArray, window: int) -> FloatArray:
+    """Return the sum of every ``window`` successive values."""
+    return np.asarray(np.sum(sliding_window_view(values, window), axis=-1))
+
+
+def _stacked_columns(shown: list[FloatArray], left: FloatArray, window: int) -> FloatArray:
+    """Return the sum of the norms of the columns of every ``window`` successive matrices, one above the other; what
+    rounding hides of each, ``left``, is added."""
+    columns = np.array([np.linalg.norm(part, axis=0) for part in shown])
+    seen = np.linalg.norm(sliding_window_view(columns, window, axis=0), axis=-1)
+    return np.asarray(np.sum(seen, axis=-1) + _windowed_sums(left, window))
 
 
 def _window_gain(model: ResidualModel, inputs: ScaledInputs) -> tuple[float, int]:
@@ -408,15 +421,18 @@ def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: 
     if model.continuous is not None or model.sampled is not None:
         return summed
     powers, (gain, count) = model.powers(), _window_gain(model, inputs)
-    roots = _energy_roots(model, powers[:window])
-    full = roots[-1]
-    gathered = np.cumsum([0.0, *(_columns(full @ power @ inputs.B) for power in powers)])
-    bound = np.empty(model.steps)
-    for k in range(model.steps):
-        length, begin = min(window, k + 1), max(k - window + 1, 0)
-        # Before the window is full it begins with the record.
-        left = roots[k] if k + 1 <= window else full @ powers[begin]
-        bound[k] = gain * np.sqrt(length * count) + largest_singular_value(left) * initial_error + gathered[begin]
+    shown = [model.C @ power for power in powers]
+    # Before the window is full it begins with the record.
+    before, length = [np.zeros_like(model.C)] * (window - 1), np.minimum(np.arange(model.steps) + 1, window)
+    hidden = _left_of_powers(model, powers, initial_error * np.eye(len(model.A)))
+    start = _stacked_norms(before + shown, window) * initial_error
+    start += _windowed_sums(np.concatenate([np.zeros(window - 1), hidden]), window)
+    earlier = np.zeros(model.steps)
+    if window < model.steps:
+        left = _left_of_powers(model, powers, inputs.B)
+        gathered = np.cumsum(_stacked_columns([part @ inputs.B for part in shown], left, window))
+        earlier[window:] = gathered[: model.steps - window]
+    bound = (gain * np.sqrt(length * count) + start + earlier) * OUTWARD
     return np.asarray(np.minimum(bound, summed))
 
 
@@ -479,13 +495,17 @@ def _window_limit(
 ) -> float:
     """Return the l2 bound of a window that begins after the table, see `window_threshold`."""
     (initial_error, left, last), (gain, count) = start_of, _window_gain(model, inputs)
-    powers = model.powers()
-    full = _energy_roots(model, powers[:window])[-1]
-    sizes = [largest_singular_value(full @ power) for power in powers]
-    gathered = sum(_columns(full @ power @ inputs.B) for power in powers)
-    aged = _columns(last @ inputs.B) * sum(sizes) / (1.0 - left)
-    start = max(max(sizes) * left, max(sizes[-window:])) * initial_error
-    return gain * float(np.sqrt(window * count)) + gathered + aged + start
+    # A window that begins with the table's last sample ends after it.
+    longer = replace(model, steps=model.steps + window - 1)
+    powers = longer.powers()
+    shown = [model.C @ power for power in powers]
+    hidden = _windowed_sums(_left_of_powers(longer, powers, np.eye(len(model.A))), window)
+    sizes = _stacked_norms(shown, window) + hidden
+    left_of_inputs = _left_of_powers(longer, powers, inputs.B)
+    gathered = float(np.sum(_stacked_columns([part @ inputs.B for part in shown], left_of_inputs, window)))
+    aged = _columns(last @ inputs.B) * float(np.sum(sizes)) / (1.0 - left)
+    start = float(max(np.max(sizes) * left, np.max(sizes[-window:]))) * initial_error
+    return (gain * float(np.sqrt(window * count)) + gathered + aged + start) * OUTWARD
 
 
 def unlimited_paper(
