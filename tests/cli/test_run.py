@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import pandas as pd
 import pytest
 
 from obsynth.cli.main import main
+from obsynth.files.outputs import replacement_of
 
 ROOT = Path(__file__).parents[2]
 HEADER = "time,u1,u2,x2,x3,x4"
@@ -96,6 +98,27 @@ def test_a_run_goes_on_from_a_saved_state(gains):
         assert run(gains, "--quiet", "--state", "state.json") == 0
         found += Path("estimates.csv").read_text().splitlines()[1:]
     assert found == whole[1:]
+
+
+def test_a_restart_removes_what_a_killed_run_has_left_and_nothing_that_is_being_written(gains):
+    log(*ROWS)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+    command = [sys.executable, "-m", "obsynth", "run", "--gains", str(gains), "--data", "-", "--out", "estimates.csv"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, env=environment) as process:
+        until = time.monotonic() + 60.0
+        while not list(Path().glob(".obsynth-*.part")) and time.monotonic() < until:
+            time.sleep(0.01)
+        process.kill()
+    left = list(Path().glob(".obsynth-*.part"))
+    assert len(left) == 1
+    same, another = replacement_of(Path("estimates.csv")), replacement_of(Path("other.csv"))
+    with same as (handle, living), another as (other, theirs):
+        # As for Parquet: the file is opened by its name.
+        os.close(handle)
+        os.close(other)
+        assert run(gains, "--quiet", "--state", "state.json") == 0
+        names = {"estimates.csv", "log.csv", "state.json", Path(living).name, Path(theirs).name}
+        assert {path.name for path in Path().iterdir()} == names
 
 
 def test_names_units_and_time_may_differ(gains):

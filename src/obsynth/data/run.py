@@ -22,7 +22,15 @@ from obsynth.data.signals import TIME_HEADER, Stamps
 from obsynth.data.sources import CHUNK_ROWS, Data, check_suffix, chunks
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.monitor import Monitor
-from obsynth.files.outputs import FileKind, HeldSignals, check_output, ending_signals, replacement_of, require_distinct
+from obsynth.files.outputs import (
+    FileKind,
+    HeldSignals,
+    check_output,
+    ending_signals,
+    remove_left_parts,
+    replacement_of,
+    require_distinct,
+)
 from obsynth.files.tables import table_writer
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
@@ -381,6 +389,9 @@ def run_on_data(
         # What cannot be read leaves no header behind; of a stream the header comes before the first row.
         rows = chain(list(islice(rows, 1)), rows)
     gathered = FrameSink(run.header, stamps, room)
+    for file in (out, state):
+        if isinstance(file, str | Path):
+            remove_left_parts(Path(file))
     with nullcontext(gathered) if out is None else sink_for(out, run.header, stamps) as sink:
         _run_rows(run, rows, sink, kept, save, progress or bool, state_every)
         if state is None and not hasattr(data, "readline"):

@@ -15,6 +15,8 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from hashlib import sha256
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -86,6 +88,8 @@ def _handlers(wanted: dict[Any, Any]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
+#: Ending of a file that is not whole yet.
+PART = ".part"
 #: Bytes of the beginning and of the end of a file that are looked at to tell its kind.
 LOOKED_AT = 1 << 16
 
@@ -226,15 +230,51 @@ def write_together(contents: Mapping[Path, str | bytes]) -> tuple[Path, ...]:
 def _temporary_beside(target: Path) -> Iterator[tuple[int, str]]:
     """Give an open temporary file in the folder of ``target``; what is left of it at the end is removed."""
     check_output(target)
-    with ending_signals():
-        temporary = None
-        try:
-            with _written(target):
-                handle, temporary = tempfile.mkstemp(dir=_followed(target).parent, prefix=".obsynth-", suffix=".part")
-            yield handle, temporary
-        finally:
-            if temporary is not None and os.path.exists(temporary):
-                os.unlink(temporary)
+    with ending_signals(), ExitStack() as stack:
+        with _written(target):
+            handle, temporary = _locked_part(_followed(target), stack)
+        yield handle, temporary
+
+
+def _locked_part(place: Path, stack: ExitStack) -> tuple[int, str]:
+    """Return a new file for what becomes ``place``, locked until the end: the system unlocks it when we are killed."""
+    while True:
+        handle, temporary = tempfile.mkstemp(dir=place.parent, prefix=_part_prefix(place), suffix=PART)
+        stack.callback(Path(temporary).unlink, missing_ok=True)
+        locks = _locks()
+        if locks is None:
+            return handle, temporary
+        # Who writes may close the file and open it again by its name.
+        kept = os.dup(handle)
+        stack.callback(os.close, kept)
+        with suppress(OSError):  # not every file system has locks
+            locks.flock(kept, locks.LOCK_EX)
+        if os.path.exists(temporary):
+            return handle, temporary
+        os.close(handle)  # another process took it for a file that was left
+
+
+def remove_left_parts(target: Path) -> None:
+    """Remove what processes that were killed have left of ``target``; what a living one writes is locked and stays."""
+    place, locks = _followed(target), _locks()
+    if locks is None:
+        return
+    for part in place.parent.glob(f"{_part_prefix(place)}*{PART}"):
+        with suppress(OSError), part.open("rb") as stream:
+            locks.flock(stream, locks.LOCK_EX | locks.LOCK_NB)
+            part.unlink()
+
+
+def _part_prefix(place: Path) -> str:
+    return f".obsynth-{sha256(os.fsencode(place.name)).hexdigest()[:12]}-"
+
+
+def _locks() -> Any:
+    """Return the module of file locks; ``None`` on Windows, where a file that is open cannot be removed anyway."""
+    try:
+        return import_module("fcntl")
+    except ImportError:
+        return None
 
 
 def _settle(temporary: str, target: Path) -> None:
