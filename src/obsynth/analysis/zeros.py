@@ -22,8 +22,9 @@ from obsynth.numerics.pencils import (
     PencilPoints,
     PencilStructure,
     finite_zeros,
+    is_regular,
+    normal_rank_of,
     reduced,
-    regularity_of_reduced,
     smallest_singular,
     structure_of_reduced,
 )
@@ -54,7 +55,8 @@ def in_own_units(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
 
 def regularity_of(plant: DescriptorSystem) -> tuple[bool, int]:
     """Return whether a plant's pencil ``A - z E`` is regular, and its normal rank, without eigenvalues."""
-    return regularity_of_reduced(plant.E.shape, _reduced(plant))
+    right, left = _reduced(plant)
+    return is_regular(plant.E.shape, right), normal_rank_of(right, left)
 
 
 @remembered

@@ -16,7 +16,6 @@ from obsynth.methods.recursive.conditions import recursive_conditions
 from obsynth.methods.recursive.steady_filter import steady_state_filter
 from obsynth.methods.ui_pi_observer.augmented_plant import direct_part, shipped_model
 from obsynth.methods.ui_pi_observer.conditions import existence_conditions
-from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.matrix_equations import discrete_lyapunov
 from obsynth.results.design import ObserverDesign
 
@@ -99,12 +98,6 @@ def _kalman(design: ObserverDesign) -> Conditions:
     data = found.data
     S = np.hstack([steady.L - data["L0"], steady.K - data["K0"]]) @ np.hstack([data["N1"], data["N2"]]).T
     X = data["X"]
-    P = X.T @ _gramian(steady.L @ data["A"]) @ X
+    P = X.T @ discrete_lyapunov((steady.L @ data["A"]).T, np.eye(len(X))) @ X
     driven = np.linalg.solve(X, np.hstack([steady.L @ data["W"], -steady.K @ data["V"]]))
     return _put(found, P=P, Y=P @ np.linalg.solve(X, S), Z=driven.T @ P @ driven)
-
-
-def _gramian(loop: FloatArray) -> FloatArray:
-    """Return P with ``P = loop' P loop + I``."""
-
-    return discrete_lyapunov(loop.T, np.eye(len(loop)))

@@ -284,7 +284,7 @@ def reduced(E: FloatArray, A: FloatArray) -> tuple[Deflation, Deflation]:
 def structure_of_reduced(shape: tuple[int, ...], passes: tuple[Deflation, Deflation]) -> PencilStructure:
     """Return the structure of a pencil ``(m, n)`` from its two passes."""
     right, left = passes
-    regular = _is_regular(shape, right)
+    regular = is_regular(shape, right)
     next_nullities = (*right.nullities[1:], 0)
     counts = [rank - following for rank, following in zip(right.ranks, next_nullities, strict=False)]
     sizes = tuple(size for size in range(len(counts), 0, -1) for _ in range(counts[size - 1]))
@@ -420,12 +420,8 @@ def _candidates(parts: _SquarePart) -> tuple[ComplexArray, NDArray[np.bool_]]:
     return values, np.zeros(len(values), dtype=bool)
 
 
-def regularity_of_reduced(shape: tuple[int, ...], passes: tuple[Deflation, Deflation]) -> tuple[bool, int]:
-    """Return whether a pencil ``(m, n)`` is regular, and its normal rank, from its two passes; without eigenvalues."""
-    return _is_regular(shape, passes[0]), normal_rank_of(*passes)
-
-
-def _is_regular(shape: tuple[int, ...], right: Deflation) -> bool:
+def is_regular(shape: tuple[int, ...], right: Deflation) -> bool:
+    """Whether a pencil ``(m, n)`` is regular, from the pass over its columns."""
     # Without right singular blocks a square pencil has no left ones either.
     return shape[0] == shape[1] and right.nullities == right.ranks
 

@@ -48,10 +48,6 @@ class MethodSection(Section):
     options: dict[str, Any] = Field(default_factory=dict)
 
 
-def _kind_of_profiles(value: Any) -> str:
-    return LIST_TAG if isinstance(value, list) else ONE_TAG
-
-
 _PROFILE_KEYS = [item.name for profile in PROFILE_KINDS.values() for item in fields(profile)]
 #: How a signal goes with time; which keys belong to which kind is checked when it is built.
 ProfileSection: Any = create_model(  # type: ignore[call-overload]
@@ -65,7 +61,7 @@ ProfileSection: Any = create_model(  # type: ignore[call-overload]
 Profiles = Annotated[
     Annotated[ProfileSection, Tag(ONE_TAG)]
     | Annotated[Annotated[list[ProfileSection], Field(min_length=1)], Tag(LIST_TAG)],
-    Discriminator(_kind_of_profiles),
+    Discriminator(lambda value: LIST_TAG if isinstance(value, list) else ONE_TAG),
 ]
 
 

@@ -318,14 +318,13 @@ class ColouredNoise(Section):
     white: Positive | Literal["unknown"] | None = None
 
 
-def _kind_of_noise(value: Any) -> str:
-    return _COLOURED if isinstance(value, dict) else ONE_TAG
-
-
 SensorNoises = dict[
-    Text, Annotated[Annotated[Positive, Tag(ONE_TAG)] | Annotated[ColouredNoise, Tag(_COLOURED)],
-                    Discriminator(_kind_of_noise)]
-]  # fmt: skip
+    Text,
+    Annotated[
+        Annotated[Positive, Tag(ONE_TAG)] | Annotated[ColouredNoise, Tag(_COLOURED)],
+        Discriminator(lambda value: _COLOURED if isinstance(value, dict) else ONE_TAG),
+    ],
+]
 #: Offsets and walks: a number, or what a calibration is to find.
 Sizes = dict[Text, Literal["unknown"] | Positive]
 

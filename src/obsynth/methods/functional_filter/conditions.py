@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.diagnosis.decoupled import fault_numbers
 from obsynth.analysis.diagnosis.diagnosing import model_points
 from obsynth.analysis.diagnosis.explanations import hidden_motion
 from obsynth.analysis.diagnosis.fault_columns import Question, dc_point, question
@@ -161,14 +162,12 @@ def _hidden(plant: DescriptorSystem, asked: Question, point: complex) -> str:
 
 def chosen_faults(faults: Any, plant: DescriptorSystem) -> list[int]:
     """Return the columns of the faults to estimate."""
-    names = plant.fault_names if faults is None else faults
-    listed = [names] if isinstance(names, str) else list(names)
-    unknown = [name for name in listed if name not in plant.fault_names]
-    if unknown or len(set(listed)) < len(listed):
-        what = f"{', '.join(map(repr, unknown))}: no such fault" if unknown else "a fault is named twice"
-        there = ", ".join(plant.fault_names) or "none"
-        raise SpecError(f"{what}; there are: {there}.", path=f"{OPTIONS_PATH}.faults")
-    return sorted(plant.fault_names.index(name) for name in listed)
+    listed = [faults] if isinstance(faults, str) else list(plant.fault_names if faults is None else faults)
+    found = fault_numbers(plant, listed, f"{OPTIONS_PATH}.faults")
+    if len(found) < len(listed):
+        there = ", ".join(plant.fault_names)
+        raise SpecError(f"a fault is named twice; there are: {there}.", path=f"{OPTIONS_PATH}.faults")
+    return sorted(found)
 
 
 def residual_sets(residuals: Any, plant: DescriptorSystem) -> list[list[int]] | None:

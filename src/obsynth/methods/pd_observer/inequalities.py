@@ -20,6 +20,7 @@ import numpy as np
 from obsynth.errors import SolverError
 from obsynth.methods.conic import lmi
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.doubling import symmetric
 
 #: How far inside the cone the inequalities must hold, with ``P3 + P3' >= 2 I`` as the scale.
 PD_MARGIN = 1e-3
@@ -85,11 +86,6 @@ def solve(task: PdTask, *, solver: str) -> PdSolution:
     return PdSolution(
         gain_j + task.decay * gain_l, gain_l, p1, symmetric(p3_value) if task.theorem == 2 else p3_value, record
     )
-
-
-def symmetric(matrix: FloatArray) -> FloatArray:
-    """Return the symmetric part of a matrix."""
-    return 0.5 * (matrix + matrix.T)
 
 
 def _stability(task: PdTask, found: _Variables, a: FloatArray, c: FloatArray, p: Any) -> Any:

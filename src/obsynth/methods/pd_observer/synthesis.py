@@ -37,14 +37,14 @@ from obsynth.methods.pd_observer.checks.certificate import (
     prove_symmetric_positive,
 )
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
-from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve, symmetric
+from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve
 from obsynth.methods.pd_observer.limits import default_delta, fastest_mode, require_possible
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states, with_sensor_noise
 from obsynth.methods.riccati import continuous_solution
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.continuous import spectral_abscissa
-from obsynth.numerics.doubling import EQUATION_TOLERANCE, continuous_riccati_solution
+from obsynth.numerics.doubling import EQUATION_TOLERANCE, continuous_riccati_solution, symmetric
 from obsynth.numerics.ranks import NEGLIGIBLE_SHARE
 from obsynth.numerics.scaling import balancing_factors
 from obsynth.observers.linear.observer import LinearObserver
@@ -499,7 +499,7 @@ def closed_form(task: PdTask, *, free_delta: bool, once: bool = False) -> tuple[
         except SolverError:
             continue
         p1, p3 = (inverse.T @ part @ inverse for part in (own.P1[0], own.P3))
-        return replace(own, J=states @ own.J, L=states @ own.L, P1=(0.5 * (p1 + p1.T),), P3=p3), delta
+        return replace(own, J=states @ own.J, L=states @ own.L, P1=(symmetric(p1),), P3=p3), delta
     raise failure
 
 
@@ -510,7 +510,7 @@ def _normalising(a: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray] 
         p = continuous_solution(a, c, np.eye(len(a)), np.eye(len(c)))
     if p is None:
         return None
-    sizes, directions = np.linalg.eigh(0.5 * (p + p.T))
+    sizes, directions = np.linalg.eigh(symmetric(p))
     roots = np.sqrt(np.maximum(sizes, NEGLIGIBLE_SHARE * sizes[-1]))
     return directions * roots, (directions / roots).T
 
@@ -537,7 +537,7 @@ def _closed_form(task: PdTask, *, free_delta: bool) -> tuple[PdSolution, float]:
             "The closed form serves Theorem 2 for smaller delta alone: take engine 'lmi', or leave delta out.",
             record={**record, "delta_limit": limit},
         )
-    return PdSolution(gain, np.zeros_like(gain), (0.5 * (p1 + p1.T),), p3, record), delta
+    return PdSolution(gain, np.zeros_like(gain), (symmetric(p1),), p3, record), delta
 
 
 _WHAT = "a PD observer with L = 0"

@@ -66,7 +66,7 @@ def synthesise(
     if options.get("guard", "") is None:
         options["guard"] = "none" if options["form"] == "literal" else "regularise"
     progress("computing the gains")
-    missing = _missing_noise(options)
+    missing = [name for name in ("Q", "R") if options[name] is None]
     far = isinstance(plant, DescriptorSystem) and PlantUnits.of(plant).spread > FAR_UNITS
     if isinstance(plant, DescriptorSystem) and far:
         options |= _identities(PlantUnits.of(plant).rounded(), options)
@@ -122,11 +122,6 @@ def _of_varying(
         notes=tuple(_notes(observer, ranks, facts, missing, own_units=own_units)),
         plant=plant,
     )
-
-
-def _missing_noise(options: Mapping[str, Any]) -> list[str]:
-    """Return which covariances of noise were not stated."""
-    return [name for name in ("Q", "R") if options[name] is None]
 
 
 def _contracts(facts: GainScheduleSummary) -> bool:
