@@ -185,6 +185,18 @@ class TestWidths:
         assert heading == ["check", *(["claim"] if width >= 110 else []), "value", "bound", "margin", "verdict", "kind"]
         assert sum(" holds " in line for line in lines) >= 10
 
+    @pytest.mark.parametrize("width", [70, 78, 80, 90])
+    def test_no_column_of_a_narrow_table_is_cut(
+        self, width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        monkeypatch.setenv("COLUMNS", str(width))
+        thermal = ROOT / "docs" / "examples" / "thermal" / "spec.yaml"
+        (report,) = obsynth.diagnose(obsynth.load_spec(thermal).plant).verdict_rows()[1:]
+        assert main(["check", "--system", str(thermal)]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert next(line for line in lines if line.startswith("fault ")).split()[-2:] == ["residual", "filter"]
+        assert next(line for line in lines if line.startswith("heater ")).split()[-3:] == list(report[-3:])
+
     def test_a_failure_is_a_word(self, wang_gains: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["verify", str(damaged(wang_gains, tmp_path / "bad.json"))]) == 6
         printed = capsys.readouterr().out

@@ -195,8 +195,8 @@ def delay(text: str) -> int | str:
 INPUT_DELAY = option(
     "--input-delay",
     "ROWS",
-    "rows of the log by which inputs act later than in the design (default: that of inputs.hold in the spec; "
-    "calibrate: or 'auto')",
+    "by how many rows of the log inputs act later than in the design (default: from inputs.hold in the spec; "
+    "calibrate also takes 'auto')",
     type=delay,
 )
 SYSTEM = option("--system", "FILE", "the spec (YAML)", type=Path, required=True)
@@ -205,20 +205,18 @@ SPEC_GAINS = option("--gains", "FILE", "a gain set for the spec's plant: nothing
 UNVERIFIED = Settings(
     (flag("--unverified", "use a gain set that fails its verification; every file that is written says so"),)
 )
-JSON = flag("--json", "print JSON on stdout, for programs; errors as well")
-FORCE = flag("--force", "replace an existing file whatever it is; never an input")
+JSON = flag("--json", "print results and errors as JSON on stdout, for programs")
+FORCE = flag("--force", "replace an existing file of any kind (inputs are never replaced)")
 QUIET = flag("--quiet", "print no progress")
 JOBS = option("--jobs", "N", "processes (default: 1)", type=count)
-CLUSTER = option("--cluster", "ADDRESS", "of scheduler of a Dask cluster, instead of --jobs")
+CLUSTER = option("--cluster", "ADDRESS", "address of the scheduler of a Dask cluster, in place of --jobs")
 MAP = option("--map", "SIGNAL=COLUMN", "column of a signal (or of the time) where the names differ; may be repeated")
-_SCALE = option(
-    "--scale", "SIGNAL=FACTOR", "the column's value times the factor is in the signal's unit; may be repeated"
-)
+_SCALE = option("--scale", "SIGNAL=FACTOR", "factor from the unit of the column to that of the signal; may be repeated")
 SCALE = Settings((_SCALE,))
 TIME_COLUMN = option(
     "--time-column",
     "COLUMN",
-    "column of the time, in seconds or as dates (ISO 8601, or 05.03.2026 08:30); default: time",
+    "column with the time, in seconds or as dates (ISO 8601, or 05.03.2026 08:30) (default: time)",
 )
 #: How a log without faults is read.
 LOG_OPTIONS = (
@@ -236,7 +234,7 @@ LOG_OPTIONS = (
     ),
 )
 #: What a monitor is made of.
-MONITOR = Group("monitor", (option("--monitor", "KIND", "watch the residual (or the parameters) by a threshold"),))
+MONITOR = Group("monitor", (option("--monitor", "KIND", "compare the residual (or the parameters) with a threshold"),))
 #: What its threshold is made of, where the scenario does not say it.
 MONITOR_SETTINGS = Settings(
     (
@@ -255,11 +253,11 @@ MONITOR_SETTINGS = Settings(
             type=probability,
             default=FALSE_ALARMS,
         ),
-        option("--window", "N", "samples looked back (default: %(default)s)", type=count, default=WINDOW),
+        option("--window", "N", "length of the window in samples (default: %(default)s)", type=count, default=WINDOW),
         option(
             "--change",
             "X",
-            "cusum: change to be found, in deviations of the residual, or in parameter units (default: 1)",
+            "cusum: change to detect, in standard deviations of the residual, or in parameter units (default: 1)",
             type=positive,
             default=CHANGE,
         ),
@@ -277,7 +275,7 @@ DATA_OPTIONS = (
             option(
                 "--normal",
                 "FILE",
-                "monitor 'learned': what the verb thresholds wrote (.json), or a log without faults",
+                "monitor 'learned': what obsynth thresholds wrote (.json), or a log without faults",
             ),
             _SCALE,
             option(
@@ -290,9 +288,9 @@ DATA_OPTIONS = (
                 "NAME=VALUE",
                 "monitor of a recursive design: nominal value of a parameter; may be repeated",
             ),
-            option("--sample-time", "SECONDS", "monitor of a continuous design: between the rows", type=float),
-            option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),
-            option("--warm-up", "SECONDS", "seconds that count as warm-up, at the start and after gaps", type=float),
+            option("--sample-time", "SECONDS", "monitor of a continuous design: time between the rows", type=float),
+            option("--gap", "SECONDS", "continuous designs: a longer interval between two rows is a gap", type=float),
+            option("--warm-up", "SECONDS", "length of the warm-up at the start and after gaps", type=float),
         )
     ),
 )

@@ -76,7 +76,7 @@ exit codes:
 _SWEEP_DETAILS = """\
 A value list is a YAML list: --set gamma='[0.1, 0.2]' --set plant.transform.sample_time='[0.01, 0.02]'
 --set plant.C.outputs='[[omega 1], [omega 1, omega 2]]'.  A name that begins with no section of a spec is an option of
-its method.  The folder keeps every gain set and result: the same command continues where an interrupted one ended.
+its method.  The folder keeps every gain set and result: the same command continues a sweep that was interrupted.
 """
 _RUN_DETAILS = """\
 The data have a column 'time', in seconds or as dates and times (ISO 8601), and one for each known input and output,
@@ -87,15 +87,15 @@ Each row of estimates has a status:
   warm-up     the initial-condition response has not settled yet
   gap         a sample is missing: fault estimates are held, the plant model stands in, no alarms
   partial     recursive and nonlinear designs: some outputs are missing, the others are used
-  recovering  after a gap; a level decides where it is passed by more than the gap can have caused
+  recovering  after a gap: an alarm needs a value that passes its threshold by more than the gap can have caused
   repeated stamp, out of order
-              a stamp that does not rise: the row is left out (more than 10 in a row are an error)
-Of sampled designs, stamps may be off their sample by a fifth of the sampling time and more (.45 at once, .25 on
-average); of longer intervals, each whole number of samples is so many rows less one that are missing.
-An estimate that lags has a column 'time of ...', the time of which it is the estimate.
+              the time stamp is not later than the last one: the row is left out (more than 10 in a row are an error)
+Designs with a sampling time allow a time stamp to be off by 0.45 of it, and by 0.25 on average. A longer interval means
+missing rows: an interval of three sampling times, for example, means that two rows are missing.
+An estimate with a delay has a column 'time of ...' with the time that it is the estimate for.
 
---monitor KIND adds columns 'statistic', 'threshold' and 'alarm', with the fault that it points to. The thresholds hold
-however long the data are. KIND is one of
+--monitor KIND adds columns 'statistic', 'threshold' and 'alarm', with the fault that the alarm points to. The
+thresholds hold however long the data are. KIND is one of
   pointwise   linear designs: the residual's peak bound, for disturbances and noise within bounds; where the plant's
               constants have tolerances, it adapts to the signals and holds for every plant within them, with columns
               for each threshold, the guaranteed interval of each fault, and the share of each constant
@@ -105,11 +105,11 @@ however long the data are. KIND is one of
   cusum       small changes of the residual, or of a parameter
   nis         recursive and nonlinear designs: innovations too large for the model
   learned     every design: thresholds from rows without faults (--normal), whatever noise the model assumes
-Where --gains is a folder, every gain set in it is run on --data, a log or a folder of logs, on --jobs processes or a
-cluster; a log with the name of a gain set is for that one alone.  --out is a folder then, with the estimates, table.csv
-and fleet.png; the same command goes on where another was stopped.
+If --gains is a folder, every gain set in it is run on --data, which is a log or a folder of logs, on --jobs processes
+or on a cluster; a log with the name of a gain set is for that gain set alone. --out is then a folder for the estimates,
+table.csv and fleet.png; the same command continues a run that was interrupted.
 
-What disturbances and noise are to be expected comes from the scenario of --system, or from the options.
+The scenario of --system, or the options, state which disturbances and noise to expect.
 """
 _LOG = "text (.csv, .tsv), Parquet, TDMS or MDF file; - for text on standard input"
 _EXPECTED_SCENARIO = option(
@@ -166,8 +166,8 @@ VERBS = {
                         type=float,
                     ),
                     option("--noise", "DEVIATION", "noise of each candidate; threshold needs it", type=float),
-                    option("--largest", "N", "sensors to add at most", type=int),
-                    option("--sample-time", "SECONDS", "of a continuous plant, for threshold", type=float),
+                    option("--largest", "N", "largest number of sensors to add", type=int),
+                    option("--sample-time", "SECONDS", "for threshold: sample time for a continuous plant", type=float),
                 )
             ),
             JSON,
@@ -189,7 +189,7 @@ VERBS = {
                         type=Path,
                         nargs="?",
                     ),
-                    option("--gains", "FILE", "the same, as other commands take it", type=Path),
+                    option("--gains", "FILE", "the same file, named as in the other commands", type=Path),
                 ),
                 required=True,
             ),
@@ -205,13 +205,13 @@ VERBS = {
                     option(
                         "--system",
                         "FILE",
-                        "with --data: the spec of a calibration, which is then done again",
+                        "with --data: the spec of a calibration, which is then repeated",
                         type=Path,
                     ),
                     option(
                         "--printed-digits",
                         "N",
-                        "take the gains as rounded to N decimals, as in a printed table",
+                        "treat the gains as rounded to N decimals, as in a printed table",
                         type=digits,
                     ),
                 )
@@ -281,7 +281,13 @@ VERBS = {
                         "instead, compare a fixed bound with the adaptive threshold for these tolerances, such as "
                         "0,1%%,2%%,5%%",
                     ),
-                    option("--confidence", "P", "of the intervals (default: 0.95)", type=float, default=0.95),
+                    option(
+                        "--confidence",
+                        "P",
+                        "confidence level of the intervals (default: 0.95)",
+                        type=float,
+                        default=0.95,
+                    ),
                     option("--plants", "N", "draw N plants from the tolerances, half of them vertices", type=int),
                     JOBS,
                 )
@@ -305,8 +311,8 @@ VERBS = {
         (
             option("--system", "FILE", "a spec (YAML), or several", type=Path, required=True, nargs="+"),
             option("--set", "PATH=LIST", "an entry of the specs and its values", action="append", default=[]),
-            option("--out", "FOLDER", "for gain sets, results, table.csv", type=Path, required=True),
-            option("--claim", "NAME", "what the picture shows (default: the most frequent claim)"),
+            option("--out", "FOLDER", "folder for gain sets, results and table.csv", type=Path, required=True),
+            option("--claim", "NAME", "the claim that the picture shows (default: the most frequent one)"),
             JOBS,
             CLUSTER,
             JSON,
@@ -344,33 +350,32 @@ VERBS = {
                     option(
                         "--outliers",
                         None,
-                        "recursive and nonlinear designs: leave out samples that are outliers (default), limit them, "
-                        "or use them as they are",
+                        "recursive and nonlinear designs: leave out outliers (default), limit them, or use them",
                         choices=("gate", "huber", "none"),
                     ),
                     option(
                         "--recovered",
                         "NAME",
-                        "a state of the plant as written to recover (or all, or none; default: all "
-                        "of up to 300); may be repeated",
+                        "recover this state of the plant as written ('all' or 'none' of them; default: all, if there "
+                        "are at most 300); may be repeated",
                         action="append",
                     ),
                     option(
                         "--lag",
                         "N",
-                        "smoothed estimates, from the N samples after each row as well: rows are delayed by N samples",
+                        "smooth each estimate with the N samples after it; rows are then delayed by N samples",
                         type=int,
                     ),
                     option(
                         "--state-every",
                         "N",
-                        "rows of a stream after which --state is saved again (default: 100)",
+                        "of a stream: save --state again after every N rows (default: 100)",
                         type=int,
                         default=100,
                     ),
                 )
             ),
-            flag("--smooth", "recursive and nonlinear designs: smoothed estimates, from the whole log"),
+            flag("--smooth", "recursive and nonlinear designs: smooth the estimates over the whole log"),
             option("--state", "FILE", "continue from this saved state if it exists, and save the new one", type=Path),
             JSON,
             FORCE,
@@ -412,9 +417,8 @@ VERBS = {
     ),
     "export": Verb(
         "data_commands:run_export",
-        "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h), "
-        "or as a functional mock-up unit for co-simulation (.fmu); of a recursive design for a "
-        "time-invariant plant, its steady state.",
+        "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h), or as a functional mock-up unit for "
+        "co-simulation (.fmu). A recursive design for a time-invariant plant is written as its steady state.",
         (
             GAINS,
             UNVERIFIED,
@@ -431,13 +435,13 @@ VERBS = {
                     option(
                         "--precision",
                         None,
-                        "of the numbers in .c (default: double); the header states the error of floats",
+                        "type of the numbers in .c (default: double); the header states the error of floats",
                         choices=("double", "float"),
                     ),
                     option(
                         "--normal",
                         "FILE",
-                        "for .c and .fmu: the monitor that the verb thresholds wrote (.json)",
+                        "for .c and .fmu: the monitor that obsynth thresholds wrote (.json)",
                         type=Path,
                     ),
                     option(
@@ -460,14 +464,14 @@ VERBS = {
             GAINS,
             UNVERIFIED,
             option("--data", "FILE", _LOG, required=True),
-            option("--out", "FILE", "picture (.png, .svg or .pdf); without it, a window", type=Path),
+            option("--out", "FILE", "picture (.png, .svg or .pdf); without it, a window opens", type=Path),
             *DATA_OPTIONS,
             Settings(
                 (
                     option(
                         "--show",
                         "PARTS",
-                        "what is drawn, of outputs,faults,residuals,statistic,shares (default: all there is)",
+                        "what to draw, from outputs,faults,residuals,statistic,shares (default: all of them)",
                         default="outputs,faults,residuals,statistic,shares",
                     ),
                 )
@@ -487,8 +491,8 @@ VERBS = {
             option(
                 "--out",
                 "FILE",
-                "the page (HTML), or a certificate (.json) for obsynth verify of what holds for every plant within "
-                "its tolerances",
+                "the page (HTML), or a certificate (.json) of what holds for every plant within its tolerances, which "
+                "obsynth verify checks again",
                 type=Path,
                 required=True,
             ),
@@ -510,7 +514,7 @@ VERBS = {
             SYSTEM,
             Settings(
                 (
-                    option("--at", None, "where (default: equilibrium)", choices=("equilibrium", "point")),
+                    option("--at", None, "where to linearise (default: equilibrium)", choices=("equilibrium", "point")),
                     option(
                         "--given", "NAME=VALUE", "value of a state, input, parameter or output there; may be repeated"
                     ),
@@ -534,7 +538,7 @@ VERBS = {
                         action="append",
                         default=[],
                     ),
-                    flag("--drift", "take a moving point, with an input 'drift'"),
+                    flag("--drift", "allow a point that is no equilibrium: its motion becomes an input 'drift'"),
                 )
             ),
             option("--data", "FILE", "the log, as for run", type=Path),
@@ -563,16 +567,16 @@ VERBS = {
                     option(
                         "--unknown",
                         "NAME=LOW:HIGH",
-                        "a constant that is to be found, with its bounds, beside those of the spec; may be repeated",
+                        "a constant to fit, with its bounds, in addition to those of the spec; may be repeated",
                     ),
                     option(
                         "--write-spec",
                         "FILE",
-                        "write the spec with what was found in it: constants, boxes, noise",
+                        "write the spec with the constants, boxes and noise that were found",
                         type=Path,
                     ),
                     INPUT_DELAY,
-                    option("--level", "P", "probability of the box (default: 0.95)", type=float),
+                    option("--level", "P", "probability that the box holds (default: 0.95)", type=float),
                 )
             ),
             option("--out", "FILE", "write the result to this file (JSON)", type=Path),
@@ -601,7 +605,7 @@ VERBS = {
             GAINS,
             UNVERIFIED,
             option("--data", "FILE", "the log, as for run", type=Path, required=True),
-            option("--row", "K", "last row of the window, from 1", type=int, required=True),
+            option("--row", "K", "last row of the window, counted from 1", type=int, required=True),
             option("--out", "FILE", "write the certificate (JSON) if there is a proof", type=Path),
             MAP,
             SCALE,
@@ -609,7 +613,7 @@ VERBS = {
                 (
                     TIME_COLUMN,
                     INPUT_DELAY,
-                    option("--window", "N", "samples (default: 20)", type=int, default=20),
+                    option("--window", "N", "length of the window in samples (default: 20)", type=int, default=20),
                     option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
                     option(
                         "--initial", "STATE=BOUND", "bound of a state at the first row (or LOW:HIGH); may be repeated"
@@ -638,7 +642,7 @@ def obsynth_parser(asked: Collection[str] | None = None) -> argparse.ArgumentPar
             name,
             help=verb.told,
             add_help=asked is None or name in asked,
-            description=verb.told,
+            description=fill(verb.told, width=78),
             epilog=verb.epilog,
             formatter_class=argparse.RawDescriptionHelpFormatter if verb.epilog else argparse.HelpFormatter,
         )
@@ -654,7 +658,10 @@ def design_parser() -> argparse.ArgumentParser:
 
 def _parser(name: str, told: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog=name, description=told, epilog=EXIT_CODES, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog=name,
+        description=fill(told, width=78),
+        epilog=EXIT_CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"obsynth {__version__}")
     return parser

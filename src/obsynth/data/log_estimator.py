@@ -163,7 +163,8 @@ class Clock:
         if count < 1 or away > STAMP_SHARE or average > OTHER_SHARE:
             raise SpecError(
                 f"Row {row} comes {step:.10g} s after the row before, but the design has dt = {self.dt:.10g} s: "
-                "stamps may be off by a fifth of it; irregular time stamps need a continuous-time design.",
+                "a time stamp may be off by 45 % of dt, and all of them by 25 % on average; irregular time stamps "
+                "need a continuous-time design.",
                 path=f"row {row}",
             )
         if count > 1 and self.longest == 0.0:

@@ -130,8 +130,10 @@ def diagnosis_report(diagnosis: Diagnosis, *, console: Console, everything: bool
 
 def _table(rows: Sequence[Sequence[str]]) -> Table:
     table = headed_table(*rows[0])
-    for column in table.columns:
+    for column, (heading, *cells) in zip(table.columns, zip(*rows, strict=True), strict=True):
         column.overflow = "fold"
+        # A column that cannot fold must not be narrowed: the last columns would be cut off.
+        column.no_wrap = " " not in heading and all(len(cell) <= len(heading) for cell in cells)
     for row in rows[1:]:
         table.add_row(*(Text(text) for text in row))
     return table
