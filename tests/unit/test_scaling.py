@@ -9,12 +9,13 @@ from hypothesis import strategies as st
 
 from obsynth.numerics import scaling
 from obsynth.numerics.scaling import (
-    balance_by_least_squares,
+    LogBalance,
+    _whole_parts,
     balance_system,
-    doubled_sums,
     equilibrate_pencil,
     power_of_two_below,
 )
+from obsynth.proofs.exact_arithmetic import nearest_doubles, stored_matrix
 
 PAPER_E = np.diag([1.0, 1.0, 1.0, 0.0])
 PAPER_A = np.array([[0.9, 0.005, -0.095, 0], [0.005, 0.995, 0.0997, 0], [0.095, -0.0997, 0.99, 0], [1, 0, 1, 1]])
@@ -134,25 +135,37 @@ def test_equilibrated_pencils_have_peaks_between_one_and_two(rng, rows, columns)
     np.testing.assert_array_equal(A, before[1])
 
 
-def test_sums_of_rows_have_twice_the_digits() -> None:
+def test_parts_of_a_sum_add_up_exactly() -> None:
     rng = np.random.default_rng(5)
-    parts = rng.normal(size=(37, 9)) * 10.0 ** rng.integers(-12, 12, size=(37, 9))
-    parts = np.vstack([parts, -parts[:36] * (1.0 + 1e-13)])
-    heads, tails = doubled_sums(parts)
-    for column, head, tail in zip(parts.T.tolist(), heads.tolist(), tails.tolist(), strict=True):
-        exact = sum(map(Fraction, column), Fraction(0))
-        # 73 terms in pairs: the error of the tails' own sums, each below eps^2 of all sizes.
-        allowed = 73 * Fraction(float(np.finfo(np.float64).eps)) ** 2 * sum(map(abs, map(Fraction, column)))
-        assert abs(Fraction(head) + Fraction(tail) - exact) <= allowed
-    assert [part.tolist() for part in doubled_sums(np.zeros((0, 2)))] == [[0.0, 0.0], [0.0, 0.0]]
+    numbers = rng.normal(size=500) * 2.0 ** rng.integers(-20, 9, size=500)
+    parts = _whole_parts(numbers)
+    for row in zip(numbers.tolist(), *(part.tolist() for part in parts), strict=True):
+        assert abs(sum(map(Fraction, row[1:])) - Fraction(row[0])) <= Fraction(1, 2**77)
+    for part in parts:
+        forth, back = float(np.add.accumulate(part)[-1]), float(np.add.accumulate(part[::-1])[-1])
+        assert forth == back == float(sum(map(Fraction, part.tolist())))
 
 
-def test_many_unknowns_are_balanced_as_few_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_least_squares_are_those_of_the_matrix_of_all_entries() -> None:
+    """Of rows, columns and a common unknown, with their signs, weights and wishes."""
     rng = np.random.default_rng(8)
-    e, a = (rng.normal(size=(9, 9)) * 10.0 ** rng.integers(-6, 6, size=(9, 1)) for _ in range(2))
-    b, c = rng.normal(size=(9, 2)), 1e5 * rng.normal(size=(3, 9))
-    few = balance_by_least_squares(e, a, inputs=[b], outputs=[c])
-    monkeypatch.setattr(scaling, "FEW_UNKNOWNS", 0)
-    many = balance_by_least_squares(e, a, inputs=[b], outputs=[c])
-    for name in ("equations", "states", "outputs"):
-        assert np.array_equal(getattr(few, name), getattr(many, name))
+    first, second = (np.where(rng.random((4, 4)) < 0.7, 10.0 ** rng.uniform(-5, 5, (4, 4)), 0.0) for _ in range(2))
+    problem = LogBalance(9)
+    problem.add(first, range(1, 5), range(5, 9), signs=(1, -1), weight=3.0)
+    problem.add(second, range(1, 5), range(5, 9), signs=(-1, 1), common=0)
+    problem.add(np.zeros((4, 0)), range(1, 5), range(9, 9))
+    problem.wish(3, 2.0)
+    rows, right, weights = [], [], []
+    for matrix, weight, signs, common in ((first, 3.0, (1.0, -1.0), 0.0), (second, 1.0, (-1.0, 1.0), 1.0)):
+        for i, j in zip(*np.nonzero(matrix), strict=True):
+            row = np.zeros(9)
+            row[0], row[1 + i], row[5 + j] = common, *signs
+            rows.append(row), right.append(-np.log2(matrix[i, j])), weights.append(weight)
+    ridge = scaling.RIDGE
+    rows += [*np.eye(9), np.eye(9)[3]]
+    right += [*np.zeros(9), 2.0]
+    weights += [*np.full(9, ridge), scaling.WISH_WEIGHT * ridge]
+    known, wanted, size = map(stored_matrix, (np.array(rows), np.array(right)[:, None], np.diag(weights)))
+    turned = known.transpose() * size
+    expected = nearest_doubles((turned * known).solve(turned * wanted)).ravel()
+    np.testing.assert_allclose(problem.solve(passes=0), expected, rtol=0, atol=1e-13)

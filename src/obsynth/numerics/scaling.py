@@ -5,11 +5,11 @@ The unknowns only shift with the units of the data: up to the rounding of expone
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -183,8 +183,9 @@ RESIDUAL_CORRECTIONS = 3
 SETTLED_SHARE = 1e-2
 #: Passes in which small entries lose their say.
 PASSES = 3
-#: Up to so many unknowns lists of numbers are added up faster than arrays in pairs.
-FEW_UNKNOWNS = 80
+#: Bits after the point of what parts of sums are split into: of a million parts below 2^10 the sum of the first has 46
+#: bits, and those of the others have 50.
+PART_BITS = (16, 46, 76)
 #: From so many on a positive definite matrix is factored as one, in a third of the time.
 MANY_UNKNOWNS = 500
 
@@ -194,7 +195,7 @@ class LogBalance:
     """Minimise ``log2 abs(M[i, j]) + row[i] + column[j] + common`` over all nonzero entries of matrices."""
 
     count: int
-    _terms: list[_Term] = field(default_factory=list)
+    _terms: list[_Entries] = field(default_factory=list)
     _wishes: list[tuple[int, float]] = field(default_factory=list)
 
     def add(
@@ -208,10 +209,17 @@ class LogBalance:
         weight: float = 1.0,
     ) -> None:
         """Ask for entries of a matrix ``(m, n)`` near one."""
-        there = matrix != 0.0
-        sizes = np.log2(np.abs(np.where(there, matrix, 1.0)))
-        places = slice(rows.start, rows.stop), slice(columns.start, columns.stop)
-        self._terms.append(_Term(sizes, weight * there, *places, *signs, common))
+        row, column = np.nonzero(matrix)
+        count = len(row)
+        self._terms.append(
+            _Entries(
+                self.count,
+                np.log2(np.abs(matrix[row, column])),
+                np.full(count, weight),
+                (rows.start + row, columns.start + column, np.full(count, self.count if common is None else common)),
+                (np.full(count, signs[0]), np.full(count, signs[1]), np.ones(count)),
+            )
+        )
 
     def wish(self, unknown: int, exponent: float) -> None:
         """Ask for a value where the entries leave the unknown open."""
@@ -219,17 +227,18 @@ class LogBalance:
 
     def solve(self, *, passes: int = PASSES, ridge: float = RIDGE, whole: bool = False) -> FloatArray:
         """Return the exponents ``(count,)``, rounded to whole numbers where these are wanted."""
-        weights = [term.weights for term in self._terms]
+        entries = _Entries.joined(self._terms, self.count)
+        weights = entries.weights
         # Of hundreds of states with a dense E the weights are so large that their rounding would be the ridge.
-        largest = sum(max(float(w.sum(axis=k).max(initial=0.0)) for k in (0, 1)) for w in weights)
+        largest = float(np.einsum("ii->i", entries.normal(weights)).max(initial=0.0))
         ridge = max(ridge, largest * float(np.finfo(np.float64).eps) / ROUNDED_RIDGE)
-        solved, found = self._solved(weights, ridge)
+        solved, found = self._solved(entries, weights, ridge)
         for _ in range(passes):
-            weights = [term.weights * term.say(found) for term in self._terms]
-            solved, found = self._solved(weights, ridge)
+            weights = entries.weights * entries.say(found)
+            solved, found = self._solved(entries, weights, ridge)
         # What the entries leave open would be rounding over the ridge: of exact residuals nothing is left of it.
         for _ in range(RESIDUAL_CORRECTIONS):
-            before, found = found, found + solved(self._missed(weights, found, ridge))
+            before, found = found, found + solved(self._missed(entries, weights, found, ridge))
             if np.array_equal(before, found):
                 break
             to_a_half = np.abs(np.abs(found - np.round(found)) - 0.5)
@@ -237,44 +246,23 @@ class LogBalance:
                 break
         return np.asarray(np.round(found) if whole else found, dtype=np.float64)
 
-    def _missed(self, weights: Sequence[FloatArray], found: FloatArray, ridge: float) -> FloatArray:
-        """Return what is left of the normal equations, each sum as if with twice the digits, or rounded once."""
-        sums = _Sums(self.count)
-        sums.add(slice(0, self.count), -ridge * found[:, None])
-        for term, weight in zip(self._terms, weights, strict=True):
-            missed = -weight * term.logarithms(found)
-            sums.add(term.rows, term.row_sign * missed)
-            sums.add(term.columns, (term.column_sign * missed).T)
-            if term.common is not None:
-                sums.add(slice(term.common, term.common + 1), missed.reshape(1, -1))
+    def _missed(self, entries: _Entries, weights: FloatArray, found: FloatArray, ridge: float) -> FloatArray:
+        """Return what is left of the normal equations."""
+        parts = _whole_parts(weights * entries.logarithms(found))
+        missed = -ridge * found - sum(map(entries.sums, parts[::-1]))
         for unknown, exponent in self._wishes:
-            wished = WISH_WEIGHT * ridge * (exponent - found[unknown : unknown + 1])
-            sums.add(slice(unknown, unknown + 1), wished[:, None])
-        return sums.total()
+            missed[unknown] += WISH_WEIGHT * ridge * (exponent - found[unknown])
+        return missed
 
     def _solved(
-        self, weights: Sequence[FloatArray], ridge: float
+        self, entries: _Entries, weights: FloatArray, ridge: float
     ) -> tuple[Callable[[FloatArray], FloatArray], FloatArray]:
         """Return what solves the normal equations for a right side, and the solution."""
-        normal, right = ridge * np.eye(self.count), np.zeros(self.count)
+        normal, right = entries.normal(weights), -entries.sums(weights * entries.sizes)
         diagonal = np.einsum("ii->i", normal)
-        for term, weight in zip(self._terms, weights, strict=True):
-            both, sizes = term.row_sign * term.column_sign * weight, weight * term.sizes
-            turned = (term.rows, term.row_sign, weight.T, sizes.T), (term.columns, term.column_sign, weight, sizes)
-            for places, sign, says, sized in turned:
-                sums = _in_turn(says)
-                right[places] -= sign * _in_turn(sized)
-                diagonal[places] += sums
-                if term.common is not None:
-                    normal[places, term.common] += sign * sums
-                    normal[term.common, places] += sign * sums
-            normal[term.rows, term.columns] += both
-            normal[term.columns, term.rows] += both.T
-            if term.common is not None:
-                right[term.common] -= _in_turn(sizes.reshape(-1))
-                diagonal[term.common] += _in_turn(weight.reshape(-1))
+        diagonal += ridge
         for unknown, exponent in self._wishes:
-            normal[unknown, unknown] += WISH_WEIGHT * ridge
+            diagonal[unknown] += WISH_WEIGHT * ridge
             right[unknown] += WISH_WEIGHT * ridge * exponent
         solved = _factored(normal)
         return solved, solved(right)
@@ -300,74 +288,70 @@ def _factored(matrix: FloatArray) -> Callable[[FloatArray], FloatArray]:
     return lambda right: np.asarray(lapack.dgetrs(factors, pivots, right)[0], dtype=np.float64)
 
 
-class _Sums:
-    """Sums ``(count,)`` of many parts, far beyond double precision: rounded once where they are few."""
+def _whole_parts(parts: FloatArray) -> list[FloatArray]:
+    """Return multiples of smaller and smaller powers of two whose sum is given, but for the last bits of small ones.
 
-    def __init__(self, count: int) -> None:
-        self.parts: list[list[float]] | None = [[] for _ in range(count)] if count <= FEW_UNKNOWNS else None
-        self.heads, self.tails = list[FloatArray](), np.zeros(count)
-
-    def add(self, place: slice, rows: FloatArray) -> None:
-        """Add to each place all entries of its row of a matrix ``(places, k)``."""
-        if self.parts is not None:
-            for part, row in zip(self.parts[place], rows.tolist(), strict=True):
-                part += row
-            return
-        head = np.zeros(len(self.tails))
-        head[place], tail = doubled_sums(rows.T)
-        self.heads.append(head)
-        self.tails[place] += tail
-
-    def total(self) -> FloatArray:
-        """Return the sums."""
-        if self.parts is not None:
-            return np.array([math.fsum(part) for part in self.parts])
-        head, tail = doubled_sums(np.array(self.heads))
-        return np.asarray(head + (tail + self.tails))
-
-
-def doubled_sums(parts: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the sums of rows ``(k, n)``, in pairs, and what rounding took from them: twice the digits together.
-
-    The error of a sum of two numbers is a double, which six operations give (Knuth's TwoSum).
-    """
-    tails = np.zeros(parts.shape[1:])
-    while len(parts) > 1:
-        half = len(parts) // 2
-        first, second = parts[:half], parts[half : 2 * half]
-        sums = first + second
-        back = sums - first
-        tails += np.sum((first - (sums - back)) + (second - back), axis=0)
-        parts = sums if 2 * half == len(parts) else np.concatenate([sums, parts[2 * half :]])
-    return (parts[0] if len(parts) else tails), tails
-
-
-def _in_turn(parts: FloatArray) -> FloatArray:
-    """Return the sum of numbers or rows, added up one after the other."""
-    if parts.ndim > 1 and parts.shape[1] > 1:
-        # Rows that follow each other in memory are added to the sum in turn; a single column would be added in pairs.
-        return np.asarray(np.add.reduce(np.ascontiguousarray(parts), axis=0))
-    return np.asarray(np.add.accumulate(parts, axis=0)[-1] if len(parts) else np.zeros(parts.shape[1:]))
+    Sums of such multiples are exact: what enters two sums enters both with the same value."""
+    found = []
+    for bits in PART_BITS:
+        found.append(np.ldexp(np.rint(np.ldexp(parts, bits)), -bits))
+        parts = parts - found[-1]
+    return found
 
 
 @dataclass(frozen=True, eq=False)
-class _Term:
-    """One matrix: the logarithms and weights of its entries (no weight for zeros), and the unknowns that scale them."""
+class _Entries:
+    """Logarithms and weights ``(k,)`` of entries, and the unknowns that scale them: places and signs, ``(k,)`` each.
 
+    Of row, of column and, where any has one, common; one place more than there are unknowns stands for none.  Sums add
+    up one entry after the other, so that they come out the same on every machine."""
+
+    count: int
     sizes: FloatArray
     weights: FloatArray
-    rows: slice
-    columns: slice
-    row_sign: int
-    column_sign: int
-    common: int | None
+    places: Sequence[NDArray[np.int64]]
+    signs: Sequence[FloatArray]
+
+    @classmethod
+    def joined(cls, terms: Sequence[_Entries], count: int) -> _Entries:
+        """Return the entries of all matrices, for so many unknowns."""
+        kinds = range(3 if any((term.places[2] < count).any() for term in terms) else 2)
+        return cls(
+            count,
+            np.concatenate([np.zeros(0), *(term.sizes for term in terms)]),
+            np.concatenate([np.zeros(0), *(term.weights for term in terms)]),
+            [np.concatenate([np.zeros(0, dtype=np.int64), *(term.places[k] for term in terms)]) for k in kinds],
+            [np.concatenate([np.zeros(0), *(term.signs[k] for term in terms)]) for k in kinds],
+        )
 
     def logarithms(self, exponents: FloatArray) -> FloatArray:
         """Return the logarithms of the scaled entries."""
-        rows, columns = self.row_sign * exponents[self.rows], self.column_sign * exponents[self.columns]
-        sizes = self.sizes + rows[:, None] + columns
-        return sizes if self.common is None else sizes + exponents[self.common]
+        found, known = self.sizes.copy(), np.append(exponents, 0.0)
+        for place, sign in zip(self.places, self.signs, strict=True):
+            found += sign * known[place]
+        return found
 
     def say(self, exponents: FloatArray) -> FloatArray:
         """Return the say of each entry: all of it above one, less the further it is below."""
         return np.asarray(1.0 / (1.0 + (np.minimum(self.logarithms(exponents), 0.0) / HALF_SAY) ** 2))
+
+    def sums(self, parts: FloatArray) -> FloatArray:
+        """Return for each unknown the sum ``(count,)``, with signs, of what is given for the entries that it scales."""
+        found = np.zeros(self.count + 1)
+        for place, sign in zip(self.places, self.signs, strict=True):
+            found += np.bincount(place, sign * parts, len(found))
+        return found[:-1]
+
+    def normal(self, weights: FloatArray) -> FloatArray:
+        """Return the matrix ``(count, count)`` of the normal equations."""
+        count = self.count + 1
+        found = np.zeros((count, count))
+        diagonal, scaled = np.einsum("ii->i", found), list(zip(self.places, self.signs, strict=True))
+        for number, (place, sign) in enumerate(scaled):
+            diagonal += np.bincount(place, weights, count)
+            for other, other_sign in scaled[:number]:
+                both = np.bincount(place * count + other, sign * other_sign * weights, count * count)
+                both = both.reshape(count, count)
+                found += both
+                found += both.T
+        return found[:-1, :-1]
