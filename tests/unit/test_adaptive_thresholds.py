@@ -181,7 +181,7 @@ def test_refusals_name_their_reason() -> None:
         obsynth.online_monitor(design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, initial_set={"x1": 1.0})
     with pytest.raises(SpecError, match="unknown state"):
         obsynth.online_monitor(design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, initial_set={"x9": 1.0})
-    with pytest.raises(SpecError, match="stands in no matrix"):
+    with pytest.raises(SpecError, match="appears in no matrix"):
         obsynth.online_monitor(design, constants={"spring": (1.0, 2.0)}, disturbance_bounds={"load": 0.1})
     with pytest.raises(SpecError, match="is for the monitor pointwise, not for window"):
         obsynth.online_monitor(design, "window", constants={"k": "1 %"})

@@ -81,7 +81,7 @@ def test_a_leak_inside_the_rows_is_found(share):
 def found_inside(rows):
     found = calibrate(tanks(), LOG, BOUNDS, rows=rows, initial_covariance=1e-4, input_delay=1, starts=1)
     assert found.change in range(55, 60)
-    assert any("not of one piece" in sentence for sentence in found.verdict)
+    assert any("not homogeneous" in sentence for sentence in found.verdict)
 
 
 def test_a_leak_that_never_opened_has_an_open_box_or_holds_zero(measured):

@@ -104,7 +104,7 @@ def test_a_sensor_of_another_sign_and_one_with_a_bias_are_named(share) -> None:
     for samples, options in share(((200, {"offset": {}, "input_delay": 0}), (240, {})), 2):
         log = circuit_log(samples, vm=lambda column: -column)
         turned = calibrate(circuit(), log, WIDE, starts=1, **options)
-        assert said(turned, "The best simulation leaves nearly all of what vm does")
+        assert said(turned, "The best simulation explains almost nothing of vm")
     bias, short = (circuit_log(samples, vm=lambda column: column + 0.3) for samples in (300, 100))
     biased = calibrate(circuit(), bias, WIDE, starts=1, offset={}, input_delay=0)
     assert said(biased, "The innovations of vm have the mean +1.00 deviations: a bias")

@@ -40,7 +40,7 @@ def test_aliases_that_multiply_are_refused(tmp_path: Path) -> None:
     path.write_text(stack(20))
     assert len(read_yaml(path)["A"]) == 20
     path.write_text(stack(120))
-    with pytest.raises(obsynth.SpecError, match=r"stands for 1\.7\de\+06 values: its aliases"):
+    with pytest.raises(obsynth.SpecError, match=r"expands to 1\.7\de\+06 values: its aliases"):
         read_yaml(path)
     path.write_text("a: &a [*a]\n")
     with pytest.raises(obsynth.SpecError):

@@ -218,7 +218,7 @@ def test_banks_with_poles_as_asked() -> None:
     assert np.diag(bank.observer.Az) == pytest.approx([0.9, 0.8, 0.7])
     each = obsynth.functional_filter(tanks(), poles=[[0.9, 0.8], [0.8, 0.7], [[0.7, 0.1], [0.7, -0.1]]])
     assert sorted(np.abs(np.linalg.eigvals(each.observer.Az)))[-1] == pytest.approx(0.9)
-    with pytest.raises(obsynth.SpecError, match="3 filters are asked for, of 1, 1, 1 poles"):
+    with pytest.raises(obsynth.SpecError, match="3 filters are asked for, with 1, 1, 1 poles"):
         obsynth.functional_filter(tanks(), residuals="isolate", poles=[0.9, 0.8, 0.7])
     with pytest.raises(obsynth.SpecError, match="functional-filter"):
         obsynth.functional_filter(tanks(), residuals="isolate", poles=[[0.9], [0.8], [0.7, 0.6]])

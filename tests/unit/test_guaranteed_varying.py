@@ -363,7 +363,7 @@ GOOD: dict[str, Any] = {"course": "constant", "samples": 3, "noise_bound": NOISE
 REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any], type[Exception], str]] = {
     "deviations": ({}, {"noise_bound": 3}, obsynth.SpecError, "states no deviations"),
     "no noise": ({}, {"noise_bound": None}, obsynth.SpecError, "noise_bound"),
-    "no bounds": ({}, {"disturbance_bounds": None}, obsynth.SpecError, "mu1, 0 where an equation holds"),
+    "no bounds": ({}, {"disturbance_bounds": None}, obsynth.SpecError, "mu1, and 0 where an equation holds"),
     "another name": ({}, {"disturbance_bounds": {"d1": 1.0}}, obsynth.SpecError, "must name mu1; unknown: d1"),
     "negative": ({}, {"disturbance_bounds": -1.0}, obsynth.SpecError, "disturbance_bounds of mu1 is -1.0"),
     "unknown fault": ({}, {"fault": "lek"}, obsynth.SpecError, "There is no fault 'lek'"),
@@ -389,7 +389,7 @@ def test_what_is_for_constant_matrices_says_so(tmp_path: Path) -> None:
     test, scenario = integrator(), obsynth.Scenario(horizon=5.0)
     refused = {
         "which no export holds": lambda: obsynth.export(test, tmp_path / "test.c"),
-        "no bench": lambda: obsynth.simulate(test, scenario),
+        "cannot be simulated": lambda: obsynth.simulate(test, scenario),
         "is for measured data": lambda: obsynth.monitor(test, scenario),
         "prove-alarm is for plants": lambda: obsynth.prove_alarm(test, log(), row=6),
         "the fixed test of each row": lambda: test.exact_interval(np.zeros((9, 1)), np.zeros((9, 1))),

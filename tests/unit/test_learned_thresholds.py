@@ -474,4 +474,4 @@ def test_what_a_followed_fault_leaves_is_told_where_estimates_are_not_watched(tm
     assert main([*asked, "--false-alarms", "1 per 200 rows"]) == 0
     told = " ".join(capsys.readouterr().out.split())
     assert "Monitored: r[cell], r[plate]." in told
-    assert "an alarm comes at its onset or not at all. Give run a level for the estimate" in told
+    assert "an alarm comes at the onset of the fault or not at all. Give run a level for the estimate" in told

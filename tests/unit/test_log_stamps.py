@@ -74,7 +74,7 @@ def test_a_log_in_utf_16_with_its_mark_is_read(tmp_path: Path, encoding: str) ->
 @pytest.mark.parametrize(
     ("stamp", "words"),
     [
-        ("05/03/2026 08:30:00 AM", "'05/03/2026 08:30:00 AM' may have the day first or the month"),
+        ("05/03/2026 08:30:00 AM", "'05/03/2026 08:30:00 AM' may begin with the day or the month"),
         ("05/13/2026 13:30:00 PM", "is no time stamp"),
         ("05/13/2026 00:30:00 AM", "is no time stamp"),
         ("13/13/2026 01:30:00", "is no time stamp"),

@@ -130,7 +130,7 @@ def test_an_index_of_dates_is_the_time(design, frame, wanted):
     [
         (["0", "2026-05-01T00:00:00"], r"Row 2, column 'time': .* is no time stamp: the rows before hold seconds"),
         (["2026-05-01T00:00:00", "1.5"], r"Row 2, .*the rows before hold dates and times"),
-        (["01/05/2026 08:00", "2"], r"Row 1, .*may have the day first or the month: write dates with the year first"),
+        (["01/05/2026 08:00", "2"], r"Row 1, .*may begin with the day or the month: write dates with the year first"),
         (["31.02.2026 08:00", "2"], r"Row 1, .*give seconds, such as 12\.5, or a date"),
         (["2026-05-01T00:00:00", "2026-05-01T00:00:01Z"], r"Row 2, .*with a time zone and without one"),
     ],

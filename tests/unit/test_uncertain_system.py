@@ -41,7 +41,7 @@ def test_nominal_values_and_ranges() -> None:
         ({"k": {"nominal": 2.0, "tolerance": "five"}, "m": 1.0}, "per cent"),
         ({"k": {"nominal": 2.0, "tolerance": "-5 %"}, "m": 1.0}, "per cent"),
         ({"k": 2.0}, "unknown name 'm'"),
-        ({"k": 2.0, "m": 1.0, "spring": (1.0, 2.0)}, "'spring' stands in no matrix"),
+        ({"k": 2.0, "m": 1.0, "spring": (1.0, 2.0)}, "'spring' appears in no matrix"),
         ({"k": {"nominal": 3.0, "range": [1.0, 2.0]}, "m": 1.0}, "outside its range"),
         ({"k": {"nominal": 2.0, "tolerance": "5 %", "range": [1.0, 2.0]}, "m": 1.0}, "both"),
         ({"k": {"nominal": 2.0, "spread": 1.0}, "m": 1.0}, "'spread' is unknown"),

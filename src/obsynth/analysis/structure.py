@@ -137,7 +137,7 @@ def _half_a_point(plant: DescriptorSystem) -> tuple[str, ...]:
         return ()
     told = f"{', '.join(list(point)[:_MOST_QUESTIONED])}, but not {listed(missing, most=_MOST_QUESTIONED)}"
     return (
-        f"operating_point has {told}: what a log holds of these is taken as a deviation. "
+        f"operating_point has {told}: the values of these in a log count as deviations. "
         f"Give their values at that point as well{_rest(plant, missing)}.",
     )
 

@@ -102,8 +102,8 @@ def proposed_states(
 
 
 _STATE_SENTENCES = {
-    "coloured": "The noise of {name} is coloured: a state stands for it (better by {gain:.3g} nats).",
-    "offset": "The sensor {name} has an offset: a state stands for it (better by {gain:.3g} nats).",
+    "coloured": "The noise of {name} is coloured: the model has a state for it (better by {gain:.3g} nats).",
+    "offset": "The sensor {name} has an offset: the model has a state for it (better by {gain:.3g} nats).",
     "walk": "The unknown input {name} is taken as a random walk (better by {gain:.3g} nats).",
 }
 
@@ -289,7 +289,7 @@ def plant_as_written(given: Any) -> Any:
 #: How often samples that stand out are left out: each time the others are known better.
 OUTLIER_ROUNDS = 3
 #: What is said of an offset without which the model follows nothing.
-OFFSET_TAKEN = "Without an offset of the sensor {} the model does not follow the log: a state stands for it."
+OFFSET_TAKEN = "Without an offset of the sensor {} the model does not follow the log: it has a state for it."
 METHODS = ("innovations", "simulation")
 INTEGRATIONS = ("auto", "backward-euler", "radau")
 #: Two sample times are the same within this share.

@@ -495,7 +495,7 @@ def _fitted(
             "or fix one of them."
         )
     found += [
-        f"The box of {name} is open on its {side} side: the bound stands there, not the log."
+        f"The box of {name} is open on its {side} side: the bound limits it there, the log does not."
         for name, side in box.open_sides
     ]
     found += [f"{name} is at a bound: widen it if the constant may lie beyond." for name in at_end]
@@ -541,9 +541,9 @@ def _misfits(problem: Problem, start: Fit, whitened: FloatArray, R: dict[str, fl
     for name in unexplained(problem, start.deviations):
         signal = float(np.nanvar(problem.y[:, problem.output_names.index(name)]))
         found.append(
-            f"The best simulation leaves nearly all of what {name} does: "
+            f"The best simulation explains almost nothing of {name}: "
             + (
-                "its sign, its unit or its equation is another, and its R stands for the signal itself."
+                "its sign, its unit or its equation is wrong, and its R is the variance of the signal itself."
                 if R[name] > SIGNAL_SHARE * signal
                 else "noise of the equations drives it more than the inputs do."
             )
@@ -578,7 +578,7 @@ def _checked(nis: Consistency, colours: dict[str, Whiteness], row: int | None, s
         found.append(f"NIS per degree of freedom is {nis.value:.2f}, outside {nis.low:.2f} to {nis.high:.2f}.")
     if row is not None:
         found.append(
-            f"These rows are not of one piece: the mean of the innovations changes at row {row}. If a fault "
+            f"These rows are not homogeneous: the mean of the innovations changes at row {row}. If a fault "
             "begins there, end the rows before it."
         )
     return found
@@ -597,11 +597,11 @@ def _told(
     if delay and losses:
         rows = "1 row" if delay == 1 else f"{delay} rows"
         gained = losses[0] - losses[delay]
-        found.append(f"The inputs are taken {rows} later than the log writes them: better by {gained:.1f} nats.")
+        found.append(f"The inputs act {rows} later than the log states: better by {gained:.1f} nats.")
     lost = losses.get(delay, 0.0)
     if lost > NOTED_NATS:
         least = min(losses, key=lambda rows: losses[rows])
-        found.append(f"The inputs taken {least:+d} row(s) would be better by {lost:.1f} nats: see input_delay.")
+        found.append(f"Inputs that act {least:+d} row(s) later would be better by {lost:.1f} nats: see input_delay.")
     if error is not None:
         what = "Radau is taken" if problem.integration == "radau" else "it is taken"
         told = f" and moves a constant by {error.moved:.2g} of its own" if error.moved else ""

@@ -219,7 +219,7 @@ def _require_explained(problem: Problem, left: FloatArray, judged: BoolArray) ->
         told = ", ".join(f"{name}: {100 * part:.3g} %" for name, part in zip(problem.output_names, share, strict=True))
         raise refused(
             "explains-nothing",
-            f"The model cannot follow the log: what the best fit leaves is as large as the signals "
+            f"The model cannot follow the log: the residual of the best fit is as large as the signals "
             f"({told} of their deviations). Check units and scales (a factor of 1000?), the sample time, and the "
             "bounds.",
             signals=names,

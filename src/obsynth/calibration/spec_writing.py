@@ -42,7 +42,9 @@ def calibrated_spec(path: Path, found: Calibration, *, calibration: Path | None 
     """
     document = read_yaml(path)
     if "plant" not in document:
-        raise SpecError(f"{path} holds a plant and no spec: name a method in a spec beside it.", path="method")
+        raise SpecError(
+            f"{path} is a plant, not a spec: write a spec that refers to it and names a method.", path="method"
+        )
     if found.substeps != 1:
         raise SpecError(
             f"The calibration takes {found.substeps} steps a sample, and designs take one: calibrate without substeps.",

@@ -128,7 +128,7 @@ def _spec_file(options: argparse.Namespace) -> Path:
     target = output_file(options.write_spec, CALIBRATED_SPEC, options)
     if target.resolve().parent != options.system.resolve().parent:
         raise SpecError(
-            f"{target} is in another folder than {options.system}, whose files it names: write it beside that.",
+            f"{target} is in another folder than {options.system}, whose files it refers to: write it to that folder.",
             path="write-spec",
         )
     return target

@@ -305,8 +305,8 @@ def run_thresholds(options: argparse.Namespace) -> int:
         )
         if expects_fault_courses(design) and not any(name.startswith("fhat[") for name in found.columns):
             lines.append(
-                "A fault that its estimate follows leaves nothing in these once it is followed: an alarm comes at its "
-                "onset or not at all. Give run a level for the estimate as well (--threshold)."
+                "Once the estimate follows a fault, these return to zero: an alarm comes at the onset of the fault or "
+                "not at all. Give run a level for the estimate as well (--threshold)."
             )
     answer(
         options,

@@ -724,7 +724,7 @@ def compare(
     """
     plant = linear_plant(plant)
     if plant.nf == 0:
-        raise SpecError("The plant has no faults: there is nothing to compare estimates of.", path="plant")
+        raise SpecError("The plant has no faults, so there are no fault estimates to compare.", path="plant")
     checked_value(tolerance, "tolerance", NonNegative)
     checked_value(disturbance, "disturbance", NonNegative)
     checked_value(runs, "runs", Count)

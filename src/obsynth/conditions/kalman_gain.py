@@ -99,7 +99,7 @@ def kalman(
             miss = float(np.linalg.norm(found[letter] - wanted) / max(float(np.linalg.norm(wanted)), 1.0))
             if not miss <= SAME_GAIN:
                 raise VerificationError(
-                    f"{letter} of the inequality misses the gain that the recursion tends to by {miss:.3g} of its "
+                    f"{letter} of the inequality differs from the steady gain of the recursion by {miss:.3g} of its "
                     "size: with other constraints or another objective this is no Kalman filter.",
                     report=made.report,
                 )

@@ -458,7 +458,7 @@ def _smoothed(run: LogRun, data: Data, *, smooth: bool, lag: int | None, state: 
         raise SpecError("A stream has no end to smooth from: give a lag, or the log as a file.", path="smooth")
     if smooth and state is not None:
         raise SpecError(
-            "smooth takes the whole record, and a saved state goes on with a part of it: give a lag, or "
+            "smooth needs the whole record, but a saved state continues a part of it: give a lag, or "
             "leave the state out.",
             path="smooth",
         )

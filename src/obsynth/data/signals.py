@@ -140,7 +140,7 @@ class Stamps:
                 self.day_first = int(one) > _MONTHS
             if self.day_first is None and one != two:
                 raise SpecError(
-                    f"Row {row}, column {column!r}: {cell!r} may have the day first or the month: write dates with "
+                    f"Row {row}, column {column!r}: {cell!r} may begin with the day or the month: write dates with "
                     f"the year first, such as {year}-12-31.",
                     path=f"row {row}",
                 )

@@ -166,7 +166,7 @@ def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
         return make_bench(design, scenario)
     if isinstance(design.observer, WindowObserver):
         raise SpecError(
-            f"Design {design.name!r} is a test whose weights change with k: there is no bench for it. Simulate the "
+            f"Design {design.name!r} is a test whose weights change with k: it cannot be simulated. Simulate the "
             "plant (obsynth.simulate(plant, scenario)) and run the test on the outputs (design.observer.run).",
             path="observer",
         )

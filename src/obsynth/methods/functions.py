@@ -33,8 +33,8 @@ def design_function(
         own = plant.plant if isinstance(plant, Transformation) else plant
         if method.over_scenario and options.get("scenario") and getattr(own, "uncertainty", None) is None:
             raise SpecError(
-                "scenario is for plants whose constants have tolerances: it weighs what they do. State some "
-                "(obsynth.uncertain_system), or leave it out.",
+                "scenario is for plants whose constants have tolerances: it weighs their effects. State tolerances "
+                "(obsynth.uncertain_system), or leave scenario out.",
                 path="scenario",
             )
         found = design(**Signature(first).bind(plant, *given).arguments, method=method.id, **options)

@@ -19,7 +19,7 @@ def tracking_of(design: ObserverDesign, affine: AffinePlant) -> Tracking:
     plant, observer = design.linear
     if any(observer.state_delays):
         raise PreconditionError(
-            "The state estimate lags by some samples: what a tolerance does to newer states is not known from it, and "
+            "The state estimate has a delay: it does not determine the effect of a tolerance on newer states, so that "
             "no bound exists. Use a design whose estimate has no delay (detectability indexes of 1).",
             condition="full state estimate",
         )

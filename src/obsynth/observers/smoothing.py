@@ -406,7 +406,7 @@ class _RecursiveLinks(Links):
     def __init__(self, recursion: Recursion) -> None:
         if recursion.literal:
             raise PreconditionError(
-                "Form 'literal' learns from residuals that are correlated in time, of which no smoother exists: use "
+                "Form 'literal' learns from residuals that are correlated in time, for which no smoother exists: use "
                 "form 'innovation' or 'random-walk'.",
                 condition="white residuals",
             )

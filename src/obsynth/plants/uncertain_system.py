@@ -153,7 +153,7 @@ def _require_used(uncertainty: Uncertainty, stated: set[str]) -> None:
     unknown = sorted(name for name in stated - uncertainty.used if name in uncertainty.box.constants)
     if unknown:
         raise SpecError(
-            f"The constant {unknown[0]!r} stands in no matrix: write an entry as an expression in it, or remove it.",
+            f"The constant {unknown[0]!r} appears in no matrix: write an entry as an expression in it, or remove it.",
             path=f"constants.{unknown[0]}",
         )
 

@@ -485,7 +485,7 @@ def agreement_section(design: ObserverDesign, run: DataRun, rows: str | None) ->
 def _facts(found: Validation, rows: str | None) -> Iterator[tuple[str, str]]:
     first, last = found.log["rows"]
     every = (
-        "" if rows is not None else (", all of them: they are taken as free of faults; name those that are with --rows")
+        "" if rows is not None else (", all of them: they are assumed to be free of faults; select others by --rows")
     )
     yield "rows", f"{first} to {last - 1}{every}"
     nis = found.nis

@@ -180,7 +180,7 @@ def verify_calibration(path: str | Path, again: Mapping[str, Any] | None = None)
     cited = str(log.get("digest", "")) if isinstance(log, dict) else ""
     if again is None:
         rows.append(information(
-            "log", f"the ranges are what the log says whose digest is {cited}: assumed, as plant and log were not "
+            "log", f"the ranges follow from the log with digest {cited}: assumed, as plant and log were not "
             "given (--system, --data)", float("nan"), source=_SOURCE, status="assumed",
         ))  # fmt: skip
     else:

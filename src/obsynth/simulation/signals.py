@@ -123,7 +123,7 @@ def check_parameters(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Sc
     for group, why in {
         "disturbances": "Such a plant has no disturbances: give noise, or make one of them a parameter.",
         "observer_state": "A recursive observer starts where its design says: leave observer_state out.",
-        "stabilise": "No feedback is made for such a plant: give inputs that keep it where it should be.",
+        "stabilise": "No feedback is designed for such a plant: give inputs that keep it near its operating point.",
     }.items():
         if getattr(scenario, group):
             raise SpecError(why, path=group)
@@ -186,7 +186,7 @@ def _actuator(plant: DescriptorSystem, fault: str, scenario: Scenario) -> int:
     where = f"faults.{fault}"
     if scenario.stabilise:
         raise SpecError(
-            "With a stabilising feedback the commands depend on the fault, and such a failure is no signal of time: "
+            "With a stabilising feedback the commands depend on the fault, and such a failure is no function of time: "
             "give a step or another profile.",
             path=where,
         )

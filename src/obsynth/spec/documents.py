@@ -51,7 +51,7 @@ def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
         raise SpecError(f"{path} has a value that YAML cannot read: {error}.", path=place) from error
     if count > max(len(text), MOST_ALIASED_VALUES):
         raise SpecError(
-            f"{path} stands for {count:.3g} values: its aliases (*name) repeat what they name too often. Put such "
+            f"{path} expands to {count:.3g} values: its aliases (*name) repeat their contents too often. Put such "
             "matrices into files beside it.",
             path=place,
         )

@@ -64,7 +64,7 @@ def _notes(observer: DAEObserver, facts: DAEFacts) -> Iterator[str]:
         )
     if observer.integration == "radau" and turn > LARGEST_TURN:
         yield (
-            f"Steps are taken by Radau IIA: at the nominal point a mode rotates by {turn:.2g} radians in one, which "
+            f"Radau IIA integrates the plant: at the nominal point a mode rotates by {turn:.2g} radians a step, which "
             "backward Euler would damp."
         )
     for direction in facts.identifiable.faint:

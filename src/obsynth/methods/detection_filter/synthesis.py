@@ -69,7 +69,7 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
     witness = _gain_witness(felt, 1.0 + PROOF_MARGIN, units)
     if witness is None or not gain_is_proved(felt, 1.0 + PROOF_MARGIN, witness):
         raise SolverError(
-            "The Riccati equation of the detection filter has no solution of which a gain can be proved: the slowest "
+            "The Riccati equation of the detection filter has no solution for which a gain can be proved: the slowest "
             f"pole is at {abscissa(observer.Az, 0.0):.3g} 1/s, next to a zero from the unknown inputs to the outputs "
             "on the imaginary axis. State noise of the states (Bw)."
         )

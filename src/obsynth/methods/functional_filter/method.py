@@ -127,7 +127,7 @@ class FunctionalFilter(Method):
             late = [name for name, default in (("delay", 0), ("mean", 1)) if getattr(self, name) != default]
             if given or late or self.joint:
                 listed = [*given, *late, *(["joint"] if self.joint else [])]
-                yield f"{', '.join(listed)} are about estimates: leave them out where only residuals are asked for."
+                yield f"{', '.join(listed)} concern estimates: leave them out if you ask for residuals only."
 
     def rates(self, plant: DescriptorSystem) -> FloatArray | None:
         """Return the walk of each fault of the plant ``(nf,)``, or ``None`` for the default; faults left out get 0."""

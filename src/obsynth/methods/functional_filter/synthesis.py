@@ -335,7 +335,7 @@ def _placed(plant: DescriptorSystem, models: Sequence[FilterModel], asked: Funct
     if len(given) != len(models) or not all(isinstance(entry, (list, tuple, np.ndarray)) for entry in given):
         orders = ", ".join(str(len(model.A)) for model in models)
         raise SpecError(
-            f"{len(models)} filters are asked for, of {orders} poles: give a list of poles for each, such as "
+            f"{len(models)} filters are asked for, with {orders} poles: give a list of poles for each, such as "
             "[[-1], [-2, -3]], or ask for one fault, one set of residuals, or joint estimates.",
             path="method.options.poles",
         )

@@ -99,7 +99,7 @@ def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Asked]) -
     first = programmes.windows[used[0]]
     yield upper_bound_check(
         "delay",
-        "a fault of the size that is surely found alarms after so many seconds at the latest"
+        "a fault of the size that is certain to be detected raises an alarm after at most so many seconds"
         f"{'' if constant else ', at rows with a verdict'}",
         delay_in_samples(first, first.weights(tests[used[0]].values)[2]) * problem.plant.dt,
         float(design.certificate.claims.get("delay", np.nan)),

@@ -159,7 +159,7 @@ class GuaranteedTestMethod(Asked, Method):
         if self.fault_rate is not None and self.course != "rate":
             yield f"fault_rate is for course rate, not {self.course}."
         if (self.disturbance_rate is None) == (self.disturbance == "rate"):
-            yield "disturbance_rate goes with disturbance rate: give both or neither."
+            yield "disturbance_rate belongs to disturbance: rate. Give both or neither."
         if self.after is not None and self.course != "step":
             yield f"after is for course step, not {self.course}: give samples."
         if self.lag and self.course in ("step", "constant"):

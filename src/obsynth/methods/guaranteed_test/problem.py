@@ -247,7 +247,7 @@ def fault_of(names: tuple[str, ...], name: str | None) -> int:
         listed = (
             f"name one of {', '.join(names)}"
             if names
-            else "the plant has none (Bf, Df; of one that changes with k Phi, Psi)"
+            else "the plant has none (Bf, Df; for a plant that changes with k: Phi, Psi)"
         )
         raise SpecError(f"{given}: {listed}.", path="method.options.fault")
     return names.index(name)
@@ -277,8 +277,8 @@ def missing_bounds(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked:
     if isinstance(plant, TimeVaryingDescriptorSystem):
         if known is None:
             yield (
-                "disturbance_bounds: the largest absolute value of mu(k) in each equation is missing: of "
-                f"{', '.join(names)}, 0 where an equation holds exactly."
+                "disturbance_bounds: the largest absolute value of mu(k) in each equation is missing: give it "
+                f"for {', '.join(names)}, and 0 where an equation holds exactly."
             )
         if not isinstance(asked.noise_bound, Mapping):
             yield (

@@ -377,7 +377,7 @@ def _notes_of_rows(
     rows = "every row from" if forever else f"the {len(of_row)} rows from"
     yield (
         f"{len(thresholds)} linear programme(s) serve {rows} k = {question.samples} on, each proved: thresholds from "
-        f"{used.min():.6g} to {used.max():.6g}, of which the largest is claimed."
+        f"{used.min():.6g} to {used.max():.6g}; the largest one is claimed."
     )
     if without:
         yield (

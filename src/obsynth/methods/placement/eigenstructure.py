@@ -103,7 +103,7 @@ def place(
     error = spectrum_error(f - k @ c, poles, dt)
     if not error <= PLACEMENT_TOLERANCE:
         raise SolverError(
-            f"The poles could not be placed: they miss by {error:.2g} of their size. The pair is "
+            f"The poles could not be placed: they are wrong by {error:.2g} of their size. The pair is "
             "close to an unobservable one: ask for slower or fewer distinct poles, lower the order of the fault model, "
             "or use decay= instead."
         )

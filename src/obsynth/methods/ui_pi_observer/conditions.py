@@ -199,7 +199,7 @@ def order_conditions(judge: Evaluator, model: Exosystem) -> list[Condition]:
     decision, point = worst[0], units.eigenvalue(worst[1])
     lost = (
         f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be distinguished "
-        "from nothing in double precision. Lower its order."
+        "from zero in double precision. Lower its order."
     )
     found = Condition(
         "order of the fault model",

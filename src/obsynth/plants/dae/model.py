@@ -136,9 +136,7 @@ def _only_states_stored(model: DAEFields, symbols: DAESymbols) -> None:
             if row.any()
         ]
         told = f" in the equation {where[0]!r}" if where else ""
-        raise SpecError(
-            f"der(...){told} is taken of what contains no state, and is zero: take it of a state.", path="equations"
-        )
+        raise SpecError(f"der(...){told} contains no state, so it is zero: differentiate a state.", path="equations")
 
 
 def _no_empty_equation(model: DAEFields, symbols: DAESymbols) -> None:

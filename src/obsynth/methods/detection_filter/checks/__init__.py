@@ -139,7 +139,7 @@ def _why_not(plant: DescriptorSystem) -> str:
     if rate >= 0.0:
         return (
             f"not proved: the plant is not stable (a pole at {rate:.3g} 1/s), and the stored numbers miss the "
-            "equations of the error by rounding: together they have no finite gain. How much a state of the plant adds "
-            "to the residuals is told by 'stored numbers: states'"
+            "equations of the error by rounding: together they have no finite gain. The row 'stored numbers: states' "
+            "bounds the effect of the plant's states on the residuals"
         )
-    return f"not proved: the plant decays at {-rate:.3g} 1/s only, too slowly for what the stored numbers miss"
+    return f"not proved: the plant decays at {-rate:.3g} 1/s only, too slowly for the rounding of the stored numbers"

@@ -125,7 +125,7 @@ def refinement_rows(observer: RecursiveObserver | DAEObserver) -> Iterator[Check
             float(len(bounded)),
             source="options: state_bounds",
             status="assumed",
-            detail=f"active for {', '.join(bounded)}; {goes_on}. That the true states keep the bounds is assumed: then "
+            detail=f"active for {', '.join(bounded)}; {goes_on}. The true states are assumed to keep the bounds: then "
             "no projection makes a squared error larger in units of the covariance",
         )
     for name, entry in (observer.sensors or {}).items():
@@ -568,8 +568,8 @@ def _steady_covariance(
         for i, name in enumerate(stated.plant.state_names)
     ]
     detail = (
-        f"standard deviations {listed(deviations, most=LISTED_DEVIATIONS)}; the filter itself, whose gains move on, "
-        "ends at these or below"
+        f"standard deviations {listed(deviations, most=LISTED_DEVIATIONS)}; the filter itself, whose gains change, "
+        "ends at or below these"
     )
     source = "P = L A P A' L' + L Q L' + K R K', outward rounded"
     if proof.proved:

@@ -128,7 +128,7 @@ def tracking_rows(
         limit = frequencies[missed[0]] if missed.size else np.inf
         yield information(
             f"fhat/f[{name}]",
-            f"frequency in rad/s up to which the estimate of an unmodelled sinusoid misses by {FAITHFUL:.0%} or less",
+            f"frequency in rad/s up to which the estimate of an unmodelled sinusoid is wrong by {FAITHFUL:.0%} or less",
             float(limit),
             source=source,
             detail=f"largest |fhat/f| {abs(own[peak]):.3g} at {frequencies[peak]:.3g} rad/s; |fhat/f| = 1 is faithful",
