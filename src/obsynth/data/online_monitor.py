@@ -13,6 +13,7 @@ which each will alarm, is taken off the rate of false alarms.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -167,7 +168,8 @@ def learn_thresholds(
     Offsets, covariance and colour of the fault estimates and residuals are taken from the rows, whatever the design
     assumes of them: they are whitened by a fitted autoregression and watched by Hotelling's T2, exponentially weighted
     means and likelihood ratios of steps; where faults are parameters that walk, by likelihood ratios of a change of
-    each fault, too.  Levels come from a bootstrap of all that is estimated, so that a short log gives higher ones.
+    each fault and by its estimate, too.  Levels come from a bootstrap of all that is estimated, so that a short log
+    gives higher ones.
 
     Parameters
     ----------
@@ -320,7 +322,8 @@ def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _Said:
     found, refused = list[tuple[int, float, FloatArray, float, Scores]](), list[FloatArray]()
     walk, taken = parameter_walk(design.observer), 0
     faults = len(design.observer.fault_names)
-    before, silent = before_any(faults), Scores(np.zeros(faults), np.zeros((faults, faults)))
+    before, nothing_of_faults = before_any(faults), np.full(faults, np.nan)
+    silent = Scores(np.zeros(faults), np.zeros((faults, faults)), nothing_of_faults, nothing_of_faults)
     settling = settling_rows(design)
     gate = run.observer if isinstance(run.observer, SteppingLogObserver) and run.observer.gates else None
     for count, last in enumerate(_rows(run, log, CHUNK_ROWS if gate is None else 1)):
@@ -345,13 +348,13 @@ def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _Said:
         if len(last.missed) > max(AGES):
             del found[-1 - len(last.missed) : -1 - max(AGES)]
     numbers, times, rows, squares, scores = zip(*found, strict=True) if found else ((),) * 5
-    both = [np.array(part) for part in zip(*((one.score, one.information) for one in scores), strict=True)]
+    both = [np.array([getattr(one, part.name) for one in scores]) for part in fields(Scores)]
     return _Said(
         np.array(numbers),
         np.array(times),
         np.array(rows),
         np.array(squares),
-        None if walk is None or not both else Scores(*both),
+        None if walk is None or not scores else Scores(*both),
         refused,
     )
 

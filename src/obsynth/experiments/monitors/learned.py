@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,7 +45,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
 
 LEARNED_KIND = "obsynth learned thresholds"
-LEARNED_VERSION = 7
+LEARNED_VERSION = 8
 LEARNED = FileKind("learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"')
 #: Columns that are watched at most, and the least share of a column's variance that others leave unexplained.
 MOST_WATCHED, LEAST_NEW = 8, 1e-6
@@ -388,7 +388,7 @@ def thresholds_from_rows(
     Where the fault estimates remember more than the rows can tell, or nearly follow from the residuals (the gains of a
     filter move them, and what is left is how these change with the inputs), the residuals alone are watched.  A fault
     that the estimates follow leaves nothing in these: where it is known what each sample says of the faults, changes of
-    these are looked for beside them, and the estimates, which say the same later, are not watched.
+    these are looked for beside them, and the estimates in units of their deviations, which follow from the same.
     """
     names, known = watched_names(design), np.asarray(np.isfinite(rows).all(axis=1))
     others = pairs.others(every)
@@ -446,7 +446,12 @@ def thresholds_from_rows(
 def _usual_scores(scores: Scores, known: NDArray[np.bool_]) -> Scores | None:
     """Return what rows say of faults, and nothing of those that are not known; `None` where they do not determine
     them."""
-    found = Scores(np.where(known[:, None], scores.score, 0.0), np.where(known[:, None, None], scores.information, 0.0))
+    found = replace(
+        scores,
+        score=np.where(known[:, None], scores.score, 0.0),
+        information=np.where(known[:, None, None], scores.information, 0.0),
+        theta=np.where(known[:, None], scores.theta, np.nan),
+    )
     return found if found.chosen(slice(len(known) // 2)).determine and found.determine else None
 
 
@@ -584,7 +589,8 @@ class LearnedRule(Rule):
             smooth = weights * np.sum(state.means**2, axis=1)
             first = [np.sum(state.white[-1] ** 2)]
             changes = self._changes(state)
-            values = np.concatenate([first, smooth, ratios, changes.max(axis=0)]) / self.learned.levels
+            squares = self._squares(sample.said)
+            values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares]) / self.learned.levels
         values = np.where(np.isnan(values), np.inf, values)
         which = self._fault(found, ratios) if self._walk is None else most_likely_change(changes)
         return state, Judged(float(values.max()), 1.0, which)
@@ -606,6 +612,12 @@ class LearnedRule(Rule):
         sums = np.cumsum(state.scores[::-1], axis=0)[np.array(AGES) - 1]
         away, power = np.hsplit(sums, 2)
         return np.asarray(np.where(power > 0.0, away**2 / power, 0.0))
+
+    def _squares(self, said: Any) -> FloatArray:
+        """Return the squares of the estimates, from where they were, in units of their deviations, ``(nf,)``."""
+        if self._walk is None or not isinstance(said, Evidence):
+            return np.zeros(0 if self._walk is None else len(self._walk))
+        return np.asarray((said.theta - self.learned.centres) ** 2 / np.diag(said.parameter_covariance))
 
     def _fault(self, found: FloatArray, ratios: FloatArray) -> int | None:
         """Return the fault whose step or ramp explains most, or whose estimate is furthest from where it was."""

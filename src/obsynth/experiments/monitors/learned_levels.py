@@ -12,11 +12,14 @@ What each sample says of parameters that walk, from estimates and covariances al
 A filter follows a fault, and its innovations return to zero.  What a sample alone says of the parameters is what its
 update added to their information: ``J = P^-1 - M^-1`` and ``s = P^-1 theta - M^-1 theta_before``, with the covariance P
 after and M before it.  Sums of ``s - J c`` over the latest rows are the score of a change from c; their square in units
-of the information is twice the log likelihood ratio of a jump at this age (Willsky & Jones 1976).
+of the information is twice the log likelihood ratio of a jump at this age (Willsky & Jones 1976).  That counts samples
+as independent of each other.  Where a fault moves a state first, such as a drain the charge of a battery, they are not,
+and the estimates themselves, in units of their deviations, pass their level earlier.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -54,11 +57,13 @@ def parameter_walk(observer: Any) -> FloatArray | None:
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Scores ``s (..., nf)`` at parameters of zero and information ``J (..., nf, nf)`` of samples; zero where a sample
-    says nothing."""
+    """Scores ``s (..., nf)`` at parameters of zero and information ``J (..., nf, nf)`` of samples, zero where a sample
+    says nothing; and estimates after them with their deviations ``(..., nf)``, NaN where they do not count."""
 
     score: FloatArray
     information: FloatArray
+    theta: FloatArray
+    deviations: FloatArray
 
     @property
     def determine(self) -> bool:
@@ -79,7 +84,11 @@ class Scores:
 
     def chosen(self, rows: Any) -> Scores:
         """Return those of some rows."""
-        return Scores(self.score[rows], self.information[rows])
+        return Scores(self.score[rows], self.information[rows], self.theta[rows], self.deviations[rows])
+
+    def followed(self, centre: FloatArray) -> FloatArray:
+        """Return the estimates from there in units of their deviations ``(..., nf)``."""
+        return np.asarray((self.theta - centre) / self.deviations)
 
 
 def before_any(faults: int) -> FloatArray:
@@ -92,7 +101,7 @@ def sample_score(before: FloatArray, evidence: Evidence, walk: FloatArray, rows:
     one ``rows`` earlier, since which parameters have walked."""
     theta, spread = evidence.theta, evidence.parameter_covariance
     after = np.vstack([theta, spread])
-    nothing = Scores(np.zeros_like(theta), np.zeros_like(spread))
+    nothing = Scores(np.zeros_like(theta), np.zeros_like(spread), theta, np.sqrt(np.diag(spread)))
     if not (np.isfinite(before).all() and np.isfinite(after).all()):
         return after, nothing
     with np.errstate(all="ignore"):
@@ -101,7 +110,7 @@ def sample_score(before: FloatArray, evidence: Evidence, walk: FloatArray, rows:
         except np.linalg.LinAlgError:
             return after, nothing
         added = own - prior
-        found = Scores(own @ theta - prior @ before[0], 0.5 * (added + added.T))
+        found = replace(nothing, score=own @ theta - prior @ before[0], information=0.5 * (added + added.T))
         # A covariance that has grown beside its walk has started again: what it was before says nothing of this.
         if not (np.isfinite(added).all() and (np.diag(added) >= -LEAST_ADDED * np.diag(own)).all()):
             return after, nothing
@@ -149,34 +158,42 @@ def most_likely_change(ratios: FloatArray) -> int:
 
 @dataclass(frozen=True, eq=False)
 class ScoreModel:
-    """Normal scores in units of their deviations, as an autoregression has them, to be drawn again.
+    """Normal scores and estimates in units of their deviations, as autoregressions have them, to be drawn again.
 
-    ``white (n, nf)`` are its innovations, NaN where a sample says nothing or one before it is missing; ``root`` and
-    ``information (n, nf, nf)`` are those of the samples.
+    ``whites (n, nf)``: innovations of scores and of estimates, NaN where a sample says nothing or one before it is
+    missing; ``root`` and ``information (n, nf, nf)`` are those of the samples.
     """
 
     model: Autoregression
-    white: FloatArray
+    followed: Autoregression
+    whites: tuple[FloatArray, FloatArray]
     root: FloatArray
     information: FloatArray
 
     @classmethod
     def of(cls, scores: Scores) -> ScoreModel:
         """Return that of normal rows ``(n, nf)``."""
-        from obsynth.numerics.autoregression import fitted_autoregression
-
         root, inverse = roots(scores.information)
-        units = (inverse @ scores.away(scores.centre())[..., None])[..., 0]
+        centre = scores.centre()
+        units = (inverse @ scores.away(centre)[..., None])[..., 0]
         said = np.asarray(np.einsum("kii->k", scores.information) > 0.0)
         units = np.where(said[:, None], units, np.nan)
-        model = fitted_autoregression(units)
-        return cls(model, model.whitened(units), root, scores.information)
+        estimates = scores.followed(centre)
+        models = fitted_autoregression(units), fitted_autoregression(estimates)
+        whites = models[0].whitened(units), models[1].whitened(estimates)
+        return cls(*models, whites, root, scores.information)
 
-    def drawn(self, white: FloatArray, places: Any) -> tuple[FloatArray, FloatArray]:
-        """Return streams of scores ``(runs, n, nf)`` and information, from innovations and the places that they are
-        of."""
-        units = self.model.simulated(white)
-        return (self.root[places] @ units[..., None])[..., 0], self.information[places]
+    @property
+    def order(self) -> int:
+        """Rows before a first one with innovations."""
+        return max(self.model.order, self.followed.order)
+
+    def drawn(self, whites: Sequence[FloatArray], places: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return streams of scores ``(runs, n, nf)``, information and estimates, from innovations and the places that
+        they are of."""
+        units = self.model.simulated(whites[0])
+        score = (self.root[places] @ units[..., None])[..., 0]
+        return score, self.information[places], self.followed.simulated(whites[1])
 
 
 #: An alarm ends when so many rows in a row were below the level.
@@ -203,6 +220,9 @@ RARER = (1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 CONFORMAL = 40
 #: Rows that are needed, of each that one row is remembered for.
 MEMORIES = 100.0
+#: The same of estimates, whose usual size each stream finds again: with 14 to 28 times what they remember 1.5 times the
+#: rate was passed in 4 to 7 % of logs, with 6 times in 17 %.
+MEMORIES_OF_ESTIMATES = 12.0
 #: A rate counts as observed when so many alarms of it are in the streams; rarer ones are extrapolated.
 OBSERVED = 10.0
 
@@ -210,7 +230,8 @@ OBSERVED = 10.0
 @dataclass(frozen=True, eq=False)
 class Statistics:
     """What is computed of whitened rows: T2, two MEWMA, and for each signature the largest likelihood ratios of a step
-    and of a ramp; beside these those of a change of each fault of ``estimates``, of which `change_ratios` are apart.
+    and of a ramp; beside these those of a change of each fault of ``estimates``, and the square of its estimate, of
+    which `change_ratios` and `Scores.followed` are apart.
 
     ``signatures (s, m)``: directions of a step, and of a ramp, in the signals as they are; ``told``: what they show.
     """
@@ -225,7 +246,8 @@ class Statistics:
         """Of the statistics, in order."""
         means = (f"MEWMA {share:g}" for share in FORGETTING)
         likely = (f"GLR of a {shape} in {name}" for shape in ("step", "ramp") for name in self.told)
-        return ("T2", *means, *likely, *(f"GLR of a change of {name}" for name in self.estimates))
+        changes = (f"GLR of a change of {name}" for name in self.estimates)
+        return ("T2", *means, *likely, *changes, *(f"square of {name}" for name in self.estimates))
 
     def responses(self) -> tuple[FloatArray, FloatArray]:
         """Return what steps, then ramps, of each signature do to e: their first p + 1 rows ``(2 s, p + 1, m)``, and
@@ -429,18 +451,29 @@ def conformal_levels(
     half = len(x) // 2
     model = fitted_autoregression(x[:half])
     found = replace(statistics, model=model)
-    runs = _of_normal(x, found, scores, None if scores is None else scores.chosen(slice(half)).centre())[:, None]
+    usual = None if scores is None else _usual(scores.chosen(slice(half)))
+    runs = _of_normal(x, found, scores, usual)[:, None]
     first, second = (np.moveaxis(part, 1, 0) for part in (runs[..., :half], runs[..., half:]))
     own, _ = _union(first, every, half - SETTLING)
     union = (second / own[None, :, None]).max(axis=1)
     rows = int(np.asarray(np.isfinite(x[half + SETTLING :]).all(axis=1)).sum())
     stretched = union[:, SETTLING:].size / rows
-    return found, Levels(read_only(own), level_of(union, stretched * _exchangeable(rows, every)), extrapolated=False)
+    return found, Levels(
+        _of_deviations(own, usual), level_of(union, stretched * _exchangeable(rows, every)), extrapolated=False
+    )
 
 
-def _changes(scores: Scores, centre: FloatArray) -> FloatArray:
-    """Return twice the largest log likelihood ratios of changes of each fault from there, ``(nf, n)``."""
-    return change_ratios(scores.away(centre), np.einsum("kii->ki", scores.information), AGES)
+def _of_faults(scores: Scores, centre: FloatArray, sizes: FloatArray) -> FloatArray:
+    """Return twice the largest log likelihood ratios of changes of each fault from there, and the squares of estimates
+    in units of what is usual, ``(2 nf, n)``."""
+    changes = change_ratios(scores.away(centre), np.einsum("kii->ki", scores.information), AGES)
+    return np.concatenate([changes, np.nan_to_num(scores.followed(centre).T ** 2 / sizes[:, None])])
+
+
+def _usual(scores: Scores) -> tuple[FloatArray, FloatArray]:
+    """Return where normal rows have the faults, and the usual squares of estimates from there ``(nf,)``."""
+    centre = scores.centre()
+    return centre, np.nanmean(scores.followed(centre) ** 2, axis=0)
 
 
 def learned_levels(
@@ -452,17 +485,18 @@ def learned_levels(
     model, n = statistics.model, len(x)
     rows = int(np.clip(ROWS_PER_ALARM * every, LEAST_STREAM_ROWS, MOST_STREAM_ROWS))
     beside = None if scores is None else ScoreModel.of(scores)
-    parts = [model.whitened(x)] if beside is None else [model.whitened(x), beside.white]
+    parts = [model.whitened(x), *(() if beside is None else beside.whites)]
     known = np.asarray(np.isfinite(np.hstack(parts)).all(axis=1))
-    known[: max(model.order, 0 if beside is None else beside.model.order)] = False
+    known[: max(model.order, 0 if beside is None else beside.order)] = False
     e, *others = [part[known] - part[known].mean(axis=0) for part in parts]
     # What is drawn together happened together.
     places = drawn_places(len(e), STREAMS, BURN_IN_ROWS + n + rows, rng)
     streams = model.simulated(drawn_rows(e, places, rng))
     of_faults = None
     if beside is not None:
-        of_faults = Scores(*beside.drawn(drawn_rows(others[0], places, rng), np.flatnonzero(known)[places]))
+        of_faults = beside.drawn([drawn_rows(part, places, rng) for part in others], np.flatnonzero(known)[places])
     known = np.asarray(np.isfinite(x).all(axis=1))
+    normal = np.arange(BURN_IN_ROWS, BURN_IN_ROWS + n)[known]
     found = []
     for i, stream in enumerate(streams):
         seen = np.where(known[:, None], stream[BURN_IN_ROWS : BURN_IN_ROWS + n], np.nan)
@@ -470,9 +504,13 @@ def learned_levels(
         judged = Statistics(again, statistics.signatures, statistics.told)
         values = judged.of_rows(again.whitened(stream[None, -rows:]))[:, 0]
         if of_faults is not None:
-            said = of_faults.chosen(i)
-            centre = said.chosen(np.arange(BURN_IN_ROWS, BURN_IN_ROWS + n)[known]).centre()
-            values = np.concatenate([values, _changes(said.chosen(slice(-rows, None)), centre)])
+            score, information, followed = (part[i] for part in of_faults)
+            said = Scores(score, information, followed, np.ones_like(followed))
+            centre = said.chosen(normal).centre()
+            # Estimates follow from what samples before them said, and have a centre of their own.
+            said = replace(said, theta=followed - followed[normal].mean(axis=0) + centre)
+            sizes = np.mean(said.chosen(normal).followed(centre) ** 2, axis=0)
+            values = np.concatenate([values, _of_faults(said.chosen(slice(-rows, None)), centre, sizes)])
         found.append(values)
     runs = np.array(found)
     total = runs[:, 0, SETTLING:].size
@@ -488,9 +526,10 @@ def learned_levels(
         before = level_of(union, seen_rate / OBSERVED)
         level += max(level - before, 0.0) * float(np.log(every / seen_rate) / np.log(OBSERVED))
     # What lasts longer in these rows than a block raises alarms in them that no stream of blocks shows.
-    itself = (_of_normal(x, statistics, scores) / own[:, None]).max(axis=0)[None]
+    usual = None if scores is None else _usual(scores)
+    itself = (_of_normal(x, statistics, scores, usual) / own[:, None]).max(axis=0)[None]
     shown_there = level_of(itself, _exchangeable(itself[:, SETTLING:].size, every))
-    return Levels(read_only(own), max(level * sure, shown_there), every > seen_rate)
+    return Levels(_of_deviations(own, usual), max(level * sure, shown_there), every > seen_rate)
 
 
 def _exchangeable(rows: int, every: float) -> float:
@@ -501,17 +540,21 @@ def _exchangeable(rows: int, every: float) -> float:
 
 
 def _of_normal(
-    x: FloatArray, statistics: Statistics, scores: Scores | None, centre: FloatArray | None = None
+    x: FloatArray, statistics: Statistics, scores: Scores | None, usual: tuple[FloatArray, FloatArray] | None
 ) -> FloatArray:
-    """Return the statistics of rows ``(n, m)`` without faults as they came, ``(k, n)``, of changes of faults from
-    ``centre``, by default where these rows have them."""
+    """Return the statistics of rows ``(n, m)`` without faults as they came, ``(k, n)``, of faults in units of what is
+    ``usual``."""
     # A row that is missing adds no evidence.
     found = statistics.of_rows(np.nan_to_num(statistics.model.whitened(x[None])))[:, 0]
-    return (
-        found
-        if scores is None
-        else np.concatenate([found, _changes(scores, scores.centre() if centre is None else centre)])
-    )
+    return found if scores is None or usual is None else np.concatenate([found, _of_faults(scores, *usual)])
+
+
+def _of_deviations(own: FloatArray, usual: tuple[FloatArray, FloatArray] | None) -> FloatArray:
+    """Return levels of which those of squares of estimates are in units of the observer's own deviations."""
+    if usual is not None:
+        sizes = usual[1]
+        own = np.concatenate([own[: -len(sizes)], own[-len(sizes) :] * sizes])
+    return read_only(own)
 
 
 def _union(runs: FloatArray, every: float, total: int) -> tuple[FloatArray, FloatArray]:
@@ -530,12 +573,14 @@ def _union(runs: FloatArray, every: float, total: int) -> tuple[FloatArray, Floa
 def rows_needed(model: Autoregression, every: float, scores: Scores | None = None) -> int:
     """Return how many rows without faults a rate of one alarm per ``every`` rows needs: as many as between alarms, a
     hundred times what the residuals remember, and enough for every coefficient; of what they say of faults (``scores``)
-    a hundred times what that remembers, in rows that say as much as most of it comes from."""
+    a hundred times what that remembers, in rows that say as much as most of it comes from, and twelve times what the
+    estimates remember."""
     m = model.channels
     needed = [every, MEMORIES * model.longest_gain, 50.0 * m * (1 + m * model.order)]
     if scores is not None:
         own = np.einsum("kii->ki", scores.information)
         # Of n rows of which one alone tells of a fault, one counts.
         share = float((own.sum(axis=0) ** 2 / (own**2).sum(axis=0)).min()) / len(own)
-        needed.append(MEMORIES * ScoreModel.of(scores).model.longest_gain / share)
+        beside = ScoreModel.of(scores)
+        needed += [MEMORIES * beside.model.longest_gain / share, MEMORIES_OF_ESTIMATES * beside.followed.longest_gain]
     return int(np.ceil(max(needed)))

@@ -361,8 +361,14 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
         }
         changed = monitor_changes(m, changes);
         for (i = 0; i < MONITOR_ESTIMATES; i++) {
+            REAL away = shown[i] - monitor_centres[0][i];
             ratio = changes[i] / monitor_levels[0][1 + MEANS + SHAPES + i];
             statistic = ratio <= statistic ? statistic : ratio;
+            if (covariance != NULL) {
+                ratio = away * away / covariance[i * (MONITOR_WIDTH + 1)];
+                ratio /= monitor_levels[0][1 + MEANS + SHAPES + MONITOR_ESTIMATES + i];
+                statistic = ratio <= statistic ? statistic : ratio;
+            }
         }
         m->statistic = isnan(statistic) ? (REAL)HUGE_VAL : statistic;
         m->alarm = m->statistic > 1;
