@@ -92,6 +92,23 @@ def test_report_refuses(folder, capsys):
     assert json.loads(Path(gains).read_text())["kind"] == "obsynth gain set"
 
 
+@pytest.mark.parametrize(
+    ("arguments", "target", "wanted"),
+    [
+        (["simulate", "--system", "spec", "--out"], "signals.png", ".csv"),
+        (["compare", "--system", "spec", "--out"], "table.csv", ".html"),
+        (["design", "--system", "spec", "--output"], "gains.YAML", ".json"),
+        (["report", "--gains", "gains", "--out"], "page.pdf", ".html"),
+    ],
+)
+def test_no_file_gets_the_name_of_another_format(folder, capsys, arguments, target, wanted):
+    """A table of signals was written to `signals.png` without a word."""
+    known = {"spec": str(ROOT / "designs" / "wang2015" / "spec.yaml"), "gains": str(folder / "wang2015.json")}
+    assert main([*(known.get(word, word) for word in arguments), target, "--force"]) == 2
+    assert f"give it a name that ends in {wanted}." in capsys.readouterr().err
+    assert list(Path().iterdir()) == []
+
+
 def test_report_shows_the_design_on_the_scenario_of_a_spec(folder, capsys):
     spec = ROOT / "designs" / "wang2015" / "spec.yaml"
     gains = str(folder / "wang2015.json")

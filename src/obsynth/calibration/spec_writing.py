@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from obsynth.calibration.reporting import Calibration
 
 #: What ``calibrate --write-spec`` writes, and may write over.
-CALIBRATED_SPEC = FileKind("a spec that obsynth has calibrated", rb"\A# Calibrated by obsynth")
+CALIBRATED_SPEC = FileKind("a spec that obsynth has calibrated", rb"\A# Calibrated by obsynth", suffix=".yaml")
 #: Methods that take Q and R as options of their own.
 _DAE, _RECURSIVE = "dae-adaptive-observer", ("descriptor-kalman", "adaptive-observer")
 #: What a plant says of noise, all of which a calibration finds anew.

@@ -16,8 +16,8 @@ from obsynth.files.inputs import protect
 from obsynth.files.outputs import FileKind, write_atomically
 
 #: Written by ``linearise`` and ``calibrate``.
-PLANT = FileKind("a plant that obsynth has linearised", rb"\A# Linearised by obsynth")
-CALIBRATION = FileKind("a calibration of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth calibration"')
+PLANT = FileKind("a plant that obsynth has linearised", rb"\A# Linearised by obsynth", suffix=".yaml")
+CALIBRATION = FileKind("a calibration of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth calibration"', suffix=".json")
 
 
 def _range(name: str, text: str) -> tuple[float, float]:

@@ -32,6 +32,8 @@ def output_file(path: str | Path, kind: FileKind | None, options: argparse.Names
     A file that the command has read, under whatever name, is never written (checked again when the file is put in its
     place).  An existing file of another kind (of any, if that is `None`) needs ``--force``."""
     target = check_output(path, option=option)
+    if kind is not None:
+        kind.check_name(target)
     if not options.force:
         check_replaceable(target, kind)
     return target

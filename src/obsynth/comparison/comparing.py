@@ -156,7 +156,7 @@ SHOWN_SAMPLES = 0.98
 #: Opacity of an estimate that reaches beyond its panel.
 FAINT = 0.25
 #: What the page of a comparison begins with.
-COMPARISON_PAGE = FileKind("a comparison of obsynth", rb'name="generator" content="obsynth compare"')
+COMPARISON_PAGE = FileKind("a comparison of obsynth", rb'name="generator" content="obsynth compare"', suffix=".html")
 _HEADER = (
     "method",
     "fault",

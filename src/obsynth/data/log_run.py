@@ -467,7 +467,7 @@ class LogRun:
 
 RUN_STATE_KIND = "obsynth run state"
 RUN_STATE_VERSION = 12
-STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"')
+STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"', suffix=".json")
 #: Parts that are seconds, or nothing before the first row.
 _TIME_PARTS = frozenset({"last", "longest"})
 

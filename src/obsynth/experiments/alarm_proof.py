@@ -446,7 +446,7 @@ def checked(design: ObserverDesign, body: Mapping[str, Any], u: FloatArray, y: F
 
 ALARM_VERSION = 2
 ALARM_KIND = "obsynth alarm certificate"
-CERTIFICATE = FileKind("an alarm certificate", b'"kind": "obsynth alarm certificate"')
+CERTIFICATE = FileKind("an alarm certificate", b'"kind": "obsynth alarm certificate"', suffix=".json")
 #: The solver of linear programmes may take so long; without an answer nothing is proved.
 SOLVER_SECONDS = 60.0
 #: Multipliers are kept to this many significant digits: any numbers prove a bound, and few digits stay readable.

@@ -327,7 +327,7 @@ def _squares(innovations: FloatArray, regressors: FloatArray, parameters: FloatA
 
 
 #: A table that `Simulation.write_csv` has written: signals of the plant beside time, and no status of rows.
-SIMULATED_SIGNALS = FileKind("a table of simulated signals", rb"\Atime,(?!status,)[^\n]*x(hat)?\[")
+SIMULATED_SIGNALS = FileKind("a table of simulated signals", rb"\Atime,(?!status,)[^\n]*x(hat)?\[", suffix=".csv")
 
 
 @dataclass(frozen=True, eq=False)

@@ -94,13 +94,39 @@ PART = ".part"
 LOOKED_AT = 1 << 16
 
 
+#: Suffixes by which files of one format are named, the usual one first.
+SUFFIXES = (
+    (".csv", ".tsv", ".txt"),
+    (".json",),
+    (".yaml", ".yml"),
+    (".html", ".htm"),
+    *(
+        (suffix,)
+        for suffix in (".png", ".svg", ".pdf", ".jpg", ".parquet", ".xlsx", ".mat", ".npz", ".fmu", ".c", ".h")
+    ),
+)
+
+
 @dataclass(frozen=True)
 class FileKind:
-    """A kind of file that obsynth writes: its name, a regular expression for its beginning or end, how it is named."""
+    """A kind of file that obsynth writes: its name, a regular expression for its beginning or end, how it is named.
+
+    ``ending``: end of the whole name by which an older one is known; ``suffix``: of its format, where it has one."""
 
     name: str
     mark: bytes
     ending: str | None = None
+    suffix: str | None = None
+
+    def check_name(self, target: Path) -> None:
+        """Raise `SpecError` for a name that is that of another format."""
+        named = next((group for group in SUFFIXES if target.suffix.lower() in group), None)
+        if self.suffix is not None and named is not None and self.suffix not in named:
+            raise SpecError(
+                f"{target} would hold {self.name}, which is no {target.suffix} file: give it a name that ends in "
+                f"{self.suffix}.",
+                path=str(target),
+            )
 
     def recognises(self, path: Path) -> bool:
         """Whether an existing file is of this kind, by its content or its name; empty files are of every kind."""

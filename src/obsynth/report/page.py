@@ -560,7 +560,7 @@ def _statistics(design: ObserverDesign, run: DataRun) -> Iterator[str]:
 
 
 #: A page that `html_report` has written.
-PAGE = FileKind("a report of obsynth", rb'name="generator" content="obsynth"')
+PAGE = FileKind("a report of obsynth", rb'name="generator" content="obsynth"', suffix=".html")
 #: Gains with more entries are not printed: the gain set has them.
 MOST_ENTRIES = 900
 

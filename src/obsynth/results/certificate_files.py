@@ -21,7 +21,9 @@ from obsynth.results.gain_set_writing import design_as_dict, digest_of, plain, r
 ROBUSTNESS, STUDY, COMPARISON = "obsynth robustness", "obsynth tolerance study", "obsynth comparison"
 RESULTS = (ROBUSTNESS, STUDY, COMPARISON)
 RESULT_FILE = FileKind(
-    "a certificate of a result", rb'\A\s*\{\s*"kind":\s*"obsynth (robustness|tolerance study|comparison)"'
+    "a certificate of a result",
+    rb'\A\s*\{\s*"kind":\s*"obsynth (robustness|tolerance study|comparison)"',
+    suffix=".json",
 )
 RESULT_VERSION = 1
 #: Digits of a digest that a sentence shows.

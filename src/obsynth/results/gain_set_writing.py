@@ -34,6 +34,7 @@ GAIN_SET = FileKind(
     "a gain set",
     rb'\A(PK\x03\x04[\s\S]{26}gain_set\.json)?\s*\{\s*"kind":\s*"obsynth gain set"',
     ending=".gains.json",
+    suffix=".json",
 )
 #: Tags of kinds of designs; linear time-invariant ones have none.
 DESIGN_KINDS = (None, "recursive", "dae", "window")

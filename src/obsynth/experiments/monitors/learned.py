@@ -46,7 +46,9 @@ from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restore
 
 LEARNED_KIND = "obsynth learned thresholds"
 LEARNED_VERSION = 8
-LEARNED = FileKind("learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"')
+LEARNED = FileKind(
+    "learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"', suffix=".json"
+)
 #: Columns that are watched at most, and the least share of a column's variance that others leave unexplained.
 MOST_WATCHED, LEAST_NEW = 8, 1e-6
 #: A direction whose largest part is this share of its length is that of one column.
