@@ -132,7 +132,7 @@ def test_short_errors_of_steps_that_add_up_take_radau() -> None:
     unknown = {"V": (0.05, 0.3), "H": (1e4, 2e5)}
     found = calibrate(model, log, unknown, starts=1, input_delay=0)
     assert found.integration == "radau"
-    assert said(found, "of its own: Radau is taken")
+    assert said(found, "of its own: Radau is used")
     assert found.box.holds({"V": 0.1, "H": 5e4})
     euler = calibrate(model, log, unknown, starts=1, integration="backward-euler", input_delay=0)
     assert not euler.box.holds({"V": 0.1, "H": 5e4})
@@ -157,7 +157,7 @@ def test_a_log_with_a_wrong_sample_is_compared_without_it_and_steps_that_are_too
 
     found = validate(design, circuit_log(300, vm=wrong))
     assert said(found, "1 value(s) of vm are far from all others")
-    assert said(found, "A step of backward Euler errs by up to 0.4")
+    assert said(found, "A step of backward Euler has an error of up to 0.4")
     exact = validate(replace(design, observer=replace(design.observer, integration="radau")), circuit_log(300))
     assert exact.nis.holds
     assert not said(exact, "backward Euler")

@@ -603,9 +603,10 @@ def _told(
         least = min(losses, key=lambda rows: losses[rows])
         found.append(f"Inputs that act {least:+d} row(s) later would be better by {lost:.1f} nats: see input_delay.")
     if error is not None:
-        what = "Radau is taken" if problem.integration == "radau" else "it is taken"
+        used = "Radau" if problem.integration == "radau" else "backward Euler"
         told = f" and moves a constant by {error.moved:.2g} of its own" if error.moved else ""
         found.append(
-            f"A step of backward Euler errs by at most {error.largest:.2g} deviations of {error.sensor}{told}: {what}."
+            f"A step of backward Euler has an error of at most {error.largest:.2g} deviations of {error.sensor}{told}: "
+            f"{used} is used."
         )
     return found

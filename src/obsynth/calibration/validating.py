@@ -340,7 +340,7 @@ def validate(
         )
     if record.error is not None and record.error.matters:
         sentences.append(
-            f"A step of backward Euler errs by up to {record.error.largest:.2g} deviations of "
+            f"A step of backward Euler has an error of up to {record.error.largest:.2g} deviations of "
             f"{record.error.sensor} (row {found.rows[0] + record.error.row}), which moves estimates of "
             "parameters: integration: radau has no such error."
         )

@@ -674,8 +674,8 @@ def compare(
 ) -> Comparison:
     """Design every method that exists for a plant and put them side by side, on one clock and the same draws.
 
-    Ranked by the root mean square error over the scenario, disturbances, noise and tolerances drawn, among those that
-    show 90 % of a step within the time asked for.
+    Methods are ranked by the root mean square error over the scenario, with disturbances, noise and tolerances drawn,
+    among those whose estimate reaches 90 % of a step within the time asked for.
 
     Parameters
     ----------

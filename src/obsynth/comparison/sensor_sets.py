@@ -219,8 +219,9 @@ def sensor_sets(
 ) -> SensorSets:
     """Find least sets of sensors to add for detecting, isolating or estimating faults.
 
-    Few sets are enumerated, which is exact.  Otherwise what is found is inclusion-minimal (no sensor of a set can be
-    left out) and said to be that only.  Every answer is confirmed on the decoupled plant.
+    If there are few candidate sets, all are tried, and the answer is exact.  Otherwise each set found is
+    inclusion-minimal (no sensor of it can be left out), and the result says so.  Every answer is confirmed on the
+    decoupled plant.
 
     Parameters
     ----------

@@ -269,8 +269,8 @@ def run_on_data(
     """Run a design on measured data, in constant memory.
 
     Each row of data gives one row of estimates.  The operating point is subtracted from the data and added back to
-    the estimates.  An estimate that lags has a column ``time of ...``: the time of which it is the estimate.  Where the
-    design is for a plant whose algebraic states were eliminated, these are recovered and stand beside the others.
+    the estimates.  An estimate with a delay has a column ``time of ...`` with the time that it is for.  If the design
+    is for a plant whose algebraic states were eliminated, these are recovered and have columns as well.
 
     Parameters
     ----------

@@ -238,8 +238,8 @@ def from_fmu(
 ) -> DescriptorSystem:
     """Return the plant of an FMU, linearised at an operating point.
 
-    By its own directional derivatives where it provides them, else by central differences, which are right to about
-    eight digits where it is smooth.
+    The FMU is linearised by its own directional derivatives if it provides them, otherwise by central differences,
+    which are accurate to about eight digits if it is smooth.
 
     Parameters
     ----------

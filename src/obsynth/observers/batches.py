@@ -120,7 +120,7 @@ def run_batch(
     """Run many trials with one observer.
 
     The gains of a recursive observer do not depend on data, so that a step is one product for all trials.  An observer
-    of a DAE runs as C where that pays and a compiler is there.
+    of a DAE runs as C if that is faster and there is a compiler.
 
     Parameters
     ----------

@@ -221,7 +221,7 @@ class Stuck(Failure):
 
 @dataclass(frozen=True, kw_only=True)
 class LostEffectiveness(Failure):
-    """An actuator or a sensor that gives only a part.
+    """An actuator or a sensor that gives only a share of its signal.
 
     Parameters
     ----------

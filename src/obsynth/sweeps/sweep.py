@@ -706,7 +706,7 @@ def run_fleet(
 
     A log with the name of a gain set (``pump.csv`` beside ``pump.gains.json``) is for that one alone; every other log
     is for every gain set, so that one stream can be watched by many designs.  The folder keeps estimates and results:
-    the same call goes on where another was stopped.
+    the same call continues one that was interrupted.
 
     Parameters
     ----------

@@ -1,7 +1,4 @@
-"""What a design promises for every plant in the box of its constants.
-
-What is known of a design over the box of its constants, frozen, as lines for people and as plain data.
-"""
+"""What a design guarantees for every plant in the box of its constants, as lines for people and as plain data."""
 
 from __future__ import annotations
 
@@ -316,7 +313,7 @@ def _with_tolerances_of(plant: DescriptorSystem, given: DescriptorSystem) -> Des
 def robustness(
     design: ObserverDesign, *, constants: Any = None, progress: Callable[[str], None] | None = None
 ) -> Robustness:
-    """Return what a linear discrete-time design promises for every plant in the box of its constants.
+    """Return what a linear discrete-time design guarantees for every plant in the box of its constants.
 
     Parameters
     ----------

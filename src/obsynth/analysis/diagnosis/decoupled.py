@@ -309,7 +309,7 @@ class DecoupledPlant:
 def decouple(
     plant: DescriptorSystem | Transformation, *, without: Sequence[str] = (), faults: Sequence[str] | None = None
 ) -> DecoupledPlant:
-    """Remove the unknown inputs, and faults that are not to show, from a plant.
+    """Remove the unknown inputs, and faults that are to have no effect, from a plant.
 
     Exact for descriptor plants of any index, and whatever the unknown inputs, the faults removed and the initial state
     are.  What is decided on the way does not depend on the units of the data, that of time included.

@@ -317,9 +317,9 @@ def diagnose(
     whole_bank: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
-    """Say for each fault whether it can be detected, told from the others, and estimated; and what forbids it.
+    """Decide for each fault whether it can be detected, distinguished from the others, and estimated; and if not, why.
 
-    Free of every unknown input and of the initial state, for descriptor plants of any index, continuous or sampled.
+    The answers hold for any unknown inputs and initial state, for descriptor plants of any index, continuous or not.
     Small plants whose numbers are as somebody wrote them are decided over the rational numbers; all others in floating
     point, in units that do not depend on those of the data, with the gap behind each decision.
 

@@ -39,7 +39,7 @@ def with_noise(
     dt: float | None = None,
     integration: str = "backward-euler",
 ) -> tuple[Transformation | DAEModel, dict[str, Any]]:
-    r"""Give a plant states for coloured noise, offsets of sensors and loads that walk.
+    r"""Give a plant states for coloured noise, for offsets of sensors, and for loads that are random walks.
 
     Coloured noise :math:`n_y` of an output, its offset :math:`o_y` and a load :math:`l` follow
 

@@ -21,8 +21,8 @@ from obsynth.verification.error_system import ErrorModel
 class DetectionFilterMethod(Method):
     """Design the residual filter of largest H-minus over H-infinity, where unknown inputs reach every output.
 
-    No residual is free of the unknown inputs (and noise) there; the best there is makes their transfer to the
-    residuals co-inner, and no filter of gain one shows any fault more at any frequency.
+    In such a plant no residual is free of the unknown inputs and noise.  The best filter makes their transfer function
+    to the residuals co-inner; no other filter of gain one responds more to any fault at any frequency.
 
     Parameters
     ----------

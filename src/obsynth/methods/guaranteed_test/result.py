@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GuaranteedTest(ObserverDesign):
-    """A design by `guaranteed_test`: with its threshold, what it surely finds, and its table of samples.
+    """A design by `guaranteed_test`: its threshold, the fault that it is certain to detect, and its table of samples.
 
     Parameters
     ----------

@@ -99,7 +99,7 @@ def _is_plain(values: ArrayLike, count: int) -> bool:
 
 
 class DAEObserver(DAESettings):
-    """An observer: what `start` and `run` need, and nothing that depends on data.
+    """A nonlinear observer: everything that `start` and `run` need, and nothing that depends on data.
 
     Parameters
     ----------

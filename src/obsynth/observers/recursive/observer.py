@@ -809,7 +809,7 @@ def _kernel_steps(
 
 @dataclass(frozen=True, eq=False)
 class RecursiveObserver(StepObserver):
-    """A recursive observer: what `start` and `run` need, and nothing that depends on data.
+    """A recursive observer: everything that `start` and `run` need, and nothing that depends on data.
 
     Parameters
     ----------
