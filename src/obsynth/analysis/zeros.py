@@ -64,7 +64,7 @@ def structure_of(plant: DescriptorSystem) -> PencilStructure:
     """Return the structure of a plant's pencil ``A - z E``, which methods and verification ask for again and again."""
     found = structure_of_reduced(plant.E.shape, _reduced(plant))
     values = PlantUnits.of(plant).rounded().eigenvalues(found.finite_eigenvalues)
-    return replace(found, finite_eigenvalues=_frozen(values))
+    return replace(found, finite_eigenvalues=read_only(values, np.complex128))
 
 
 def unstable_poles(plant: DescriptorSystem) -> tuple[complex, ...]:
@@ -85,9 +85,7 @@ def system_zeros(E: FloatArray, A: FloatArray, *, nx: int) -> FiniteZeros:
     # Both of a pair are judged by the upper one.
     upper = [complex(z.real, abs(z.imag)) for z in found.values]
     kept = np.array([abs(z) <= 1.0 or _is_singular(E, A, z, found.normal_rank, nx=nx) for z in upper], dtype=bool)
-    values = found.values[kept]
-    values.setflags(write=False)
-    return replace(found, values=values)
+    return replace(found, values=read_only(found.values[kept], np.complex128))
 
 
 def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int, *, nx: int) -> bool:
@@ -258,7 +256,9 @@ def zeros_with_directions(
             continue
         if value.imag < 0.0:
             # Pairs follow each other and are exact.
-            state, driving = (_frozen(part.conj()) for part in (zeros[-1].state_direction, zeros[-1].input_direction))
+            state, driving = (
+                read_only(part.conj(), np.complex128) for part in (zeros[-1].state_direction, zeros[-1].input_direction)
+            )
             zeros.append(Zero(value, state, driving, zeros[-1].input_share))
             continue
         pencil = equilibrated_at(E, A, value, nx=nx)
@@ -294,13 +294,8 @@ def _zero_along(direction: NDArray[Any], value: complex, scale: FloatArray, *, n
     leading = original[np.argmax(np.abs(original))]
     original = original * (abs(leading) / leading / np.linalg.norm(original))
     share = float(np.linalg.norm(direction[nx:]))
-    return Zero(value, _frozen(original[:nx]), _frozen(original[nx:]), share)
-
-
-def _frozen(vector: NDArray[Any]) -> ComplexArray:
-    copy = np.array(vector, dtype=np.complex128)
-    copy.setflags(write=False)
-    return copy
+    state, driving = (read_only(part, np.complex128) for part in (original[:nx], original[nx:]))
+    return Zero(value, state, driving, share)
 
 
 #: At most this many signals are named in a failed condition.

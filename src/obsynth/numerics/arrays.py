@@ -44,9 +44,9 @@ def remembered(make: Callable[Concatenate[Any, Given], Made]) -> Callable[Concat
     return once
 
 
-def read_only(array: FloatArray) -> FloatArray:
+def read_only(array: NDArray[Any], dtype: Any = np.float64) -> NDArray[Any]:
     """Return a private copy of ``array`` that nobody can write to."""
-    copy = np.array(array, dtype=np.float64, order="C", copy=True)
+    copy = np.array(array, dtype=dtype, order="C", copy=True)
     copy.setflags(write=False)
     return copy
 

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
+from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value, read_only
 from obsynth.numerics.lapack import eigenvalues
 from obsynth.numerics.ranks import CLUSTER_TOLERANCE, RANK_TOLERANCE, RankDecision, rank_from
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
@@ -455,6 +455,4 @@ def _in_pairs(values: ComplexArray) -> ComplexArray:
     upper = values[values.imag >= 0.0]
     upper = upper[np.lexsort((upper.imag, upper.real))]
     paired = [pair for value in upper for pair in ((value, value.conjugate()) if value.imag > 0.0 else (value,))]
-    result = np.array(paired, dtype=np.complex128)
-    result.setflags(write=False)
-    return result
+    return read_only(np.array(paired), np.complex128)

@@ -35,7 +35,7 @@ from obsynth.analysis.zeros import structure_of
 from obsynth.errors import SpecError
 from obsynth.files.tables import html_table, text_table
 from obsynth.numerics.arguments import arguments_checked, is_finite_number, truth
-from obsynth.numerics.arrays import ComplexArray
+from obsynth.numerics.arrays import ComplexArray, read_only
 from obsynth.numerics.libraries import failed_computations, on_one_thread_if_small
 from obsynth.numerics.ranks import REST_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
@@ -540,9 +540,7 @@ def _isolability(
     asked = {(i, j): questions.of((j,), i) for i in range(plant.nf) for j in others(plant, i)}
     for place, pair in {**asked, **{(i, i): own for i, own in enumerate(shown)}}.items():
         weak[place], strong[place] = pair.visible, pair.shows_at_rest
-    weak.setflags(write=False)
-    strong.setflags(write=False)
-    return weak, strong, list(asked.values())
+    return read_only(weak, bool), read_only(strong, bool), list(asked.values())
 
 
 def _warnings(plant: DescriptorSystem, asked: Sequence[Question]) -> tuple[str, ...]:

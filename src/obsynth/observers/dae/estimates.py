@@ -190,8 +190,7 @@ class GatheredRows:
         first, *more = self.parts
         whole = {name: np.concatenate([part[name] for part in self.parts]) for name in first} if more else dict(first)
         whole["excitation"] = _excitation(self.observer, whole["informations"])
-        received = ~np.isnan(whole["innovations"])
-        received.setflags(write=False)
+        received = read_only(~np.isnan(whole["innovations"]), bool)
         return named_estimates(self.observer, **whole, projection=self.projection, received=received)
 
 
@@ -250,8 +249,7 @@ class SampleEstimates(Estimates):
         elif name == "projection":
             made = read_only(self._row.moved)
         elif name == "received":
-            made = ~np.isnan(self.innovations)
-            made.setflags(write=False)
+            made = read_only(~np.isnan(self.innovations), bool)
         else:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         vars(self)[name] = made

@@ -45,8 +45,7 @@ class Steps:
         self.implicit = ImplicitStep(self.graph.functions, settings.dt, largest_move=settings.largest_move)
         self._unmoved = read_only(np.zeros(settings.model.nx))
         self._all_there = read_only(np.ones(settings.model.ny))
-        self._all_seen = np.ones(settings.model.ny, dtype=bool)
-        self._all_seen.setflags(write=False)
+        self._all_seen = read_only(self._all_there, bool)
         self.first = DAEState(
             initial_memory(settings, settings.initial_state),
             0,

@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, real_number
-from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
+from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only, remembered
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.spectra import abscissa, eigenvalues, speeds
@@ -37,9 +37,7 @@ def poles_of(observer: LinearObserver) -> ComplexArray:
     """Return the eigenvalues of a shipped ``Az``."""
     if observer.order >= STATES_FOR_ALL_MODES:
         return modes_of(observer).values
-    found = eigenvalues(observer.Az)
-    found.setflags(write=False)
-    return found
+    return read_only(eigenvalues(observer.Az), np.complex128)
 
 
 def is_stable(observer: LinearObserver) -> bool:

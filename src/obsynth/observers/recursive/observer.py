@@ -243,7 +243,7 @@ def recursive_estimates(
         nis=nis,
         nis_degrees=degrees,
         excitation=levels,
-        received=received_in(np.array([row.y for row in rows]).reshape(len(rows), observer.plant.ny)),
+        received=read_only(~np.isnan(np.array([row.y for row in rows])).reshape(len(rows), observer.plant.ny), bool),
     )
 
 
@@ -294,13 +294,6 @@ def _spreads(rows: Sequence[RawEstimate], nx: int, nq: int) -> dict[str, FloatAr
         "state_covariances": states,
         "cross_covariances": cross,
     }
-
-
-def received_in(y: FloatArray) -> NDArray[np.bool_]:
-    """Return which outputs were there, ``(samples, ny)`` and read-only; NaN marks those that were not."""
-    received = ~np.isnan(y)
-    received.setflags(write=False)
-    return received
 
 
 def excitation_levels(regressors: Sequence[FloatArray], window: int) -> FloatArray:
@@ -760,7 +753,7 @@ def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> Estimate
         regressors=np.full((samples, most, nq), np.nan),
         excitation=excitation,
         nis=np.nansum(innovations * innovations, axis=1),
-        received=received_in(y),
+        received=read_only(~np.isnan(y), bool),
     )
 
 
