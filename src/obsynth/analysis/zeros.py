@@ -36,6 +36,7 @@ from obsynth.numerics.ranks import (
     NAMED_SHARE,
     NEGLIGIBLE_INPUT,
     RANK_TOLERANCE,
+    numerical_rank,
 )
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
@@ -277,8 +278,7 @@ def _kernel(pencil: EquilibratedPencil, value: complex, *, least: int) -> NDArra
         count = max(least, int(np.sum(values <= RANK_TOLERANCE * largest)))
         return np.asarray(vectors[:, :count])
     _, singular_values, right = np.linalg.svd(matrix)
-    kept = int(np.sum(singular_values > RANK_TOLERANCE * singular_values[0])) if singular_values.size else 0
-    return np.asarray(right[min(kept, matrix.shape[1] - least) :].conj().T)
+    return np.asarray(right[min(numerical_rank(singular_values), matrix.shape[1] - least) :].conj().T)
 
 
 def _smallest_part_first(basis: NDArray[Any], part: slice) -> NDArray[Any]:

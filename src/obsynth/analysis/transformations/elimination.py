@@ -30,7 +30,14 @@ from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import one_thread_if_small
 from obsynth.numerics.pencils import GENERIC_POINTS
-from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, but_rounding, product_but_rounding, rounding_rank
+from obsynth.numerics.ranks import (
+    NAMED_SHARE,
+    RANK_TOLERANCE,
+    but_rounding,
+    numerical_rank,
+    product_but_rounding,
+    rounding_rank,
+)
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.numerics.sparse import (
     CoarseStructure,
@@ -652,7 +659,7 @@ class _Pieces:
             left, right, values = np.ones((1, 1)), np.ones((1, 1)), np.abs(block[0])
         else:
             left, values, right = np.linalg.svd(block)
-            rank = int(np.sum(values > RANK_TOLERANCE * norm))
+            rank = numerical_rank(values, scale=norm)
             whole_rows, whole_columns = rank == len(rows), rank == len(columns)
             if not whole_columns:
                 right[:rank] = _settled_basis(right[:rank].T).T

@@ -34,7 +34,14 @@ from obsynth.analysis.zeros import are_outside, leading_names
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, RankDecision, decide_rank, real_but_rounding
+from obsynth.numerics.ranks import (
+    NAMED_SHARE,
+    RANK_TOLERANCE,
+    RankDecision,
+    decide_rank,
+    numerical_rank,
+    real_but_rounding,
+)
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
 from obsynth.numerics.spectra import pole_text
 from obsynth.numerics.square_root_estimation import OUTGROWN, least_squares_step, rank_revealing_step
@@ -383,8 +390,7 @@ def _open_states(
     """Return the states in the null space of ``A - point E``, by their shares when the pencil is equilibrated."""
     pencil = equilibrate_pencil(E, A)
     _, values, right = np.linalg.svd(pencil.A - (point if point.imag else point.real) * pencil.E)
-    kept = int(np.sum(values > RANK_TOLERANCE * values[0])) if values.size else 0
-    kernel = right[min(kept, plant.nx - 1) :]
+    kernel = right[min(numerical_rank(values), plant.nx - 1) :]
     return leading_names(np.linalg.norm(kernel, axis=0), plant.state_names)
 
 

@@ -22,7 +22,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.recursive.conditions import recursive_conditions
 from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.ranks import numerical_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
@@ -86,14 +86,14 @@ def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
     units = 1.0 / np.where(sizes > 0.0, sizes, 1.0)
     bd, dd = plant.Bd * units, plant.Dd * units
     _, values, right = np.linalg.svd(outputs * dd) if dd.size else (None, np.zeros(0), np.eye(plant.nd))
-    rank = int(np.sum(values > RANK_TOLERANCE))
+    rank = numerical_rank(values, scale=1.0)
     shown, hidden = right[:rank].T, right[rank:].T
     if rank == plant.nd:
         shown, names = np.eye(plant.nd), plant.disturbance_names
     else:
         names = tuple(f"unknown input {i + 1}" for i in range(rank))
     left, sizes_of_entry, _ = np.linalg.svd(rows * bd @ hidden)
-    moved = int(np.sum(sizes_of_entry > RANK_TOLERANCE))
+    moved = numerical_rank(sizes_of_entry, scale=1.0)
     equations = left[:, moved:].T * own.equations if moved else np.eye(plant.nx)
     if rank == plant.nd:
         # In their own units again, with their own names.

@@ -19,7 +19,7 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
-from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank, product_but_rounding
+from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank, numerical_rank, product_but_rounding
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, stated_eigenvalues
@@ -85,7 +85,7 @@ def direct_part(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray, FloatA
     if not plant.Dd.any():
         return np.eye(plant.ny), np.zeros((plant.nx, plant.ny)), _range_basis(plant.Bd)
     left, values, right = np.linalg.svd(plant.Dd)
-    rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
+    rank = numerical_rank(values)
     inverse = right[:rank].T @ (left[:, :rank] / values[:rank]).T
     return left[:, rank:].T, plant.Bd @ inverse, _range_basis(plant.Bd @ right[rank:].T)
 
@@ -95,7 +95,7 @@ def _range_basis(matrix: FloatArray) -> FloatArray:
         return np.zeros((matrix.shape[0], 0))
     lengths = np.linalg.norm(matrix, axis=0)
     left, values, _ = np.linalg.svd(matrix / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
-    return np.asarray(left[:, : int(np.sum(values > RANK_TOLERANCE * values[0]))])
+    return np.asarray(left[:, : numerical_rank(values)])
 
 
 def decouple(plant: DescriptorSystem) -> Decoupled:
@@ -131,7 +131,7 @@ def _completing(ut: FloatArray, nu: FloatArray, wanted: FloatArray, generic: Flo
         return np.zeros((rows, nu.shape[0]))
     left, values, right = np.linalg.svd(ut)
     largest = float(values[0]) if values.size and values[0] > 0.0 else 1.0
-    rank = int(np.sum(values > RANK_TOLERANCE * largest)) if values.size else 0
+    rank = numerical_rank(values)
     lacking = columns - rank
     if lacking == 0:
         return np.zeros((rows, nu.shape[0]))
@@ -147,7 +147,7 @@ def _nearest_isometry(matrix: FloatArray, otherwise: FloatArray, scale: float) -
     """Return the matrix ``(m, n)``, ``m >= n``, with orthonormal columns that is nearest: the polar factor.
     Directions in which the matrix is nothing beside ``scale`` go where ``otherwise (m, n)`` sends them."""
     left, values, right = np.linalg.svd(matrix)
-    rank = int(np.sum(values > RANK_TOLERANCE * scale))
+    rank = numerical_rank(values, scale=scale)
     found = left[:, :rank] @ right[:rank]
     if rank < matrix.shape[1]:
         outer, inner = left[:, rank:], right[rank:]

@@ -33,7 +33,7 @@ from obsynth.methods.recursive.conditions import SOURCE, recursive_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.matrix_equations import discrete_lyapunov
 from obsynth.numerics.norms import spectral_radius
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.ranks import RANK_TOLERANCE, numerical_rank
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.square_root_estimation import LeastSquaresStep, least_squares_step, rank_revealing_step
 from obsynth.observers.dae.observer import DAEObserver
@@ -393,7 +393,7 @@ def _record(observer: RecursiveObserver, samples: int) -> tuple[FloatArray, Floa
     triangle = qr((np.hstack([moved, S[:, S.any(axis=0)]]) / rows[:, None]).T, mode="r")[0]
     basis, kept, _ = qr(triangle[: len(H)].T, pivoting=True)
     sizes = np.abs(np.diagonal(kept))
-    perfect = basis[:, int(np.sum(sizes > RANK_TOLERANCE * sizes[0])) :] / rows[:, None]
+    perfect = basis[:, numerical_rank(sizes) :] / rows[:, None]
     if not perfect.shape[1]:
         return y, u
     # The data are affine in the record: a column of the map is the difference that one sample makes.

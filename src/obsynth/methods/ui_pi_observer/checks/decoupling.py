@@ -18,7 +18,7 @@ from obsynth.methods.ui_pi_observer.pencils import equilibrated
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.lapack import LAPACK_BLOCK
 from obsynth.numerics.modal_response import pencils_at
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.ranks import RANK_TOLERANCE, numerical_rank
 from obsynth.numerics.scaling import balancing_factors
 from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.derived import frequency_grid
@@ -172,7 +172,7 @@ def _null_spaces(pencils: ComplexArray) -> tuple[list[ComplexArray], FloatArray,
             found.append(last)
         else:
             _, values, right = np.linalg.svd(scaled[place])
-            found.append(right[int(np.sum(values > RANK_TOLERANCE * values[0])) :].conj().T)
+            found.append(right[numerical_rank(values) :].conj().T)
     return found, columns, sure
 
 
