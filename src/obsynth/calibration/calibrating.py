@@ -16,11 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.analysis.dae_structure import identifiability
+from obsynth.analysis.transformations.noise import with_noise
 from obsynth.calibration.diagnostics import (
     LEAST_DIAGNOSED_ROWS,
     LEAST_EXPLANATION,
@@ -51,7 +53,8 @@ from obsynth.calibration.plants import (
 from obsynth.calibration.problem import Problem, calibration_problem, require_variation
 from obsynth.calibration.reporting import Calibration, IntegrationError, integration_error, reported
 from obsynth.calibration.simulation_error import FIRST_ROWS, Fit, SimulationError, simulation_fits, with_seen_start
-from obsynth.errors import PreconditionError, SpecError
+from obsynth.errors import PreconditionError, SolverError, SpecError
+from obsynth.methods.dae_adaptive_observer.conditions import NOMINAL_SAMPLES
 from obsynth.numerics.arguments import Seed, arguments_checked, chosen, is_whole, whole_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.plants.dae.model import DAEModel
@@ -90,13 +93,20 @@ def proposed_states(
             note(f"{kind} of {name}")
             reached, place = known.best(_like(problem, problem_with(tried)))
             gain = value - reached - 0.5 * ADDED_NUMBERS[kind] * np.log(problem.log.samples)
-            found.append((gain - LEAST_NATS[kind], kind, name, tried, reached, place))
+            least = LEAST_NATS[kind]
+            if kind == "offset" and least < gain < LEAST_EXPLANATION and hidden_faults(problem, fit, tried):
+                least = LEAST_EXPLANATION
+            found.append((gain - least, kind, name, tried, reached, place))
         if not found:
             break
         gain, kind, name, tried, reached, place = max(found, key=lambda item: item[0])
         if not gain > 0.0:
             break
-        told.append(_STATE_SENTENCES[kind].format(name=name, gain=gain + LEAST_NATS[kind]))
+        hidden = hidden_faults(problem, fit, tried) if kind == "offset" else ()
+        least = LEAST_EXPLANATION if hidden else LEAST_NATS[kind]
+        told.append(_STATE_SENTENCES[kind].format(name=name, gain=gain + least))
+        if hidden:
+            told.append(_HIDDEN.format(name=name, faults=" and ".join(hidden)))
         states, value, known = tried, reached, place
     return states, told
 
@@ -106,6 +116,29 @@ _STATE_SENTENCES = {
     "offset": "The sensor {name} has an offset: the model has a state for it (better by {gain:.3g} nats).",
     "walk": "The unknown input {name} is taken as a random walk (better by {gain:.3g} nats).",
 }
+
+
+_HIDDEN = (
+    "At constant inputs {faults} cannot be distinguished from the offset of {name}: a design for both may be "
+    "refused. If the sensor has no offset, state this (offset: {{}} in calibrate)."
+)
+
+
+def hidden_faults(problem: Problem, fit: InnovationsFit, states: NoiseStates) -> tuple[str, ...]:
+    """Return the faults of a nonlinear plant that the outputs determine at nominal constant inputs, but not beside the
+    offsets of sensors."""
+    inner = problem.plant.inner if isinstance(problem.plant, PlantWithNoise) else problem.plant
+    if not isinstance(inner, NonlinearPlant) or not inner.model.nq:
+        return ()
+    model, found = inner.model, []
+    u = np.tile(model.nominal_input, (NOMINAL_SAMPLES, 1))
+    for plant in (model, cast(DAEModel, with_noise(model, offset=states.offsets)[0])):
+        try:
+            told = identifiability(plant, u, dt=problem.log.dt, R=np.diag(fit.R), method=problem.integration)
+        except SolverError:
+            return ()
+        found.append(told.unidentifiable)
+    return tuple(name for name in model.parameter_names if name in found[1] and name not in found[0])
 
 
 def _asking(problem: Problem, fit: InnovationsFit) -> set[tuple[str, str]]:

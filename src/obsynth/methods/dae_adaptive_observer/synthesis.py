@@ -22,6 +22,7 @@ from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.running import plain_recursion
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.step import PROJECTION_NOTICE
+from obsynth.plants.noise_model import offset_state
 from obsynth.results.design import Certificate
 
 
@@ -69,9 +70,11 @@ def _notes(observer: DAEObserver, facts: DAEFacts) -> Iterator[str]:
         )
     for direction in facts.identifiable.faint:
         shares = ", ".join(f"{name} ({share:+.3g})" for name, share in direction.items())
+        offsets = [name for name in observer.model.output_names if offset_state(name) in direction]
+        remedy = f"add a sensor, or leave out the offset of {' and '.join(offsets)}" if offsets else "or add a sensor"
         yield (
             "At nominal constant inputs the outputs do not distinguish this direction from noise, in prior deviations "
-            f"and nominal sizes: {shares}. Excite the plant, or add a sensor."
+            f"and nominal sizes: {shares}. Excite the plant, {remedy}."
         )
     window = 1.0 / (1.0 - observer.forgetting) if observer.forgetting < 1.0 else np.inf
     if observer.form == "forgetting" and facts.decay_time > window:
