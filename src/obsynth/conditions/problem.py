@@ -129,8 +129,8 @@ class Conditions:
             The solver failed.
         """
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the status says the same
+            with warnings.catch_warnings(action="ignore"):
+                # The status says the same.
                 self.problem.solve(solver=solver, **settings)
         except (KeyboardInterrupt, SystemExit):
             raise

@@ -217,8 +217,8 @@ def _coordinates(F: FloatArray, C: FloatArray, where: LMIRegion, *, discrete: bo
         (discrete_riccati, F / max(np.abs(found))) if discrete else (continuous_riccati, F - max(found) * np.eye(n))
     )
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what comes of it is a scale alone
+        with warnings.catch_warnings(action="ignore"):
+            # What comes of it is a scale alone.
             covariance = solve(moved.T, C.T, np.eye(n), np.eye(len(C)))
             return np.asarray(np.linalg.cholesky(0.5 * (covariance + covariance.T)))
     except (np.linalg.LinAlgError, ValueError):

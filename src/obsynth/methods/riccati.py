@@ -105,8 +105,7 @@ def lyapunov_solution(a: FloatArray, weight: FloatArray) -> FloatArray | None:
     """Return ``P = a' P a + weight``, however badly conditioned; None where there is none."""
 
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             return discrete_lyapunov(a.T, weight)
     except (np.linalg.LinAlgError, ValueError):
         return None
@@ -145,9 +144,8 @@ def _by_doubling(
     possible: Callable[[FloatArray], bool] | None = None,
 ) -> FloatArray | None:
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(action="ignore"):
             # An ill-conditioned equation only makes a worse filter or certificate, which is then not taken.
-            warnings.simplefilter("ignore")
             return doubled_riccati_solution(a, h, process, weight, cross, possible=possible)
     except np.linalg.LinAlgError:
         return None
@@ -158,8 +156,7 @@ def _by_qz(
 ) -> FloatArray | None:
 
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             return discrete_riccati(a.T, h.T, process, weight, s=cross)
     except (np.linalg.LinAlgError, ValueError):
         return None
@@ -171,8 +168,7 @@ def continuous_solution(
     """Return P with ``a P + P a' - (P h' + cross) weight^-1 (P h' + cross)' + process = 0`` by SciPy, or ``None``."""
 
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             p = continuous_riccati(a.T, h.T, process, weight, s=cross)
     except (np.linalg.LinAlgError, ValueError):
         return None
@@ -224,9 +220,8 @@ def _factor(a: FloatArray, dt: float, share: float, rounds: int, edge: float) ->
     for _ in range(rounds):
         moved = np.linalg.solve(change, a @ change)
         try:
-            with warnings.catch_warnings(), np.errstate(all="ignore"):
+            with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
                 # What a badly conditioned equation gives is judged by whether it proves anything.
-                warnings.simplefilter("ignore")
                 if dt > 0.0:
                     p = discrete_lyapunov((moved / max(edge, SMALLEST) ** share).T, np.eye(n))
                 else:

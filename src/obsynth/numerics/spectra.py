@@ -213,9 +213,8 @@ def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray,
     # In states and a time of their own: units must not cost digits.
     a, b, c = balanced_realisation(a, b, c)
     size = largest_singular_value(a)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(action="error", category=RuntimeWarning):
         # Poles within rounding of the axis: what comes out is no covariance.
-        warnings.simplefilter("error", RuntimeWarning)
         try:
             states = continuous_lyapunov(a / size, -b @ b.T)
         except RuntimeWarning:

@@ -248,9 +248,8 @@ def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArra
     from scipy.linalg import qr
 
     one = np.eye(len(a))
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
+    with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
         # Scales of very different units are cast to positions of a permutation.
-        warnings.simplefilter("ignore")
         balanced, scale = balanced_matrix(a)
         if discrete and rate > 0.0 and len(a) >= STATES_FOR_DOUBLED_SUMS:
             root = _root_of_sum(balanced / rate)

@@ -39,8 +39,7 @@ def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
     if re.search(r"^%YAML\s+(?!1\.2\s*$)", text, flags=re.MULTILINE):
         raise SpecError(f"{path} asks for another YAML than 1.2: remove the %YAML line.", path=place)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", YAMLWarning)
+        with warnings.catch_warnings(action="error", category=YAMLWarning):
             document = YAML(typ="safe", pure=True).load(text)
         count = _values_in(document, {})
     except (YAMLError, YAMLWarning) as error:

@@ -123,8 +123,7 @@ def _read_array(path: Path, *, variable: str | None, where: str, keep_sparse: bo
         raise SpecError(f"{path.name} holds one matrix only: remove 'variable'.", path=where)
     input_file(path, where=where)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", UserWarning)
+        with warnings.catch_warnings(action="error", category=UserWarning):
             content = readers[suffix](path) if suffix in readers else archives[suffix](path)
             raw = content if suffix in readers else _selected(content, variable, path, where)
             return raw if keep_sparse and is_sparse(raw) and suffix == ".mtx" else _as_dense(raw)

@@ -168,9 +168,8 @@ def solved(problem: cvxpy.Problem, what: str, solver: str) -> dict[str, Any]:
     settings = {**SOLVER_SETTINGS.get(solver, {}), **getattr(solver, "options", {})}
     record: dict[str, Any] = {"what": what, "solver": str(solver), "version": _version(solver), "settings": settings}
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(action="ignore"):
             # "Solution may be inaccurate": every solution is verified, so the warning tells nobody anything.
-            warnings.simplefilter("ignore")
             problem.solve(solver=solver, **settings)
         stats = problem.solver_stats
         iterations = None if stats is None or stats.num_iters is None else int(stats.num_iters)

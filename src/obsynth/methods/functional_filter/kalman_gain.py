@@ -279,9 +279,8 @@ class _Equation:
         limit, dt = (1.0, 1.0) if self.sampled else (0.0, 0.0)
         if not np.all(np.isfinite(closed)) or not abscissa(closed, dt) < limit:
             return None
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(action="ignore"):
             # What an ill-conditioned step gives is judged by what it misses.
-            warnings.simplefilter("ignore")
             try:
                 found = discrete_lyapunov(closed, driven) if self.sampled else continuous_lyapunov(closed, -driven)
             except np.linalg.LinAlgError:

@@ -104,9 +104,8 @@ def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> Floa
 def _gram(a: FloatArray) -> FloatArray:
     """Return P with ``a' P + P a = -norm(a) I`` for a stable ``a (n, n)``."""
 
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(action="ignore"):
         # "An eigenvalue pair whose sum is very close to zero": what comes of it is proved or thrown away.
-        warnings.simplefilter("ignore")
         p = continuous_lyapunov(a.T, -np.linalg.norm(a) * np.eye(len(a)))
     return np.asarray(0.5 * (p + p.T))
 

@@ -105,9 +105,8 @@ def _filtered(
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return the gain of a Kalman filter, and states in which its error covariance is the identity."""
     bound, dt = asked
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
+    with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
         # What a badly conditioned equation gives is judged by its poles.
-        warnings.simplefilter("ignore")
         try:
             inverse = np.linalg.inv(change)
             moved, noise = inverse @ f @ change, inverse @ driven @ inverse.T

@@ -202,9 +202,8 @@ def _scaling(problem: KalmanProblem, region: Region) -> FloatArray:
     closed, entering = problem.F - gain @ problem.C, problem.B - gain @ problem.D
     noise = entering @ entering.T + problem.drive @ problem.drive.T
     noise = noise + gain @ problem.background @ problem.background.T @ gain.T
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
+    with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
         # A poor scaling is judged by what the solver makes of it.
-        warnings.simplefilter("ignore")
         if problem.dt > 0.0:
             radius = np.exp(-region.decay * problem.dt)
             covariance = discrete_lyapunov(closed / radius, noise)

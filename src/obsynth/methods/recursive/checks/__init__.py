@@ -547,8 +547,8 @@ def _steady_covariance(
     claim = "covariance of the errors that the listed gains lead to, enclosed: positive definite"
     L, K = (Ball.exact(part) for part in gains)
     noise = L @ Ball.exact(stated.Q.at(0)) @ L.T + K @ Ball.exact(stated.R.at(0)) @ K.T
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the enclosure says what an ill-conditioned equation costs
+    with warnings.catch_warnings(action="ignore"):
+        # The enclosure says what an ill-conditioned equation costs.
         found = discrete_lyapunov(transition.midpoint, noise.midpoint)
     X = Ball.exact((found + found.T) / 2.0)
     norm = Ball.exact(contraction.Q)
