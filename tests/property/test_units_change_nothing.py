@@ -1,5 +1,7 @@
 """Units change nothing: verdicts and settled estimates of every linear method, in random powers of two."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from flint import fmpq, fmpq_mat
@@ -11,7 +13,9 @@ from obsynth import (
     pd_observer,
     ui_pi_observer,
 )
+from obsynth.spec import load_spec
 
+DESIGNS = Path(__file__).parents[2] / "designs"
 PLANTS = {
     "fault-estimation-filter": (
         fault_estimation_filter,
@@ -104,3 +108,38 @@ def test_hidden_faults_are_refused_for_the_same_reason_in_all_units(method, seed
             design(in_units({**data, **HIDDEN[method]}, number)[0])
         conditions.append(error.value.condition)
     assert conditions[0] == conditions[1]
+
+
+#: Another unit of each state, output and fault, and of time.
+UNITS = ([7.1e2, 3.3e-3, 41.0, 0.17], [0.023, 670.0], [5.9, 0.083], 17.3)
+
+
+@pytest.mark.parametrize("case", ["filasova", "one slow", "oscillator"])
+def test_a_pd_observer_claims_and_is_the_same_in_all_units(case):
+    """Not powers of two: the rate that is imposed, the eigenvalues and the gains are the same but for the units."""
+    plants = {
+        "filasova": load_spec(DESIGNS / "filasova" / "spec.yaml").plant,
+        "one slow": DescriptorSystem(
+            None, [[-0.2, 1.0, 0.0, 0.3], [0.0, -2.0, 0.5, 0.0], [0.1, 0.0, -1.0, 2.0], [0.0, 0.0, 0.4, -3.0]],
+            C=[[1, 0, 0, 0], [0, 0, 1, 0]], Bf=[[0, 1], [1, 0], [0, 0], [0, 2]],
+        ),
+        "oscillator": DescriptorSystem(
+            None, [[0.0, 3.0, 0.0, 0.0], [-3.0, 0.1, 1.0, 0.0], [0.0, 0.0, -1.0, 2.0], [0.5, 0.0, 0.0, -2.0]],
+            C=[[1, 0, 0, 1], [0, 0, 1, 0]], Bf=[[1, 0], [0, 0], [0, 1], [1, 1]],
+        ),
+    }  # fmt: skip
+    plant = plants[case]
+    states, outputs, faults, time = (np.array(part) for part in UNITS)
+    other = DescriptorSystem(
+        None,
+        time * plant.A * states / states[:, None],
+        C=plant.C * states / outputs[:, None],
+        Bf=time * plant.Bf * faults / states[:, None],
+    )
+    found, scaled = pd_observer(plant), pd_observer(other)
+    claims, others = found.certificate.claims, scaled.certificate.claims
+    assert others["decay"] == pytest.approx(claims["decay"] * time, rel=1e-6)
+    assert others["delta"] == pytest.approx(claims["delta"] / time, rel=1e-6)
+    assert scaled.report["error system"].value == pytest.approx(found.report["error system"].value * time, rel=1e-4)
+    gains = scaled.gains["L"] * states[:, None] / outputs
+    np.testing.assert_allclose(gains, found.gains["L"], rtol=1e-3, atol=1e-4 * np.max(np.abs(found.gains["L"])))

@@ -83,7 +83,7 @@ def single() -> DescriptorSystem:
 
 
 GOOD: dict[str, Callable[[], ObserverDesign]] = {
-    "paper": lambda: pd_observer(paper(), delta=0.1),
+    "paper": lambda: pd_observer(paper(), delta=0.1, decay=0.0),
     "second theorem": lambda: pd_observer(paper(), theorem=2, decay=0.5),
     "bounds": lambda: pd_observer(
         paper(), delta=0.1, decay=1.0, gain_bound=60.0, fault_rate_gain=0.5, noise_gain=3.0, disk=[20.0, 19.5]

@@ -265,8 +265,9 @@ class TestDefaults:
         a = np.diag([-0.05, 1.0, -3.0])
         plant = obsynth.DescriptorSystem(None, a, C=[[0.0, 1, 0], [0, 0, 1]], Bf=[[0.0], [1.0], [0.0]])
         design = obsynth.pd_observer(plant)
-        assert design.certificate.claims["decay"] <= 0.025
-        assert design.report["error system"].value == pytest.approx(-0.05)
+        assert design.certificate.claims["decay"] == pytest.approx(0.025)
+        assert design.report["error system"].value <= -0.025
+        assert np.min(np.abs(np.linalg.eigvals(design.observer.Az) + 0.05)) < 1e-9
 
     def test_a_default_decay_rate_never_makes_a_design_impossible(self) -> None:
         """Theorem 2 with delta = 0.35 serves the hidden pair -0.4 +- 2j, but not with a decay rate of 0.2."""

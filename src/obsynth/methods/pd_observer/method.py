@@ -45,7 +45,9 @@ class PdObserver(Method):
         ``"riccati"`` may take less.
     decay : float, optional, 1/seconds
         Errors decay at least like ``exp(-decay t)``.  By default nothing is imposed when the smallest gains give a
-        tenth of the plant's fastest mode, else that rate, or as much of it as moderate gains allow; 0 imposes nothing.
+        tenth of the plant's fastest mode, else that rate, or as much of it as moderate gains allow; up to 20 unknown
+        states these gains are small in the plant's own units, and the same in any.  0 imposes nothing: then, and for a
+        rate that is given, gains are small in the given units.
     disk : array_like, optional, 1/seconds
         ``[c, r]``: every eigenvalue s of the error system has ``|s + c| < r``.
     gain_bound : float, optional

@@ -3,6 +3,8 @@
 Unlike the paper: P and Q are both variables in Theorem 2; the G of (25), which is in no theorem, acts inside the loop;
 what is minimised, ``||[Y Z]||_F + ||P3||_F`` with ``P3 + P3' >= 2 I``, keeps solvers from P3 close to singular.
 
+A decay rate that nobody gives is chosen in the plant's own units, and its gains are small in these.
+
 Of many states gains come in closed form: L = 0 and J of a Kalman filter for unit noise.  Their certificate comes from a
 Lyapunov equation of ``A - J C``, for a delta below a limit that it tells.
 """
@@ -12,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -51,8 +53,8 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
 
-#: The unit of time is the power of two nearest to this many times the inverse of the plant's fastest mode, where the
-#: objective weighs J and L as it does for a plant with modes of a few 1/s in seconds.
+#: Beside the given units of signals that of time is the power of two nearest to this many times the inverse of the
+#: plant's fastest mode, where the objective weighs J and L as it does for a plant with modes of a few 1/s in seconds.
 TIME_UNITS = 10.0
 #: By default errors should decay at least at this fraction of the plant's fastest mode.
 DECAY_SHARE = 0.1
@@ -60,36 +62,81 @@ DECAY_SHARE = 0.1
 DECAY_RETRIES = (1.0, 0.3, 0.1, 0.03)
 #: Gains may grow by this factor for the sake of the default decay rate.
 DECAY_PRICE = 100.0
+#: In the plant's own units, gains of this size are small, whatever the smallest ones are.
+SMALL_GAIN = 1.0
 #: With more unknown states the least of these rates comes first, in one set of units, and the first failure is the end.
 MANY_UNKNOWN_STATES = 100
 #: By default a decay rate is never closer to that of an unobservable mode, which nothing moves.
 HIDDEN_SHARE = 0.5
 
 
+class _Units(NamedTuple):
+    """Units in which the gains are found: what the augmented states, the outputs and the time are multiples of."""
+
+    states: FloatArray
+    outputs: FloatArray
+    time: float
+
+    def size(self, gains: PdGains) -> float:
+        """Return the spectral norm of ``[J L S]`` in these units, S from outputs straight to the estimates."""
+        parts = [self.time * gains.J, gains.L, gains.observer.Dy[: len(self.states)]]
+        return largest_singular_value(np.hstack([part * self.outputs for part in parts]) / self.states[:, None])
+
+
 def design_gains(plant: DescriptorSystem, asked: PdObserver) -> tuple[PdGains, list[Mapping[str, Any]]]:
-    """Return the gains to ship and the records of all solver runs."""
-    plain = gains_for(plant, asked, decay=0.0 if asked.decay is None else float(asked.decay))
+    """Return the gains to ship and the records of all solver runs.
+
+    What decays as asked is small in the given units.  A rate that is ours to choose is chosen, with its gains, in the
+    plant's own units, so that it is the same in any; only a higher one may come from the given units.
+    """
+    free = asked.decay is None and asked.disk is None
+    own = free and asked.gain_bound is None and asked.engines_for(plant.nx + plant.nf)[0] == "lmi"
+    plain = gains_for(plant, asked, decay=0.0 if asked.decay is None else float(asked.decay), own=own)
     records = [plain.record]
     slowest = max((mode.real for mode in analyse_structure(plant).unobservable_modes), default=-np.inf)
     target = float(min(DECAY_SHARE * fastest_mode(plant.A), -HIDDEN_SHARE * slowest))
-    if asked.decay is not None or asked.disk is not None or plain.abscissa <= -target:
+    if not free or plain.abscissa <= -target:
         return plain, records
     if plant.nx + plant.nf > MANY_UNKNOWN_STATES:
         return _faster_at_little_cost(plant, asked, plain, target), records
+    found = _faster(plant, asked, plain, target, records, own=own)
+    if own and found.decay < target:
+        try:
+            given = gains_for(plant, asked, decay=0.0)
+        except (SolverError, InfeasibleError):
+            return found, records
+        records.append(given.record)
+        other = _faster(plant, asked, given, target, records, own=False)
+        found = other if other.decay > found.decay else found
+    return found, records
+
+
+def _faster(
+    plant: DescriptorSystem,
+    asked: PdObserver,
+    plain: PdGains,
+    target: float,
+    records: list[Mapping[str, Any]],
+    *,
+    own: bool,
+) -> PdGains:
+    """Return gains that decay as fast as moderate ones do, or ``plain``, the smallest; adds the records."""
+    units, least = (_own_units(plant), SMALL_GAIN) if own else (_given_units(plant), 0.0)
+    most = DECAY_PRICE * max(units.size(plain), least)
     for share in DECAY_RETRIES:
         if share * target <= -plain.abscissa:
             break
         try:
-            faster = gains_for(plant, asked, decay=share * target)
+            faster = gains_for(plant, asked, decay=share * target, own=own)
         except SolverError as error:
             records.append(error.record)
             continue
         except InfeasibleError:
             continue  # this rate was not asked for
         records.append(faster.record)
-        if faster.size <= DECAY_PRICE * plain.size:
-            return faster, records
-    return plain, records
+        if units.size(faster) <= most:
+            return faster
+    return plain
 
 
 def _faster_at_little_cost(plant: DescriptorSystem, asked: PdObserver, plain: PdGains, target: float) -> PdGains:
@@ -99,14 +146,17 @@ def _faster_at_little_cost(plant: DescriptorSystem, asked: PdObserver, plain: Pd
         if share * target <= -plain.abscissa:
             continue
         try:
-            found = gains_for(plant, asked, decay=share * target, most=DECAY_PRICE * plain.size)
+            found = gains_for(plant, asked, decay=share * target, most=DECAY_PRICE * _given_units(plant).size(plain))
         except (SolverError, InfeasibleError):
             break  # this rate was not asked for
     return found
 
 
-def gains_for(plant: DescriptorSystem, asked: PdObserver, *, decay: float, most: float | None = None) -> PdGains:
-    """Return gains of the first coordinates whose answer is proved; with a bound ``most``, of the first alone."""
+def gains_for(
+    plant: DescriptorSystem, asked: PdObserver, *, decay: float, most: float | None = None, own: bool = False
+) -> PdGains:
+    """Return gains of the first coordinates whose answer is proved; with a bound ``most``, of the first alone.
+    The plant's ``own`` units come first, or those that suit the engine."""
     delta = default_delta(plant, asked, decay)
     require_possible(plant, asked, delta=delta, decay=decay)
     failure = SolverError(
@@ -114,9 +164,10 @@ def gains_for(plant: DescriptorSystem, asked: PdObserver, *, decay: float, most:
     )
     engine, *spare = asked.engines_for(plant.nx + plant.nf)
     for name in (engine, *spare):
-        for states, outputs in islice(_units(plant, asked, balanced_first=name != "lmi"), None if most is None else 1):
+        tried = _units(plant, asked, balanced_first=name != "lmi", own_first=own)
+        for units in islice(tried, None if most is None else 1):
             try:
-                found = _solved(plant, asked, name, delta, decay, states, outputs, most)
+                found = _solved(plant, asked, name, delta, decay, units, most)
             except SolverError as error:
                 # What the spare engine meets says less than why it was needed.
                 failure = error if name == engine else failure
@@ -136,17 +187,17 @@ def _advice(asked: PdObserver) -> str:
     return f"Gains exist without {', '.join(given)}: ask for less there, or try another delta."
 
 
-def _units(
-    plant: DescriptorSystem, asked: PdObserver, *, balanced_first: bool
-) -> Iterable[tuple[FloatArray, FloatArray]]:
+def _units(plant: DescriptorSystem, asked: PdObserver, *, balanced_first: bool, own_first: bool) -> Iterable[_Units]:
     """Return units of augmented states and outputs: the user's, balancing ones, those with the plant near one."""
     found = [*_candidate_units(plant, asked)]
     if asked.gain_bound is not None:
         return found
-    units = PlantUnits.of(plant).rounded()
-    natural = np.concatenate([units.states, units.faults]), 1.0 / units.outputs
     users, *others = found
-    if units.spread > FAR_UNITS:
+    if own_first:
+        return [_own_units(plant), *others, users]
+    rounded = PlantUnits.of(plant).rounded()
+    natural = _with_faults(rounded, users.time)
+    if rounded.spread > FAR_UNITS:
         return [users, natural, *others]
     # A Riccati equation has no objective that would weigh gains in the user's units.
     if balanced_first and len(others) == 2:
@@ -154,9 +205,27 @@ def _units(
     return [users, *others, natural]
 
 
-def _candidate_units(plant: DescriptorSystem, asked: PdObserver) -> Iterator[tuple[FloatArray, FloatArray]]:
+def _own_units(plant: DescriptorSystem) -> _Units:
+    """Return the plant's own units as they are: powers of two near them would hang on the given ones.
+
+    With the fastest mode as the unit of rates, J and L weigh the same there.  A unit ten times longer makes L cheap:
+    noise then reaches the estimates several times larger.
+    """
+    return _with_faults(PlantUnits.of(plant), 1.0 / fastest_mode(plant.A))
+
+
+def _with_faults(units: PlantUnits, time: float) -> _Units:
+    return _Units(np.concatenate([units.states, units.faults]), 1.0 / units.outputs, time)
+
+
+def _given_units(plant: DescriptorSystem) -> _Units:
+    return _Units(np.ones(plant.nx + plant.nf), np.ones(plant.ny), 1.0)
+
+
+def _candidate_units(plant: DescriptorSystem, asked: PdObserver) -> Iterator[_Units]:
     n, ny = plant.nx + plant.nf, plant.ny
-    yield np.ones(n), np.ones(ny)
+    time = float(np.exp2(np.round(np.log2(TIME_UNITS / fastest_mode(plant.A)))))
+    yield _given_units(plant)._replace(time=time)
     if asked.gain_bound is not None:
         return  # it is a bound in the user's units
     augmented = with_faults_as_states(plant, _inner_gain(plant, asked))
@@ -164,11 +233,11 @@ def _candidate_units(plant: DescriptorSystem, asked: PdObserver) -> Iterator[tup
     system[:n, :n], system[n:, :n] = augmented.A, augmented.C
     factors = balancing_factors(system)
     if np.any(factors != 1.0):
-        yield factors[:n], factors[n:]
+        yield _Units(factors[:n], factors[n:], time)
     sizes = np.abs(np.vstack([augmented.A, augmented.C]))
     columns = np.exp2(-np.round(np.log2(np.maximum(np.max(sizes, axis=0), np.finfo(np.float64).tiny))))
     rows = np.max(np.abs(augmented.C) * columns, axis=1)
-    yield columns, np.exp2(np.round(np.log2(np.where(rows > 0.0, rows, 1.0))))
+    yield _Units(columns, np.exp2(np.round(np.log2(np.where(rows > 0.0, rows, 1.0)))), time)
 
 
 def _inner_gain(plant: DescriptorSystem, asked: PdObserver) -> FloatArray | None:
@@ -182,13 +251,12 @@ def _solved(
     engine: str,
     delta: float,
     decay: float,
-    states: FloatArray,
-    outputs: FloatArray,
+    units: _Units,
     most: float | None = None,
 ) -> PdGains | None:
-    """Return the gains found in the given units, with a proved certificate where there is one."""
-    unit = float(np.exp2(np.round(np.log2(TIME_UNITS / fastest_mode(plant.A)))))
-    task = _task(plant, asked, delta, decay, states, outputs, unit)
+    """Return the gains found in some units, with a proved certificate where there is one."""
+    states, outputs, unit = units
+    task = _task(plant, asked, delta, decay, units)
     if engine == "riccati":
         found, used = closed_form(task, free_delta=asked.delta is None, once=most is not None)
         delta = delta if used == task.delta else used * unit
@@ -211,11 +279,9 @@ def _task(
     asked: PdObserver,
     delta: float,
     decay: float,
-    states: FloatArray,
-    outputs: FloatArray,
-    unit: float,
+    units: _Units,
 ) -> PdTask:
-    nx, nf = plant.nx, plant.nf
+    (states, outputs, unit), nx, nf = units, plant.nx, plant.nf
     g = _inner_gain(plant, asked)
     ends = asked.range_numbers
     gains = [g] if ends is None else [end * np.eye(nf) for end in ends]
@@ -373,11 +439,6 @@ class PdGains:
     def abscissa(self) -> float:
         """Largest real part of an eigenvalue of the error system, 1/seconds."""
         return spectral_abscissa(self.observer.Az)
-
-    @property
-    def size(self) -> float:
-        """Spectral norm of ``[J L]``."""
-        return largest_singular_value(np.hstack([self.J, self.L]))
 
 
 def certified(
