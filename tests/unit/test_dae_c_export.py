@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,11 +51,11 @@ def designed(name: str, **options) -> obsynth.ObserverDesign:
 
 
 def run_c(
-    design: obsynth.ObserverDesign, y: np.ndarray, u: np.ndarray, folder: Path, *, quick: bool = False
+    design: obsynth.ObserverDesign, y: np.ndarray, u: np.ndarray, folder: Path, *, quick: bool = False, **options: Any
 ) -> dict[str, np.ndarray]:
     """Return what the compiled export says, by field, and what each step returned; ``quick``: compiled as it stands,
     which takes a third of the time of a large source."""
-    source, header = obsynth.export(design, folder / "observer.c")
+    source, header = obsynth.export(design, folder / "observer.c", **options)
     assert header == folder / "observer.h"
     nu, ny = u.shape[1], y.shape[1]
     arguments = f"in, in + {nu}" if nu else "in"

@@ -14,6 +14,7 @@ from test_validate import designed
 
 import obsynth
 from obsynth import SpecError, dae_adaptive_observer, simulate_dae
+from obsynth.observers.running import changed
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
 OPTIONS = {
@@ -91,6 +92,27 @@ def test_outliers_in_c(form, name, tmp_path) -> None:
         assert np.abs(without.states - expected.states)[33].max() > 0.01
         assert np.array_equal(without.states[:33], expected.states[:33])
     assert_same(run_c(design, y, u, tmp_path), expected)
+
+
+@pytest.mark.parametrize("asked", ["none", "huber"])
+def test_an_export_takes_outliers_as_a_run_is_told_to(asked, tmp_path) -> None:
+    """C could not be told to use every sample, as `run --outliers none` does."""
+    design = tank_observer("augmented-kalman", {})
+    y, u = leaking(design)
+    y[20, 1], y[60, 1:], y[111, 2] = y[19, 1] + 0.05, np.nan, np.nan
+    expected = changed(design.observer, outliers=asked).run(y, u)
+    gated = changed(design.observer, outliers="gate").run(y, u)
+    assert np.abs(gated.states - expected.states)[33].max() > 0.01
+    assert_same(run_c(design, y, u, tmp_path, quick=True, outliers=asked), expected)
+    with pytest.raises(SpecError, match="outliers"):
+        obsynth.export(design, tmp_path / "a.c", outliers="all")
+
+
+def test_an_export_of_a_linear_design_says_that_it_knows_no_outliers(tmp_path) -> None:
+    plant = obsynth.DescriptorSystem(E=[[1.0]], A=[[0.5]], B=[[1.0]], C=[[1.0]], dt=1.0)
+    design = obsynth.descriptor_kalman(plant, Q=[[1e-2]], R=[[1e-2]])
+    with pytest.raises(SpecError, match="outliers is for nonlinear designs"):
+        obsynth.export(design, tmp_path / "a.c", outliers="none")
 
 
 def test_a_sample_beside_a_missing_input_is_left_out_however_near_it_is(tmp_path) -> None:

@@ -408,6 +408,7 @@ def run_export(options: argparse.Namespace) -> int:
         warm_up=options.warm_up,
         monitor=monitor,
         precision=options.precision,
+        outliers=options.outliers,
         unverified=options.unverified,
     )
     answer(options, {"gains": options.gains, "files": files, **({"unverified": mark} if mark else {})}, mark)

@@ -439,6 +439,12 @@ VERBS = {
                         choices=("double", "float"),
                     ),
                     option(
+                        "--outliers",
+                        None,
+                        "nonlinear designs, .c and .fmu: leave out outliers (default), limit them, or use them",
+                        choices=("gate", "huber", "none"),
+                    ),
+                    option(
                         "--normal",
                         "FILE",
                         "for .c and .fmu: the monitor that obsynth thresholds wrote (.json)",

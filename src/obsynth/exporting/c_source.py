@@ -636,7 +636,12 @@ def _as_float(found: re.Match[str]) -> str:
 
 
 def write_dae_c(
-    design: ObserverDesign, target: Path, sample_time: float | None, alarms: Alarms, precision: str
+    design: ObserverDesign,
+    target: Path,
+    sample_time: float | None,
+    alarms: Alarms,
+    precision: str,
+    outliers: str | None,
 ) -> tuple[Path, ...]:
     """Write source and header."""
     if target.suffix.lower() != ".c":
@@ -645,7 +650,7 @@ def write_dae_c(
         )
     require_no_sample_time(design, sample_time)
     prefix, header = c_identifier(target.stem), target.with_suffix(".h")
-    source, declarations, _ = dae_c_texts(design, prefix, header.name, alarms)
+    source, declarations, _ = dae_c_texts(design, prefix, header.name, alarms, outliers)
     if precision == "float":
         source, declarations = in_floats(source), in_floats(declarations)
         said = float_error(design, prefix, source, declarations)
@@ -679,12 +684,14 @@ def dae_alarms(
     return found
 
 
-def dae_c_texts(design: ObserverDesign, prefix: str, header: str, alarms: Alarms) -> tuple[str, str, str]:
-    """Return source, header and the digest of the gain set. Outliers are left out where the design says nothing of
-    them, as `run` leaves them out."""
+def dae_c_texts(
+    design: ObserverDesign, prefix: str, header: str, alarms: Alarms, outliers: str | None = None
+) -> tuple[str, str, str]:
+    """Return source, header and the digest of the gain set. Outliers are left out where neither the design nor
+    ``outliers`` says anything of them, as `run` leaves them out."""
     model, observer = design.nonlinear
     digest = gain_set_digest(design)
-    observer = as_run(observer)
+    observer = as_run(observer, outliers)
     if alarms.learned is not None:
         observer = as_learned(observer, alarms.learned)
     inner = f"{prefix}_observer" if observer.timing.is_plain else f"{prefix}_observer_memory"

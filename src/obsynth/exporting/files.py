@@ -39,6 +39,7 @@ from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.numerics.arguments import arguments_checked, chosen, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.outliers import OUTLIER_KINDS
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.sensor_timing import require_plain
 from obsynth.observers.windows import WindowObserver
@@ -306,6 +307,7 @@ def export(
     warm_up: float | None = None,
     monitor: Monitor | None = None,
     precision: str | None = None,
+    outliers: str | None = None,
     unverified: bool = False,
 ) -> tuple[Path, ...]:
     """Write the observer of a design for MATLAB and Simulink, for numpy, as C99, or as a functional mock-up unit.
@@ -343,6 +345,9 @@ def export(
     precision : {"double", "float"}, optional
         Of the numbers in C; the header of floats bounds what these change for linear observers, and says what was
         measured for nonlinear ones (which takes a C compiler).
+    outliers : {"gate", "huber", "none"}, optional
+        Of a nonlinear design: what is done with outliers, in place of what the design states, as for `run_on_data`.
+        Where neither states it, they are left out; ``"none"`` uses every sample.
     unverified : bool, optional
         Whether a design whose report fails is written all the same, with a mark in the file that says so.
 
@@ -385,6 +390,10 @@ def export(
         suffix, fmi=fmi, thresholds=thresholds, warm_up=warm_up, monitor=monitor, precision=precision
     )
     numbers = chosen(precision or "double", "precision", C_PRECISIONS)
+    if outliers is not None:
+        chosen(outliers, "outliers", OUTLIER_KINDS)
+        if not (isinstance(design, ObserverDesign) and isinstance(design.observer, DAEObserver)):
+            raise SpecError("outliers is for nonlinear designs: exports of others use every sample.", path="outliers")
     learned = None if monitor is None else _learned_by(monitor, design)
     if suffix == ".fmu":
         from obsynth.exporting.fmu.archive import write_fmu
@@ -403,12 +412,14 @@ def export(
             thresholds=thresholds,
             warm_up=warm_up,
             learned=learned,
+            outliers=outliers,
         )
         return (made,)
     if isinstance(design, ObserverDesign) and isinstance(design.observer, DAEObserver):
         if monitor is not None and learned is None:
             raise SpecError("Of nonlinear designs, learned monitors are written as C.", path="monitor")
-        return write_dae_c(design, target, sample_time, dae_alarms(design, thresholds, warm_up, learned), numbers)
+        alarms = dae_alarms(design, thresholds, warm_up, learned)
+        return write_dae_c(design, target, sample_time, alarms, numbers, outliers)
     found = Realisation.of(design, sample_time, numbers)
     if suffix != ".c":
         return (write_atomically(target, _as_arrays(found, design, suffix)),)

@@ -305,10 +305,11 @@ def write_fmu(
     thresholds: Mapping[str, float] | None,
     warm_up: float | None,
     learned: LearnedThresholds | None,
+    outliers: str | None = None,
 ) -> Path:
     """Write an FMU for co-simulation; the binary is left out where there is no compiler."""
     chosen(version, "fmi", VERSIONS)
-    signals, texts, digest = _contents(design, sample_time, thresholds, warm_up, learned)
+    signals, texts, digest = _contents(design, sample_time, thresholds, warm_up, learned, outliers)
     identifier = c_identifier(target.stem)
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, ' '.join((digest, version, repr(signals))))}}}"
     sentence = f"Observer of {design.name} by {design.method}, written by obsynth; sha256 of the gain set {digest}"
@@ -339,13 +340,14 @@ def _contents(
     thresholds: Mapping[str, float] | None,
     warm_up: float | None,
     learned: LearnedThresholds | None,
+    outliers: str | None,
 ) -> tuple[Signals, tuple[str, str], str]:
     """Return the signals, source and header, and the digest of the gain set."""
     header = f"{_PREFIX}.h"
     if isinstance(design.observer, DAEObserver):
         require_no_sample_time(design, sample_time)
         alarms = dae_alarms(design, thresholds, warm_up, learned)
-        text, declared, digest = dae_c_texts(design, _PREFIX, header, alarms)
+        text, declared, digest = dae_c_texts(design, _PREFIX, header, alarms, outliers)
         return signals_of_dae(design, alarms), (text, declared), digest
     found = Realisation.of(design, sample_time)
     if found.observer.dt == 0.0:
