@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import obsynth
@@ -52,6 +54,11 @@ class NoArray:
         raise RuntimeError("it is on another device")
 
 
+@cache
+def design() -> obsynth.ObserverDesign:
+    return obsynth.ui_pi_observer(plant(Bf=[[1.0], [0.0]]))
+
+
 LINEAR = obsynth.LinearObserver(
     [[0.5]], np.zeros((1, 0)), [[1.0]], [[1.0]], np.zeros((1, 0)), [[0.0]], 1.0, (), ("y",), ("x",), (), (), (0,), ()
 )
@@ -84,6 +91,19 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
         "Q has 1e",
     ),
     "huge level": (lambda: conditions.wang2015(plant(**FAULTY), gamma=1e308), "gamma is 1e"),
+    "column that is a list": (
+        lambda: obsynth.run_on_data(design(), pd.DataFrame({"time": [0.0, 1.0]}), columns={"y1": []}),
+        "The column of 'y1' is",
+    ),
+    "parameter without a name": (
+        lambda: obsynth.sweep({"a": plant()}, {1: [1.0]}, method="fault-estimation-filter"),
+        "The parameter 1 is",
+    ),
+    "step of no plant": (lambda: obsynth.Scenario(horizon=1.0).step_of(None), "plant is missing"),
+    "huge bound of a start": (
+        lambda: obsynth.monitor(design(), obsynth.Scenario(horizon=5.0), initial_error=1e308),
+        "initial_error is 1e",
+    ),
     "steps of noise": (
         lambda: obsynth.with_noise(obsynth.DAEModel(**MODEL), process_noise={"x": 0.1}, dt=1e-310),
         "1 / dt",

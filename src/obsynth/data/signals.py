@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.data.log_estimator import LogObserver
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, number_in_text
+from obsynth.numerics.arguments import is_finite_number, number_in_text, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 
 #: What a missing sample may look like in a log.
@@ -233,6 +233,8 @@ class Signals:
             raise SpecError(
                 f"{unknown[0]!r} is no input or output of this observer, which has {', '.join(names)}.", path="columns"
             )
+        for name, column in renamed.items():
+            require_kind(column, str, f"The column of {name!r}", "the name of a column", path="columns")
         for name, factor in factors.items():
             if not is_finite_number(factor) or factor == 0.0:
                 raise SpecError(f"The scale of {name!r} is {factor!r}: give a finite number, not zero.", path="scales")

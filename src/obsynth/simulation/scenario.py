@@ -451,8 +451,10 @@ class Scenario:
         Raises
         ------
         SpecError
-            The plant is continuous and the scenario has no sample time, or both have different ones.
+            The plant is of another kind, it is continuous and the scenario has no sample time, or both have different
+            ones.
         """
+        require_kind(plant, DescriptorSystem, "plant", "a DescriptorSystem")
         if plant.is_discrete:
             if self.sample_time is not None and self.sample_time != plant.dt:
                 raise SpecError(

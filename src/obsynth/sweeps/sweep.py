@@ -129,6 +129,7 @@ def _varied(plant: DescriptorSystem, changes: Mapping[str, Any]) -> DescriptorSy
 def _combinations(parameters: Mapping[str, Sequence[Any]], sources: int) -> Iterator[dict[str, Any]]:
     count = sources
     for name, values in parameters.items():
+        require_kind(name, str, f"The parameter {name!r}", "its name", path="parameters")
         if isinstance(values, (str, Mapping)) or not isinstance(values, Sequence) or not len(values):
             raise SpecError(f"The parameter {name!r} is {values!r}: give a list of values.", path=f"parameters.{name}")
         count *= len(values)

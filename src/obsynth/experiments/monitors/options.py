@@ -7,6 +7,7 @@ from typing import Any
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_number, whole_number
+from obsynth.numerics.arrays import require_no_overflow
 
 _BOUNDED = ("disturbance_bounds", "noise_bound", "initial_error", "scenario", "sample_time")
 _STATISTICAL = ("window", "false_alarms", "scenario", "sample_time")
@@ -53,7 +54,7 @@ def checked_options(
     for name in ("noise_bound", "initial_error", "gamma"):
         value = given[name]
         if value is not None:
-            real_number(value, name, "a number, 0 or more", least=0.0)
+            require_no_overflow(real_number(value, name, "a number, 0 or more", least=0.0), name, name)
     defaults: dict[str, Any] = {"window": WINDOW, "false_alarms": FALSE_ALARMS, "change": CHANGE}
     window, false_alarms, change = (defaults[name] if given[name] is None else given[name] for name in defaults)
     for name, count, least in (("window", window, 1), ("isolation_delay", isolation_delay, 0)):
