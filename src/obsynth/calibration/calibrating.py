@@ -106,7 +106,7 @@ def proposed_states(
         least = LEAST_EXPLANATION if hidden else LEAST_NATS[kind]
         told.append(_STATE_SENTENCES[kind].format(name=name, gain=gain + least))
         if hidden:
-            told.append(_HIDDEN.format(name=name, faults=" and ".join(hidden)))
+            told.append(_OFFSET_HIDES.format(name=name, faults=" and ".join(hidden)))
         states, value, known = tried, reached, place
     return states, told
 
@@ -118,7 +118,7 @@ _STATE_SENTENCES = {
 }
 
 
-_HIDDEN = (
+_OFFSET_HIDES = (
     "At constant inputs {faults} cannot be distinguished from the offset of {name}: a design for both may be "
     "refused. If the sensor has no offset, state this (offset: {{}} in calibrate)."
 )
