@@ -308,6 +308,7 @@ def run_thresholds(options: argparse.Namespace) -> int:
                 "Once the estimate follows a fault, these return to zero: an alarm comes at the onset of the fault or "
                 "not at all. Give run a level for the estimate as well (--threshold)."
             )
+    lines += found.notes
     answer(
         options,
         {
@@ -315,6 +316,7 @@ def run_thresholds(options: argparse.Namespace) -> int:
             "file": file,
             "holds": found.holds,
             "statement": found.statement,
+            "notes": list(found.notes),
             "rows": found.rows,
             "needed": found.needed,
             "rows_per_alarm": found.every,

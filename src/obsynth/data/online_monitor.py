@@ -13,7 +13,7 @@ which each will alarm, is taken off the rate of false alarms.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from obsynth.data.log_estimator import DECIDING, STALE, Row
 from obsynth.data.log_run import LogRun
+from obsynth.data.normal_notes import notes_of_normal_rows
 from obsynth.data.signals import TIME_HEADER, Stamps
 from obsynth.data.sources import CHUNK_ROWS, Data, chunks, parsed_rows
 from obsynth.data.step_log import SteppingLogObserver
@@ -42,6 +43,7 @@ from obsynth.experiments.monitors.learned import (
     has_innovations_by_sensor,
     learned_monitor,
     load_thresholds,
+    raised_levels,
     rows_per_alarm,
     settling_rows,
     thresholds_from_rows,
@@ -190,7 +192,8 @@ def learn_thresholds(
     Returns
     -------
     LearnedThresholds
-        For `obsynth.online_monitor`; ``statement`` says what they mean, and ``holds`` whether the rows suffice.
+        For `obsynth.online_monitor`; ``statement`` says what they mean, and ``holds`` whether the rows suffice;
+        ``notes`` name rows to be looked at: events that raise the levels, outputs that are stuck.
 
     Raises
     ------
@@ -211,9 +214,9 @@ def learn_thresholds(
         known = design if sizes is None else design.replace(observer=changed(design.observer, outlier_sizes=sizes))
         return LogRun(known, columns, scales, gap=gap, warm_up=warm_up)
 
-    first_run = started()
+    first_run, stamps = started(), Stamps()
     log = np.vstack(
-        [np.zeros((0, 1 + len(first_run.signals.names))), *chunks(data, first_run.signals, Stamps(), CHUNK_ROWS)]
+        [np.zeros((0, 1 + len(first_run.signals.names))), *chunks(data, first_run.signals, stamps, CHUNK_ROWS)]
     )
     if len(log) < LEAST_NORMAL:
         raise SpecError(f"The log has {len(log)} rows: give {LEAST_NORMAL} and more.", path="normal")
@@ -224,17 +227,19 @@ def learn_thresholds(
     first, last = parsed_rows(rows, int(said.numbers[-1]) + 1)
     chosen = (first <= said.numbers) & (said.numbers < last)
     dt = design.observer.dt or float(np.median(np.diff(said.times[chosen])))
-    return thresholds_from_rows(
+    watched, scores = said.watched[chosen], None if said.scores is None else said.scores.chosen(chosen)
+    given: dict[str, Any] = {"every": rows_per_alarm(false_alarms, dt), "dt": dt, "seed": seed, "pairs": pairs}
+    found = thresholds_from_rows(
         design,
-        said.watched[chosen],
-        every=rows_per_alarm(false_alarms, dt),
-        dt=dt,
-        seed=seed,
-        pairs=pairs,
+        watched,
+        scores=scores,
         innovation=_usual_innovation(said.squares[chosen]),
-        scores=None if said.scores is None else said.scores.chosen(chosen),
         outlier_sizes=sizes,
+        **given,
     )
+    raised = raised_levels(design, found, watched, scores, **given)
+    notes = notes_of_normal_rows(raised, said.numbers[chosen], log, slice(first, last), first_run.signals, stamps)
+    return replace(found, notes=notes)
 
 
 def _sized(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
+from obsynth.experiments.monitors.learned_events import TOLD_LEVEL_FACTOR, Event, events_of, factors, without_events
 from obsynth.experiments.monitors.learned_levels import (
     AGES,
     FORGETTING,
@@ -143,6 +144,8 @@ class LearnedThresholds:
     outlier_sizes : FloatArray, optional
         ``(ny,)``: how far off the outliers of each output are at least, by these rows, in place of what the design
         says; without them, what it says agrees with these rows.
+    notes : tuple of str
+        What in these rows is to be looked at: events that raise the levels, outputs that are stuck.
     """
 
     columns: tuple[str, ...]
@@ -161,6 +164,7 @@ class LearnedThresholds:
     pairs: WrongPairs = NO_PAIRS
     innovation: float = 1.0
     outlier_sizes: FloatArray | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def holds(self) -> bool:
@@ -229,6 +233,7 @@ class LearnedThresholds:
             "innovation": self.innovation,
             "estimates": list(self.statistics.estimates),
             "outlier_sizes": self.outlier_sizes,
+            "notes": list(self.notes),
         }
 
     def save(self, path: str | Path) -> Path:
@@ -318,6 +323,8 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         WrongPairs(int(data["pairs"]["number"]), float(data["pairs"]["chance"])),
         float(data["innovation"]),
         None if data["outlier_sizes"] is None else read_only(np.asarray(data["outlier_sizes"], dtype=np.float64)),
+        # Files of before have none.
+        tuple(map(str, data.get("notes", ()))),
     )
 
 
@@ -381,11 +388,12 @@ def thresholds_from_rows(
     innovation: float = 1.0,
     scores: Scores | None = None,
     outlier_sizes: FloatArray | None = None,
+    like: LearnedThresholds | None = None,
 ) -> LearnedThresholds:
     """Return thresholds from ``rows (n, m)`` of all that may be watched, NaN where nothing is known; ``pairs``: what
     does not stand in them, but alarms; ``innovation``: how large innovations are in the observer's own deviations;
     ``scores``: what these rows say of faults, where that is known; ``outlier_sizes``: what the design is to say
-    instead.
+    instead; ``like``: thresholds of which columns and directions are taken.
 
     Where the fault estimates remember more than the rows can tell, or nearly follow from the residuals (the gains of a
     filter move them, and what is left is how these change with the inputs), the residuals alone are watched.  A fault
@@ -404,8 +412,11 @@ def thresholds_from_rows(
     faults = len(design.observer.fault_names)
     conformal = is_conformal(count, others)
     scores = None if scores is None else _usual_scores(scores, known)
-    both, residuals = independent(rows[known], 0), independent(rows[known], faults)
-    choices = [part for part in ((both, residuals) if scores is None else (residuals or both,)) if part]
+    if like is None:
+        both, residuals = independent(rows[known], 0), independent(rows[known], faults)
+        choices = [part for part in ((both, residuals) if scores is None else (residuals or both,)) if part]
+    else:
+        choices = [[names.index(name) for name in like.columns]]
     if not choices:
         raise SpecError("No monitored signal changes in these rows: there is no noise to learn from.", path="normal")
     fits = [(kept, fitted_autoregression(np.where(known[:, None], rows[:, kept], np.nan))) for kept in choices]
@@ -416,11 +427,8 @@ def thresholds_from_rows(
     centres, scales = rows[known, :faults].mean(axis=0), rows[known, :faults].std(axis=0)
     if scores is not None:
         centres = scores.chosen(slice(len(rows) // 2 if conformal else None)).centre()
-    statistics = Statistics(
-        model,
-        *signatures(design, kept, np.sqrt(np.nanvar(x, axis=0))),
-        estimates=() if scores is None else names[:faults],
-    )
+    found = signatures(design, kept, np.sqrt(np.nanvar(x, axis=0))) if like is None else like.statistics.directions
+    statistics = Statistics(model, *found, estimates=() if scores is None else names[:faults])
     if conformal:
         statistics, levels = conformal_levels(x, others, statistics, scores)
     else:
@@ -443,6 +451,38 @@ def thresholds_from_rows(
         innovation,
         outlier_sizes,
     )
+
+
+class Raised(NamedTuple):
+    """Events that raise levels, and how many times as large a change must be to pass that of a statistic: the one for
+    which this is most."""
+
+    events: tuple[Event, ...] = ()
+    statistic: str = ""
+    factor: float = 1.0
+
+
+def raised_levels(
+    design: ObserverDesign, found: LearnedThresholds, rows: FloatArray, scores: Scores | None, **given: Any
+) -> Raised:
+    """Return what in ``rows (n, m)`` raises the levels that were ``found`` with what was ``given`` to
+    `thresholds_from_rows`: no events where none do by much."""
+    known = np.asarray(np.isfinite(rows).all(axis=1))
+    said = _usual_scores(scores, known) if found.statistics.estimates and scores is not None else None
+    places = [watched_names(design).index(name) for name in found.columns]
+    x = np.where(known[:, None], rows[:, places], np.nan)
+    events = events_of(x, found.columns, found.statistics, found.levels, said, found.centres)
+    left = without_events(rows, events)
+    count = int(np.isfinite(left).all(axis=1).sum())
+    others = found.pairs.others(found.every)
+    if not events or count < LEAST_NORMAL or is_conformal(count, others) != is_conformal(found.rows, others):
+        return Raised()
+    other = thresholds_from_rows(design, left, scores=scores, like=found, **given)
+    if other.statistics.names != found.statistics.names:
+        return Raised()
+    each = factors(found.statistics, found.levels, other.statistics, other.levels)
+    most = max(each, key=lambda name: each[name])
+    return Raised(events, most, each[most]) if each[most] >= TOLD_LEVEL_FACTOR else Raised()
 
 
 def _usual_scores(scores: Scores, known: NDArray[np.bool_]) -> Scores | None:

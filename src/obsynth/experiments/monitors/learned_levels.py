@@ -249,6 +249,11 @@ class Statistics:
         changes = (f"GLR of a change of {name}" for name in self.estimates)
         return ("T2", *means, *likely, *changes, *(f"square of {name}" for name in self.estimates))
 
+    @property
+    def directions(self) -> tuple[FloatArray, tuple[str, ...]]:
+        """Signatures, and what they show."""
+        return self.signatures, self.told
+
     def responses(self) -> tuple[FloatArray, FloatArray]:
         """Return what steps, then ramps, of each signature do to e: their first p + 1 rows ``(2 s, p + 1, m)``, and
         what each row after that adds ``(2 s, m)``."""
@@ -399,6 +404,15 @@ class Tail(NamedTuple):
         shape = float(np.clip(shape, *SHAPES))
         return cls(begin, mean * (1.0 - shape), shape)
 
+    def share_beyond(self, radius: float) -> float:
+        """Return the share of the tail that is beyond a radius."""
+        if not self.scale > 0.0:
+            return float(radius <= self.begin)
+        far = max(radius - self.begin, 0.0) / self.scale
+        if abs(self.shape) < NO_SHAPE:
+            return float(np.exp(-far))
+        return float(max(1.0 + self.shape * far, 0.0) ** (-1.0 / self.shape))
+
     def drawn(self, uniform: FloatArray) -> FloatArray:
         """Return radii above the begin from numbers between 0 and 1."""
         if abs(self.shape) < NO_SHAPE:
@@ -452,7 +466,7 @@ def conformal_levels(
     model = fitted_autoregression(x[:half])
     found = replace(statistics, model=model)
     usual = None if scores is None else _usual(scores.chosen(slice(half)))
-    runs = _of_normal(x, found, scores, usual)[:, None]
+    runs = normal_statistics(x, found, scores, usual)[:, None]
     first, second = (np.moveaxis(part, 1, 0) for part in (runs[..., :half], runs[..., half:]))
     own, _ = _union(first, every, half - SETTLING)
     union = (second / own[None, :, None]).max(axis=1)
@@ -527,7 +541,7 @@ def learned_levels(
         level += max(level - before, 0.0) * float(np.log(every / seen_rate) / np.log(OBSERVED))
     # What lasts longer in these rows than a block raises alarms in them that no stream of blocks shows.
     usual = None if scores is None else _usual(scores)
-    itself = (_of_normal(x, statistics, scores, usual) / own[:, None]).max(axis=0)[None]
+    itself = (normal_statistics(x, statistics, scores, usual) / own[:, None]).max(axis=0)[None]
     shown_there = level_of(itself, _exchangeable(itself[:, SETTLING:].size, every))
     return Levels(_of_deviations(own, usual), max(level * sure, shown_there), every > seen_rate)
 
@@ -539,7 +553,7 @@ def _exchangeable(rows: int, every: float) -> float:
     return rows / allowed if allowed > 0 else np.inf
 
 
-def _of_normal(
+def normal_statistics(
     x: FloatArray, statistics: Statistics, scores: Scores | None, usual: tuple[FloatArray, FloatArray] | None
 ) -> FloatArray:
     """Return the statistics of rows ``(n, m)`` without faults as they came, ``(k, n)``, of faults in units of what is

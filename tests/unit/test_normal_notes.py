@@ -1,0 +1,128 @@
+"""Events that raise learned levels, and outputs that are stuck: both are told of the rows that are learned from."""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.signal import lfilter
+
+import obsynth
+from obsynth.cli.main import main
+from obsynth.data.normal_notes import stuck_rows
+
+DT = 0.1
+ROWS, EVENT = 1_500, slice(700, 709)
+pytestmark = pytest.mark.usefixtures("taken_as_verified")
+
+
+@functools.cache
+def heated() -> obsynth.ObserverDesign:
+    plant = obsynth.DescriptorSystem(
+        E=np.eye(2), A=[[0.95, 0.02], [0.01, 0.96]], B=[[0.1], [0.0]], C=np.eye(2), Bf=[[0.1], [0.0]], dt=DT,
+        state_names=["a", "b"], output_names=["ya", "yb"], input_names=["u"], fault_names=["f"],
+        sensor_noise={"ya": 0.01, "yb": 0.01},
+    )  # fmt: skip
+    return obsynth.design(plant, "fault-estimation-filter")
+
+
+def log(seed: int, *, memory: float = 0.8, step: float = 0.0) -> pd.DataFrame:
+    """Return rows without faults; ``step``: of the quantisation of both sensors."""
+    noise = 0.01 * lfilter([1.0], [1.0, -memory], np.random.default_rng(seed).standard_normal((ROWS, 2)), axis=0)
+    plant, x, found = heated().plant, np.zeros(2), []
+    for k in range(ROWS):
+        u = np.array([np.sin(k / 4.0)])
+        found.append([k * DT, u[0], *(x + noise[k])])
+        x = plant.A @ x + plant.B @ u
+    table = pd.DataFrame(found, columns=["time", "u", "ya", "yb"])
+    if step:
+        table[["ya", "yb"]] = step * np.round(table[["ya", "yb"]] / step)
+    return table
+
+
+def learned(data: pd.DataFrame) -> obsynth.types.LearnedThresholds:
+    return obsynth.learn_thresholds(heated(), data, false_alarms="1 per 500 rows")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_event_that_raises_the_levels_is_told_with_its_rows(seed: int) -> None:
+    data = log(seed)
+    usual = learned(data)
+    data.loc[EVENT.start : EVENT.stop - 1, "ya"] += 0.3
+    raised = learned(data.drop(index=range(300, 310)).reset_index(drop=True))
+    (note,) = raised.notes
+    first, last, begin, end = (float(part) for part in stretch_of(note))
+    # Ten rows are gone before it; the estimate takes a few rows to forget it.
+    assert 690 <= first <= 692
+    assert 698 <= last <= 704
+    assert (begin, end) == (pytest.approx((first + 10) * DT), pytest.approx((last + 10) * DT))
+    # What is told is what the levels are, in units in which the noise counts: the whitener has shrunk by the event.
+    told = float(note.split("a change ")[1].split()[0])
+    ratio = np.sqrt(raised.levels[0] / usual.levels[0]) * usual.statistics.model.whitener[0, 0]
+    assert told > 2.0
+    assert told >= 0.8 * ratio / raised.statistics.model.whitener[0, 0]
+
+
+def stretch_of(note: str) -> list[str]:
+    """Return the first and last row and time of the first stretch that a note names."""
+    rows, times = note.split("rows ")[1].split(")")[0].split(" (")
+    return [*rows.split(" to "), *times.replace(" s", "").split(" to ")]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("memory", "step"), [(0.0, 0.0), (0.8, 0.0), (0.8, 0.02), (0.95, 0.05)])
+def test_nothing_is_told_of_usual_rows(seed: int, memory: float, step: float) -> None:
+    assert learned(log(seed, memory=memory, step=step)).notes == ()
+
+
+def test_an_event_that_raises_the_levels_by_little_is_none() -> None:
+    data = log(0)
+    data.loc[EVENT.start : EVENT.stop - 1, "ya"] += 0.07
+    assert learned(data).notes == ()
+
+
+def test_a_stuck_sensor_is_told_by_the_command_and_kept_in_the_file(tmp_path: Path, capsys) -> None:
+    data = log(1)
+    data.loc[EVENT.start : EVENT.stop - 1, "yb"] = data.loc[EVENT.start, "yb"]
+    gains, normal, file = (tmp_path / name for name in ("g.json", "normal.csv", "t.json"))
+    heated().save(gains)
+    data.to_csv(normal, index=False)
+    asked = ["thresholds", "--gains", str(gains), "--data", str(normal), "--false-alarms", "1 per 500 rows"]
+    assert main([*asked, "--out", str(file)]) == 0
+    assert "yb repeats one value in rows 700 to 708 (70 s to 70.8 s)" in " ".join(capsys.readouterr().out.split())
+    assert main([*asked, "--json"]) == 0
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    assert [note.split(" in ")[0] for note in notes] == ["yb repeats one value"]
+    assert obsynth.load_thresholds(file).notes == tuple(notes)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("memory", [0.0, 0.9, 0.98])
+@pytest.mark.parametrize("step", [0.0, 0.3, 1.0, 3.0])
+def test_quantised_signals_are_not_stuck_until_they_are(seed: int, memory: float, step: float) -> None:
+    drawn = np.random.default_rng(seed).standard_normal(3_000)
+    values = lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], drawn)
+    values = step * np.round(values / step) if step else values
+    assert stuck_rows(values) == []
+    changes = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
+    longest = int(np.diff(changes).max())
+    if longest > 100:
+        # What seldom changes at all does not show what is usual.
+        return
+    last = 1_000 + 6 * max(longest, 10)
+    values[1_000 : last + 1] = 99.0
+    values[1_005] = np.nan
+    assert stuck_rows(values) == [(1_000, last)]
+
+
+def test_what_never_or_rarely_changes_is_not_stuck() -> None:
+    assert stuck_rows(np.full(500, 2.0)) == []
+    assert stuck_rows(np.repeat(np.arange(30.0), 20)) == []
+    held = np.repeat(np.random.default_rng(0).standard_normal(200), 10)
+    assert stuck_rows(held) == []
+    held[1_000:1_040] = held[1_000]
+    assert stuck_rows(held) == [(1_000, 1_039)]
