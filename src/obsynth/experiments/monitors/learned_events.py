@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from obsynth.experiments.monitors.learned_levels import HOLD, Scores, Statistics, Tail, normal_statistics
+from obsynth.experiments.monitors.learned_levels import HOLD, Scores, Statistics, normal_statistics
 from obsynth.numerics.arrays import FloatArray
 
 #: Parts of a log whose largest statistics are compared, the share of them that is taken as usual, and how many times
@@ -15,10 +14,8 @@ from obsynth.numerics.arrays import FloatArray
 LOG_PARTS, USUAL_PARTS_SHARE, EVENT_STANDS_OUT = 20, 0.75, 2.0
 #: So many events, and this share of the rows, may be left out at most: what comes more often is how the plant is.
 MOST_LEFT_EVENTS, MOST_LEFT_OUT = 5, 0.1
-#: Probability below which so many events are none of the noise.
-NOISE_CHANCE = 0.01
 #: Changes have to be so many times as large to be noticed: without events it was 1.3 at most in 600 logs with normal
-#: innovations, white or coloured, and this much in one of eight logs whose innovations follow Student's t with 4.
+#: innovations, white or coloured, and this much in one of seven logs whose innovations follow Student's t with 4.
 TOLD_LEVEL_FACTOR = 2.0
 
 
@@ -48,8 +45,6 @@ def events_of(
     out = [part for part in stretches if part.size and values[part].max() > EVENT_STANDS_OUT]
     if len(out) > MOST_LEFT_EVENTS or sum(part[-1] - part[0] + 1 for part in out) > MOST_LEFT_OUT * len(x):
         return ()
-    if not out or _are_chance(values, out):
-        return ()
     own = np.abs(statistics.model.whitened(x) @ np.linalg.inv(statistics.model.whitener).T)
     own = own / np.sqrt(np.nanmean(own**2, axis=0))
     events = []
@@ -60,17 +55,6 @@ def events_of(
         signal = columns[int(np.argmax(np.nan_to_num(own[first : last + 1]).max(axis=0)))]
         events.append(Event(first, last, int(part[0]), int(part[-1]), signal))
     return tuple(events)
-
-
-def _are_chance(values: FloatArray, out: list[NDArray[np.int64]]) -> bool:
-    """Whether the tail of the other rows makes so many events probable: noise with heavy tails has such rows."""
-    from scipy.special import pdtrc
-
-    others = np.sqrt(np.delete(values, np.concatenate([np.arange(part[0], part[-1] + 1) for part in out])))
-    tail = Tail.of(others)
-    least = min(float(values[part].max()) for part in out)
-    expected = np.count_nonzero(others > tail.begin) * tail.share_beyond(float(np.sqrt(least)))
-    return float(pdtrc(len(out) - 1, expected)) >= NOISE_CHANCE
 
 
 def _in_usual(values: FloatArray) -> FloatArray:

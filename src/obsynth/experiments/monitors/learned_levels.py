@@ -404,15 +404,6 @@ class Tail(NamedTuple):
         shape = float(np.clip(shape, *SHAPES))
         return cls(begin, mean * (1.0 - shape), shape)
 
-    def share_beyond(self, radius: float) -> float:
-        """Return the share of the tail that is beyond a radius."""
-        if not self.scale > 0.0:
-            return float(radius <= self.begin)
-        far = max(radius - self.begin, 0.0) / self.scale
-        if abs(self.shape) < NO_SHAPE:
-            return float(np.exp(-far))
-        return float(max(1.0 + self.shape * far, 0.0) ** (-1.0 / self.shape))
-
     def drawn(self, uniform: FloatArray) -> FloatArray:
         """Return radii above the begin from numbers between 0 and 1."""
         if abs(self.shape) < NO_SHAPE:
