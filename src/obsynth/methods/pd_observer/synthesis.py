@@ -209,9 +209,13 @@ def _own_units(plant: DescriptorSystem) -> _Units:
     """Return the plant's own units as they are: powers of two near them would hang on the given ones.
 
     With the fastest mode as the unit of rates, J and L weigh the same there.  A unit ten times longer makes L cheap:
-    noise then reaches the estimates several times larger.
+    noise then reaches the estimates several times larger.  So it does by an output that hardly shows the states but for
+    its noise, where that is stated: beside the others its unit is no less than its noise has it.
     """
-    return _with_faults(PlantUnits.of(plant), 1.0 / fastest_mode(plant.A))
+    found = _with_faults(PlantUnits.of(plant), 1.0 / fastest_mode(plant.A))
+    noise = np.linalg.norm(plant.Dw, axis=1)
+    shown = float(np.max(found.outputs[noise > 0.0] / noise[noise > 0.0], initial=0.0))
+    return found._replace(outputs=np.maximum(found.outputs, shown * noise))
 
 
 def _with_faults(units: PlantUnits, time: float) -> _Units:
