@@ -14,10 +14,14 @@ import pytest
 
 import obsynth
 from obsynth.analysis.transformations.elimination import dynamic_coordinates
+from obsynth.methods.ui_pi_observer.assembly import KNOWN_POLES
 from obsynth.numerics import scaling
 from obsynth.numerics.scaling import LogBalance
+from obsynth.numerics.spectra import rounding_of_eigenvalues
 from obsynth.proofs import contraction
+from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import LEFT_OF_SUM, prove_contraction, proved_contractions
+from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
 from obsynth.verification import certificates, stored_numbers
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
@@ -278,3 +282,35 @@ def test_sampling_leaves_nothing_where_nothing_is() -> None:
     t = 0.5
     wanted = np.array([[1.0, 0.0, -2.8 * t], [2.8 * t, 1.0, -4.0 * t - 2.8**2 * t**2 / 2.0], [0.0, 0.0, 1.0]])
     np.testing.assert_allclose(few.A, wanted, rtol=4e-16, atol=0.0)
+
+
+#: Ahat of a UI-PI observer of a random plant: eigenvectors that nearly coincide (condition 2.8e8), poles -.085 to -2.6.
+NEARLY_DEFECTIVE = np.array([
+    [263774.73911251506, -22342020.275202632, 13923394.06998052, 182108.14628100855],
+    [8290.803491496486, -702245.9912898951, 437636.9595185154, 5723.569098334252],
+    [8306.628052921707, -703588.7472811849, 438474.65471950674, 5734.345876469068],
+    [-4.7798725891514655, 318.55799424353467, -166.17041576504408, -8.662796324496068],
+])  # fmt: skip
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_a_contraction_is_found_where_double_precision_loses_it(discrete: bool) -> None:
+    """Haswell's kernels proved none where Nehalem's did: what one processor claimed the other called not proved."""
+    # A quarter of a second by Euler's rule, the same to the last digit on every machine.
+    matrix = np.eye(4) + 0.25 * NEARLY_DEFECTIVE if discrete else NEARLY_DEFECTIVE
+    poles = np.array([middle_of(ball) for ball in enclosed_eigenvalues(matrix) or ()])
+    slowest = float(np.max(np.abs(poles)) if discrete else -np.max(poles.real))
+    rate, faster = (0.5 + 0.5 * slowest, 0.99 * slowest) if discrete else (0.5 * slowest, 1.01 * slowest)
+    factor = contraction._precise_factor(matrix, rate, discrete=discrete)
+    assert factor is not None
+    assert contraction._proved(Ball.of(matrix), factor, rate, discrete=discrete) is not None
+    # No norm contracts faster than the slowest pole.
+    assert contraction._precise_factor(matrix, faster, discrete=discrete) is None
+    assert len(list(proved_contractions(matrix, discrete=discrete, poles=poles))) == len(contraction.TRIED_RATES)
+
+
+def test_poles_that_rounding_moves_are_told() -> None:
+    assert rounding_of_eigenvalues(np.diag([-1.0, -2.0])) <= 1e-15
+    assert rounding_of_eigenvalues(NEARLY_DEFECTIVE) > KNOWN_POLES
+    assert rounding_of_eigenvalues(np.array([[0.0, 1.0], [0.0, 0.0]])) == np.inf
+    assert rounding_of_eigenvalues(np.zeros((0, 0))) == 0.0

@@ -40,6 +40,21 @@ def eigenvalues(matrix: FloatArray) -> ComplexArray:
     return np.asarray(values, dtype=np.complex128)
 
 
+def rounding_of_eigenvalues(matrix: FloatArray) -> float:
+    """Return what a rounding of a matrix ``(n, n)`` moves an eigenvalue by, relative to that, of the worst of them."""
+    if not matrix.size:
+        return 0.0
+    values, vectors = np.linalg.eig(matrix)
+    with np.errstate(all="ignore"):
+        try:
+            lefts = np.linalg.inv(vectors)
+        except np.linalg.LinAlgError:
+            return np.inf
+        moved = np.linalg.norm(lefts, axis=1) * np.linalg.norm(vectors, axis=0) * np.linalg.norm(matrix)
+        worst = float(np.max(np.where(moved > 0.0, moved / np.abs(values), 0.0))) * float(np.finfo(np.float64).eps)
+    return worst if np.isfinite(worst) else np.inf
+
+
 def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray, dt: float) -> float:
     """Return how far the eigenvalues of ``matrix (n, n)`` are from n wanted ones, relative to their size.
 

@@ -20,8 +20,9 @@ import math
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import flint
 import numpy as np
 
 from obsynth.numerics import lapack
@@ -31,7 +32,7 @@ from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyap
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_up
 from obsynth.proofs.definiteness import prove_positive_definite
-from obsynth.proofs.extended_balls import Enclosed, block
+from obsynth.proofs.extended_balls import Enclosed, arb_matrix, block
 from obsynth.proofs.products import exponential
 
 #: Where between the spectral radius (0) and one (1) the rate is tried, in turn.
@@ -47,6 +48,8 @@ MOST_STATES_FOR_SUMS, MOST_SUM_DOUBLINGS, SUMS_SETTLED = 100, 80, 1e-17
 STATES_FOR_DOUBLED_SUMS = 200
 #: Beside sums up to so large rounding hides no identity matrix: 1e-16 of them is 1e-7 of it.
 LARGEST_SUM = 1e9
+#: Where both lose it the sum is formed in so many digits, in bits, up to so many states.
+PRECISE_BITS, MOST_STATES_PRECISELY = 512, 20
 #: The same where the rate itself is what is asked for.
 TIGHT_RATES = (0.01, 0.1)
 
@@ -171,7 +174,7 @@ def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> 
 
 def _tried(ball: Ball, rate: float, *, discrete: bool, sums_first: bool) -> Contraction | None:
     ways = (_summed_factor, _lyapunov_factor)
-    for way in ways if sums_first else ways[::-1]:
+    for way in (*(ways if sums_first else ways[::-1]), _precise_factor):
         factor = way(ball.midpoint, rate, discrete=discrete)
         found = None if factor is None else _proved(ball, factor, rate, discrete=discrete)
         if found is not None:
@@ -228,6 +231,56 @@ def _summed_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray 
         if found is not None and size * float(np.max(np.sum(found**2, axis=0))) > LARGEST_SUM:
             found = _summed(power, found / np.max(np.abs(found)) @ start)
         return None if found is None else np.asarray(np.triu(np.linalg.qr(found / scale[None, :], mode="r")))
+
+
+def _precise_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray | None:
+    """Return the second sum of `_summed_factor` in many digits, where double precision has lost it to eigenvectors that
+    nearly coincide: whether it does is a matter of one processor's rounding."""
+    n = len(a)
+    if n > MOST_STATES_PRECISELY or not np.all(np.isfinite(a)) or not rate > 0.0:
+        return None
+    balanced, scale = balanced_matrix(a)
+    with flint.ctx.workprec(PRECISE_BITS):
+        one, matrix = arb_matrix(np.eye(n)), arb_matrix(balanced)
+        if discrete:
+            power, total = matrix * (1 / flint.arb(rate)), one
+        else:
+            shifted = matrix + one * flint.arb(rate)
+            size = flint.arb(largest_singular_value(balanced) + rate)
+            try:
+                inverse = (one * size - shifted).inv()
+            except ZeroDivisionError:
+                return None
+            power, total = inverse * (one * size + shifted), inverse.transpose() * inverse
+        for _ in range(2):
+            found = _precisely_summed(power, total)
+            if found is None:
+                return None
+            total = found
+        rows = total.tolist()
+        for k in range(n):
+            if not rows[k][k] > 0:
+                return None
+            root = rows[k][k].sqrt()
+            rows[k] = [value / root for value in rows[k]]
+            for i in range(k + 1, n):
+                rows[i] = [value - rows[k][i] * other for value, other in zip(rows[i], rows[k], strict=True)]
+        factor = np.array([[float(value.mid()) for value in row] for row in rows])
+    return np.asarray(np.triu(factor / scale[None, :]))
+
+
+def _precisely_summed(power: Any, total: Any) -> Any | None:
+    """Return the sum of ``(A^k)' W A^k`` over all k; ``None`` where it does not settle."""
+    for _ in range(MOST_SUM_DOUBLINGS):
+        later = power.transpose() * total * power
+        total = (total + later).mid()
+        sizes = [(float(later[i, i]), float(total[i, i])) for i in range(int(total.nrows()))]
+        if not all(math.isfinite(size) for _, size in sizes):
+            return None
+        if all(added <= SUMS_SETTLED * size for added, size in sizes):
+            return total
+        power = (power * power).mid()
+    return None
 
 
 def _summed(power: FloatArray, factor: FloatArray) -> FloatArray | None:
