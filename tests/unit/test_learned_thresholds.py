@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from heated_plant import DT, heated
 from scipy.signal import lfilter
 
 import obsynth
@@ -38,8 +39,6 @@ from obsynth.experiments.monitors.monitor import LinearSample, Sample
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 from obsynth.numerics.square_root_estimation import ParameterState
 from obsynth.observers.recursive.observer import RawEstimate
-
-DT = 0.1
 
 
 def coloured(rng: np.random.Generator, rows: int, m: int = 1, memory: float = 0.7) -> np.ndarray:
@@ -205,16 +204,6 @@ def test_columns_that_others_explain_are_left_out() -> None:
     rows = np.column_stack([x[:, 0], 3.0 * x[:, 0] + 1.0, np.full(500, 2.0), x[:, 1], x @ [1.0, 2.0]])
     assert independent(rows, 0) == [0, 3]
     assert independent(rows, 1) == [1, 3]
-
-
-@functools.cache
-def heated() -> obsynth.ObserverDesign:
-    plant = obsynth.DescriptorSystem(
-        E=np.eye(2), A=[[0.95, 0.02], [0.01, 0.96]], B=[[0.1], [0.0]], C=np.eye(2), Bf=[[0.1], [0.0]], dt=DT,
-        state_names=["a", "b"], output_names=["ya", "yb"], input_names=["u"], fault_names=["f"],
-        sensor_noise={"ya": 0.01, "yb": 0.01},
-    )  # fmt: skip
-    return obsynth.design(plant, "fault-estimation-filter")
 
 
 def log(rows: int, seed: int, *, begin: int | None = None, size: float = 2.0) -> pd.DataFrame:

@@ -2,32 +2,21 @@
 
 from __future__ import annotations
 
-import functools
 import json
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from heated_plant import DT, heated
 from scipy.signal import lfilter
 
 import obsynth
 from obsynth.cli.main import main
 from obsynth.data.normal_notes import stuck_rows
 
-DT = 0.1
 ROWS, EVENT = 1_500, slice(700, 709)
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
-
-
-@functools.cache
-def heated() -> obsynth.ObserverDesign:
-    plant = obsynth.DescriptorSystem(
-        E=np.eye(2), A=[[0.95, 0.02], [0.01, 0.96]], B=[[0.1], [0.0]], C=np.eye(2), Bf=[[0.1], [0.0]], dt=DT,
-        state_names=["a", "b"], output_names=["ya", "yb"], input_names=["u"], fault_names=["f"],
-        sensor_noise={"ya": 0.01, "yb": 0.01},
-    )  # fmt: skip
-    return obsynth.design(plant, "fault-estimation-filter")
 
 
 def log(seed: int, *, memory: float = 0.8, step: float = 0.0, freedom: float = np.inf) -> pd.DataFrame:
