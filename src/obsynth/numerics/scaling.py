@@ -230,7 +230,7 @@ class LogBalance:
         entries = _Entries.joined(self._terms, self.count)
         weights = entries.weights
         # Of hundreds of states with a dense E the weights are so large that their rounding would be the ridge.
-        largest = float(np.einsum("ii->i", entries.normal(weights)).max(initial=0.0))
+        largest = float(entries.diagonal(weights).max(initial=0.0))
         ridge = max(ridge, largest * float(np.finfo(np.float64).eps) / ROUNDED_RIDGE)
         solved, found = self._solved(entries, weights, ridge)
         for _ in range(passes):
@@ -342,13 +342,19 @@ class _Entries:
             found += np.bincount(place, sign * parts, len(found))
         return found[:-1]
 
+    def diagonal(self, weights: FloatArray) -> FloatArray:
+        """Return for each unknown the weight ``(count,)`` of all entries that it scales."""
+        found = np.zeros(self.count + 1)
+        for place in self.places:
+            found += np.bincount(place, weights, len(found))
+        return found[:-1]
+
     def normal(self, weights: FloatArray) -> FloatArray:
         """Return the matrix ``(count, count)`` of the normal equations."""
         count = self.count + 1
-        found = np.zeros((count, count))
-        diagonal, scaled = np.einsum("ii->i", found), list(zip(self.places, self.signs, strict=True))
+        found = np.diag(np.append(self.diagonal(weights), 0.0))
+        scaled = list(zip(self.places, self.signs, strict=True))
         for number, (place, sign) in enumerate(scaled):
-            diagonal += np.bincount(place, weights, count)
             for other, other_sign in scaled[:number]:
                 both = np.bincount(place * count + other, sign * other_sign * weights, count * count)
                 both = both.reshape(count, count)
