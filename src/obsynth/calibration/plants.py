@@ -33,8 +33,7 @@ from obsynth.numerics.newton import largest_entries
 from obsynth.numerics.ranks import rounding_rank
 from obsynth.observers.dae.c_code import compiler, shared_library
 from obsynth.plants.dae.functions import BUTCHER, DAEFunctions
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.dae.symbols import symbolic_value, symbols_of
+from obsynth.plants.dae.model import DAEModel, symbolic_value, symbols_of
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.noise_model import UNKNOWN_NUMBER, noise_state, offset_state, seconds
 from obsynth.plants.time_varying import INDEX_NAME, MatrixSequence, TimeVaryingDescriptorSystem

@@ -22,8 +22,7 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.dae.symbols import equation_of, symbols_of
+from obsynth.plants.dae.model import DAEModel, equation_of, symbols_of
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import matrices_of
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_exponential, affine_zero_order_hold

@@ -11,8 +11,7 @@ import numpy as np
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import chosen
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.dae.symbols import DAESymbols, symbols_of
+from obsynth.plants.dae.model import DAEModel, DAESymbols, symbols_of
 
 _ROOT_OF_SIX = np.sqrt(6.0)
 #: Butcher matrices of the implicit methods whose last stage is the result (stiffly accurate).

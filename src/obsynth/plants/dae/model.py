@@ -1,10 +1,13 @@
-"""Nonlinear differential-algebraic plants with unknown parameters, and checks of what they are made of."""
+"""Nonlinear differential-algebraic plants with unknown parameters, and checks of what they are made of.
+
+Their equations, stored quantities and outputs as CasADi expressions, which are exact to differentiate.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import fields as fields_of
 from functools import cached_property, partial
 from types import MappingProxyType
@@ -16,15 +19,25 @@ from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import real_array, real_number
 from obsynth.numerics.arrays import FloatArray, as_given, read_only
-from obsynth.numerics.expressions import DECIDING_WORDS, FUNCTIONS, FUNCTIONS_OF_TWO, NAMED_NUMBERS
+from obsynth.numerics.expressions import (
+    DECIDING_WORDS,
+    FUNCTIONS,
+    FUNCTIONS_OF_TWO,
+    NAMED_NUMBERS,
+    Expression,
+    parse_expression,
+    step_function,
+)
 from obsynth.numerics.libraries import imported
-from obsynth.plants.dae.symbols import EQUALS, DAEFields, DAESymbols, Equations, symbols_of
 from obsynth.plants.validation import Problems, checked_names, checked_units
 
 #: Names that mean something else in the language.
 RESERVED = frozenset({*NAMED_NUMBERS, *FUNCTIONS, *FUNCTIONS_OF_TWO, *DECIDING_WORDS, "der", "where"})
 #: An equation that is named by the derivative that it gives.
 _DERIVATIVE_NAME = re.compile(r"der\(\w+\)")
+#: The sign between two sides, which is no part of a comparison.
+EQUALS = re.compile("(?<![<>=])=(?!=)")
+Equations = Mapping[str, str] | Callable[..., Sequence[Any]]
 
 
 def checked_signals(values: Mapping[str, float] | None, what: str) -> dict[str, float]:
@@ -76,7 +89,7 @@ def checked_equation_names(
     return checked_names(names, states, prefix="equation ", what=what)
 
 
-def check_distinct(model: DAEFields) -> None:
+def check_distinct(model: DAEModel) -> None:
     """Raise `SpecError` when a name stands for two things."""
     groups = (model.states, model.inputs, model.parameters, model.constants, model.definitions)
     names = [name for group in groups for name in group]
@@ -89,7 +102,179 @@ def check_distinct(model: DAEFields) -> None:
         )
 
 
-def check_structure(model: DAEFields, problems: Problems) -> None:
+@dataclass(frozen=True, eq=False)
+class DAESymbols:
+    """``F(q', x, u, theta) = 0``, ``y = h(x, theta)``, q ``stored``, as columns of CasADi's SX; ``rates`` is q'."""
+
+    rates: Any
+    x: Any
+    u: Any
+    theta: Any
+    equations: Any
+    stored: Any
+    outputs: Any
+
+
+def symbols_of(model: DAEModel) -> DAESymbols:
+    """Return the symbols of a model."""
+    return _from_functions(model) if callable(model.equations) else _from_texts(model, model.equations)
+
+
+def _columns(model: DAEModel) -> tuple[Any, Any, Any]:
+    return tuple(
+        ca.vertcat(*(ca.SX.sym(name) for name in names)) if names else ca.SX(0, 1)
+        for names in (model.state_names, model.input_names, model.parameter_names)
+    )
+
+
+def _from_texts(model: DAEModel, equations: Mapping[str, str]) -> DAESymbols:
+    x, u, theta = _columns(model)
+    known: dict[str, Any] = dict(model.constants)
+    for names, column in ((model.state_names, x), (model.input_names, u), (model.parameter_names, theta)):
+        known |= {name: column[i] for i, name in enumerate(names)}
+    for name, text in model.definitions.items():
+        known[name] = _text_value(text, known, f"definitions.{name}")
+    parsed = {name: equation_of(text, f"equations.{name}") for name, text in equations.items()}
+    stored: dict[str, Any] = {}
+    for name, expression in parsed.items():
+        for key, inner in expression.rates.items():
+            stored.setdefault(key, _value(inner, known, f"equations.{name}"))
+    rates = ca.SX.sym("rates", len(stored))
+    with_rates = known | {key: rates[i] for i, key in enumerate(stored)}
+    rows = [_value(expression, with_rates, f"equations.{name}") for name, expression in parsed.items()]
+    if callable(model.outputs):
+        raise SpecError(
+            "The equations are texts, but the outputs are a function: give both in one way.", path="outputs"
+        )
+    seen = [_text_value(text, known, f"outputs.{name}") for name, text in model.outputs.items()]
+    return DAESymbols(rates, x, u, theta, ca.vertcat(*rows), ca.vertcat(*stored.values()), ca.vertcat(*seen))
+
+
+def _text_value(text: str, known: Mapping[str, Any], path: str) -> Any:
+    return _value(_parsed(text, path), known, path)
+
+
+def _parsed(text: str, path: str, *, rates: bool = False) -> Expression:
+    """Parse a text, and say where it stands when it is malformed."""
+    try:
+        return parse_expression(text, rates=rates)
+    except SpecError as error:
+        raise SpecError(f"{path}: {error}", path=path) from error
+
+
+def equation_of(text: str, path: str) -> Expression:
+    """Parse ``left = right``, or an expression that is zero."""
+    sides = EQUALS.split(text, maxsplit=1)
+    for side in sides:
+        _parsed(side.strip(), path, rates=True)
+    whole = _parsed(f"({sides[0]}) - ({sides[1]})" if len(sides) > 1 else text, path, rates=True)
+    return replace(whole, text=text)
+
+
+def _value(expression: Expression, known: Mapping[str, Any], path: str) -> Any:
+    unknown = sorted(expression.names - set(known))
+    if unknown:
+        raise SpecError(
+            f"{path}: {expression.text!r} uses {', '.join(map(repr, unknown))}, which is no state, input, parameter, "
+            f"constant or earlier definition; there are: {', '.join(n for n in known if 'der(' not in n)}.",
+            path=path,
+        )
+    return symbolic_value(expression, known)
+
+
+def symbolic_value(expression: Expression, known: Mapping[str, Any]) -> Any:
+    """Return a parsed expression of symbols by name as a symbol."""
+    return ca.SX(expression.translated(known, _translation))
+
+
+def _translation(operation: Callable[..., Any]) -> Callable[..., Any]:
+    """Return CasADi's operation for one of numpy's: the names agree but for a few."""
+    special: dict[Callable[..., Any], Callable[..., Any]] = {
+        np.add: ca.plus,
+        np.subtract: ca.minus,
+        np.multiply: ca.times,
+        np.divide: ca.rdivide,
+        np.power: ca.power,
+        np.negative: lambda a: -a,
+        np.arcsin: ca.asin,
+        np.arccos: ca.acos,
+        np.arctan: ca.atan,
+        np.abs: ca.fabs,
+        np.minimum: ca.fmin,
+        np.maximum: ca.fmax,
+        step_function: lambda a: ca.if_else(a >= 0.0, 1.0, 0.0),
+        np.where: ca.if_else,
+        np.less: ca.lt,
+        np.less_equal: ca.le,
+        np.greater: ca.gt,
+        np.greater_equal: ca.ge,
+    }
+    found = special.get(operation) or getattr(ca, operation.__name__)
+
+    return lambda *values: found(*(ca.SX(value) for value in values))
+
+
+def _from_functions(model: DAEModel) -> DAESymbols:
+    x, u, theta = _columns(model)
+    stored = x if model.storage is None else _called(model.storage, (x, theta), "storage")
+    rates = ca.SX.sym("rates", stored.numel())
+    if not callable(model.outputs) or not callable(model.equations):
+        raise SpecError(
+            "The equations are a function, but the outputs are texts: give both in one way.", path="outputs"
+        )
+    rows = _called(model.equations, (rates, x, u, theta), "equations")
+    seen = _called(model.outputs, (x, theta), "outputs")
+    return DAESymbols(rates, x, u, theta, rows, stored, seen)
+
+
+def _called(function: Callable[..., Any], columns: Sequence[Any], path: str) -> Any:
+    """Call a user's function on lists of symbols, with numpy's functions meaning CasADi's meanwhile."""
+    arguments = [[column[i] for i in range(column.numel())] for column in columns]
+    mode = ca.GlobalOptions.getNumpyMode()
+    ca.GlobalOptions.setNumpyMode(1)
+    try:
+        found = function(*arguments)
+        if not isinstance(found, (list, tuple, np.ndarray, ca.SX)):
+            raise SpecError(f"The function {path} must return a list with one expression for each entry.", path=path)
+        entries = ca.vertsplit(ca.vec(found)) if isinstance(found, ca.SX) else list(found)
+        column = ca.vertcat(*(ca.SX(entry) for entry in entries)) if entries else ca.SX(0, 1)
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        if "truth value" in str(error):
+            raise SpecError(
+                f"The function {path} decides with `if` (or `and`, `or`, `min`, `max`) on a state, which has no value "
+                "yet: use numpy.where(condition, a, b), numpy.logical_and, numpy.minimum or numpy.maximum.",
+                path=path,
+            ) from error
+        raise _not_symbolic(path, len(columns), f"{type(error).__name__}: {str(error).splitlines()[0]}") from error
+    finally:
+        ca.GlobalOptions.setNumpyMode(mode)
+    if _holds_nan(column, columns):
+        # A symbol made into a number, such as by the functions of `math`.
+        raise _not_symbolic(path, len(columns), "an expression is not a number")
+    return column
+
+
+def _not_symbolic(path: str, count: int, reason: str) -> SpecError:
+    taken = {4: "rates, x, u, theta", 2: "x, theta"}[count]
+    return SpecError(
+        f"The function {path} cannot be called on symbols: {reason}. It takes lists ({taken}), in the order of the "
+        "names, and returns a list; use numpy's functions (sqrt, where, minimum, ...) in place of those of math, and "
+        "no numbers that are made of a state, such as int(x) or range(x).",
+        path=path,
+    )
+
+
+def _holds_nan(column: Any, columns: Sequence[Any]) -> bool:
+    function = ca.Function("found", list(columns), [column], {"allow_free": True})
+    constants = (
+        function.instruction_constant(i)
+        for i in range(function.n_instructions())
+        if function.instruction_id(i) == ca.OP_CONST
+    )
+    return any(np.isnan(constant) for constant in constants)
+
+
+def check_structure(model: DAEModel, problems: Problems) -> None:
     """Note what is wrong with the equations as a whole: their number, empty ones, signals that enter nothing."""
     symbols = problems.collect(lambda: symbols_of(model))
     problems.raise_if_any()
@@ -98,7 +283,7 @@ def check_structure(model: DAEFields, problems: Problems) -> None:
     _every_signal_used(model, symbols, problems)
 
 
-def _square(model: DAEFields, symbols: DAESymbols) -> None:
+def _square(model: DAEModel, symbols: DAESymbols) -> None:
     rows, ny = symbols.equations.numel(), symbols.outputs.numel()
     if rows != model.nx:
         few = "few" if rows < model.nx else "many"
@@ -117,7 +302,7 @@ def _square(model: DAEFields, symbols: DAESymbols) -> None:
         )
 
 
-def _only_states_stored(model: DAEFields, symbols: DAESymbols) -> None:
+def _only_states_stored(model: DAEModel, symbols: DAESymbols) -> None:
     found = _depends(symbols.stored, symbols.u)
     if found.any():
         name = model.input_names[int(np.argmax(found.any(axis=0)))]
@@ -139,7 +324,7 @@ def _only_states_stored(model: DAEFields, symbols: DAESymbols) -> None:
         raise SpecError(f"der(...){told} contains no state, so it is zero: differentiate a state.", path="equations")
 
 
-def _no_empty_equation(model: DAEFields, symbols: DAESymbols) -> None:
+def _no_empty_equation(model: DAEModel, symbols: DAESymbols) -> None:
     filled = _depends(symbols.equations, ca.vertcat(symbols.x, symbols.rates)).any(axis=1)
     empty = [repr(name) for name, full in zip(model.equation_names, filled, strict=False) if not full]
     if empty:
@@ -155,7 +340,7 @@ def _no_empty_equation(model: DAEFields, symbols: DAESymbols) -> None:
         raise SpecError(f"The state {name!r} enters no equation: nothing determines it.", path=f"states.{name}")
 
 
-def _every_signal_used(model: DAEFields, symbols: DAESymbols, problems: Problems) -> None:
+def _every_signal_used(model: DAEModel, symbols: DAESymbols, problems: Problems) -> None:
     """Note the first input and parameter that enter nothing, and the first output that nothing enters."""
     # What an output must not contain is said elsewhere.
     everything = ca.vertcat(symbols.equations, symbols.stored, symbols.outputs)
@@ -190,7 +375,7 @@ def step_length(dt: Any) -> float:
     return real_number(dt, "dt", "the seconds between samples, a positive number", above=0.0)
 
 
-def checked_inputs(model: DAEFields, u: Any, samples: int | None = None) -> FloatArray:
+def checked_inputs(model: DAEModel, u: Any, samples: int | None = None) -> FloatArray:
     """Return known inputs ``(samples, nu)``; raise `SpecError` naming the signal and k where one is not finite."""
     if u is None and (model.nu or samples is None):
         raise SpecError(f"u is missing: the model has {model.nu} input(s), {', '.join(model.input_names)}.", path="u")
@@ -236,7 +421,7 @@ def _depends(expressions: Any, symbols: Any) -> Any:
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class DAEModel(DAEFields):
+class DAEModel:
     r"""A nonlinear descriptor plant with constant or slowly changing parameters.
 
     .. math::
@@ -295,6 +480,18 @@ class DAEModel(DAEFields):
        2013, (3)-(4).  There h does not depend on theta only in the derivation; (21) needs it, and we allow it.
     """
 
+    equations: Equations
+    outputs: Equations
+    states: Mapping[str, float]
+    inputs: Mapping[str, float]
+    parameters: Mapping[str, float]
+    constants: Mapping[str, float]
+    definitions: Mapping[str, str]
+    units: Mapping[str, str]
+    storage: Callable[..., Sequence[Any]] | None
+    equation_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+
     def __init__(
         self,
         equations: Equations,
@@ -336,6 +533,41 @@ class DAEModel(DAEFields):
         known = {*required, *self.constants, *self.definitions}
         object.__setattr__(self, "units", problems.collect(lambda: checked_units(units, known)))
         problems.raise_if_any()
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states, in order."""
+        return tuple(self.states)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the known inputs, in order."""
+        return tuple(self.inputs)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters, in order."""
+        return tuple(self.parameters)
+
+    @property
+    def nx(self) -> int:
+        """Number of states, and of equations."""
+        return len(self.states)
+
+    @property
+    def nu(self) -> int:
+        """Number of known inputs."""
+        return len(self.inputs)
+
+    @property
+    def ny(self) -> int:
+        """Number of outputs."""
+        return len(self.output_names)
+
+    @property
+    def nq(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters)
 
     @property
     def nominal_state(self) -> FloatArray:
