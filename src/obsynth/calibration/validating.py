@@ -36,7 +36,7 @@ from obsynth.calibration.problem import Problem
 from obsynth.calibration.reporting import IntegrationError, integration_error
 from obsynth.calibration.simulation_error import Fit
 from obsynth.errors import PreconditionError, SolverError, SpecError
-from obsynth.numerics.arguments import arguments_checked, require_kind
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.estimates import GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
@@ -372,7 +372,6 @@ def _usable_log(
     scales: Mapping[str, float] | None,
 ) -> Log:
     """Return the log of a design whose innovations it can contradict, without samples that are clearly wrong."""
-    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     if not states_innovations(design):
         raise SpecError(
             f"The method {design.method} states no covariance of its residual with which a log could be compared: "

@@ -39,7 +39,6 @@ from obsynth.numerics.arguments import (
     Positive,
     Probability,
     arguments_checked,
-    checked_value,
     is_finite_number,
     require_kind,
 )
@@ -660,12 +659,12 @@ def compare(
     scenario: Scenario | None = None,
     options: Mapping[str, Mapping[str, Any]] | None = None,
     methods: Sequence[str] | None = None,
-    sample_time: float | None = None,
-    within: float | None = None,
-    tolerance: float = 0.0,
-    disturbance: float = 1.0,
-    runs: int = RUNS,
-    false_alarms: float = 0.05,
+    sample_time: Positive | None = None,
+    within: Positive | None = None,
+    tolerance: NonNegative = 0.0,
+    disturbance: NonNegative = 1.0,
+    runs: Count = RUNS,
+    false_alarms: Probability = 0.05,
     data: Any = None,
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
@@ -725,13 +724,6 @@ def compare(
     plant = linear_plant(plant)
     if plant.nf == 0:
         raise SpecError("The plant has no faults, so there are no fault estimates to compare.", path="plant")
-    checked_value(tolerance, "tolerance", NonNegative)
-    checked_value(disturbance, "disturbance", NonNegative)
-    checked_value(runs, "runs", Count)
-    checked_value(false_alarms, "false_alarms", Probability)
-    for name, value in (("sample_time", sample_time), ("within", within)):
-        if value is not None:
-            checked_value(value, name, Positive)
     unused = sorted(name for name, given in (("columns", columns), ("scales", scales)) if given and data is None)
     if unused:
         raise SpecError(f"{unused[0]} is for a log: give data.", path=unused[0])

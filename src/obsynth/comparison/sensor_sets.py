@@ -26,7 +26,7 @@ from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.files.tables import html_table, text_table
 from obsynth.methods.functions import functional_filter
 from obsynth.methods.guaranteed_test.result import GuaranteedTest, guaranteed_test
-from obsynth.numerics.arguments import Count, arguments_checked, checked_value, is_finite_number, real_vector
+from obsynth.numerics.arguments import Count, arguments_checked, is_finite_number, real_vector
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -207,10 +207,10 @@ def sensor_sets(
     candidates: Sequence[str] | Mapping[str, Any] | None = None,
     cost: Mapping[str, float] | None = None,
     noise: float | Mapping[str, float] | None = None,
-    largest: int | None = None,
-    copies: int = 1,
+    largest: Annotated[int, Ge(0)] | None = None,
+    copies: Count = 1,
     may_fail: bool = False,
-    most: int = MOST_LISTED_SETS,
+    most: Count = MOST_LISTED_SETS,
     fault: str | None = None,
     below: float | None = None,
     sample_time: float | Sequence[float] | None = None,
@@ -285,8 +285,6 @@ def sensor_sets(
         raise SpecError(f"goal is {goal!r}: use one of {', '.join((*GOALS, 'threshold'))}.", path="goal")
     if not chosen:
         raise SpecError("The plant has no faults to place sensors for.", path="faults")
-    for name, count in (("copies", copies), ("most", most), ("largest", largest)):
-        checked_value(count, name, Annotated[int, Ge(0)] | None if name == "largest" else Count)
     sensors = _candidates(plant, candidates, noise)
     _require_positive(cost or {}, sensors, "cost", whole=False)
     costs = [float((cost or {}).get(sensor.name, 1.0)) for sensor in sensors]

@@ -35,7 +35,7 @@ from obsynth.files.tables import table_writer
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.tolerant import rows_before
-from obsynth.numerics.arguments import arguments_checked, require_kind, truth, whole_number
+from obsynth.numerics.arguments import arguments_checked, require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
@@ -359,7 +359,6 @@ def run_on_data(
     whole_number(state_every, "state_every")
     _require_files(state=state, out=out, data=data)
     if time_column is not None:
-        require_kind(time_column, str, "time_column", "the name of a column")
         columns = {**(columns or {}), TIME_HEADER: time_column}
     stamps = Stamps()
     run = LogRun(
@@ -450,7 +449,7 @@ def _require_a_window(design: ObserverDesign, rows: int) -> None:
 
 def _smoothed(run: LogRun, data: Data, *, smooth: bool, lag: int | None, state: str | Path | None) -> None:
     """Let rows wait for those after them, if they shall."""
-    if not truth(smooth, "smooth") and lag is None:
+    if not smooth and lag is None:
         return
     if smooth and lag is not None:
         raise SpecError("smooth takes the whole record, and lag some samples of it: give one of them.", path="lag")

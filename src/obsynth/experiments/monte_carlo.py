@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.simulation import Bench, Runs, aligned_errors, bench_of, make_bench
-from obsynth.numerics.arguments import OpenUnitInterval, arguments_checked, checked_value, whole_number
+from obsynth.numerics.arguments import OpenUnitInterval, arguments_checked, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import ParameterMonitor
@@ -162,7 +162,7 @@ def evaluate(
     monitor: Monitor | ParameterMonitor | None = None,
     executor: Executor | None = None,
     progress: RunsProgress | bool | None = None,
-    confidence: float = 0.95,
+    confidence: OpenUnitInterval = 0.95,
     plants: int | None = None,
 ) -> Evaluation:
     """Run a scenario many times, with the seeds ``scenario.seed``, ``scenario.seed + 1``, ...
@@ -200,7 +200,6 @@ def evaluate(
     PreconditionError
         As for `simulate`.
     """
-    checked_value(confidence, "confidence", OpenUnitInterval)
     runs = max(whole_number(runs, "runs"), 1 if plants is None else whole_number(plants, "plants"))
     seeds = range(scenario.seed, scenario.seed + runs)
     bench = bench_of(design, scenario)

@@ -36,7 +36,7 @@ from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.methods.guaranteed_test.bank import groups_of, is_bank
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
-from obsynth.numerics.arguments import arguments_checked, chosen, require_kind
+from obsynth.numerics.arguments import arguments_checked, chosen
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.outliers import OUTLIER_KINDS
@@ -381,24 +381,22 @@ def export(
     suffix = target.suffix.lower()
     if suffix not in EXPORT_SUFFIXES:
         raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(EXPORT_SUFFIXES)}.", path=str(target))
-    if isinstance(design, ObserverDesign):
-        require_verified(design, unverified=unverified)
-        require_fixed(design, suffix)
-        if isinstance(design.observer, RecursiveObserver):
-            require_plain(design.observer, "An export")
+    require_verified(design, unverified=unverified)
+    require_fixed(design, suffix)
+    if isinstance(design.observer, RecursiveObserver):
+        require_plain(design.observer, "An export")
     _require_fitting_options(
         suffix, fmi=fmi, thresholds=thresholds, warm_up=warm_up, monitor=monitor, precision=precision
     )
     numbers = chosen(precision or "double", "precision", C_PRECISIONS)
     if outliers is not None:
         chosen(outliers, "outliers", OUTLIER_KINDS)
-        if not (isinstance(design, ObserverDesign) and isinstance(design.observer, DAEObserver)):
+        if not isinstance(design.observer, DAEObserver):
             raise SpecError("outliers is for nonlinear designs: exports of others use every sample.", path="outliers")
     learned = None if monitor is None else _learned_by(monitor, design)
     if suffix == ".fmu":
         from obsynth.exporting.fmu.archive import write_fmu
 
-        require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
         if monitor is not None and learned is None:
             raise SpecError(
                 "An FMU holds learned monitors and levels of outputs, not this monitor: write it as C (.c).",
@@ -415,7 +413,7 @@ def export(
             outliers=outliers,
         )
         return (made,)
-    if isinstance(design, ObserverDesign) and isinstance(design.observer, DAEObserver):
+    if isinstance(design.observer, DAEObserver):
         if monitor is not None and learned is None:
             raise SpecError("Of nonlinear designs, learned monitors are written as C.", path="monitor")
         alarms = dae_alarms(design, thresholds, warm_up, learned)

@@ -17,7 +17,7 @@ import numpy as np
 from obsynth.data.linear_log import GAP_LEFT_SHARE, LEAST_SHOWN, LinearLogObserver
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned import LearnedThresholds
-from obsynth.numerics.arguments import real_number, require_kind, require_mapping
+from obsynth.numerics.arguments import real_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
@@ -67,7 +67,6 @@ class Realisation:
     @classmethod
     def of(cls, design: ObserverDesign, sample_time: float | None, precision: str = "double") -> Realisation:
         """Return the realisation of a design."""
-        require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
         digest = gain_set_digest(design)
         if isinstance(design.observer, RecursiveObserver):
             if design.observer.outliers != "none":

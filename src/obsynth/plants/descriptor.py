@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from functools import cached_property, partial
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,15 +36,6 @@ from obsynth.plants.validation import (
     rows_picking,
     signal_counts,
 )
-
-
-class Written(Protocol):
-    """A linear plant: its matrices by name, and the seconds between its samples."""
-
-    @property
-    def dt(self) -> float:
-        """Sample time in s, zero for a plant in continuous time."""
-
 
 #: The matrices on which existence depends.
 DECISIVE = ("E", "A", "Bf", "Bd", "C", "Df", "Dd")
@@ -74,7 +65,7 @@ class ExactNumbers:
         """Return the numbers before any were taken for rounding."""
         return self if self.uncleaned is None else replace(self, matrices=self.uncleaned, uncleaned=None)
 
-    def require_of(self, plant: Written) -> None:
+    def require_of(self, plant: DescriptorSystem) -> None:
         """Raise `SpecError` where these are not the numbers behind the matrices of a plant."""
         for name in DECISIVE:
             rows, matrix = self.matrices[name], getattr(plant, name)
@@ -144,7 +135,7 @@ def _fraction(text: str) -> Fraction:
     return Fraction(int(found.p), int(found.q))
 
 
-def note_source(source: Written, new: Written, *, sample_time: float | None = None) -> None:
+def note_source(source: DescriptorSystem, new: DescriptorSystem, *, sample_time: float | None = None) -> None:
     """Note on a plant that elimination or sampling has just made which plant, as written, it comes from."""
     if new is source:
         return
@@ -153,7 +144,7 @@ def note_source(source: Written, new: Written, *, sample_time: float | None = No
         object.__setattr__(new, "_made_from", (written, earlier if sample_time is None else sample_time))
 
 
-def carry_source(old: Written, new: Written) -> None:
+def carry_source(old: DescriptorSystem, new: DescriptorSystem) -> None:
     """Note on a changed plant which plant, as written, the old one comes from, if nothing has changed that matters."""
     made = getattr(old, "_made_from", None)
     unchanged = old.dt == new.dt and all(

@@ -34,7 +34,7 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.analysis.zeros import structure_of
 from obsynth.errors import SpecError
 from obsynth.files.tables import html_table, text_table
-from obsynth.numerics.arguments import arguments_checked, is_finite_number, truth
+from obsynth.numerics.arguments import arguments_checked, is_finite_number
 from obsynth.numerics.arrays import ComplexArray, read_only
 from obsynth.numerics.libraries import failed_computations, on_one_thread_if_small
 from obsynth.numerics.ranks import REST_TOLERANCE
@@ -361,7 +361,6 @@ def diagnose(
     if not all(is_finite_number(value) and value >= 0.0 for value in frequencies):
         raise SpecError(f"frequencies is {list(frequencies)!r}: give numbers in rad/s, 0 or more.", path="frequencies")
     model = exosystem(fault_model, plant.fault_names, plant.dt)
-    whole_bank = truth(whole_bank, "whole_bank")
     if whole_bank and plant.nf > MOST_FAULTS_OF_WHOLE_BANK:
         raise SpecError(
             f"The plant has {plant.nf} faults: the whole bank of residuals is listed_sets for up to "

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arguments import arguments_checked, chosen, real_number
+from obsynth.numerics.arguments import arguments_checked, real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import parse_expression
 from obsynth.numerics.ranks import JACOBIAN_RANK_TOLERANCE
@@ -506,7 +506,7 @@ SHIFT_INPUT = "shift"
 def linearise(
     model: DAEModel,
     *,
-    at: str = "equilibrium",
+    at: Literal["equilibrium", "point"] = "equilibrium",
     given: Mapping[str, float] | None = None,
     free: Sequence[str] | Mapping[str, tuple[float, float]] = (),
     faults: Sequence[str] | None = None,
@@ -590,7 +590,6 @@ def linearise(
     .. [CampbellLinearisation1995] S. L. Campbell, "Linearization of DAEs along trajectories", ZAMP 46, 1995; at a
        moving point we keep E x' as an input, which is exact to first order.
     """
-    chosen(at, "at", ("equilibrium", "point"))
     values, freed = dict(given or {}), _names(free, "free")
     for name, bounds in free.items() if isinstance(free, Mapping) else ():
         if np.shape(bounds) != (2,) or not float(bounds[0]) <= float(bounds[1]):
