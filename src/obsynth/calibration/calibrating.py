@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -55,7 +55,7 @@ from obsynth.calibration.reporting import Calibration, IntegrationError, integra
 from obsynth.calibration.simulation_error import FIRST_ROWS, Fit, SimulationError, simulation_fits, with_seen_start
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.dae_adaptive_observer.conditions import NOMINAL_SAMPLES
-from obsynth.numerics.arguments import Seed, arguments_checked, chosen, is_whole, whole_number
+from obsynth.numerics.arguments import Seed, arguments_checked, is_whole, whole_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -323,8 +323,6 @@ def plant_as_written(given: Any) -> Any:
 OUTLIER_ROUNDS = 3
 #: What is said of an offset without which the model follows nothing.
 OFFSET_TAKEN = "Without an offset of the sensor {} the model does not follow the log: it has a state for it."
-METHODS = ("innovations", "simulation")
-INTEGRATIONS = ("auto", "backward-euler", "radau")
 #: Two sample times are the same within this share.
 SAME_TIME = 1e-6
 
@@ -346,8 +344,8 @@ def calibrate(
     scales: Mapping[str, float] | None = None,
     dt: float | None = None,
     input_delay: int | str = "auto",
-    method: str = "innovations",
-    integration: str = "auto",
+    method: Literal["innovations", "simulation"] = "innovations",
+    integration: Literal["auto", "backward-euler", "radau"] = "auto",
     substeps: int = 1,
     level: float = 0.95,
     starts: int = 3,
@@ -452,8 +450,6 @@ def calibrate(
        Psychometrika 78, 2013: the weight that keeps variances from zero, which we give only to those that the log
        cannot distinguish from it.
     """
-    chosen(method, "method", METHODS)
-    chosen(integration, "integration", INTEGRATIONS)
     if not isinstance(level, (int, float)) or not 0.0 < level < 1.0:
         raise SpecError(f"level is {level!r}: give a probability, such as 0.95.", path="level")
     starts = whole_number(starts, "starts")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -36,10 +37,10 @@ from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.methods.guaranteed_test.bank import groups_of, is_bank
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
-from obsynth.numerics.arguments import arguments_checked, chosen
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.outliers import OUTLIER_KINDS
+from obsynth.observers.outliers import Outliers
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.sensor_timing import require_plain
 from obsynth.observers.windows import WindowObserver
@@ -282,7 +283,6 @@ COPY_U    for (i = NU; i < WIDTH; i++) {
 """
 
 
-C_PRECISIONS = ("double", "float")
 EXPORT_SUFFIXES = (".mat", ".npz", ".c", ".fmu")
 
 #: What an existing file has to be for another export to take its place.
@@ -306,8 +306,8 @@ def export(
     thresholds: Mapping[str, float] | None = None,
     warm_up: float | None = None,
     monitor: Monitor | None = None,
-    precision: str | None = None,
-    outliers: str | None = None,
+    precision: Literal["double", "float"] | None = None,
+    outliers: Outliers | None = None,
     unverified: bool = False,
 ) -> tuple[Path, ...]:
     """Write the observer of a design for MATLAB and Simulink, for numpy, as C99, or as a functional mock-up unit.
@@ -388,11 +388,9 @@ def export(
     _require_fitting_options(
         suffix, fmi=fmi, thresholds=thresholds, warm_up=warm_up, monitor=monitor, precision=precision
     )
-    numbers = chosen(precision or "double", "precision", C_PRECISIONS)
-    if outliers is not None:
-        chosen(outliers, "outliers", OUTLIER_KINDS)
-        if not isinstance(design.observer, DAEObserver):
-            raise SpecError("outliers is for nonlinear designs: exports of others use every sample.", path="outliers")
+    numbers = precision or "double"
+    if outliers is not None and not isinstance(design.observer, DAEObserver):
+        raise SpecError("outliers is for nonlinear designs: exports of others use every sample.", path="outliers")
     learned = None if monitor is None else _learned_by(monitor, design)
     if suffix == ".fmu":
         from obsynth.exporting.fmu.archive import write_fmu

@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arguments import chosen, real_number
+from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.records import named_bounds, named_vector
 
 BoolArray = NDArray[np.bool_]
 Outliers = Literal["none", "gate", "huber"]
-OUTLIER_KINDS = ("none", "gate", "huber")
 #: Standard deviations: of a gate, so that no sample of a true model is left out in a million; and of Huber's weight.
 LIMITS = {"gate": 6.0, "huber": 3.0}
 #: What is larger has no square: it is no measurement, whatever the model says.
@@ -48,7 +47,6 @@ Row = TypeVar("Row", bound=Any)
 
 def checked_limit(kind: str, limit: float | None) -> float:
     """Return the limit in standard deviations, infinite for ``none``."""
-    chosen(kind, "outliers", OUTLIER_KINDS)
     if limit is None:
         return LIMITS.get(kind, float("inf"))
     return real_number(limit, "outlier_limit", "a positive number of standard deviations", above=0.0)

@@ -11,7 +11,7 @@ from typing import Any, Generic, Self, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arguments import check_fields, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.estimates import STEP_RESIDUAL, Estimates
 from obsynth.observers.outliers import Outliers, checked_limit, checked_sizes, checked_state_bounds
@@ -71,6 +71,7 @@ class StepObserver(Observer[Any, Any]):
     state_bounds: FloatArray | None
 
     def _check_options(self) -> None:
+        check_fields(self, type(self))
         checked_limit(self.outliers, self.outlier_limit)
         object.__setattr__(self, "outlier_sizes", checked_sizes(self.outlier_sizes, self.plant.output_names))
         object.__setattr__(self, "sensors", checked_sensors(self.sensors, self.plant.output_names))

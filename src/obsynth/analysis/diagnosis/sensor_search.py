@@ -104,8 +104,6 @@ def _outside(span: ComplexArray, vector: ComplexArray) -> NDArray[np.float64]:
     return np.asarray(np.linalg.norm(vector, axis=1))
 
 
-#: What sensors may be wanted for.
-GOALS = ("detect", "isolate", "estimate-step", "estimate")
 #: Sets of one size are enumerated up to so many; the best of each size are confirmed until so many fail in a row.
 MOST_ENUMERATED_SETS = 40_000
 MOST_CONFIRMED = 400

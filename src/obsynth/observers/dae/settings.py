@@ -16,7 +16,6 @@ from obsynth.numerics.arguments import (
     ForgettingFactor,
     Positive,
     Probability,
-    check_fields,
     require_kind,
     require_shape,
 )
@@ -65,7 +64,6 @@ class DAESettings(StepObserver):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "dt", step_length(self.dt))
-        check_fields(self, DAESettings)
         self._check_options()
         self._check_arrays()
 
