@@ -10,12 +10,16 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from annotated_types import Gt, Le
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import (
+    OpenUnitInterval,
+    Positive,
+    check_fields,
     is_finite_number,
     is_number,
     real_array,
@@ -50,6 +54,7 @@ class Profile:
                 raise SpecError(f"{item.name} is {shown(value)}: give a finite number.", path=item.name)
             if item.name != "end":
                 require_no_overflow(value, item.name, item.name)
+        check_fields(self, type(self))
         if not self.end > self.start:
             raise SpecError(f"end ({self.end:g} s) is not after start ({self.start:g} s).", path="end")
 
@@ -57,11 +62,6 @@ class Profile:
         """Return which of the samples 0 to ``steps - 1`` it acts on."""
         place = np.arange(steps) + SAMPLE_SLACK
         return np.asarray((place >= self.start / dt) & (place < self.end / dt))
-
-
-def _require(condition: bool, text: str, path: str) -> None:
-    if not condition:
-        raise SpecError(text, path=path)
 
 
 class Additive(Profile, ABC):
@@ -159,11 +159,7 @@ class Drift(Additive):
 
     held: ClassVar[bool] = False
     size: float
-    time_constant: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _require(self.time_constant > 0.0, "time_constant must be greater than 0.", "time_constant")
+    time_constant: Positive
 
     def _at(self, time: FloatArray) -> FloatArray:
         # Before the start it is masked; there the exponential must not overflow.
@@ -187,13 +183,8 @@ class Intermittent(Additive):
     """
 
     size: float
-    period: float
-    duty: float = 0.5
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _require(self.period > 0.0, "period must be greater than 0.", "period")
-        _require(0.0 < self.duty < 1.0, "duty must lie between 0 and 1.", "duty")
+    period: Positive
+    duty: OpenUnitInterval = 0.5
 
     def _at(self, time: FloatArray) -> FloatArray:
         turn = (time - self.start) / self.period + SAMPLE_SLACK
@@ -231,11 +222,7 @@ class LostEffectiveness(Failure):
         When it acts.
     """
 
-    share: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _require(0.0 < self.share <= 1.0, "share must be greater than 0 and at most 1.", "share")
+    share: Annotated[float, Gt(0.0), Le(1.0)]
 
 
 class Random(Profile, ABC):
@@ -270,7 +257,8 @@ class Uniform(Random):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require(self.high > self.low, "high must be greater than low.", "high")
+        if not self.high > self.low:
+            raise SpecError("high must be greater than low.", path="high")
 
     def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
         return np.asarray(rng.uniform(self.low, self.high, steps))
@@ -294,12 +282,8 @@ class Gaussian(Random):
         When it acts.
     """
 
-    deviation: float
+    deviation: Positive
     mean: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _require(self.deviation > 0.0, "deviation must be greater than 0.", "deviation")
 
     def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
         return np.asarray(rng.normal(self.mean, self.deviation, steps))
