@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 from time_varying_plants import observer_for, printed, textbook, varying
 
 from obsynth import PreconditionError, SpecError, TimeVaryingDescriptorSystem
-from obsynth.observers.decisions import STATISTICS, decide
+from obsynth.observers.decisions import Statistic, decide
 from obsynth.simulation.linear import simulate_time_varying
 
 SAMPLES, CHANGE = 160, 90
+STATISTICS = get_args(Statistic)
 PLANT = varying(horizon=SAMPLES)
 
 

@@ -9,12 +9,13 @@ What a decision says, and the statistics that need the gains of a record again.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import arguments_worded, chosen, real_array, real_number, real_vector
+from obsynth.numerics.arguments import arguments_worded, check_fields, real_array, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
@@ -173,7 +174,7 @@ def _doubled_log_ratios(information: FloatArray, scores: FloatArray) -> FloatArr
     return np.asarray(np.einsum("oq,oqr,or->o", scaled, inverses, scaled))
 
 
-STATISTICS = ("chi-square", "cusum", "glr", "nis")
+Statistic: TypeAlias = Literal["chi-square", "cusum", "glr", "nis"]
 #: Forms whose parameters are states: their samples say nothing of parameters that stay as they are.
 WALKING_FORMS = ("random-walk", "augmented-kalman")
 #: Samples that the NIS sums up: the choice that its threshold was tried with.
@@ -191,7 +192,7 @@ def decide(
     observer: RecursiveObserver | DAEObserver,
     estimates: Estimates,
     *,
-    statistic: str = "chi-square",
+    statistic: Statistic = "chi-square",
     nominal: ArrayLike | None = None,
     false_alarms: float = 0.01,
     change: ArrayLike = 0.1,
@@ -227,7 +228,6 @@ def decide(
         It is no such observer, the statistic is unknown or does not go with the observer's form, an option is out of
         range, or the estimates are of another observer.
     """
-    chosen(statistic, "statistic", STATISTICS)
     theta, size = _asked(observer, statistic, nominal, false_alarms, change)
     nq, false_alarms = len(theta), float(false_alarms)
     if (estimates.state_names, estimates.parameter_names) != (observer.state_names, observer.fault_names):
@@ -271,9 +271,7 @@ def _asked(
             "'nis' tests whether the model still fits the data.",
             path="observer",
         )
-    probability = real_number(false_alarms, "false_alarms", "a probability between 0 and 1")
-    if not 0.0 < probability < 1.0:
-        raise SpecError(f"false_alarms is {probability}: give a probability between 0 and 1.", path="false_alarms")
+    real_number(false_alarms, "false_alarms", "a probability between 0 and 1", above=0.0, below=1.0)
     if form in WALKING_FORMS and statistic in ("cusum", "glr"):
         raise SpecError(
             f"{statistic} needs regressors, which form {form!r} does not have: use a form with a forgetting factor.",
@@ -314,13 +312,13 @@ class ParameterMonitor:
         The statistic is unknown, or a change is given for another one than ``cusum``.
     """
 
-    statistic: str = "chi-square"
+    statistic: Statistic = "chi-square"
     nominal: tuple[float, ...] | None = None
     false_alarms: float = 0.01
     change: float | tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        chosen(self.statistic, "statistic", STATISTICS)
+        check_fields(self, ParameterMonitor)
         if self.change is not None and self.statistic != "cusum":
             raise SpecError(f"change is for cusum, not for {self.statistic}: leave it out.", path="change")
 

@@ -6,16 +6,14 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import chosen, is_finite_number, is_number, real_number
+from obsynth.numerics.arguments import check_fields, is_finite_number, is_number, real_number
 from obsynth.numerics.arrays import FloatArray, freeze
 
-VARIATIONS = ("constant", "varying")
-SOURCES = ("stated", "set-membership", "calibrated")
 _KEYS = ("nominal", "tolerance", "range", "unit")
 #: Signals, states and constants that a sentence lists; a digest stands for the others.
 MOST_LISTED = 6
@@ -127,8 +125,8 @@ class ConstantsBox:
     """
 
     constants: Mapping[str, Constant]
-    variation: str = "constant"
-    source: str = "stated"
+    variation: Literal["constant", "varying"] = "constant"
+    source: Literal["stated", "set-membership", "calibrated"] = "stated"
     level: float | None = None
     digest: str = ""
     calibrated: tuple[str, ...] = ()
@@ -137,8 +135,7 @@ class ConstantsBox:
     def __post_init__(self) -> None:
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
         object.__setattr__(self, "calibrated", tuple(self.calibrated))
-        chosen(self.variation, "variation", VARIATIONS)
-        chosen(self.source, "source", SOURCES)
+        check_fields(self, ConstantsBox)
         calibrated = self.source == "calibrated"
         if calibrated and not (is_finite_number(self.level) and 0.0 < float(self.level or 0.0) < 1.0):
             raise SpecError(
