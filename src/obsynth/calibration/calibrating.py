@@ -147,14 +147,13 @@ def _asking(problem: Problem, fit: InnovationsFit) -> set[tuple[str, str]]:
     inputs."""
     found = {("walk", name) for name in problem.plant.unknown_inputs}
     names, ny = problem.output_names, len(problem.output_names)
-    whitened = np.where(np.isfinite(problem.y), fit.whitened, np.nan)
-    coloured = [whiteness(column).probability < SIGNIFICANT for column in whitened.T]
+    coloured = [whiteness(column).probability < SIGNIFICANT for column in fit.whitened.T]
     # Process noise that stands for coloured noise whitens that sensor: the next one pays for it, or none does.
     # A mean is no colour, but a bias.
     hidden = any(coloured) or not np.all(fit.limited_Q)
     found |= {
         ("coloured", name)
-        for name, own, column in zip(names, coloured, whitened.T, strict=True)
+        for name, own, column in zip(names, coloured, fit.whitened.T, strict=True)
         if own or (hidden and not mean_off(column))
     }
     v = fit.v
@@ -163,7 +162,7 @@ def _asking(problem: Problem, fit: InnovationsFit) -> set[tuple[str, str]]:
         (_whitened(problem, v + step, problem.y) - before) / SMALL_MOVE
         for step in SMALL_MOVE * np.hstack([np.diag(problem.widths), np.zeros((len(fit.t), len(v) - len(fit.t)))])
     ]
-    deviations = np.sqrt(np.nanmean(np.where(np.isfinite(problem.y), fit.innovations, np.nan) ** 2, axis=0))
+    deviations = np.sqrt(np.nanmean(fit.innovations**2, axis=0))
     for j, name in enumerate(names):
         offset = deviations[j] * (np.arange(ny) == j)
         effect = _whitened(problem, v, problem.y - offset) - before
@@ -174,7 +173,7 @@ def _asking(problem: Problem, fit: InnovationsFit) -> set[tuple[str, str]]:
 
 def _whitened(problem: Problem, v: FloatArray, y: FloatArray) -> FloatArray:
     """Return whitened innovations ``(n, ny)`` of other measurements, NaN where nothing was measured."""
-    return np.where(np.isfinite(y), Likelihood(problem, y).innovations(v)[0], np.nan)
+    return Likelihood(problem, y).innovations(v)[0]
 
 
 def _candidates(
@@ -210,11 +209,11 @@ class _Known:
     @classmethod
     def of(cls, problem: Problem, fit: InnovationsFit) -> _Known:
         """Return what a fit found; ``kept``: how much of an innovation of each sensor its next one keeps."""
-        whitened = np.where(np.isfinite(problem.y), fit.whitened, np.nan)
-        kept = {name: whiteness(column).first for name, column in zip(problem.output_names, whitened.T, strict=True)}
+        columns = zip(problem.output_names, fit.whitened.T, strict=True)
+        kept = {name: whiteness(column).first for name, column in columns}
         both = (*problem.noisy, *problem.output_names)
         variances = dict(zip(both, (*fit.Q.tolist(), *fit.R.tolist()), strict=True))
-        spread = np.nanmean(np.where(np.isfinite(problem.y), fit.innovations, np.nan) ** 2, axis=0)
+        spread = np.nanmean(fit.innovations**2, axis=0)
         return cls(dict(zip(problem.unknown, fit.t.tolist(), strict=True)), variances, kept, spread)
 
     def best(self, problem: Problem) -> tuple[float, _Known]:
@@ -264,12 +263,11 @@ LONGEST_RUN, RETURNED = 5, 3
 def wrong_runs(problem: Problem, fit: InnovationsFit) -> BoolArray:
     """Return which measurements ``(n, ny)`` stand out with others of the same sensor beside them, are not seen by
     another sensor, and leave the next samples where these are predicted without them."""
-    whitened = np.where(np.isfinite(problem.y), fit.whitened, np.nan)
     found = np.zeros(problem.y.shape, dtype=bool)
     seen = np.isfinite(problem.y)
     enough = seen.sum(axis=0) >= LEAST_DIAGNOSED_ROWS
-    usual = np.array([usual_size(column) if many else np.inf for column, many in zip(whitened.T, enough, strict=True)])
-    far = seen & (np.abs(whitened) > STANDS_OUT * usual)
+    usual = np.array([usual_size(e) if many else np.inf for e, many in zip(fit.whitened.T, enough, strict=True)])
+    far = seen & (np.abs(fit.whitened) > STANDS_OUT * usual)
     for i in range(far.shape[1]):
         for first, last in _groups(far[:, i]):
             if np.delete(far[first : last + 1], i, axis=1).any():
@@ -631,7 +629,7 @@ class _Fitting:
             if found.fit is None:
                 break
             problem = found.problem
-            alone = standing_out(np.where(np.isfinite(problem.y), found.fit.whitened, np.nan))
+            alone = standing_out(found.fit.whitened)
             wrong = alone | wrong_runs(problem, found.fit)
             off = np.abs(found.fit.innovations).T
             if not wrong.any():

@@ -624,7 +624,8 @@ WEAK_CURVATURE = 1.0
 
 @dataclass(frozen=True, eq=False)
 class InnovationsFit:
-    """Constants ``(nt,)``, their information and box, variances by equation and sensor, and what the filter said."""
+    """Constants ``(nt,)``, their information and box, variances by equation and sensor, and what the filter said: no
+    innovation (NaN) where nothing was measured."""
 
     t: FloatArray
     value: float
@@ -733,7 +734,7 @@ def innovations_fit(
     Q, R = np.where(limited[: len(Q)], limits[: len(Q)], Q), np.where(limited[len(Q) :], limits[len(Q) :], R)
     whitened, e, spread = objective.likelihood.innovations(objective.full(maximum.z))
     coloured = [len(Q) + j in _beside(problem) for j in range(len(R))]
-    R = np.where(coloured, np.maximum(R, DEFAULT_WHITE_SHARE**2 * np.mean(e**2, axis=0)), R)
+    R = np.where(coloured, np.maximum(R, DEFAULT_WHITE_SHARE**2 * np.nanmean(e**2, axis=0)), R)
     bounds = at_bounds(maximum.z, objective.low, objective.high)[: objective.nt]
     return InnovationsFit(
         objective.constants(maximum.z),

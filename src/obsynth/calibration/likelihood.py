@@ -31,7 +31,8 @@ class Likelihood:
     def __init__(self, problem: Problem, y: FloatArray | None = None) -> None:
         graphs, noisy = problem.graphs, problem.noisy_equations
         self.ny, self.size = graphs.ny, graphs.nt + len(noisy) + graphs.ny
-        self._both = Compiled(_whole(graphs, problem.u, problem.y if y is None else y, noisy, problem.x0, problem.P0))
+        y = problem.y if y is None else y
+        self._both, self._missing = Compiled(_whole(graphs, problem.u, y, noisy, problem.x0, problem.P0)), np.isnan(y)
 
     def __call__(self, v: FloatArray) -> tuple[float, FloatArray]:
         """Return the value and its gradient ``(nt + len(noisy) + ny,)``."""
@@ -41,9 +42,10 @@ class Likelihood:
         return (float(total[0, 0]), gradient[:, 0]) if good else (IMPOSSIBLE, np.zeros(self.size))
 
     def innovations(self, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return whitened innovations, innovations and their variances, each ``(n, ny)``; zero where y is missing."""
-        rows, ny = self._both(v)[2], self.ny
-        return rows[1 : 1 + ny].T, rows[1 + ny : 1 + 2 * ny].T, rows[1 + 2 * ny : 1 + 3 * ny].T
+        """Return whitened innovations, innovations and their variances, each ``(n, ny)``; no innovation (NaN) where y
+        is missing."""
+        whitened, e, variances = (part.T for part in np.split(self._both(v)[2][1 : 1 + 3 * self.ny], 3))
+        return np.where(self._missing, np.nan, whitened), np.where(self._missing, np.nan, e), variances
 
 
 def _whole(

@@ -342,14 +342,13 @@ def reported(
 ) -> Calibration:
     """Return the calibration of a fit of innovations, or of a simulation where there is none."""
     found = fit if fit is not None else _of_simulation(problem, start, level)
-    names, seen = problem.names, np.isfinite(problem.y)
+    names, whitened = problem.names, found.whitened
     covariance = found.information.covariance
     deviations = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(deviations, deviations)
-    whitened = np.where(seen, found.whitened, np.nan)
     colours = {name: whiteness(column) for name, column in zip(problem.output_names, whitened.T, strict=True)}
     change = change_of_mean(whitened)
-    nis = consistency(float((found.whitened[seen] ** 2).sum()), int(seen.sum()))
+    nis = consistency(float(np.nansum(whitened**2)), int(np.isfinite(problem.y).sum()))
     box = _box(
         names, found, level, digest, stands=all(colour.probability >= SIGNIFICANT for colour in colours.values())
     )
@@ -452,7 +451,7 @@ def _of_simulation(problem: Problem, start: Fit, level: float) -> InnovationsFit
     found = np.linalg.inv(np.linalg.inv(found)[kept, kept]) if problem.plant.bounds else found
     information = covariance_of(found, problem.widths[kept], problem.names)
     y = error.simulated(np.concatenate([start.t, start.x0]) / scale)[0]
-    e = np.where(np.isfinite(problem.y), problem.y - y, 0.0)
+    e = problem.y - y
     root = quantile(level, len(problem.names), problem.log.samples, len(problem.output_names))
     spread = root * np.sqrt(np.diag(information.covariance))
     sides = []
