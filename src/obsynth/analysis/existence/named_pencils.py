@@ -347,14 +347,6 @@ COMPRESSIONS = 2
 MOST_POINTS = 40
 
 
-@dataclass(frozen=True)
-class Distance:
-    """The least singular value found, relative to the largest, and where."""
-
-    value: float
-    point: complex
-
-
 def distance_to_loss(
     E: FloatArray,
     A: FloatArray,
@@ -363,8 +355,9 @@ def distance_to_loss(
     discrete: bool,
     zeros: tuple[complex, ...] = (),
     sizes: FloatArray | None = None,
-) -> Distance:
-    """Return how far ``A - s E (m, n)`` is from losing column rank on or outside the stability boundary.
+) -> tuple[float, complex]:
+    """Return how far ``A - s E (m, n)`` is from losing column rank on or outside the stability boundary: the least
+    singular value found, relative to the largest, and where.
     ``sizes (m, n)`` of the terms of A: what rounding of the data behind it may change is relative to those."""
     candidates = [*_boundary(E, A, discrete), *(_to_boundary(zero, discrete) for zero in zeros)]
     if A.shape[0] > A.shape[1]:
@@ -373,7 +366,7 @@ def distance_to_loss(
     if sizes is not None:
         values = np.minimum(values, relative_singular_values(E, A, candidates, nx=nx, sizes=sizes))
     least = int(np.argmin(values))
-    return Distance(float(values[least]), candidates[least])
+    return float(values[least]), candidates[least]
 
 
 def zeros_at_rounding_level(

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from operator import itemgetter
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -16,7 +17,6 @@ from numpy.typing import NDArray
 from obsynth.analysis.conditions import Condition, rank_condition
 from obsynth.analysis.existence.named_pencils import (
     ROUNDING_LEVEL,
-    Distance,
     NamedPencil,
     distance_to_loss,
     least_share,
@@ -69,7 +69,9 @@ class ZeroVerdict:
 
     answer: str  # no, yes or unclear
     facts: SystemFacts
-    distance: Distance | None = None  # there unless the answer is no
+    # Unless the answer is no: the least singular value found, relative to the largest, and where.
+    least: float = 0.0
+    point: complex | None = None
 
     @property
     def means(self) -> str:
@@ -88,20 +90,23 @@ def zero_verdict(
         return ZeroVerdict("no", facts)
     distance = distance_to_loss(E, A, nx=nx, discrete=discrete, zeros=facts.zeros, sizes=sizes)
     lost = _lost_in_computing(facts, E, A, nx=nx, discrete=discrete)
-    distance = min(distance, lost or distance, key=lambda found: found.value)
-    return ZeroVerdict("unclear" if distance.value <= ROUNDING_LEVEL or lost else "yes", facts, distance)
+    least, point = min(distance, lost or distance, key=itemgetter(0))
+    return ZeroVerdict("unclear" if least <= ROUNDING_LEVEL or lost else "yes", facts, least, point)
 
 
-def _lost_in_computing(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, discrete: bool) -> Distance | None:
-    """Return a zero on or outside the boundary that computed data have but for their rounding; ``None`` without one."""
+def _lost_in_computing(
+    facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, discrete: bool
+) -> tuple[float, complex] | None:
+    """Return a zero on or outside the boundary that computed data have but for their rounding, after what they lack to
+    have it; ``None`` without one."""
     if not facts.computed:
         return None
     dt = 1.0 if discrete else 0.0
     values = [*facts.zeros, *map(complex, system_zeros(E, A, nx=nx).values)]
     outside = [value for value in values if is_outside(value, dt)]
-    found = map(Distance, map(float, relative_singular_values(E, A, outside, nx=nx)), outside)
-    best = min(found, key=lambda distance: distance.value, default=None)
-    return best if best is not None and best.value <= COMPUTED else None
+    found = zip(map(float, relative_singular_values(E, A, outside, nx=nx)), outside, strict=True)
+    best = min(found, key=itemgetter(0), default=None)
+    return best if best is not None and best[0] <= COMPUTED else None
 
 
 def believed(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int) -> SystemFacts:
@@ -329,9 +334,8 @@ class Evaluator:
             sizes = self._in_own_units(said, pencil[0], self.arranged(said.at_zero, self.terms))[1]
         discrete = self.plant.is_discrete
         found = zero_verdict(facts.timed(self.units.rate), *pencil, nx=self.plant.nx, discrete=discrete, sizes=sizes)
-        distance = found.distance
-        own = None if distance is None else Distance(distance.value, self.units.eigenvalue(distance.point))
-        return replace(found, facts=found.facts.timed(1.0 / self.units.rate), distance=own)
+        point = None if found.point is None else self.units.eigenvalue(found.point)
+        return replace(found, facts=found.facts.timed(1.0 / self.units.rate), point=point)
 
     def no_zero_outside(
         self,
@@ -344,39 +348,36 @@ class Evaluator:
         """Return the condition that a pencil has no zero outside: where it holds, and what hides where it does not.
         ``what`` would exist."""
         verdict = self.verdict(said)
-        facts, distance = verdict.facts, verdict.distance
+        facts, point = verdict.facts, verdict.point
         if verdict.answer == "no":
             found = lost(facts)
             gain = "" if found.mode is None or self.numbers is None else self._needed_gain(said, found.mode)
             return replace(found, detail=f"{found.detail} {gain}".rstrip())
         found = holding(facts)
-        if distance is None:
+        if point is None:
             return found
         if verdict.answer == "yes":
-            where = pole_text(distance.point)
-            least = f"least singular value {distance.value:.2g} of the scaled pencil outside (near {where})"
+            least = f"least singular value {verdict.least:.2g} of the scaled pencil outside (near {pole_text(point)})"
             return replace(found, detail=f"{found.detail}; {least}, {verdict.means}")
         detail = (
             f"{'An' if what[0] in 'aeiou' else 'A'} {what} exists for the numbers as written ({verdict.means}), but "
-            f"the least singular value of the scaled pencil outside is {distance.value:.1g}: rounding of the data, or "
+            f"the least singular value of the scaled pencil outside is {verdict.least:.1g}: rounding of the data, or "
             "of any gains, is as large."
         )
-        seen = self.seen(said).outside or (() if said.inputs else (distance.point,))
+        seen = self.seen(said).outside or (() if said.inputs else (point,))
         found = replace(found, holds=False, detail=detail)
         if seen:
             found = lost(replace(facts, outside=seen))
             found = replace(found, detail=f"{detail} In floating point, {found.detail}")
-        return found.in_doubt(self._zero_doubt(said, distance, what), self.plant)
+        return found.in_doubt(self._zero_doubt(said, point, verdict.least, what), self.plant)
 
-    def _zero_doubt(self, said: NoZeroOutside, found: Distance, what: str) -> Unclear:
+    def _zero_doubt(self, said: NoZeroOutside, point: complex, least: float, what: str) -> Unclear:
         """Return why it is unclear whether a pencil has a zero outside."""
-        point = found.point
-        where = pole_text(point, 6)
         return self.doubt(
             self.named(said.at_zero),
-            f"has a zero at {where}, and no {what}",
+            f"has a zero at {pole_text(point, 6)}, and no {what}",
             point=point,
-            tolerance=max(ROUNDING_LEVEL, found.value),
+            tolerance=max(ROUNDING_LEVEL, least),
             moving=True,
         )
 

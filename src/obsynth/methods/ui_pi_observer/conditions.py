@@ -585,8 +585,8 @@ def _fixed_modes(judge: Evaluator, model: Exosystem) -> tuple[ComplexArray, Cond
         nearly = zeros_at_rounding_level(*pencil, finite_zeros(*pencil).values, facts.zeros, nx=augmented.order)
         zeros = np.array([*map(units.eigenvalue, (*facts.zeros, *nearly))], dtype=np.complex128)
         verdict = zero_verdict(facts, *pencil, nx=augmented.order, discrete=plant.dt > 0.0)
-        if verdict.answer == "unclear" and verdict.distance is not None:
-            point = units.eigenvalue(verdict.distance.point)
+        if verdict.answer == "unclear" and verdict.point is not None:
+            point = units.eigenvalue(verdict.point)
             return zeros, lost_in_rounding(judge, model, point)
     else:
         drops = system_zeros(*pencil, nx=augmented.order).values
