@@ -27,7 +27,7 @@ from obsynth.experiments.monitors.residual_model import largest_disturbances
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.files.tables import html_table, standing_page, text_table
 from obsynth.methods.automatic import SETTLING_TIMES, Candidate, Maker, candidate, linear_methods
-from obsynth.methods.designing import design
+from obsynth.methods.designing import agree, design
 from obsynth.methods.fault_figures import DECOUPLED, FaultFigures, held, on_the_clock, step_responses
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
@@ -47,7 +47,6 @@ from obsynth.numerics.continuous import driven
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
 from obsynth.plotting.panels import (
     LINE_COLOURS,
     TRUE_STYLE,
@@ -861,24 +860,10 @@ def compared_again(
     return result, comparison_statement(body["result"], digests, body["log"]), others
 
 
-#: Entries of a plant that was sampled again agree to this share of the largest of their matrix.
-SAME_PLANT = 1e-9
-
-
 def _is_of(made: ObserverDesign, plants: Sequence[DescriptorSystem]) -> bool:
     """Whether a design is for one of some plants, as it was written or transformed."""
     own = [made.plant] if made.source is None else [made.source.plant, made.plant]
-
-    def same(one: Any, other: DescriptorSystem) -> bool:
-        pairs = [(getattr(one, name), getattr(other, name)) for name in UNCERTAIN_MATRICES]
-        return all(
-            a.shape == b.shape
-            and float(np.max(np.abs(a - b), initial=0.0)) <= SAME_PLANT * np.max(np.abs(b), initial=0.0)
-            for a, b in pairs
-        )
-
-    return any(isinstance(one, DescriptorSystem) and same(one.dense() if one.is_sparse else one, other)
-               for one in own for other in plants)  # fmt: skip
+    return any(isinstance(one, DescriptorSystem) and agree(one.dense(), other) for one in own for other in plants)
 
 
 def _checked_methods(methods: Sequence[str] | None) -> list[str]:

@@ -338,8 +338,9 @@ def design_from_gains(
     return draft.replace(report=verify(draft))
 
 
-#: A plant that a method eliminated in units of its own is the one that is eliminated as written to this share.
-SAME_ELIMINATION = 1e-9
+#: Two plants are one where the entries of each matrix agree to this share of its largest: rounding of an elimination in
+#: units of its own, or of a sampling that is done again.
+SAME_PLANT = 1e-9
 
 
 def _with_tolerances_of(given: Plant, shipped: Any) -> Any:
@@ -355,16 +356,16 @@ def _with_tolerances_of(given: Plant, shipped: Any) -> Any:
             same = eliminate_algebraic_states(given).plant
         except PreconditionError:
             same = given
-        if same.state_names == shipped.state_names and same.dt == shipped.dt and _agree(same, shipped):
+        if same.state_names == shipped.state_names and same.dt == shipped.dt and agree(same, shipped):
             return shipped.replace(uncertainty=same.uncertainty)
     return shipped.replace(uncertainty=uncertain.left_behind("the method changed the plant by itself"))
 
 
-def _agree(one: DescriptorSystem, other: DescriptorSystem) -> bool:
+def agree(one: DescriptorSystem, other: DescriptorSystem) -> bool:
+    """Whether the matrices of two plants are the same but for rounding."""
     pairs = [(getattr(one, name), getattr(other, name)) for name in UNCERTAIN_MATRICES]
     return all(
-        a.shape == b.shape and bool(np.all(np.abs(a - b) <= SAME_ELIMINATION * np.abs(a).max(initial=0.0)))
-        for a, b in pairs
+        a.shape == b.shape and bool(np.all(np.abs(a - b) <= SAME_PLANT * np.abs(a).max(initial=0.0))) for a, b in pairs
     )
 
 
