@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.data.normal_notes import stuck_rows
+from obsynth.data.stuck_sensors import RepeatedValues, stuck_rows
 
 ROWS, EVENT = 1_500, slice(700, 709)
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
@@ -125,3 +125,54 @@ def test_what_never_or_rarely_changes_is_not_stuck() -> None:
     # Where a tenth of the runs is long, of any length, one of three times the longest is no wonder.
     lengths = [1] * 50 + [2, 4, 8, 10, 20, 40, 60, 80, 301, 100]
     assert stuck_rows(np.repeat(np.arange(60.0), lengths)) == []
+
+
+@pytest.mark.parametrize("digits", [6, 17])
+@pytest.mark.parametrize("poles", [(0.9, 0.5), (0.95 * np.exp(0.3j), 0.95 * np.exp(-0.3j))])
+@pytest.mark.parametrize("course", ["a step", "steps", "from rest"])
+def test_what_comes_to_rest_without_noise_is_not_stuck(
+    digits: int, poles: tuple[complex, complex], course: str
+) -> None:
+    u = np.repeat(np.random.default_rng(2).standard_normal(10), 400)
+    if course != "steps":
+        u[400:] = 0.0 if course == "a step" else u[400:].cumsum()
+        u[:400] = 1.0 if course == "a step" else 0.0
+    y = lfilter([0.0, 1.0], np.poly(poles).real, u)
+    assert stuck_rows(np.array([float(f"{value:.{digits}g}") for value in y])) == []
+
+
+@pytest.mark.parametrize("rows", [1, 7, 400])
+def test_stuck_rows_do_not_depend_on_the_pieces_of_a_log(rows: int) -> None:
+    values = np.round(np.random.default_rng(4).standard_normal((3_000, 2)), 1)
+    values[1_000:1_040, 1], values[2_990:, 1], values[50:60] = 5.0, 7.0, np.nan
+    gathered = RepeatedValues(2)
+    for first in range(0, len(values), rows):
+        gathered.take(values[first : first + rows])
+    assert gathered.stuck() == [[], [(1_000, 1_039), (2_990, 2_999)]]
+
+
+def test_a_stuck_sensor_is_told_by_runs_of_files_and_of_streams(tmp_path: Path, capsys) -> None:
+    data = log(1)
+    data.loc[EVENT.start : EVENT.stop - 1, "yb"] = data.loc[EVENT.start, "yb"]
+    # The same row once more is left out, and repeats nothing.
+    data = data.loc[[*range(200), *[199] * 9, *range(200, ROWS)]].reset_index(drop=True)
+    gains, file, out = (tmp_path / name for name in ("g.json", "log.csv", "out.csv"))
+    heated().save(gains)
+    data.to_csv(file, index=False)
+    assert main(["run", "--gains", str(gains), "--data", str(file), "--out", str(out), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["stuck"] == {"yb": [[710, 718]]}
+    assert "yb repeats one value in rows 710 to 718, for longer" in " ".join(told["warnings"])
+    with file.open(encoding="utf-8") as stream:
+        assert obsynth.run_on_data(heated(), stream).stuck == {"yb": ((710, 718),)}
+    assert obsynth.run_on_data(heated(), log(1)).stuck == {}
+
+
+def test_a_stuck_sensor_is_told_by_validate() -> None:
+    from obsynth.calibration.logs import read_log
+
+    data = log(1)
+    data.loc[EVENT.start : EVENT.stop - 1, "yb"] = data.loc[EVENT.start, "yb"]
+    (note,) = read_log(data, ["u"], ["ya", "yb"], rows="100:").notes
+    assert "yb repeats one value in rows 700 to 708, for longer" in note
+    assert read_log(log(1), ["u"], ["ya", "yb"]).notes == ()

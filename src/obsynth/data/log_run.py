@@ -19,6 +19,7 @@ from obsynth.data.alarm_events import NO_DECISION, AlarmLog
 from obsynth.data.linear_log import log_observer
 from obsynth.data.log_estimator import DECIDING, RECOVERING, STALE, Clock, LogObserver, Row
 from obsynth.data.signals import TIME_HEADER, Signals, Stamps
+from obsynth.data.stuck_sensors import RepeatedValues
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.learned import LearnedRule, as_learned
 from obsynth.experiments.monitors.monitor import LinearSample, Monitor, Sample
@@ -251,6 +252,7 @@ class LogRun:
         self.statuses, self.alarms, self.isolated = Counter[str](), dict[str, float](), ""
         self.alarm_rows = dict[str, int]()
         self.events = AlarmLog(self.header)
+        self.repeated = RepeatedValues(len(observer.output_names))
 
     def take(self, chunk: FloatArray) -> list[list[Any]]:
         """Take rows ``[time, u, y]`` as read; return rows of output (``chunk (rows, 1 + nu + ny)``)."""
@@ -349,6 +351,7 @@ class LogRun:
         if self.recovered is not None:
             estimates = [np.concatenate([row.values, self._recovered_in(row)]) for row in taken]
         self.statuses.update(row.status for row in taken)
+        self.repeated.take(np.array([self._outputs_of(row) for row in taken]))
         shown: list[list[float]] = (np.array(estimates) + self._point).tolist()
         rows: list[list[Any]] = [
             [row.time, row.status, *(row.time - lag for lag in self._lags), *cells]
@@ -359,6 +362,13 @@ class LogRun:
             for number, (row, values, cells) in enumerate(zip(taken, estimates, rows, strict=True), first):
                 cells.extend(self._decided(row, values, number, cells))
         return rows
+
+    def _outputs_of(self, row: Row) -> FloatArray:
+        """Return what was measured of the outputs ``(ny,)``, nothing in a row that is left out."""
+        count = len(self.observer.output_names)
+        if row.deviations is None or row.status in STALE:
+            return np.full(count, np.nan)
+        return row.deviations[len(row.deviations) - count :]
 
     def _recovered_in(self, row: Row) -> FloatArray:
         if self.recovered is None or row.status in STALE:

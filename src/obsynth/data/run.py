@@ -20,6 +20,7 @@ from obsynth.data.alarm_events import AlarmEvent
 from obsynth.data.log_run import LogRun, resume_state, save_state
 from obsynth.data.signals import TIME_HEADER, Stamps
 from obsynth.data.sources import CHUNK_ROWS, Data, check_suffix, chunks
+from obsynth.data.stuck_sensors import stuck_texts
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.files.outputs import (
@@ -207,6 +208,8 @@ class DataRun:
         How many rows were without a decision, by their status; ``undecided`` where the monitor decides nothing.
     statement : str
         What the threshold of its monitor promises, and what that rests on; empty without one.
+    stuck : mapping of str to tuple of (int, int)
+        First and last rows, from 1, in which an output repeats one value for longer than it otherwise does.
     """
 
     rows: int
@@ -225,6 +228,7 @@ class DataRun:
     events: tuple[AlarmEvent, ...] = ()
     silent: Mapping[str, int] = field(default_factory=dict)
     statement: str = ""
+    stuck: Mapping[str, tuple[tuple[int, int], ...]] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the summary as plain data, without the table."""
@@ -239,6 +243,7 @@ class DataRun:
             "isolated": self.isolated,
             "recovered": dict(self.recovered),
             "outliers": dict(self.outliers),
+            "stuck": {name: [list(run) for run in runs] for name, runs in self.stuck.items()},
             "warnings": list(self.warnings),
             "gains_sha256": self.digest,
         }
@@ -399,6 +404,8 @@ def run_on_data(
         save_state(Path(state), run, digest)
     table = gathered.frame() if out is None else None
     shown = {} if run.recovered is None else dict(run.recovered.flags)
+    found = zip(run.observer.output_names, run.repeated.stuck(), strict=True)
+    stuck = {name: tuple((first + 1, last + 1) for first, last in runs) for name, runs in found if runs}
     return DataRun(
         run.rows,
         dict(run.statuses),
@@ -406,7 +413,7 @@ def run_on_data(
         run.isolated,
         shown,
         dict(getattr(run.observer, "outliers", {})),
-        (*run.observer.notes, *stamps.warnings(), *run.first.warnings()),
+        (*run.observer.notes, *stamps.warnings(), *run.first.warnings(), *stuck_texts(stuck)),
         digest,
         table,
         None if kept is None else kept.frame(),
@@ -416,6 +423,7 @@ def run_on_data(
         run.events.events(),
         dict(run.events.silent),
         "" if monitor is None else monitor.statement,
+        stuck,
     )
 
 
