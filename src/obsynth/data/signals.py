@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, tzinfo
 from typing import Any
@@ -40,6 +40,25 @@ _MICROSECOND = timedelta(microseconds=1)
 _NANO, _MICRO, _DAY_SECONDS, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
 
 
+#: What the unit of the time may be called in a line of units, and how many of them are a second; empty: seconds.
+_UNITS_OF_TIME = {
+    **dict.fromkeys(("", "-", "s", "sec", "secs", "second", "seconds", "sek"), 1.0),
+    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e3),
+    **dict.fromkeys(("us", "µs", "μs", "usec", "microsecond", "microseconds"), 1e6),
+    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e9),
+    **dict.fromkeys(("min", "minute", "minutes"), 1 / 60),
+    **dict.fromkeys(("h", "hr", "hour", "hours"), 1 / 3600),
+}
+
+
+def _is_number(text: str) -> bool:
+    try:
+        number_in_text(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
 def _clock(text: str) -> str:
     """Return a time of day, with what stands before it, as ISO 8601 writes it; other texts as they are."""
     found = _CLOCK.fullmatch(text)
@@ -61,6 +80,7 @@ class Stamps:
         self.digits = "auto"  # how dates are written back: with a fraction in every row where the log has one
         self.day_first: bool | None = None  # of dates with slashes, by the first one
         self.per_second: float | None = None  # how many of the numbers of the log are a second, by the first one
+        self.notes: list[str] = []  # what is to be said of the file
         #: Cells that hold a word instead of a number, which are missing, by column: how many; first row and text.
         self.words: dict[str, tuple[int, int, str]] = {}
         #: Columns that have shown a number: of the others words are no bad samples, but another kind of column.
@@ -69,10 +89,13 @@ class Stamps:
         self.earlier: FloatArray | None = None
 
     def warnings(self) -> tuple[str, ...]:
-        """Return a text for each column with words in it."""
-        return tuple(
-            f"{count} cell(s) of {column!r} hold no number and count as missing, first {text!r} in row {row}."
-            for column, (count, row, text) in self.words.items()
+        """Return what is to be said of the file, and a text for each column with words in it."""
+        return (
+            *self.notes,
+            *(
+                f"{count} cell(s) of {column!r} hold no number and count as missing, first {text!r} in row {row}."
+                for column, (count, row, text) in self.words.items()
+            ),
         )
 
     def take_word(self, column: str, row: int, text: str) -> None:
@@ -80,12 +103,27 @@ class Stamps:
         count, first_row, first_text = self.words.get(column, (0, row, text))
         self.words[column] = (count + 1, first_row, first_text)
 
+    def take_units(self, cells: Sequence[str]) -> bool:
+        """Whether the line below the header holds units, of which that of the time counts: its cell is one of time, or
+        is empty, and no other is a number.  ``cells`` are those that are read, the time first."""
+        if not cells or not any(cells) or any(map(_is_number, cells)):
+            return False
+        unit = cells[0].strip("[]()").lower()
+        per_second = _UNITS_OF_TIME.get(unit)
+        if per_second is None or not any(cell.lower() not in MISSING_TEXTS for cell in cells):
+            return False
+        if unit:
+            self.per_second = per_second
+        self.notes.append(f"The line below the header is taken as units: {', '.join(map(repr, cells))}.")
+        return True
+
     def require_numbers(self) -> None:
         """Raise `SpecError`, at the end of a log, for a column of words in which no row holds a number."""
         for column, (_, row, text) in self.words.items():
             if column not in self.numeric:
+                advice = " Write 1 and 0." if text.lower() in ("true", "false") else ""
                 raise SpecError(
-                    f"The column {column!r} holds no number: row {row} has {text!r}.", path=f"columns.{column}"
+                    f"The column {column!r} holds no number: row {row} has {text!r}.{advice}", path=f"columns.{column}"
                 )
 
     def read(self, text: str, row: int, column: str, *, comma: bool = False) -> float:
@@ -154,21 +192,23 @@ class Stamps:
         if self.are_missing:
             return np.full(len(column), np.nan)
         kind = getattr(column.dtype, "kind", "O")
-        if kind not in "Mm" and not hasattr(column.dtype, "tz"):
+        if kind not in "Mm":
             return None
         missing = np.asarray(column.isna())
         if kind == "m":
             self.is_dated = False
             seconds = np.asarray(column.dt.total_seconds(), dtype=np.float64)
         else:
+            zone = column.dt.tz
             if self.is_dated is None:
-                self.is_dated, self.zone = True, getattr(column.dtype, "tz", None)
-            plain = column.dt.tz_convert("UTC").dt.tz_localize(None) if hasattr(column.dtype, "tz") else column
-            counts = plain.to_numpy().astype("datetime64[ns]").astype(np.int64)
-            if np.any(counts[~missing] % 1_000_000_000):
+                self.is_dated, self.zone = True, zone
+            moments = (column if zone is None else column.dt.tz_convert("UTC").dt.tz_localize(None)).to_numpy()
+            # Apart, so that the fraction keeps its digits, and in seconds, of which no date has too many.
+            whole = moments.astype("datetime64[s]")
+            parts = np.where(missing, 0, (moments - whole).astype("timedelta64[ns]").astype(np.int64))
+            if np.any(parts):
                 self.digits = "microseconds"
-            # Apart, so that the fraction keeps its digits.
-            seconds = (counts // 1_000_000_000).astype(np.float64) + (counts % 1_000_000_000) * _NANO
+            seconds = whole.astype(np.int64) + parts * _NANO
         return np.where(missing, np.nan, seconds)
 
     def shown(self, seconds: float) -> str:
@@ -283,13 +323,14 @@ class Signals:
 
 
 #: How columns of time stamps are often called.
-_TIME_NAMES = ("timestamp", "datetime", "date", "t", "zeit", "time")
+_TIME_NAMES = ("timestamp", "datetime", "date", "zeit", "time")
 
 
 def _advice(header: tuple[str, ...], missing: list[str]) -> str:
     if len(header) == 1 and any(mark in header[0] for mark in ":#~^ "):
         return "Separate columns by commas, semicolons, tabs or bars."
     found = next((name for kind in _TIME_NAMES for name in header if name.lower().startswith(kind)), None)
+    found = found or next((name for name in header if name.lower() == "t"), None)
     if TIME_HEADER in missing and found is not None:
         return f"If {found!r} is the time: --time-column {found!r}, or columns={{'time': {found!r}}}."
     return "Map signals to columns where their names differ."

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import codecs
 import csv
+import gc
 import itertools
+import logging
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,7 +25,7 @@ import numpy as np
 
 from obsynth.data.signals import MISSING_TEXTS, TIME_HEADER, Signals, Stamps
 from obsynth.errors import SpecError
-from obsynth.files.inputs import input_file
+from obsynth.files.inputs import input_file, reason
 from obsynth.files.tables import unquoted
 from obsynth.numerics.arguments import number_in_text, require_kind
 from obsynth.numerics.arrays import FloatArray
@@ -81,15 +84,25 @@ class Dialect:
 
 
 def encoding_of(path: Path) -> str:
-    """Return the encoding of a text: UTF-8 but where its first bytes say UTF-16, as Windows writes it."""
+    """Return the encoding of a text: UTF-8 but where its first bytes say UTF-16 or UTF-32, with or without a mark."""
     with path.open("rb") as stream:
-        return "utf-16" if stream.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
+        first = stream.read(4)
+    if first in (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE):
+        return "utf-32"
+    if first[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        return "utf-16"
+    # A header begins with characters of ASCII, whose upper byte is zero.
+    return {b"\1\0": "utf-16-le", b"\0\1": "utf-16-be"}.get(bytes(map(bool, first[:2])), "utf-8-sig")
+
+
+#: What helps where a file is in another encoding than it seems to be.
+SAVE_AS_TEXT = "If another program reads it, save it there as UTF-8."
 
 
 def no_text(path: Path, error: UnicodeDecodeError) -> SpecError:
     """Return what is told of a file whose bytes are no text."""
-    name = "UTF-16" if error.encoding.startswith("utf-16") else "UTF-8"
-    return SpecError(f"{path} is no {name} text (byte {error.start}).", path=str(path))
+    name = next((name for name in ("UTF-16", "UTF-32") if error.encoding.upper().startswith(name)), "UTF-8")
+    return SpecError(f"{path} is no {name} text (byte {error.start}). {SAVE_AS_TEXT}", path=str(path))
 
 
 def text_chunks(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
@@ -109,17 +122,21 @@ def text_chunks(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iter
 def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[FloatArray]:
     """Yield one row at a time, ``(1, 1 + nu + ny)``, as soon as its line is there."""
     header, dialect, table = _opened(stream, signals.columns)
+    if not header:
+        raise SpecError("The data are empty: their first line is the names of the columns.", path="data")
     places = signals.positions(header)
     row = 0
     for cells in table:
         if not any(cell.strip() for cell in cells):
             continue
+        if row == 0 and stamps.take_units([cells[place].strip() for place in places if place < len(cells)]):
+            continue
         row += 1
-        if len(cells) > len(header):
+        if any(cell.strip() for cell in cells[len(header) :]):
             raise SpecError(
                 f"Row {row} has {len(cells)} cells, but the header has {len(header)}.", path=f"cells of row {row}"
             )
-        cells += [""] * (len(header) - len(cells))
+        cells = [*cells[: len(header)], *[""] * (len(header) - len(cells))]
         time = stamps.read(cells[places[0]], row, header[places[0]], comma=dialect.comma)
         values = [dialect.number(cells[place], row, header[place], stamps) for place in places[1:]]
         yield np.array([[time, *values]])
@@ -140,10 +157,13 @@ def header_of(path: Path, wanted: Sequence[str]) -> list[str]:
 
 def _opened(stream: TextIO, wanted: Sequence[str]) -> tuple[tuple[str, ...], Dialect, Iterator[list[str]]]:
     """Return the names of the columns, how the log is written, and the cells of the lines below the header.  What a
-    logger remarks before the header, in lines that begin with ``#`` and name no column that is read, is passed over."""
+    logger remarks before the header, in blank lines and in lines that begin with ``#`` and name no column that is read,
+    is passed over."""
     lines = _text_lines(stream)
     head = next(lines, "")
-    while head.startswith(REMARK) and not any(set(wanted) & set(_names(head, separator)) for separator in SEPARATORS):
+    while (head and not head.strip()) or (
+        head.startswith(REMARK) and not any(set(wanted) & set(_names(head, separator)) for separator in SEPARATORS)
+    ):
         head = next(lines, "")
     told = _SEPARATOR_LINE.fullmatch(head)
     head = next(lines, "") if told else head
@@ -193,7 +213,9 @@ def _text_lines(stream: TextIO) -> Iterator[str]:
             block = stream.readline()
         except UnicodeDecodeError as error:
             name = getattr(stream, "name", "The data")
-            raise SpecError(f"{name} is no text of its encoding after line {count}.", path="data") from error
+            raise SpecError(
+                f"{name} is no text of its encoding after line {count}. {SAVE_AS_TEXT}", path="data"
+            ) from error
         if not block:
             return
         for line in _OLD_LINES.findall(block):
@@ -276,7 +298,8 @@ def _chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator
                 yield from text_chunks(path, signals, stamps, rows)
             else:
                 _require_beginning(path)
-                yield from _converted(_READERS[path.suffix.lower()](path, signals, rows), signals, stamps)
+                with _read_by(NEEDED_PACKAGES[path.suffix.lower()][0], path):
+                    yield from _converted(_READERS[path.suffix.lower()](path, signals, stamps, rows), signals, stamps)
     elif is_stream(data):
         yield from stream_rows(data, signals, stamps)
     else:
@@ -331,58 +354,215 @@ def _readable(path: Path) -> Iterator[None]:
     except UnicodeDecodeError as error:
         raise no_text(path, error) from error
     except OSError as error:
-        raise SpecError(f"{path} cannot be read: {error.strerror or error}.", path=str(path)) from error
-    except (ValueError, KeyError, IndexError, AttributeError, Warning) as error:
-        raise SpecError(f"{path} cannot be read: {' '.join(str(error).split())}", path=str(path)) from error
+        raise SpecError(f"{path} cannot be read: {reason(error)}.", path=str(path)) from error
 
 
-def _parquet(path: Path, signals: Signals, rows: int) -> Iterator[pd.DataFrame]:
+@contextmanager
+def _read_by(package: str, path: Path) -> Iterator[None]:
+    """Turn whatever a package raises about a file, which may be damaged in any place, into an error that names both.
+    What it would log is in that error."""
+    import_module(package)
+    loggers = [
+        logging.getLogger(name) for name in (package, *logging.root.manager.loggerDict) if name.startswith(package)
+    ]
+    were_disabled = [logger.disabled for logger in loggers]
+    for logger in loggers:
+        logger.disabled = True
+    try:
+        yield
+    except SpecError:
+        raise
+    except Exception as error:  # readers of damaged bytes raise what comes: struct.error, TypeError, a bare Exception
+        raise _unreadable(path, package, error) from error
+    finally:
+        for logger, was_disabled in zip(loggers, were_disabled, strict=True):
+            logger.disabled = was_disabled
+
+
+def _unreadable(path: Path, package: str, error: Exception) -> SpecError:
+    told = " ".join(reason(error).split()) or type(error).__name__
+    return SpecError(
+        f"{path} cannot be read: {package} says {told!r}. If the file is damaged, or its end is missing, copy it or "
+        "export it again.",
+        path=str(path),
+    )
+
+
+def _parquet(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[pd.DataFrame]:
     import pyarrow.parquet
 
+    time = signals.columns[0]
     with pyarrow.parquet.ParquetFile(path) as file:
-        signals.positions(tuple(file.schema_arrow.names))
-        for batch in file.iter_batches(batch_size=rows, columns=list(dict.fromkeys(signals.columns))):
-            yield batch.to_pandas()
+        header, own, counted = _parquet_header(file.schema_arrow, time)
+        signals.positions(tuple(header))
+        wanted = [
+            own if name == time else name for name in dict.fromkeys(signals.columns) if name != time or not counted
+        ]
+        done = 0
+        for batch in file.iter_batches(batch_size=rows, columns=wanted):
+            # What pandas notes about an index would take it out of the columns.
+            frame = batch.to_pandas(ignore_metadata=True).rename(columns={own: time})
+            if counted is not None:
+                frame[time] = counted[0] + counted[1] * np.arange(done, done + len(frame))
+            done += len(frame)
+            yield frame
 
 
-def _tdms(path: Path, signals: Signals, rows: int) -> Iterator[pd.DataFrame]:
+def _parquet_header(schema: Any, time: str) -> tuple[list[str], str, tuple[float, float] | None]:
+    """Return the names of all columns, how the file itself calls the time, and first number and step of the time where
+    it is an index that counts, which pandas writes to no column.  Dates and time differences may have no name."""
+    import pyarrow as pa
+
+    names = list(schema.names)
+    indices = [] if time in names else (schema.pandas_metadata or {}).get("index_columns", [])
+    for index in indices:
+        if isinstance(index, dict) and index.get("kind") == "range" and index.get("name") == time:
+            return [*names, time], time, (float(index["start"]), float(index["step"]))
+        if time == TIME_HEADER and isinstance(index, str) and index.startswith(_UNNAMED_INDEX):
+            kind = schema.field(index).type
+            if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+                return [time if name == index else name for name in names], index, None
+    return names, time, None
+
+
+#: How pandas calls the column of an index without a name.
+_UNNAMED_INDEX = "__index_level_"
+
+
+def _only(path: Path, name: str, channels: Sequence[tuple[str, str, Any]]) -> Any:
+    """Return the channel that is called so, or as its group and it, such as ``rig/level``; `None` where there is none.
+    ``channels`` are groups, names and channels."""
+    found = [(group, channel) for group, own, channel in channels if name in (own, f"{group}/{own}")]
+    if len(found) > 1:
+        groups = ", ".join(repr(group) for group, _ in found)
+        raise SpecError(
+            f"{path} has more than one channel {name!r}, in the groups {groups}: name the group too, such as "
+            f"'{found[0][0]}/{name}' (--map, or columns={{...}}).",
+            path=str(path),
+        )
+    return found[0][1] if found else None
+
+
+#: Waveforms whose samples are further apart than this share of their interval are no rows of one table.
+LARGEST_SHIFT = 0.5
+
+
+def _tdms(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[pd.DataFrame]:
     """Yield the channels of a TDMS file; where no channel is the time, that of the waveforms is."""
     from nptdms import TdmsFile
 
-    with TdmsFile.open(path) as file:
-        channels = {channel.name: channel for group in file.groups() for channel in group.channels()}
-        wanted = {name: channels[name] for name in signals.columns if name in channels}
+    with path.open("rb") as stream, TdmsFile.open(stream) as file:
+        if file.file_status.incomplete_final_segment:
+            stamps.notes.append(f"{path} ends within its last segment: what follows was lost, or not written yet.")
+        channels = [(group.name, channel.name, channel) for group in file.groups() for channel in group.channels()]
+        found = {name: _only(path, name, channels) for name in signals.columns}
+        wanted = {name: channel for name, channel in found.items() if channel is not None}
         frame: dict[str, Any] = {name: channel[:] for name, channel in wanted.items()}
         time = signals.columns[0]
-        if time not in frame and wanted:
-            first = next(iter(wanted.values()))
-            if "wf_increment" in first.properties:
-                frame = {time: first.time_track(), **frame}
         lengths = {name: len(values) for name, values in frame.items()}
         if len(set(lengths.values())) > 1:
             told = ", ".join(f"{name!r} {count}" for name, count in lengths.items())
             raise SpecError(f"{path}: the channels have different numbers of samples: {told}.", path=str(path))
-        others = {name: np.zeros(0) for name in channels if name not in frame}
+        if time not in frame and wanted:
+            waves = {name: channel for name, channel in wanted.items() if "wf_increment" in channel.properties}
+            if waves:
+                frame = {time: _wave_times(path, waves), **frame}
+        others = {name: np.zeros(0) for _, name, _ in channels if name not in frame}
         yield from _frames(frame, others, signals, rows)
 
 
-def _mdf(path: Path, signals: Signals, rows: int) -> Iterator[pd.DataFrame]:
-    """Yield the channels of an MDF file on one raster: that of the time channel, else of the first signal."""
-    from asammdf import MDF
+def _wave_times(path: Path, waves: dict[str, Any]) -> FloatArray:
+    """Return the times of waveforms ``(rows,)``, which must be the same for all of them."""
+    first = next(iter(waves))
+    times = np.asarray(waves[first].time_track())
+    start = waves[first].properties.get("wf_start_time")
+    for name, wave in waves.items():
+        own = np.asarray(wave.time_track())
+        begin = wave.properties.get("wf_start_time")
+        if begin is not None and start is not None:
+            own = own + (begin - start) / np.timedelta64(1, "s")
+        step = abs(float(waves[first].properties["wf_increment"]))
+        if not np.all(np.abs(own - times) <= LARGEST_SHIFT * step):
+            raise SpecError(
+                f"{path}: the waveforms {first!r} and {name!r} have other times: resample them to the same times.",
+                path=str(path),
+            )
+    return times
 
-    with MDF(path) as file:
-        known = [name for name in file.channels_db if file.channels_db[name]]
-        wanted = [name for name in signals.columns[1:] if name in known]
+
+def _mdf(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[pd.DataFrame]:
+    """Yield the channels of an MDF file on the raster of the first signal, with the stamps of the time channel."""
+    with _mdf_file(path) as file:
+        known = [
+            (str(group), name, (group, index)) for name, places in file.channels_db.items() for group, index in places
+        ]
+        masters = set(file.masters_db.items())
+        time = signals.columns[0]
+        found = {name: _only(path, name, known) for name in signals.columns[1:]}
+        wanted = {name: place for name, place in found.items() if place is not None}
         frame: dict[str, Any] = {}
         if wanted:
-            raster = file.get(wanted[0]).timestamps
-            frame[signals.columns[0]] = raster
-            for name in wanted:
-                signal = file.get(name)
-                if len(signal.timestamps) != len(raster) or not np.array_equal(signal.timestamps, raster):
-                    signal = signal.interp(raster)
-                frame[name] = np.asarray(signal.samples, dtype=np.float64)
-        yield from _frames(frame, dict.fromkeys(known), signals, rows)
+            raster = np.asarray(file.get_master(next(iter(wanted.values()))[0]), dtype=np.float64)
+            of_time = _only(path, time, [entry for entry in known if entry[2] not in masters])
+            names = {name for _, name, place in known if place in masters}
+            if of_time is not None:
+                frame[time] = _on_raster(file, time, of_time, raster)
+            elif time == TIME_HEADER or time in names:
+                frame[time] = raster
+            frame.update({name: _on_raster(file, name, place, raster) for name, place in wanted.items()})
+        yield from _frames(frame, dict.fromkeys(name for _, name, _ in known), signals, rows)
+
+
+@contextmanager
+def _mdf_file(path: Path) -> Iterator[Any]:
+    """Open an MDF file.  What asammdf leaves of one that it cannot open fails once more when it is thrown away: nobody
+    is to read of it."""
+    from asammdf import MDF
+
+    hook = sys.unraisablehook
+    sys.unraisablehook = lambda _: None
+    try:
+        file = MDF(path)
+    except Exception as error:
+        # Without its traceback nothing holds what is half open but itself.
+        error.with_traceback(None)
+        gc.collect()
+        raise _unreadable(path, "asammdf", error) from error
+    finally:
+        sys.unraisablehook = hook
+    with file:
+        yield file
+
+
+def _on_raster(file: Any, name: str, place: tuple[int, int], raster: FloatArray) -> Any:
+    """Return a channel on a raster ``(rows,)``: interpolated between its samples, missing where it has none or where
+    the logger says that they are invalid."""
+    group, index = place
+    signal = file.get(group=group, index=index)
+    if signal.samples.ndim != 1 or signal.samples.dtype.names:
+        raise SpecError(f"The channel {name!r} holds arrays: give one that holds a number a sample.", path="columns")
+    own = np.asarray(file.get_master(group), dtype=np.float64)
+    valid = np.isin(own, signal.timestamps)
+    if np.array_equal(own, raster) and valid.all():
+        return _cells_of(signal.samples)
+    if np.any(np.diff(own) < 0) or not len(signal.samples):
+        raise SpecError(
+            f"The channel {name!r} has {'times that fall' if len(signal.samples) else 'no valid sample'}.",
+            path="columns",
+        )
+    # Half a step before the first sample and after the last one these still count.
+    margin = LARGEST_SHIFT * float(np.median(np.diff(own))) if len(own) > 1 else 0.0
+    within = np.interp(raster, own, valid.astype(np.float64)) == 1.0
+    within &= (raster >= own[0] - margin) & (raster <= own[-1] + margin)
+    cells = _cells_of(signal.interp(raster).samples)
+    return np.where(within, cells, None if cells.dtype == object else np.nan)
+
+
+def _cells_of(samples: Any) -> Any:
+    """Return samples ``(rows,)`` as numbers, or as the texts of a channel of words."""
+    if samples.dtype.kind == "S":
+        return np.array([cell.decode("utf-8", "replace") for cell in samples], dtype=object)
+    return np.asarray(samples, dtype=object if samples.dtype.kind == "U" else np.float64)
 
 
 def _frames(found: dict[str, Any], others: dict[str, Any], signals: Signals, rows: int) -> Iterator[pd.DataFrame]:
@@ -397,7 +577,7 @@ def _frames(found: dict[str, Any], others: dict[str, Any], signals: Signals, row
 
 
 #: How files of these kinds begin.
-_BEGINNINGS = {".tdms": b"TDSm", ".mf4": b"MDF ", ".mdf": b"MDF ", ".dat": b"MDF "}
+_BEGINNINGS = {".parquet": b"PAR1", ".tdms": b"TDSm", ".mf4": b"MDF ", ".mdf": b"MDF ", ".dat": b"MDF "}
 
 
 def _require_beginning(path: Path) -> None:
@@ -410,7 +590,7 @@ def _require_beginning(path: Path) -> None:
             raise SpecError(f"{path} cannot be read: it is no {path.suffix} file.", path=str(path))
 
 
-_READERS: dict[str, Callable[[Path, Signals, int], Iterator[Any]]] = {
+_READERS: dict[str, Callable[[Path, Signals, Stamps, int], Iterator[Any]]] = {
     ".parquet": _parquet,
     ".tdms": _tdms,
     ".mf4": _mdf,
@@ -424,6 +604,7 @@ def _with_time(frame: pd.DataFrame, signals: Signals) -> pd.DataFrame:
     import pandas as pd
 
     time, names = signals.columns[0], [str(name) for name in frame.columns]
+    frame = frame.set_axis(names, axis=1)
     dated = isinstance(frame.index, (pd.DatetimeIndex, pd.TimedeltaIndex))
     if time in names or not (dated or frame.index.name == time):
         return frame
@@ -461,6 +642,8 @@ def _numbers(column: pd.Series, done: int, stamps: Stamps | None = None) -> Floa
     """Return a column as numbers; a cell that is no number is named with its row."""
     import pandas as pd
 
+    if pd.api.types.is_complex_dtype(column):
+        raise SpecError(f"The column {str(column.name)!r} holds complex numbers: give real ones.", path="columns")
     if pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column):
         found = np.asarray(column.to_numpy(dtype=np.float64, na_value=np.nan))
         if stamps is not None and not np.isnan(found).all():
@@ -515,10 +698,10 @@ def _header(data: Any, wanted: Sequence[str]) -> list[str]:
     if path.suffix.lower() == ".parquet":
         import pyarrow.parquet
 
-        try:
-            return list(pyarrow.parquet.read_schema(path).names)
-        except (ValueError, OSError):  # the reader says what is wrong with it
-            return list(wanted)
+        with _readable(path):
+            _require_beginning(path)
+            with _read_by("pyarrow", path):
+                return _parquet_header(pyarrow.parquet.read_schema(path), wanted[0])[0]
     return list(wanted)
 
 
