@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -134,36 +134,26 @@ def pair(text: str) -> tuple[str, str]:
     return name, value
 
 
-def digits(text: str) -> int:
-    """Return a count of decimals."""
-    count = int(text)
-    if not 1 <= count <= 15:
-        raise argparse.ArgumentTypeError(f"{count} is not between 1 and 15")
-    return count
+def number_type(
+    name: str, read: Callable[[str], float], fits: Callable[[float], bool], wrong: str
+) -> Callable[[str], float]:
+    """Return a type of arguments: numbers that fit. argparse tells its name where a text is no number, and what is
+    ``wrong`` where it is another one."""
+
+    def checked(text: str) -> float:
+        value = read(text)
+        if not fits(value):
+            raise argparse.ArgumentTypeError(f"{text} {wrong}")
+        return value
+
+    checked.__name__ = name
+    return checked
 
 
-def probability(text: str) -> float:
-    """Return a number between 0 and 1."""
-    value = float(text)
-    if not 0.0 < value < 1.0:
-        raise argparse.ArgumentTypeError(f"{text} is no probability between 0 and 1")
-    return value
-
-
-def positive(text: str) -> float:
-    """Return a positive finite number."""
-    value = float(text)
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text} is no positive number")
-    return value
-
-
-def count(text: str) -> int:
-    """Return a whole number of one or more."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is less than 1")
-    return value
+digits = number_type("digits", int, lambda value: 1 <= value <= 15, "is not between 1 and 15")
+probability = number_type("probability", float, lambda value: 0.0 < value < 1.0, "is no probability between 0 and 1")
+positive = number_type("positive", float, lambda value: 0.0 < value < math.inf, "is no positive number")
+count = number_type("count", int, lambda value: value >= 1, "is less than 1")
 
 
 #: Settings with a default, which count as given only where they were stated.
