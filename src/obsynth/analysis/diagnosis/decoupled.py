@@ -19,7 +19,7 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_v
 from obsynth.numerics.lapack import LAPACK_BLOCK, pencil_eigenvalues
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.pencils import full_svd
-from obsynth.numerics.ranks import CLEAR_GAP, RankDecision, product_but_rounding, rank_from
+from obsynth.numerics.ranks import RankDecision, product_but_rounding, rank_from
 from obsynth.numerics.scaling import LogBalance, equilibrate_pencil, power_of_two_below
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -274,11 +274,6 @@ class DecoupledPlant:
     def thinnest(self) -> RankDecision | None:
         """The least clear rank decision; ``None`` where nothing had to be decided."""
         return min(self.decisions, key=lambda decision: decision.gap, default=None)
-
-    @property
-    def clear(self) -> bool:
-        """Whether every rank was decided with a gap that can be trusted."""
-        return self.thinnest is None or self.thinnest.gap >= CLEAR_GAP
 
     @property
     def plant(self) -> DescriptorSystem:
