@@ -34,7 +34,7 @@ def synthesise(plant: DAEModel, asked: DaeAdaptiveObserver, *, progress: Callabl
     progress("running the observer on its own model")
     facts = dae_facts(plain_recursion(observer))
     claims = {
-        "index": float(facts.index.index),
+        "index": float(facts.index),
         "condition": facts.condition,
         "contraction": facts.contraction,
         "steps": float(NOMINAL_STEPS),

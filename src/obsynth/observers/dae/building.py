@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.dae_structure import Identifiability, IndexReport, identifiability, index_report
+from obsynth.analysis.dae_structure import Identifiability, identifiability, index_report
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.lapack import pencil_eigenvalues
@@ -140,7 +140,7 @@ NOMINAL_STEPS = 100
 class DAEFacts:
     """Facts of a nominal run."""
 
-    index: IndexReport  # at the nominal point
+    index: int  # at the nominal point, 0 where (7) is always singular
     condition: float  # largest condition number of (7) along the run
     condition_k: int  # the sample at which it is largest
     residual: float  # largest scaled Newton residual
@@ -190,7 +190,7 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
         parameter_scales=np.sqrt(np.diag(observer.initial_parameter_covariance)),
     )
     return DAEFacts(
-        index_report(model, observer.dt, x=found.states[-1], u=u, theta=found.parameters[-1]),
+        index_report(model, observer.dt, x=found.states[-1], u=u, theta=found.parameters[-1]).index,
         float(found.conditions.max()),
         int(np.argmax(found.conditions)),
         float(found.residuals.max()),

@@ -76,7 +76,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         yield from _model_rows(observer, facts)
         yield listed_gains(design, {"K": facts.K, "Upsilon": facts.Upsilon})
         found = {
-            "index": float(facts.index.index),
+            "index": float(facts.index),
             "condition": facts.condition,
             "contraction": facts.contraction,
             "steps": float(NOMINAL_STEPS),
