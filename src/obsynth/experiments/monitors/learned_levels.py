@@ -462,10 +462,7 @@ def conformal_levels(
     own, _ = _union(first, every, half - SETTLING)
     union = (second / own[None, :, None]).max(axis=1)
     rows = int(np.asarray(np.isfinite(x[half + SETTLING :]).all(axis=1)).sum())
-    stretched = union[:, SETTLING:].size / rows
-    return found, Levels(
-        _of_deviations(own, usual), level_of(union, stretched * _exchangeable(rows, every)), extrapolated=False
-    )
+    return found, Levels(_of_deviations(own, usual), exchangeable_level(union, rows, every), extrapolated=False)
 
 
 def _of_faults(scores: Scores, centre: FloatArray, sizes: FloatArray) -> FloatArray:
@@ -533,15 +530,23 @@ def learned_levels(
     # What lasts longer in these rows than a block raises alarms in them that no stream of blocks shows.
     usual = None if scores is None else _usual(scores)
     itself = (normal_statistics(x, statistics, scores, usual) / own[:, None]).max(axis=0)[None]
-    shown_there = level_of(itself, _exchangeable(itself[:, SETTLING:].size, every))
+    shown_there = exchangeable_level(itself, itself[:, SETTLING:].size, every)
     return Levels(_of_deviations(own, usual), max(level * sure, shown_there), every > seen_rate)
 
 
-def _exchangeable(rows: int, every: float) -> float:
-    """Return how many rows there may be for each alarm in so many normal ones: with one fewer than a rate of one in
-    ``every`` allows, the mean rate of later rows is at most that, as their alarms are exchangeable with these."""
-    allowed = int(rows / every) - 1
-    return rows / allowed if allowed > 0 else np.inf
+def exchangeable_level(values: FloatArray, rows: int, every: float) -> float:
+    """Return the level in normal ``values (runs, n)``, of so many ``rows`` that say something, with one alarm fewer
+    than a rate of one in ``every`` allows: then the mean rate of later rows is at most that, as their alarms are
+    exchangeable with these.
+
+    Where less than a whole alarm is allowed beside the others, the level is as much nearer to that of one more: as a
+    share of what is between them, this leaves the mean at most as stated for tails from even to heavy ones.
+    """
+    allowed = max(rows / every - 1.0, 0.0)
+    whole, size = int(allowed), values[:, SETTLING:].size
+    # Halves, as a quotient of a quotient may be less than the whole number.
+    higher, lower = (level_of(values, size / (count + 0.5)) for count in (whole, whole + 1))
+    return higher - (allowed - whole) * (higher - lower)
 
 
 def normal_statistics(
