@@ -141,6 +141,7 @@ def number_type(
     ``wrong`` where it is another one."""
 
     def checked(text: str) -> float:
+        """Return the number in a text, where it fits."""
         value = read(text)
         if not fits(value):
             raise argparse.ArgumentTypeError(f"{text} {wrong}")
