@@ -297,3 +297,17 @@ def test_outliers_that_a_gate_leaves_out_blame_no_variance(tank_design):
     found = validate(gated, log)
     assert found.passed, str(found)
     assert found.ratios == {}
+
+
+def test_no_run_is_made_twice(tank_design, monkeypatch):
+    from obsynth.calibration import validating
+
+    runs, run = [], validating.recorded_innovations
+
+    def counted(design, log):
+        runs.append((design.observer.random_walk.tobytes(), tuple(design.plant.constants.values())))
+        return run(design, log)
+
+    monkeypatch.setattr(validating, "recorded_innovations", counted)
+    validate(walking_design(tank_design, 0.02), walking_tank(0.0))
+    assert len(runs) == len(set(runs)) == len(validating.VARIANCE_SHARES)

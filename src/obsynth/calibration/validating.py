@@ -110,7 +110,7 @@ class RecordedInnovations:
     squares: float
     degrees: int
     estimates: Mapping[str, FloatArray]
-    error: IntegrationError | None = None  # of backward Euler along the log, where an observer takes such steps
+    states: FloatArray  # ``(n, nx)``
 
     @property
     def standardised(self) -> FloatArray:
@@ -138,19 +138,23 @@ def recorded_innovations(design: ObserverDesign, log: Log) -> RecordedInnovation
 
 
 def _nonlinear(observer: DAEObserver, log: Log) -> RecordedInnovations:
-    found, error = _over(observer, log), None
-    deviations = np.sqrt(np.einsum("kii->ki", found.innovation_covariances))
-    if observer.integration == "backward-euler":
-        # Where the noise of a sensor is coloured, R is what is white beside it, next to nothing.
-        error = integration_error(
-            observer.model,
-            np.array(found.states),
-            log.u,
-            np.array(found.parameters[-1]),
-            np.median(deviations, axis=0),
-            observer.dt,
-        )
-    return _recorded(found, found.innovations, deviations, error)
+    found = _over(observer, log)
+    return _recorded(found, found.innovations, np.sqrt(np.einsum("kii->ki", found.innovation_covariances)))
+
+
+def _integration_error(observer: object, log: Log, record: RecordedInnovations) -> IntegrationError | None:
+    """Return the error of backward Euler along a log, where an observer takes such steps."""
+    if not (isinstance(observer, DAEObserver) and observer.integration == "backward-euler"):
+        return None
+    # Where the noise of a sensor is coloured, R is what is white beside it, next to nothing.
+    return integration_error(
+        observer.model,
+        record.states,
+        log.u,
+        np.array([columns[-1, 0] for columns in record.estimates.values()]),
+        np.median(record.deviations, axis=0),
+        observer.dt,
+    )
 
 
 def _over(observer: DAEObserver, log: Log) -> Estimates:
@@ -181,13 +185,11 @@ def _recursive(observer: RecursiveObserver, log: Log, point: Mapping[str, float]
     return _recorded(recursive_estimates(observer, rows), e, deviations)
 
 
-def _recorded(
-    found: Estimates, innovations: FloatArray, deviations: FloatArray, error: IntegrationError | None = None
-) -> RecordedInnovations:
+def _recorded(found: Estimates, innovations: FloatArray, deviations: FloatArray) -> RecordedInnovations:
     columns = np.stack([found.parameters, found.parameter_deviations], axis=2)
     estimates = {name: read_only(columns[:, i]) for i, name in enumerate(found.parameter_names)}
     return RecordedInnovations(
-        innovations, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()), estimates, error
+        innovations, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()), estimates, found.states
     )
 
 
@@ -320,10 +322,9 @@ def validate(
     note = progress or (lambda text: None)
     found = _usable_log(design, log, rows=rows, columns=columns, scales=scales)
     note(f"innovations of {found.samples} rows")
-    estimates = recorded_innovations(design, found).estimates
-    design, told = _as_far_as_it_walks(design, found, note)
-    far_off, near = _far(estimates, design, found.samples)
-    record = replace(recorded_innovations(design, found), estimates=estimates)
+    whole_walk = recorded_innovations(design, found)
+    design, record, told = _as_far_as_it_walks(design, found, whole_walk, note)
+    far_off, near = _far(whole_walk.estimates, design, found.samples)
     sensors = _sensors(record, design.plant.output_names)
     whole, white = consistency(record.squares, record.degrees), _white(sensors)
     place = change_of_mean(record.standardised if white else whitened(record.standardised))
@@ -338,10 +339,11 @@ def validate(
         sentences.append(
             f"Q and R are too {far} together: the innovations are {np.sqrt(whole.value):.2g} times what is expected."
         )
-    if record.error is not None and record.error.matters:
+    error = _integration_error(design.observer, found, record)
+    if error is not None and error.matters:
         sentences.append(
-            f"A step of backward Euler has an error of up to {record.error.largest:.2g} deviations of "
-            f"{record.error.sensor} (row {found.rows[0] + record.error.row}), which moves estimates of "
+            f"A step of backward Euler has an error of up to {error.largest:.2g} deviations of "
+            f"{error.sensor} (row {found.rows[0] + error.row}), which moves estimates of "
             "parameters: integration: radau has no such error."
         )
     if passed:
@@ -358,7 +360,7 @@ def validate(
         read_only(record.deviations),
         read_only(np.array(found.y)),
         read_only(found.y - record.innovations),
-        record.estimates,
+        whole_walk.estimates,
         found.described,
     )
 
@@ -403,14 +405,16 @@ def _contradicted(
     """Return the variances that a log contradicts, and what explains innovations that these leave coloured; ``None``
     where they are white, as the design states its variances or with the likeliest ones."""
     white, observer = _white(sensors), design.observer
-    # What a gate leaves out is no sample of the stated noise.
-    passed_by_gate = replace(log, y=read_only(np.where(np.isfinite(record.innovations), log.y, np.nan)))
+    # A variance that moves no innovation out of what is expected is no reason to change a design.
+    if whole.holds and white and all(item.nis.holds for item in sensors.values()):
+        return {}, None
+    said = None
     if isinstance(observer, DAEObserver):
         note("variances that the log makes likeliest")
-    said = noise_ratios(observer, passed_by_gate) if isinstance(observer, DAEObserver) else None
-    # A variance that moves no innovation out of what is expected is no reason to change a design.
-    agree = whole.holds and white and all(item.nis.holds for item in sensors.values())
-    ratios: Mapping[str, float] = {} if said is None or agree else said[0]
+        # What a gate leaves out is no sample of the stated noise.
+        passed_by_gate = replace(log, y=read_only(np.where(np.isfinite(record.innovations), log.y, np.nan)))
+        said = noise_ratios(observer, passed_by_gate)
+    ratios: Mapping[str, float] = {} if said is None else said[0]
     if white:
         return ratios, None
     others = _explanations(design, log, record, note)
@@ -426,20 +430,25 @@ def _contradicted(
 
 
 def _as_far_as_it_walks(
-    design: ObserverDesign, log: Log, note: Callable[[str], object]
-) -> tuple[ObserverDesign, list[str]]:
-    """Return the design with as much of the walk of its parameters as the log shows, and what is said of that."""
+    design: ObserverDesign, log: Log, record: RecordedInnovations, note: Callable[[str], object]
+) -> tuple[ObserverDesign, RecordedInnovations, list[str]]:
+    """Return the design with as much of the walk of its parameters as the log shows, its run, and what is said of
+    that; ``record`` is the run with all of it."""
     observer = design.observer
     walk = stated_walk(observer)
     if not walk.any() or not isinstance(observer, (DAEObserver, RecursiveObserver)):
-        return design, []
+        return design, record, []
+    runs = {walk.tobytes(): (design, record)}
 
-    def with_another(tried: FloatArray) -> ObserverDesign:
-        return design.replace(observer=with_walk(observer, tried))
+    def loss(tried: FloatArray) -> float:
+        if tried.tobytes() not in runs:
+            another = design.replace(observer=with_walk(observer, tried))
+            runs[tried.tobytes()] = another, recorded_innovations(another, log)
+        return runs[tried.tobytes()][1].loss
 
     note("how far parameters walk in this log")
-    shares = likeliest_shares(walk, lambda tried: recorded_innovations(with_another(tried), log).loss)
-    return with_another(shared_walk(walk, shares)), told_shares(design.observer.fault_names, walk, shares)
+    shares = likeliest_shares(walk, loss)
+    return *runs[shared_walk(walk, shares).tobytes()], told_shares(design.observer.fault_names, walk, shares)
 
 
 def states_innovations(design: ObserverDesign) -> bool:

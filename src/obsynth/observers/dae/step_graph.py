@@ -7,6 +7,7 @@ update; the parameters; the state that follows them; H, L and K at the result.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ Arrays = dict[str, Any]
 class ObserverGraph:
     """The functions of an observer."""
 
+    settings: DAESettings
     memory: Layout  # memory, row: of what is carried on, and of what is said besides
     row: Layout
     functions: DAEFunctions  # the model with its method of integration
@@ -31,10 +33,19 @@ class ObserverGraph:
     first: Any  # from memory, outputs and one for each that is seen, at k = 0, to memory and row
     # from memory, stages of the solved step, input, outputs, what is seen, and what `unknown` says, to memory and row
     sample: Any
-    unknown: Any  # from memory, stages, input and variances of what is missing of it to a covariance of the state
     whole: Any  # the implicit step and `sample`: from memory and ``[u; y; seen]`` to memory and row
-    forecast: Any  # from memory and row of a sample that nothing was seen of to mean and deviation of each output
     _stretches: dict[int, Any] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def unknown(self) -> Any:
+        """From memory, stages, inputs and variances of these to what missing inputs add to the covariance; `None`
+        without inputs."""
+        return _unknown(self.settings, self.functions, self.memory) if self.settings.model.nu else None
+
+    @cached_property
+    def forecast(self) -> Any:
+        """From memory and row of a sample that nothing was seen of to mean and deviation of each output."""
+        return _forecast(self.settings, self.functions, self.memory, self.row)
 
     def over(self, samples: int) -> Any:
         """Return `whole` over several samples: from memory and arriving columns to columns of memory and row."""
@@ -62,7 +73,6 @@ def observer_graph(observer: DAESettings) -> ObserverGraph:
     predicted = _predicted(observer, before, X[-nx:], local, missing)
     found = {**nothing, **_Update(observer, functions, y, seen).later(predicted)}
     sample = ca.Function("sample", [packed, X, u, y, seen, missing], _outcome(found, memory, row))
-    unknown = _unknown(observer, functions, memory) if nu else None
     if step.small:
         first, sample = first.expand(), sample.expand()
     arriving = ca.MX.sym("arriving", nu + 2 * ny)
@@ -73,8 +83,7 @@ def observer_graph(observer: DAESettings) -> ObserverGraph:
     # The residual and the verdict are the last two entries of a row.
     said = ca.vertcat(said[: row.size - 2], residual, trusted)
     whole = ca.Function("whole", [packed, arriving], [after, said])
-    forecast = _forecast(observer, functions, memory, row)
-    return ObserverGraph(memory, row, functions, step, first, sample, unknown, whole, forecast)
+    return ObserverGraph(observer, memory, row, functions, step, first, sample, whole)
 
 
 def _unknown(observer: DAESettings, functions: DAEFunctions, memory: Layout) -> Any:

@@ -120,7 +120,7 @@ class StepModel:
         self._correction: StepMatrices | None = None
         self._H: FloatArray | None = None
         self._noise: FloatArray | None = None
-        self._last: tuple[StepMatrices, StepMatrices] | None = None
+        self._last: tuple[int, StepMatrices, StepMatrices] | None = None
         self._H_is_constant = plant.E.is_constant and plant.C.is_constant and (plant.A.is_constant or not self.early)
         self._noise_is_constant = self.Q.is_constant and self.R.is_constant
         self._is_constant = self._noise_is_constant and plant.is_time_invariant
@@ -170,12 +170,18 @@ class StepModel:
 
     def at(self, k: int) -> StepMatrices:
         """Return the matrices of the step from k to k + 1; the same object for the same step."""
-        step, last = self.without_walk(k), self._last
+        last = self._last
+        if last is not None and last[0] == k:
+            return last[2]
+        step = self.without_walk(k)
         if self.walk is None:
-            return step
-        if last is None or last[0] is not step:
-            self._last = last = (step, with_walking_parameters(step, self.walk, early=self.early))
-        return last[1]
+            found = step
+        elif last is not None and last[1] is step:
+            found = last[2]
+        else:
+            found = with_walking_parameters(step, self.walk, early=self.early)
+        self._last = (k, step, found)
+        return found
 
     def first(self) -> StepMatrices | None:
         """Return the correction of x(0), and of parameters that walk, by the algebraic equations of step 0, where these

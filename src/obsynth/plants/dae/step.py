@@ -97,8 +97,9 @@ def _whole(newton: Any, sizes: FloatArray, stages: int, largest_move: float) -> 
              (3, "theta")))]  # fmt: skip
     start = ca.repmat(point[0], stages, 1)
     state = [start, *newton(start, *point), ca.MX(0.0), ca.MX(0.0), ca.MX(0.0)]
+    iteration = _iteration(newton, sizes)
     for i, count in enumerate(BLOCKS):
-        block, done = _block(newton, sizes, count), state[4]
+        block, done = _block(iteration, count), state[4]
         if i:
             inputs = block.mx_in()
             kept = ca.Function("kept", inputs, inputs[: len(state)])
@@ -112,27 +113,34 @@ def _whole(newton: Any, sizes: FloatArray, stages: int, largest_move: float) -> 
     return ca.Function("step", point, [X, residual, trusted], ["x", "u", "theta"], ["stages", "residual", "trusted"])
 
 
-def _block(newton: Any, sizes: FloatArray, count: int) -> Any:
-    """Return some iterations, from and to stages, residual, row scales, Newton step, and whether and how it ended."""
+def _iteration(newton: Any, sizes: FloatArray) -> Any:
+    """Return one iteration, from and to stages, residual, row scales, Newton step, and whether and how it ended."""
     inputs = [newton.mx_in(0)] + [ca.MX.sym(name, len(sizes)) for name in ("value", "rows", "move")]
     inputs += [ca.MX.sym(name) for name in ("done", "converged", "residual")]
     point = [newton.mx_in(i) for i in (1, 2, 3)]
     X, value, rows, move, done, converged, residual = inputs
-    for _ in range(count):
-        # A comparison with what is not a number is false, so that it never converges.
-        last = _all(ca.fabs(move) <= LAST_STEP * ca.fmax(ca.fabs(X), ca.DM(sizes)))
-        after = [X + move, *newton(X + move, *point)]
-        reached = ca.fabs(rows * after[1])
-        smaller = _all(reached < ca.mmax(ca.fabs(rows * value)))
-        solved_now = ca.logic_and(last, _all(reached <= LARGEST_RESIDUAL))
-        converged = ca.if_else(done, converged, solved_now)
-        residual = ca.if_else(done, residual, ca.mmax(reached))
-        X, value, rows, move = (
-            ca.if_else(done, old, new) for old, new in zip((X, value, rows, move), after, strict=True)
-        )
-        done = ca.logic_or(done, ca.logic_or(last, ca.logic_not(smaller)))
-    found = ca.Function("iterations", [*inputs, *point], [X, value, rows, move, done, converged, residual])
+    # A comparison with what is not a number is false, so that it never converges.
+    last = _all(ca.fabs(move) <= LAST_STEP * ca.fmax(ca.fabs(X), ca.DM(sizes)))
+    after = [X + move, *newton(X + move, *point)]
+    reached = ca.fabs(rows * after[1])
+    smaller = _all(reached < ca.mmax(ca.fabs(rows * value)))
+    solved_now = ca.logic_and(last, _all(reached <= LARGEST_RESIDUAL))
+    converged = ca.if_else(done, converged, solved_now)
+    residual = ca.if_else(done, residual, ca.mmax(reached))
+    X, value, rows, move = (ca.if_else(done, old, new) for old, new in zip((X, value, rows, move), after, strict=True))
+    done = ca.logic_or(done, ca.logic_or(last, ca.logic_not(smaller)))
+    found = ca.Function("iteration", [*inputs, *point], [X, value, rows, move, done, converged, residual])
     return found.expand() if len(sizes) <= SMALL else found
+
+
+def _block(iteration: Any, count: int) -> Any:
+    """Return so many iterations as one function."""
+    inputs = iteration.mx_in()
+    state, point = inputs[: iteration.n_out()], inputs[iteration.n_out() :]
+    for _ in range(count):
+        state = iteration(*state, *point)
+    found = ca.Function("iterations", inputs, state)
+    return found.expand() if iteration.is_a("SXFunction") else found
 
 
 def _all(conditions: Any) -> Any:
