@@ -302,7 +302,7 @@ def export(
     path: str | Path,
     *,
     sample_time: float | None = None,
-    fmi: str | None = None,
+    fmi: Literal["2.0", "3.0"] | None = None,
     thresholds: Mapping[str, float] | None = None,
     warm_up: float | None = None,
     monitor: Monitor | None = None,

@@ -21,7 +21,7 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.files.outputs import write_atomically
 from obsynth.methods.tracking import tracking_of
 from obsynth.methods.verifying import verify
-from obsynth.numerics.arguments import arguments_checked, require_kind
+from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, freeze
 from obsynth.plants.constants import SAME_TOLERANCE, ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
@@ -278,7 +278,6 @@ SAME_ENTRY, SAME_PLANT_ZERO = 1e-9, 1e-12
 
 def with_tolerances(design: ObserverDesign, constants: Any) -> tuple[ObserverDesign, DescriptorSystem]:
     """Return a linear design and its plant with the tolerances that are asked for."""
-    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     plant, _ = design.linear
     if constants is None:
         return design, plant

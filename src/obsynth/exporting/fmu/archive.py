@@ -34,7 +34,6 @@ from obsynth.exporting.c_source import (
 )
 from obsynth.exporting.realisation import STATISTIC, Alarms, Realisation, linear_alarms, verification_words
 from obsynth.files.outputs import write_atomically
-from obsynth.numerics.arguments import chosen
 from obsynth.observers.dae.c_code import FLAGS, compiler, shared_library
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.results.design import ObserverDesign, unverified_mark
@@ -289,7 +288,6 @@ def _text(root: Element) -> bytes:
     return bytes(ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
 
 
-VERSIONS = ("2.0", "3.0")
 #: Of every name in the C of the observer inside an FMU.
 _PREFIX = "observer"
 #: Archives of equal content are equal: the first day that a zip file can hold.
@@ -308,7 +306,6 @@ def write_fmu(
     outliers: str | None = None,
 ) -> Path:
     """Write an FMU for co-simulation; the binary is left out where there is no compiler."""
-    chosen(version, "fmi", VERSIONS)
     signals, texts, digest = _contents(design, sample_time, thresholds, warm_up, learned, outliers)
     identifier = c_identifier(target.stem)
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, ' '.join((digest, version, repr(signals))))}}}"

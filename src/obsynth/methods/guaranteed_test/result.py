@@ -14,7 +14,7 @@ from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import Programmes, free_faults, problem_as_designed, window_as_designed
 from obsynth.methods.guaranteed_test.tolerant import rows_before
 from obsynth.methods.guaranteed_test.windows import courses_of
-from obsynth.numerics.arguments import real_array, require_kind, whole_number
+from obsynth.numerics.arguments import arguments_checked, real_array, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
@@ -41,6 +41,7 @@ class GuaranteedTest(ObserverDesign):
     """
 
     @classmethod
+    @arguments_checked
     def of(cls, design: ObserverDesign) -> GuaranteedTest:
         """Return a design by this method, such as a loaded one, as what it is.
 
@@ -54,7 +55,6 @@ class GuaranteedTest(ObserverDesign):
         SpecError
             It is by another method.
         """
-        require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
         if design.method != GuaranteedTestMethod.id:
             raise SpecError(f"Design {design.name!r} is by {design.method}, no guaranteed test.", path="design")
         return cls(**{field.name: getattr(design, field.name) for field in fields(ObserverDesign)})
@@ -233,6 +233,7 @@ class GuaranteedTest(ObserverDesign):
         limits = self.limits(len(row))
         return row - limits, row + limits
 
+    @arguments_checked
     def residual(self, estimates: Estimates) -> FloatArray:
         """Return the residual of each row of a record ``(steps,)``; NaN before the window is full.
 
@@ -241,7 +242,6 @@ class GuaranteedTest(ObserverDesign):
         estimates : Estimates
             What the observer said over a record, from its start.
         """
-        require_kind(estimates, Estimates, "estimates", "the Estimates of a whole run, such as observer.run(y, u)")
         self._single("a residual")
         row = np.hstack([estimates.faults, estimates.residuals])[..., 0].astype(np.float64)
         if isinstance(self.observer, LinearObserver):
