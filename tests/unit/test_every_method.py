@@ -24,10 +24,10 @@ from obsynth.exporting.files import is_window
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arguments import field_types
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.gain_schedule import steady_observer
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.running import Estimates
 
 SAMPLES = 24
 #: The methods of obsynth, and one that a test registers: it has a folder and one line of the registry, no more.

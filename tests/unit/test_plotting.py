@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.observers.estimates import Estimates
+from obsynth.observers.running import Estimates
 from obsynth.plotting import (
     estimate_gains,
     plot_faults,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import SMALLEST, FloatArray
-from obsynth.observers.estimates import BAND_WIDTH
+from obsynth.observers.running import BAND_WIDTH
 from obsynth.plotting.panels import (
     BAND_STYLE,
     ESTIMATE_STYLE,

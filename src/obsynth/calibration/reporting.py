@@ -31,7 +31,7 @@ from obsynth.calibration.problem import Problem
 from obsynth.calibration.simulation_error import Fit, SimulationError, unexplained
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import SMALLEST, FloatArray, read_only
-from obsynth.observers.estimates import BAND_WIDTH
+from obsynth.observers.running import BAND_WIDTH
 from obsynth.plants.constants import CalibratedBox
 from obsynth.plants.dae.functions import BUTCHER, DAEFunctions
 from obsynth.plants.dae.model import DAEModel

@@ -40,10 +40,9 @@ from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.estimates import GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver, recursive_estimates
-from obsynth.observers.running import changed
+from obsynth.observers.running import Estimates, changed
 from obsynth.observers.windows import WindowObserver
 from obsynth.results.design import ObserverDesign
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from obsynth.data.log_estimator import GAP, OUT_OF_ORDER, PARTIAL, RECOVERING, REPEATED_STAMP, WARM_UP
 from obsynth.experiments.monitors.learned_levels import HOLD
-from obsynth.observers.estimates import BAND_WIDTH
+from obsynth.observers.running import BAND_WIDTH
 
 #: What stands for the status of rows that are well, but in which the monitor decides nothing.
 NO_DECISION = "undecided"

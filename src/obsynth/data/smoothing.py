@@ -17,10 +17,9 @@ from obsynth.data.step_log import SteppingLogObserver
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import read_only
-from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import deviations_in
-from obsynth.observers.running import changed
+from obsynth.observers.running import Estimates, changed
 from obsynth.observers.smoothing import (
     Chain,
     Smoothed,

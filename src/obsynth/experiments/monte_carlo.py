@@ -18,10 +18,10 @@ from obsynth.numerics.arguments import OpenUnitInterval, arguments_checked, whol
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import ParameterMonitor
-from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.progress import RunsProgress, as_they_come, progress_of_runs
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.running import Estimates
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.tolerances.exact_plant import drawn_points, plant_at

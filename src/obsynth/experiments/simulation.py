@@ -23,11 +23,11 @@ from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.estimates import BAND_WIDTH, Estimates
 from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver, split_rows
 from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.running import BAND_WIDTH, Estimates
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem

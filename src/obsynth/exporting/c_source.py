@@ -36,9 +36,8 @@ from obsynth.exporting.realisation import Alarms, Realisation, verification_word
 from obsynth.files.outputs import write_together
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.observers.dae.c_code import FLAGS, compiler, in_lines, observer_code, observer_struct, shared_library
-from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.derived import checked_warm_up
-from obsynth.observers.running import as_run
+from obsynth.observers.running import Estimates, as_run
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest

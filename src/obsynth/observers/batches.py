@@ -18,13 +18,12 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.c_code import BATCH_PARTS, compiler
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.observer import DAEObserver, advanced
-from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.progress import shown_progress
 from obsynth.observers.records import batch_record
 from obsynth.observers.recursive import gain_schedule
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.running import named_estimates
+from obsynth.observers.running import Estimates, named_estimates
 
 #: Samples in one call of the library: a second or less, so that progress shows and an interrupt takes effect.
 BATCH_SAMPLES_PER_CALL = 100_000

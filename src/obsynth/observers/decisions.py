@@ -18,9 +18,9 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_worded, check_fields, real_array, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.gain_schedule import gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.running import Estimates
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_array, real_vector, whole_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, freeze, read_only
-from obsynth.observers.estimates import Estimates
 from obsynth.observers.records import (
     NAME_FIELDS,
     measured_record,
@@ -19,7 +18,7 @@ from obsynth.observers.records import (
     require_names,
     whole_record,
 )
-from obsynth.observers.running import Observer
+from obsynth.observers.running import Estimates, Observer
 
 
 class WindowState(NamedTuple):

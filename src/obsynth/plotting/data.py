@@ -13,7 +13,7 @@ from obsynth.data.log_estimator import DECIDING
 from obsynth.data.run import DataRun
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked
-from obsynth.observers.estimates import BAND_WIDTH
+from obsynth.observers.running import BAND_WIDTH
 from obsynth.plotting.estimates import MODEL_BAND
 from obsynth.plotting.panels import (
     BAND_STYLE,

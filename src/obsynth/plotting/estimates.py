@@ -17,7 +17,7 @@ from obsynth.experiments.simulation import Simulation
 from obsynth.numerics.arguments import arguments_checked, real_array
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.decisions import Decision
-from obsynth.observers.estimates import BAND_WIDTH, Estimates
+from obsynth.observers.running import BAND_WIDTH, Estimates
 from obsynth.plants.validation import index_of
 from obsynth.plotting.panels import (
     BAND_STYLE,

@@ -9,7 +9,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.numerics.arguments import arguments_checked
-from obsynth.observers.estimates import Estimates
+from obsynth.observers.running import Estimates
 from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH, label_time, legend_above, new_panels, tidy
 from obsynth.results.design import ObserverDesign
 

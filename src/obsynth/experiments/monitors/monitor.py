@@ -18,9 +18,8 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.estimates import DAERow
-from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.observer import RawEstimate
-from obsynth.observers.running import state_as_data, state_from_data
+from obsynth.observers.running import Estimates, state_as_data, state_from_data
 from obsynth.plants.constants import shown
 
 if TYPE_CHECKING:

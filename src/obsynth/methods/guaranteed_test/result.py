@@ -16,9 +16,9 @@ from obsynth.methods.guaranteed_test.tolerant import rows_before
 from obsynth.methods.guaranteed_test.windows import courses_of
 from obsynth.numerics.arguments import arguments_checked, real_array, whole_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import measured_record
+from obsynth.observers.running import Estimates
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem

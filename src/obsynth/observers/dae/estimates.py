@@ -15,8 +15,7 @@ from obsynth.errors import SolverError
 from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.ranks import SINGULAR_CONDITION
-from obsynth.observers.estimates import NO_NUMBERS, STEP_RESIDUAL, Estimates
-from obsynth.observers.running import named_estimates
+from obsynth.observers.running import NO_NUMBERS, STEP_RESIDUAL, Estimates, named_estimates
 
 if TYPE_CHECKING:
     from obsynth.observers.dae.settings import DAESettings

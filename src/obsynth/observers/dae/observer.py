@@ -20,9 +20,9 @@ from obsynth.observers.dae.estimates import DAERow, GatheredRows, SampleEstimate
 from obsynth.observers.dae.settings import DAESettings
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import DAEState, Steps
-from obsynth.observers.estimates import Estimates
 from obsynth.observers.progress import shown_progress
 from obsynth.observers.records import measured_record
+from obsynth.observers.running import Estimates
 from obsynth.observers.unknown_inputs import require_inputs
 from obsynth.plants.dae.functions import Compiled, take_samples
 from obsynth.plants.dae.model import checked_inputs

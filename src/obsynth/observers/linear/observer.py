@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, is_whole, real_array, require_kind, require_shape, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.observers.estimates import Estimates
 from obsynth.observers.records import NAME_FIELDS, checked_sample, require_names, whole_record
-from obsynth.observers.running import Observer, RunningObserver
+from obsynth.observers.running import Estimates, Observer, RunningObserver
 
 
 class LinearState(NamedTuple):

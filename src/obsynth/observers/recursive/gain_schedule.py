@@ -13,12 +13,11 @@ from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.spectra import abscissa
 from obsynth.numerics.square_root_estimation import least_squares_step, rank_revealing_step, update
-from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import batch_record, require_horizon
 from obsynth.observers.recursive.observer import RecursiveObserver, posterior_residual
 from obsynth.observers.recursive.step_model import PreparedStep, StepMatrices, spreads
-from obsynth.observers.running import named_estimates
+from obsynth.observers.running import Estimates, named_estimates
 from obsynth.observers.sensor_timing import require_plain
 
 

@@ -50,7 +50,6 @@ from obsynth.numerics.square_root_estimation import (
     start_of,
     update,
 )
-from obsynth.observers.estimates import Estimates
 from obsynth.observers.outliers import (
     Outliers,
     checked_limit,
@@ -70,7 +69,7 @@ from obsynth.observers.recursive.step_model import (
     stacked_noise,
     with_missing_inputs,
 )
-from obsynth.observers.running import StepObserver, named_estimates
+from obsynth.observers.running import Estimates, StepObserver, named_estimates
 from obsynth.observers.unknown_inputs import TakenInputs, held_inputs, no_inputs, require_inputs, taken_inputs
 from obsynth.plants.time_varying import MatrixSequence, TimeVaryingDescriptorSystem
 
