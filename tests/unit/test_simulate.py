@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import pickle
+import re
 from pathlib import Path
 
 import control
@@ -100,6 +101,21 @@ def test_bad_profiles_and_scenarios_say_where(make, path: str) -> None:
     with pytest.raises(SpecError) as caught:
         make()
     assert caught.value.path == path
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: obsynth.Intermittent(size=1, period=1, duty=1.0), "duty is 1.0: give a number above 0 and below 1."),
+        (lambda: obsynth.LostEffectiveness(share=1.5), "share is 1.5: give a number above 0 and at most 1."),
+        (lambda: obsynth.Drift(size=1, time_constant=-2.0), "time_constant is -2.0: give a number above 0."),
+    ],
+)
+def test_a_profile_out_of_range_tells_value_and_range(make, text: str) -> None:
+    with pytest.raises(SpecError, match=re.escape(text)):
+        make()
+    # The upper end of a share is all of the signal.
+    assert obsynth.LostEffectiveness(share=1.0).share == 1.0
 
 
 def test_a_scenario_cannot_be_changed_and_travels(wang) -> None:
