@@ -11,6 +11,7 @@ import pytest
 import obsynth
 from obsynth import SpecError
 from obsynth.cli.main import main
+from obsynth.data.sources import log_table
 
 ROWS = 30
 SIGNALS = ["valve", "level", "flow"]
@@ -228,6 +229,26 @@ def test_words_of_an_mdf_file_are_told_as_those_of_a_text(design, frame, tmp_pat
     path = mdf(tmp_path / "log.mf4", [on, channel(frame, "level"), channel(frame, "flow")])
     with pytest.raises(SpecError, match="The column 'valve' holds no number: row 1 has 'on'"):
         obsynth.run_on_data(design, path)
+
+
+@of_asammdf
+@pytest.mark.parametrize("suffix", [".csv", ".parquet", ".tdms", ".mf4"])
+def test_columns_that_a_log_need_not_have_are_found_missing_in_every_format(frame, tmp_path, suffix):
+    path = tmp_path / f"log{suffix}"
+    if suffix == ".csv":
+        frame.to_csv(path, index=False)
+    elif suffix == ".parquet":
+        pytest.importorskip("pyarrow")
+        frame.set_index("time").to_parquet(path)
+    elif suffix == ".tdms":
+        waves = {"wf_increment": 0.5, "wf_start_offset": 0.0, "wf_samples": ROWS}
+        tdms(path, [("rig", name, frame[name].to_numpy(), waves) for name in SIGNALS])
+    else:
+        mdf(path, [channel(frame, name) for name in SIGNALS])
+    table, header, _ = log_table(path, ["level", "leak", "flow"])
+    assert sorted(table) == ["flow", "level", "time"]
+    assert sorted(header) == sorted(frame.columns)
+    assert np.array_equal(table["time"], frame["time"])
 
 
 def damaged(whole: bytes, rng: np.random.Generator) -> bytes:

@@ -90,6 +90,18 @@ def test_the_shift_is_where_the_equilibrium_goes() -> None:
     assert np.abs(moved - predicted).max() < 0.02 * np.abs(moved).max()
 
 
+def test_a_log_to_compare_on_has_no_column_of_the_shift() -> None:
+    linear = linearise(tanks(), given=POINT, free=["u1", "u3"], constants={"a1": "1 %"})
+    plant = obsynth.discretise(linear.replace(sensor_noise=dict.fromkeys(linear.output_names, 1e-3)), 5.0).plant
+    point = linear.operating_point
+    names = ("u1", "u3", *linear.output_names)
+    values = [point["u1"], point["u3"], *(plant.C @ [point[name] for name in ("h1", "h2", "h3")])]
+    log = pd.DataFrame([values] * 60, columns=names)
+    found = obsynth.compare(plant, data=log, methods=["ui-pi-observer"], runs=1)
+    assert not found.methods[0].refused
+    assert np.abs(found.methods[0].estimates).max() < 1e-9
+
+
 SPEC = """schema_version: 1
 name: tanks
 plant:

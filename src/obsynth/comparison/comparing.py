@@ -416,7 +416,7 @@ class Comparison:
         body = [
             f'<p class="verdict {"holds" if self.recommended else "fails"}">{escape(self.advice)}</p>',
             f"<p>{escape(self.setting)}</p>",
-            f'<div class="scroll">{html_table(self.rows())}</div>',
+            f'<div class="scroll figures">{html_table(self.rows())}</div>',
             f'<p class="soft">{escape(self.meanings())}</p>',
             *(f"<p>{escape(text)}</p>" for text in self.refusals),
             f'<figure><img alt="Estimates of each method" src="{data_url(written(self.plot()))}"></figure>',
@@ -917,6 +917,10 @@ def _log(
     }
     table, *_ = log_table(data, list(wanted.values()), (columns or {}).get(TIME_HEADER, TIME_HEADER))
     frame = {name: table[column] for name, column in wanted.items() if column in table}
+    shift = None if plant.uncertainty is None else plant.uncertainty.shift
+    if shift and frame:
+        # The input of a linearised plant that is one in every row has no column.
+        frame[shift] = np.ones(max(map(len, frame.values())))
     missing = [wanted[name] for name in (*plant.input_names, *plant.output_names) if name not in frame]
     if missing:
         raise SpecError(f"The log has no column {', '.join(map(repr, missing))}.", path="data")

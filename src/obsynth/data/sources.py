@@ -408,6 +408,12 @@ def _parquet(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterato
             yield frame
 
 
+def _parquet_names(path: Path, wanted: Sequence[str]) -> list[str]:
+    import pyarrow.parquet
+
+    return _parquet_header(pyarrow.parquet.read_schema(path), wanted[0])[0]
+
+
 def _parquet_header(schema: Any, time: str) -> tuple[list[str], str, tuple[float, float] | None]:
     """Return the names of all columns, how the file itself calls the time, and first number and step of the time where
     it is an index that counts, which pandas writes to no column.  Dates and time differences may have no name."""
@@ -454,7 +460,7 @@ def _tdms(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[p
     with path.open("rb") as stream, TdmsFile.open(stream) as file:
         if file.file_status.incomplete_final_segment:
             stamps.notes.append(f"{path} ends within its last segment: what follows was lost, or not written yet.")
-        channels = [(group.name, channel.name, channel) for group in file.groups() for channel in group.channels()]
+        channels = _tdms_channels(file)
         found = {name: _only(path, name, channels) for name in signals.columns}
         wanted = {name: channel for name, channel in found.items() if channel is not None}
         frame: dict[str, Any] = {name: channel[:] for name, channel in wanted.items()}
@@ -469,6 +475,28 @@ def _tdms(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[p
                 frame = {time: _wave_times(path, waves), **frame}
         others = {name: np.zeros(0) for _, name, _ in channels if name not in frame}
         yield from _frames(frame, others, signals, rows)
+
+
+def _tdms_channels(file: Any) -> list[tuple[str, str, Any]]:
+    return [(group.name, channel.name, channel) for group in file.groups() for channel in group.channels()]
+
+
+def _tdms_names(path: Path, wanted: Sequence[str]) -> list[str]:
+    from nptdms import TdmsFile
+
+    with path.open("rb") as stream, TdmsFile.read_metadata(stream) as file:
+        channels = _tdms_channels(file)
+        have_times = any("wf_increment" in channel.properties for _, name, channel in channels if name in wanted)
+        return _called(channels, wanted, have_times=have_times)
+
+
+def _called(channels: Sequence[tuple[str, str, Any]], wanted: Sequence[str], *, have_times: bool) -> list[str]:
+    """Return the names of channels, with the group too where they are wanted so; the time, which is wanted first, as
+    well where the file has times without a channel of that name."""
+    names = list(dict.fromkeys(name for _, name, _ in channels))
+    full = {f"{group}/{name}" for group, name, _ in channels}
+    names += [name for name in dict.fromkeys(wanted) if name in full and name not in names]
+    return [*names, wanted[0]] if have_times and wanted[0] not in names else names
 
 
 def _wave_times(path: Path, waves: dict[str, Any]) -> FloatArray:
@@ -493,9 +521,7 @@ def _wave_times(path: Path, waves: dict[str, Any]) -> FloatArray:
 def _mdf(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[pd.DataFrame]:
     """Yield the channels of an MDF file on the raster of the first signal, with the stamps of the time channel."""
     with _mdf_file(path) as file:
-        known = [
-            (str(group), name, (group, index)) for name, places in file.channels_db.items() for group, index in places
-        ]
+        known = _mdf_channels(file)
         masters = set(file.masters_db.items())
         time = signals.columns[0]
         found = {name: _only(path, name, known) for name in signals.columns[1:]}
@@ -511,6 +537,15 @@ def _mdf(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[pd
                 frame[time] = raster
             frame.update({name: _on_raster(file, name, place, raster) for name, place in wanted.items()})
         yield from _frames(frame, dict.fromkeys(name for _, name, _ in known), signals, rows)
+
+
+def _mdf_channels(file: Any) -> list[tuple[str, str, tuple[int, int]]]:
+    return [(str(group), name, (group, at)) for name, places in file.channels_db.items() for group, at in places]
+
+
+def _mdf_names(path: Path, wanted: Sequence[str]) -> list[str]:
+    with _mdf_file(path) as file:
+        return _called(_mdf_channels(file), wanted, have_times=wanted[0] == TIME_HEADER)
 
 
 @contextmanager
@@ -597,6 +632,14 @@ _READERS: dict[str, Callable[[Path, Signals, Stamps, int], Iterator[Any]]] = {
     ".mdf": _mdf,
     ".dat": _mdf,
 }
+#: The names of all columns, of which some are wanted, the time first.
+_HEADERS: dict[str, Callable[[Path, Sequence[str]], list[str]]] = {
+    ".parquet": _parquet_names,
+    ".tdms": _tdms_names,
+    ".mf4": _mdf_names,
+    ".mdf": _mdf_names,
+    ".dat": _mdf_names,
+}
 
 
 def _with_time(frame: pd.DataFrame, signals: Signals) -> pd.DataFrame:
@@ -682,7 +725,7 @@ def log_table(
 
 
 def _header(data: Any, wanted: Sequence[str]) -> list[str]:
-    """Return the names of all columns; those that are wanted where a file tells them only when it is read."""
+    """Return the names of all columns, of which some are wanted, the time first."""
     if not isinstance(data, str | Path):
         names = [str(name) for name in data.columns]
         dated = getattr(data.index, "dtype", None) is not None and data.index.dtype.kind in "Mm"
@@ -695,14 +738,10 @@ def _header(data: Any, wanted: Sequence[str]) -> list[str]:
     input_file(path)
     if path.suffix.lower() in TEXT_SUFFIXES:
         return header_of(path, wanted)
-    if path.suffix.lower() == ".parquet":
-        import pyarrow.parquet
-
-        with _readable(path):
-            _require_beginning(path)
-            with _read_by("pyarrow", path):
-                return _parquet_header(pyarrow.parquet.read_schema(path), wanted[0])[0]
-    return list(wanted)
+    with _readable(path):
+        _require_beginning(path)
+        with _read_by(NEEDED_PACKAGES[path.suffix.lower()][0], path):
+            return _HEADERS[path.suffix.lower()](path, wanted)
 
 
 def parsed_rows(rows: str | slice | Sequence[int] | None, count: int) -> tuple[int, int]:
