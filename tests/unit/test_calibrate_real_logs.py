@@ -19,6 +19,7 @@ from obsynth import (
     simulate_dae,
     validate,
 )
+from obsynth.calibration.reporting import integration_error
 
 TRUE = {"C": 1e-3, "Rs": 100.0}
 WIDE = {"C": (1e-4, 1e-2), "Rs": (10.0, 1000.0)}
@@ -141,6 +142,20 @@ def test_short_errors_of_steps_that_add_up_take_radau() -> None:
 def test_rows_that_are_asked_for_are_named() -> None:
     with pytest.raises(SpecError, match=r"rows 400:500 holds nothing: the log has 160 rows"):
         calibrate(circuit(), circuit_log(), WIDE, rows="400:500")
+
+
+def test_steps_are_compared_where_held_inputs_change() -> None:
+    """Changes before rows 20, 40, ... of 400: of 100 rows that are evenly spread none is there."""
+    model = DAEModel({"lag": "der(x) = u - x"}, {"y": "x"}, states={"x": 0.0}, inputs={"u": 0.0})
+    u = np.repeat(np.random.default_rng(4).uniform(-1.0, 1.0, 20), 20)[:, None]
+    x = np.zeros_like(u)
+    for k in range(1, len(x)):
+        x[k] = u[k] + np.exp(-1.0) * (x[k - 1] - u[k])
+    found = integration_error(model, x, u, np.zeros(0), np.ones(1), 1.0)
+    away = np.abs(u[1:] - x[:-1])[:, 0]
+    # A step of backward Euler goes half the way, the plant 1 - 1 / e of it; Radau's own error is 1e-4 of it.
+    np.testing.assert_allclose(found.largest, (0.5 - np.exp(-1.0)) * away.max(), rtol=2e-3)
+    assert found.row == 1 + away.argmax()
 
 
 @pytest.mark.long

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.calibration.diagnostics import (
     SIGNIFICANT,
@@ -275,7 +276,8 @@ def _boxes(panel: Axes, found: Calibration) -> None:
 
 #: A step whose error in an output exceeds this share of the sensor's deviation is not exact enough.
 TOLERATED = 0.25
-#: Samples at which both methods are compared, spread over the record.
+#: Samples at which both methods are compared: half of them spread over the record, half before the largest changes of
+#: the inputs, as inputs that are held change in rows that an even spread may miss.
 COMPARED = 100
 
 
@@ -294,15 +296,24 @@ class IntegrationError:
         return not self.largest <= TOLERATED
 
 
+def _compared(u: FloatArray) -> NDArray[np.int64]:
+    """Return the samples of inputs ``(n, nu)`` from which steps are compared."""
+    steps = max(len(u) - 1, 1)
+    if steps <= COMPARED:
+        return np.arange(steps)
+    spread = np.linspace(0, steps - 1, COMPARED // 2).astype(np.int64)
+    changes, sizes = np.abs(np.nan_to_num(np.diff(u, axis=0))), np.nanstd(u, axis=0)
+    largest = np.max(changes / np.where(sizes > 0.0, sizes, 1.0), axis=1, initial=0.0)
+    return np.union1d(spread, np.argsort(-largest, kind="stable")[: COMPARED // 2])
+
+
 def integration_error(
     model: DAEModel, states: FloatArray, u: FloatArray, theta: FloatArray, deviations: FloatArray, dt: float
 ) -> IntegrationError | None:
     """Compare one step from each state ``(n, nx)``, where Radau has a solution, with the input that leads on."""
     steps = [ImplicitStep(DAEFunctions(model, method), dt) for method in ("backward-euler", "radau")]
     worst = IntegrationError(0.0, model.output_names[0], 0)
-    for k in np.unique(
-        np.linspace(0, max(len(states) - 2, 0), min(COMPARED, max(len(states) - 1, 1))).astype(np.int64)
-    ):
+    for k in _compared(u[: len(states)]):
         after = min(k + 1, len(u) - 1)
         try:
             seen = [
