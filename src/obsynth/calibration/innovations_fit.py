@@ -639,6 +639,9 @@ class InnovationsFit:
     whitened: FloatArray
     innovations: FloatArray
     variances: FloatArray
+    #: The state after the last row, and its deviations, to which those of the constants are added; `None` where there
+    #: is no filter.
+    at_end: tuple[FloatArray, FloatArray] | None = None
 
     @property
     def v(self) -> FloatArray:
@@ -749,7 +752,22 @@ def innovations_fit(
         whitened,
         e,
         spread,
+        _at_end(objective, maximum, found),
     ), moved
+
+
+def _at_end(objective: Objective, maximum: Maximum, said: Information) -> tuple[FloatArray, FloatArray]:
+    """Return the state after the last row, and its deviations: of the filter, and by those of the constants."""
+    v, deviations = objective.full(maximum.z), np.sqrt(np.diag(said.covariance))
+    x, P = objective.likelihood.at_end(v)
+    moved = np.zeros((len(x), len(deviations)))
+    for i, deviation in enumerate(deviations.tolist()):
+        near = v.copy()
+        near[i] += deviation
+        found = objective.likelihood.at_end(near)[0] - x
+        # Where the plant has no solution a constant is not so far off.
+        moved[:, i] = found / deviation if np.isfinite(found).all() else 0.0
+    return x, np.sqrt(np.diag(P) + np.einsum("ij,jk,ik->i", moved, said.covariance, moved))
 
 
 def _beside(problem: Problem) -> list[int]:

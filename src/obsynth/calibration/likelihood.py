@@ -31,15 +31,20 @@ class Likelihood:
     def __init__(self, problem: Problem, y: FloatArray | None = None) -> None:
         graphs, noisy = problem.graphs, problem.noisy_equations
         self.ny, self.size = graphs.ny, graphs.nt + len(noisy) + graphs.ny
-        y = problem.y if y is None else y
+        y, self._nx = problem.y if y is None else y, graphs.nx
         self._both, self._missing = Compiled(_whole(graphs, problem.u, y, noisy, problem.x0, problem.P0)), np.isnan(y)
 
     def __call__(self, v: FloatArray) -> tuple[float, FloatArray]:
         """Return the value and its gradient ``(nt + len(noisy) + ny,)``."""
-        total, gradient, rows = self._both(v)
+        total, gradient, rows, _ = self._both(v)
         left = rows[-1]
         good = np.isfinite(total).all() and np.isfinite(gradient).all() and np.abs(left).max() <= LARGEST_STEP_RESIDUAL
         return (float(total[0, 0]), gradient[:, 0]) if good else (IMPOSSIBLE, np.zeros(self.size))
+
+    def at_end(self, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the state after the last row ``(nx,)``, and its covariance."""
+        packed = self._both(v)[3][:, 0]
+        return packed[: self._nx], packed[self._nx :].reshape(self._nx, self._nx)
 
     def innovations(self, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return whitened innovations, innovations and their variances, each ``(n, ny)``; no innovation (NaN) where y
@@ -51,7 +56,7 @@ class Likelihood:
 def _whole(
     graphs: SampleGraphs, u: FloatArray, y: FloatArray, noisy: Sequence[int], x0: FloatArray, P0: FloatArray
 ) -> Any:
-    """Return the function from v to value, gradient and rows."""
+    """Return the function from v to value, gradient, rows, and the state and covariance after them, packed."""
     nx, nt, n = graphs.nx, graphs.nt, len(y)
     first = _first(graphs, noisy)
     seen = np.isfinite(y)
@@ -77,13 +82,13 @@ def _whole(
             ca.repmat(v, 1, n - 1),
         )
         end = costates[:, -1]
-        costate, gradient = end[:size], end[size:]
+        costate, gradient, last = end[:size], end[size:], states[:, -1]
     else:
-        costate = ca.MX.zeros(size)
+        costate, last = ca.MX.zeros(size), state
     seed = ca.MX.zeros(row.shape[0])
     seed[0] = 1.0
     gradient = gradient + back_first(begin, data[:, 0], v, state, row, costate, seed)[2]
-    return ca.Function("likelihood", [v], [total, ca.densify(gradient), ca.densify(rows)])
+    return ca.Function("likelihood", [v], [total, ca.densify(gradient), ca.densify(rows), ca.densify(last)])
 
 
 def _update(graphs: SampleGraphs, x: Any, P: Any, u: Any, t: Any, log_r: Any, y: Any, seen: Any) -> tuple[Any, Any]:

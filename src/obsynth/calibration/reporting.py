@@ -110,6 +110,8 @@ class Calibration:
     outlier_sizes : mapping
         How far from its prediction an outlier of each output is at least, in its unit, as the outliers of this log say;
         nothing of outputs without any. What is nearer may be the onset of a fault.
+    found_offsets : mapping of str to (float, float)
+        Offset of each sensor that has one, as it is at the end of the log, and its standard deviation.
     """
 
     nominal: Mapping[str, float]
@@ -144,6 +146,7 @@ class Calibration:
     initial_covariance: Mapping[str, float] = field(default_factory=dict)
     own_equations: tuple[str, ...] = ()
     outlier_sizes: Mapping[str, float] = field(default_factory=dict)
+    found_offsets: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -184,7 +187,10 @@ class Calibration:
                 f"  coloured noise of {name}: deviation {noise['deviation']:.3g}, correlation "
                 f"{noise['correlation']:.3g} s"
             )
-        lines += [f"  offset of {name}: unknown" for name in self.offset]
+        for name in self.offset:
+            value, deviation = self.found_offsets.get(name, (0.0, np.inf))
+            known = f"{value:.3g}, deviation {deviation:.3g}" if np.isfinite(deviation) else "unknown"
+            lines.append(f"  offset of {name}: {known}")
         lines += [f"  walk of {name}: {step:.3g} per root of a second" for name, step in self.walks.items()]
         lines.append(
             f"  NIS per degree of freedom {self.nis.value:.2f} (95 %: {self.nis.low:.2f} to {self.nis.high:.2f})"
@@ -207,6 +213,7 @@ class Calibration:
             "stands": self.box.stands,
             "sensor_noise": {name: dict(item) for name, item in self.sensor_noise.items()},
             "offset": dict(self.offset),
+            "found_offsets": {name: list(found) for name, found in self.found_offsets.items()},
             "walks": dict(self.walks),
             "initial_covariance": dict(self.initial_covariance),
             "outlier_sizes": dict(self.outlier_sizes),
@@ -409,6 +416,7 @@ def reported(
         dict(zip(problem.plant.state_names, np.diag(problem.P0).tolist(), strict=True)),
         getattr(problem.plant, "inner", problem.plant).equation_names,
         _outlier_sizes(problem.log, np.sqrt(np.median(found.variances, axis=0))),
+        _found_offsets(problem, found),
     )
 
 
@@ -450,6 +458,15 @@ def _noise_model(
     # Continuous plants: what is added to the rate of a load during a step, as a walk over one second.
     step = dt**0.5 if problem.integration in BUTCHER else 1.0
     return sensors, offsets, {name: step * Q[name] ** 0.5 for name in states.loads}
+
+
+def _found_offsets(problem: Problem, found: InnovationsFit) -> dict[str, tuple[float, float]]:
+    """Return the offset of each sensor after the last row, and its deviation."""
+    if not isinstance(problem.plant, PlantWithNoise) or found.at_end is None:
+        return {}
+    end = dict(zip(problem.plant.state_names, np.transpose(found.at_end).tolist(), strict=True))
+    pairs = {name: end[offset_state(name)] for name in problem.plant.states.offsets}
+    return {name: (value, deviation) for name, (value, deviation) in pairs.items()}
 
 
 def _of_simulation(problem: Problem, start: Fit, level: float) -> InnovationsFit:

@@ -10,6 +10,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.files.outputs import FileKind, yaml_text
+from obsynth.plants.noise_model import offset_state
 from obsynth.spec.documents import read_yaml
 
 if TYPE_CHECKING:
@@ -68,6 +69,8 @@ def calibrated_spec(path: Path, found: Calibration, *, calibration: Path | None 
         if not linear:
             method["id"] = _DAE if method["id"] == "auto" else method["id"]
             options |= _nonlinear_options(found)
+            if found.found_offsets:
+                options["initial_state"] = _started(plant, options.get("initial_state"), found)
     told = {"unknown": {}, **(document.get("calibrate") or {}), "digest": found.box.digest}
     told |= {"input_delay": int(found.input_delay)}
     whole = {**document, "plant": plant, "method": {**method, "options": options}, "calibrate": told}
@@ -136,13 +139,21 @@ def _set_noise(plant: dict[str, Any], found: Calibration, *, linear: bool) -> No
         plant["Bw"] = rows.tolist()
 
 
+def _started(plant: Mapping[str, Any], stated: Any, found: Calibration) -> dict[str, float]:
+    """Return the first state by name, as it was stated and with the offsets that were found."""
+    own = stated if isinstance(stated, Mapping) else dict(zip(plant["states"], stated or (), strict=False))
+    return {**own, **{offset_state(name): value for name, (value, _) in found.found_offsets.items()}}
+
+
 def _nonlinear_options(found: Calibration) -> dict[str, Any]:
+    # What rows without faults say of an offset, no later row can: a fault of the same sensor looks the same.
+    known = {offset_state(name): deviation**2 for name, (_, deviation) in found.found_offsets.items()}
     return {
         "dt": float(found.log["dt"]),
         "Q": {name: float(value) for name, value in found.Q.items()},
         "R": {name: float(value) for name, value in found.R.items()},
         "integration": found.integration,
-        "initial_covariance": {name: float(value) for name, value in found.initial_covariance.items()},
+        "initial_covariance": {name: float(value) for name, value in found.initial_covariance.items()} | known,
         **({"outliers": "gate", "outlier_sizes": dict(found.outlier_sizes)} if found.outlier_sizes else {}),
     }
 

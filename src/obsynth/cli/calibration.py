@@ -144,7 +144,7 @@ def _asked(spec: obsynth.Spec | None, options: argparse.Namespace) -> dict[str, 
                 asked["noisy"] = [name for name, variance in method["Q"].items() if variance > 0.0]
             for name in ("dt", "initial_state", "initial_covariance"):
                 if method.get(name) is not None:
-                    asked[name] = method[name]
+                    asked[name] = _without_offsets(method[name], spec)
         for name, value in (spec.noise or {}).items():
             asked[name] = value if name != "sensor_noise" else _coloured(value)
         asked |= dict(spec.calibrate or {})
@@ -161,6 +161,16 @@ def _asked(spec: obsynth.Spec | None, options: argparse.Namespace) -> dict[str, 
         if getattr(options, name) is not None:
             asked[name] = getattr(options, name)
     return asked
+
+
+def _without_offsets(stated: Any, spec: obsynth.Spec) -> Any:
+    """Return what is said of a start without the offsets that another log has shown: this log shows its own."""
+    from obsynth.plants.noise_model import offset_state
+
+    offsets = {offset_state(name) for name in (spec.noise or {}).get("offset") or ()}
+    if not (offsets and isinstance(stated, Mapping)):
+        return stated
+    return {name: value for name, value in stated.items() if name not in offsets} or None
 
 
 def _coloured(noise: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -1,0 +1,94 @@
+"""An offset that a log without faults has shown is known to the design: a fault of its sensor looks the same later."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+import obsynth
+from obsynth.cli.main import main
+
+OFFSET, ROWS = 0.06, 300
+
+
+def log(seed: int) -> pd.DataFrame:
+    """Return rows without faults of a room with a heater, whose sensor shows too much."""
+    rng = np.random.default_rng(seed)
+    power = np.repeat(rng.uniform(0.5, 1.5, ROWS // 25 + 1), 25)[:ROWS]
+    x, shown = 1.0, np.zeros(ROWS)
+    for k in range(ROWS):
+        # Backward Euler with a step of one second, as the design has it.
+        x = (x + 0.1 * power[k] + 1e-3 * rng.standard_normal() * (k > 0)) / 1.1 if k else x
+        shown[k] = x + OFFSET + 0.01 * rng.standard_normal()
+    return pd.DataFrame({"time": np.arange(float(ROWS)), "power": power, "y": shown})
+
+
+SPEC = {
+    "schema_version": 1,
+    "name": "room",
+    "plant": {
+        "kind": "dae", "equations": {"heat": "der(x) = c * (power - x)"}, "outputs": {"y": "x + bias"},
+        "states": {"x": 1.0}, "inputs": {"power": 1.0}, "parameters": {"bias": 0.0}, "constants": {"c": 0.1},
+        "offset": {"y": "unknown"}, "sensor_noise": {"y": 0.01},
+    },
+    "method": {
+        "id": "dae-adaptive-observer",
+        "options": {
+            "dt": 1.0, "form": "augmented-kalman", "Q": {"heat": 1.0e-6}, "R": {"y": 1.0e-4},
+            "random_walk": {"bias": 1.0e-5}, "initial_parameter_covariance": {"bias": 1.0e-4},
+            "integration": "backward-euler",
+        },
+    },
+    "calibrate": {"log": "normal.csv", "input_delay": 0, "unknown": {"c": [0.05, 0.2]}},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    found = tmp_path_factory.mktemp("room")
+    log(1).to_csv(found / "normal.csv", index=False)
+    (found / "spec.yaml").write_text(yaml.safe_dump(SPEC, sort_keys=False))
+    asked = ["calibrate", "--system", str(found / "spec.yaml"), "--out", str(found / "c.json")]
+    assert main([*asked, "--write-spec", str(found / "found.yaml"), "--quiet"]) == 0
+    return found
+
+
+def test_the_offset_of_the_log_and_its_deviation_are_told_and_written(folder: Path) -> None:
+    value, deviation = json.loads((folder / "c.json").read_text())["found_offsets"]["y"]
+    assert abs(value - OFFSET) <= 3.0 * deviation
+    assert deviation <= 0.02
+    options = yaml.safe_load((folder / "found.yaml").read_text())["method"]["options"]
+    assert options["initial_state"] == {"offset_y": value}
+    assert options["initial_covariance"]["offset_y"] == pytest.approx(deviation**2)
+
+
+def test_the_design_takes_the_offset_for_no_fault_of_its_sensor(folder: Path) -> None:
+    spec = obsynth.load_spec(folder / "found.yaml")
+    design = obsynth.design(spec.plant, spec.method, **dict(spec.options))
+    for seed in range(2, 6):
+        table = obsynth.run_on_data(design, log(seed)).table
+        assert table is not None
+        # Of an unknown offset the fault took its share: a deviation of 0.019, and as large an error for the whole log.
+        deviations = table["sd fhat[bias]"]
+        assert deviations.iloc[-1] <= 0.01
+        assert (np.abs(table["fhat[bias]"]) <= 4.0 * deviations).all()
+        assert np.abs(table["xhat[offset_y]"] - OFFSET).max() <= 0.005
+
+
+def test_another_log_shows_its_own_offset(folder: Path) -> None:
+    data = log(9)
+    data["y"] += 0.1
+    data.to_csv(folder / "other.csv", index=False)
+    written = folder / "again.json"
+    spec = yaml.safe_load((folder / "found.yaml").read_text())
+    del spec["calibrate"]["digest"]
+    (folder / "again.yaml").write_text(yaml.safe_dump(spec, sort_keys=False))
+    asked = ["calibrate", "--system", str(folder / "again.yaml"), "--data", str(folder / "other.csv")]
+    assert main([*asked, "--out", str(written), "--quiet"]) == 0
+    value, deviation = json.loads(written.read_text())["found_offsets"]["y"]
+    assert abs(value - OFFSET - 0.1) <= 3.0 * deviation
