@@ -246,7 +246,7 @@ print("at 1 rad/s:", [complex(np.round(obsynth.fault_response(each, [1.0])[0, 0,
 print("error of the matched model at 20 s:", f"{estimate[-1] - fault[-1]:.1e}")
 
 # %% [markdown]
-# ## 9. A plant of your own
+# ## 8. A plant of your own
 #
 # An oven: heater, air and wall store heat, the surface of the heater stores none, so its balance is algebraic. The
 # heater may lose power. Nobody measures the temperature of the room, and no estimate shall show it.
@@ -280,7 +280,7 @@ obsynth.plotting.plot_simulation(obsynth.simulate(own, happens))
 plt.show()
 
 # %% [markdown]
-# ## 10. Without any numbers
+# ## 9. Without any numbers
 #
 # Without poles the toolbox takes the fastest Kalman gain, up to the median speed of the plant's own modes, that costs
 # at most ten times the noise of the quietest one.

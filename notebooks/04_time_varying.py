@@ -39,7 +39,7 @@ assert np.allclose(kalman.gains()["K"], riccati.K, atol=1e-3)
 print(kalman.design(name="Kalman"))
 
 # %% [markdown]
-# ## 1. Feasibility against the speed
+# ## Feasibility against the speed
 #
 # What a Riccati equation cannot do: the same with a region for the eigenvalues of $LA$. The smaller the disk, the
 # larger the variance, without end: every mode can be moved here.
@@ -243,7 +243,7 @@ alarm = obsynth.decide(robust.observer, holes, statistic="glr", nominal=[1.0], f
 print(f"glr: {alarm.parameter} at k = {alarm.k}, onset {alarm.onset}, confidence {alarm.confidence:.4f}")
 
 # %% [markdown]
-# ## 10. A plant of your own
+# ## 9. A plant of your own
 #
 # A tank whose heater warms a stream that is not constant, with a sensor behind a mixing point that stores nothing. The
 # matrices hold expressions in `k`; the parameter is the share of the heating power that is missing.

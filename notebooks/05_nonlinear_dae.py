@@ -54,7 +54,7 @@ for solver, settings in {"CLARABEL": {}, "SCS": {"eps_abs": 1e-6, "eps_rel": 1e-
     print(f"{solver:9} {paper.problem.status}: deviations of phi {phi:.5f}, of psi {psi:.1f} Pa")
 
 # %% [markdown]
-# ## 1. What the thermometer is worth, and where it ends
+# ## What the thermometer is worth, and where it ends
 #
 # The deviations against the noise of the thermometer. Without it there is no gain at all: the solver says infeasible,
 # and `existence` names the mode. At the point of operation the pressure alone does not tell the two parameters apart.
@@ -105,7 +105,7 @@ for name in ("M1", "U1", "m2"):
 print({name: f"{value:g} {model.units[name]}" for name, value in model.inputs.items()})
 
 # %% [markdown]
-# ## 3. What can the sensors tell?
+# ## 2. What can the sensors tell?
 #
 # Before any tuning: which directions of initial state and parameters leave a trace in the outputs along a trajectory of
 # 1,000 s? With both sensors everything is told, without any excitation.
@@ -174,7 +174,7 @@ for title, momentum in (
     print(f"{title}: cannot be told: {', '.join(found.unidentifiable)}")
 
 # %% [markdown]
-# ## 4. The observer
+# ## 3. The observer
 
 # %%
 design = obsynth.design(model, spec.method, name=spec.name, **spec.options)
@@ -183,7 +183,7 @@ for name in ("exists: index", "condition of (7)", "derivatives", "contraction", 
     print(f"{name:17s} {check.value:9.3g}  {'holds' if check.passed else 'FAILS'}  {check.detail}")
 
 # %% [markdown]
-# ## 5. Both faults
+# ## 4. Both faults
 #
 # The efficiency falls to 0.85 between 200 s and 400 s; at 600 s the sensor jumps by 3 kPa. The plant is integrated by
 # Radau IIA: it does not share the observer's discretisation. The bands are two standard deviations *for constant
@@ -210,7 +210,7 @@ axes = obsynth.plotting.plot_states(slow, states=truth.states, dt=1.0, units=mod
 plt.show()
 
 # %% [markdown]
-# ## 6. Beside the augmented Kalman filter
+# ## 5. Beside the augmented Kalman filter
 #
 # One option, the same interface. With `forgetting=1` the two are the same filter.
 
@@ -248,8 +248,9 @@ for name, observer in rivals.items():
 # %% [markdown]
 # There is no difference in cost that would matter: both spend their time on the implicit step and its derivatives. The
 # paper expects the adaptive observer to be cheaper; with four states and two parameters it is not.
+
 # %% [markdown]
-# ## A plant of your own first
+# ## 6. A plant of your own
 #
 # A tank with a clogging outlet: the balance as text, the outlet's coefficient as the parameter.
 
