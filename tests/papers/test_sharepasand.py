@@ -247,6 +247,10 @@ class TestLimits:
         np.testing.assert_allclose(estimates[late], expected, atol=1e-3)
         assert abs(gain) > 3.0
 
+    def test_a_slow_sinusoid_is_within_ten_per_cent(self, design: obsynth.ObserverDesign) -> None:
+        slow, faster = abs(obsynth.fault_response(design, [0.11, 0.12])[:, 0, 0])
+        assert slow < 1.1 < faster
+
     def test_the_right_model_follows_the_sinusoid(self) -> None:
         found = obsynth.ui_pi_observer(PLANT, fault_model={"sinusoid": 1.0}, poles=FIVE)
         estimates, time, _ = started(found, fault=sine(1.0), disturbance=NOISY, wf=[0, 1], wd=[0, 1, 0, 1])
