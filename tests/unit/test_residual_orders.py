@@ -44,7 +44,7 @@ def least_order(plant: obsynth.DescriptorSystem, removed: tuple[int, ...], fault
     return None
 
 
-def random_plant(rng: np.random.Generator, scale: float = 1.0) -> obsynth.DescriptorSystem:
+def random_plant(rng: np.random.Generator, *, regular: bool = True) -> obsynth.DescriptorSystem:
     def sparse(rows: int, columns: int, share: float = 0.5) -> np.ndarray:
         return np.array(rng.integers(-3, 4, (rows, columns)) * (rng.random((rows, columns)) < share), dtype=float)
 
@@ -53,7 +53,7 @@ def random_plant(rng: np.random.Generator, scale: float = 1.0) -> obsynth.Descri
         e, a = sparse(n, n), sparse(n, n)
         if rng.random() < 0.4:
             e = np.eye(n)
-        if abs(np.linalg.det(a - 0.7310585 * e)) > 1e-6:
+        if (abs(np.linalg.det(a - 0.7310585 * e)) > 1e-6) == regular:
             break
     return obsynth.DescriptorSystem(
         e, a, sparse(n, 1), sparse(ny, n), Bf=sparse(n, nf), Df=sparse(ny, nf, 0.2), Bd=sparse(n, nd),
@@ -61,11 +61,12 @@ def random_plant(rng: np.random.Generator, scale: float = 1.0) -> obsynth.Descri
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("regular", [True, False])
 @pytest.mark.parametrize("seed", range(4))
-def test_least_order_is_that_of_a_minimal_polynomial_basis(seed: int) -> None:
+def test_least_order_is_that_of_a_minimal_polynomial_basis(seed: int, *, regular: bool) -> None:
     rng = np.random.default_rng(seed)
     for _ in range(8):
-        plant = random_plant(rng)
+        plant = random_plant(rng, regular=regular)
         for fault in range(plant.nf):
             removed = tuple(j for j in range(plant.nf) if j != fault) if rng.random() < 0.5 else ()
             truth = least_order(plant, removed, fault)
@@ -123,6 +124,21 @@ def test_derivatives_of_exact_constraints_cost_no_order(exactly: bool) -> None:
         assert question(plant, (), 0, exactly).residual_order == 0
 
 
+@pytest.mark.parametrize("exactly", [True, False])
+def test_an_equation_of_the_fault_alone_is_a_residual_of_order_zero(exactly: bool) -> None:
+    # 0 = -f1: the equations of a plant that is not regular may say so, of a plant with and without dynamics.
+    plants = [
+        obsynth.DescriptorSystem(np.zeros((2, 2)), [[0, 0], [-2, 0]], None, [[-2, 0]], Bf=[[-2, 0], [0, 0]]),
+        obsynth.DescriptorSystem(
+            np.diag([1.0, 0.0]), [[-1, 0], [0, 0]], None, [[1, 0]], Bf=[[1, 0], [-1, 0]], fault_names=["a", "b"]
+        ),
+    ]
+    for plant in plants:
+        assert least_order(plant, (), 0) == 0
+        assert question(plant, (), 0, exactly).residual_order == 0
+        assert question(plant, (), 1, exactly).residual_order is None
+
+
 def test_a_residual_that_sees_two_faults_has_the_larger_of_their_orders() -> None:
     # y1 = a at once, y2 = x2 behind two states shows b: order 2.
     plant = obsynth.DescriptorSystem(
@@ -134,12 +150,13 @@ def test_a_residual_that_sees_two_faults_has_the_larger_of_their_orders() -> Non
 
 
 def test_orders_that_follow_by_hand_where_a_fault_acts_at_once_and_later() -> None:
-    """Shifted by hand: ``0 = -z2 - f, z2+ = 0``, and ``0 = z2 - f - w2, z2+ = z2 + z3, z3+ = w2 - w1``."""
+    """Shifted by hand: ``0 = -z2 - f, z2+ = 0``, which says ``0 = f+`` without w, and ``0 = z2 - f - w2, z2+ = z2 + z3,
+    z3+ = w2 - w1``."""
 
     def order(*matrices: list[list[int]]) -> int | None:
         return exact_residual_order(*(fmpq_mat(matrix) for matrix in matrices))
 
     column, none = [[0], [0], [1]], [[0]]
-    assert order([[0, 1, 0], [0, 0, 0], [0, 1, 0]], [[0, -1, 0]], column, [[-1]], [[1], [0], [0]], none) == 1
+    assert order([[0, 1, 0], [0, 0, 0], [0, 1, 0]], [[0, -1, 0]], column, [[-1]], [[1], [0], [0]], none) == 0
     known = [[1, -1], [0, 0], [-1, 1]]
     assert order([[0, 0, 1], [0, 1, 1], [0, 0, 0]], [[0, 1, 0]], [[-1], [0], [0]], [[-1]], known, [[0, -1]]) == 2

@@ -22,6 +22,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_poly
+from numpy.typing import NDArray
 
 from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled, finite_values, left_part, unknowns_pencil
 from obsynth.analysis.zeros import are_outside
@@ -478,6 +479,9 @@ def exact_residual_order(A: fmpq_mat, C: fmpq_mat, F: fmpq_mat, G: fmpq_mat, K: 
     # Rows [w | z | f, f', ...] in echelon form: those without w come last, then those without z.
     rows = blocks([[L, C, G]])
     while True:
+        # Equations of the fault alone, which a plant that is not regular may have.
+        if _from_column(rows, known + n).nrows():
+            return 0
         rows = _kept(rows, known + n)
         without = _from_column(rows, known)
         if without.nrows() <= free:
@@ -546,12 +550,12 @@ def residual_orders(
     The columns of ``[F; G]`` and of ``[K; L]`` have entries near one, as A and C; rows of zeros are equations as well.
     """
     n, count = A.shape[0], F.shape[1]
-    found: list[int | None] = [None] * count
-    basis, new = _Rows(np.zeros((0, n)), np.zeros((0, 1, count))), _of_degree_zero(A, C, F, G, K, L)
+    basis, (new, alone) = _Rows(np.zeros((0, n)), np.zeros((0, 1, count))), _of_degree_zero(A, C, F, G, K, L)
+    found: list[int | None] = [0 if is_alone else None for is_alone in alone.tolist()]
     scale = largest_singular_value(C)
     for order in range(n + 1):
         new, hidden, terms = _beside(basis, new, scale)
-        shown = np.any(np.linalg.norm(hidden, axis=1) > TRACE_TOLERANCE * np.maximum(terms, 1.0), axis=0)
+        shown = _shown(hidden, terms)
         found = [order if seen and one is None else one for one, seen in zip(found, shown.tolist(), strict=True)]
         if not len(new.z) or all(one is not None for one in found):
             break
@@ -559,9 +563,18 @@ def residual_orders(
     return found
 
 
-def _of_degree_zero(A: FloatArray, C: FloatArray, F: FloatArray, G: FloatArray, K: FloatArray, L: FloatArray) -> _Rows:
-    """Return the equations in which no derivative of w stands."""
+def _shown(hidden: FloatArray, terms: FloatArray) -> NDArray[np.bool_]:
+    """Return which faults stand in equations, of which these are the fault parts and the sizes of their terms."""
+    return np.asarray(np.any(np.linalg.norm(hidden, axis=1) > TRACE_TOLERANCE * np.maximum(terms, 1.0), axis=0))
+
+
+def _of_degree_zero(
+    A: FloatArray, C: FloatArray, F: FloatArray, G: FloatArray, K: FloatArray, L: FloatArray
+) -> tuple[_Rows, NDArray[np.bool_]]:
+    """Return the equations in which no derivative of w stands, and which faults have equations without z and w, as a
+    plant that is not regular may have them."""
     n, count = A.shape[0], F.shape[1]
+    alone = np.zeros(count, dtype=bool)
     rows, w = _Rows(C, G[:, None]), L
     free = _Rows(np.zeros((0, n)), np.zeros((0, 1, count)))
     size = max(largest_singular_value(L), largest_singular_value(K))
@@ -569,14 +582,15 @@ def _of_degree_zero(A: FloatArray, C: FloatArray, F: FloatArray, G: FloatArray, 
     for _ in range(n + 1):
         left, values, _ = full_svd(w)
         rank = int(np.count_nonzero(values > RANK_TOLERANCE * size))
-        new, *_ = _beside(free, rows.combined(left[:, rank:].T), scale)
+        new, hidden, terms = _beside(free, rows.combined(left[:, rank:].T), scale)
+        alone |= _shown(hidden, terms)
         rows, w = rows.combined(left[:, :rank].T), left[:, :rank].T @ w
         if not len(new.z):
             break
         # Their derivatives hold no derivative of w: they are of degree 0 as well.
         free, scale = free.joined(new), max(scale, largest_singular_value(A))
         rows, w = rows.joined(new.differentiated(A, F)), np.vstack([w, new.z @ K])
-    return rows.joined(free)
+    return rows.joined(free), alone
 
 
 def _beside(basis: _Rows, rows: _Rows, scale: float) -> tuple[_Rows, FloatArray, FloatArray]:
