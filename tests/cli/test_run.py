@@ -183,7 +183,7 @@ def test_a_bad_log_is_refused_and_leaves_nothing(gains, capsys, monkeypatch, nam
         monkeypatch.setattr("sys.stdin", io.StringIO("\n".join(lines)))
         assert run(gains, "--state", "state.json", data="-") == 2
         message = message.replace("log.csv cannot be read", "cells, but the header has 6")
-        message = "no column" if message == "cannot be read" else message.replace("cannot be read", "no rows")
+        message = "The data are empty" if message == "cannot be read" else message.replace("cannot be read", "no rows")
     assert message in capsys.readouterr().err
     assert {path.name for path in Path().iterdir()} <= {"log.csv"}
 

@@ -53,7 +53,7 @@ def swept(
 def test_a_dask_cluster_gives_the_same_numbers(linear, recursive, here) -> None:
     distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'obsynth[cluster]'")
     with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
     ):
         executor = client.get_executor()
@@ -64,7 +64,7 @@ def test_a_dask_cluster_gives_the_same_numbers(linear, recursive, here) -> None:
 def test_a_dask_worker_of_another_process_gives_the_same_numbers(linear, here) -> None:
     distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'obsynth[cluster]'")
     with (
-        distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
     ):
         there = swept(linear, client.get_executor())
