@@ -14,12 +14,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import dataclasses
 import platform
 import sys
+from typing import get_args
 
 import numpy as np
 
 import obsynth
-from obsynth.observers.decisions import STATISTICS
+from obsynth.observers.decisions import Statistic
 
+STATISTICS = get_args(Statistic)
 SAMPLES, MISSING, ASKED = 300, 0.1, (0.01, 0.05, 0.2)
 
 PLANTS = {
