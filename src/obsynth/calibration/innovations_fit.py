@@ -639,8 +639,8 @@ class InnovationsFit:
     whitened: FloatArray
     innovations: FloatArray
     variances: FloatArray
-    #: The state after the last row, and its deviations, to which those of the constants are added; `None` where there
-    #: is no filter.
+    #: The state after the last row, and its deviations, to which those of the constants are added; `None` where no
+    #: offset of a sensor is asked of it, or there is no filter.
     at_end: tuple[FloatArray, FloatArray] | None = None
 
     @property
@@ -752,7 +752,7 @@ def innovations_fit(
         whitened,
         e,
         spread,
-        _at_end(objective, maximum, found),
+        _at_end(objective, maximum, found) if _has_offsets(problem) else None,
     ), moved
 
 
@@ -768,6 +768,10 @@ def _at_end(objective: Objective, maximum: Maximum, said: Information) -> tuple[
         # Where the plant has no solution a constant is not so far off.
         moved[:, i] = found / deviation if np.isfinite(found).all() else 0.0
     return x, np.sqrt(np.diag(P) + np.einsum("ij,jk,ik->i", moved, said.covariance, moved))
+
+
+def _has_offsets(problem: Problem) -> bool:
+    return isinstance(problem.plant, PlantWithNoise) and bool(problem.plant.states.offsets)
 
 
 def _beside(problem: Problem) -> list[int]:
