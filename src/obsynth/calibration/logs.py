@@ -170,9 +170,6 @@ def read_log(
         numbers = _numbers(table[wanted], wanted, length)[first:last]
         return np.asarray(numbers * float((scales or {}).get(name, 1.0)), dtype=np.float64)
 
-    def counted(first_stuck: int, last_stuck: int) -> str:
-        return f"rows {first + first_stuck} to {first + last_stuck}"
-
     in_table = (columns or {}).get("time", "time") in table
     if not in_table and dt is None:
         raise SpecError("The log has no column 'time': name it by columns, or give dt.", path="columns.time")
@@ -180,8 +177,11 @@ def read_log(
     u = np.column_stack([column(name) for name in input_names]) if input_names else np.zeros((last - first, 0))
     y = np.column_stack([column(name) for name in output_names])
     found = _on_grid(time, u, y, dt, tuple(input_names), tuple(output_names), (first, last), source)
-    stuck = {name: stuck_rows(values) for name, values in zip(found.output_names, found.y.T, strict=True)}
-    return replace(found, notes=(*said, *found.notes, *stuck_texts(stuck, counted)))
+    stuck = {
+        name: [(first + begins, first + ends) for begins, ends in stuck_rows(values)]
+        for name, values in zip(found.output_names, found.y.T, strict=True)
+    }
+    return replace(found, notes=(*said, *found.notes, *stuck_texts(stuck)))
 
 
 def _table(log: Any, wanted: Sequence[str]) -> tuple[dict[str, Any], list[str], str, tuple[str, ...]]:

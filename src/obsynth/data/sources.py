@@ -297,9 +297,9 @@ def _chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator
             if path.suffix.lower() in TEXT_SUFFIXES:
                 yield from text_chunks(path, signals, stamps, rows)
             else:
-                _require_beginning(path)
-                with _read_by(NEEDED_PACKAGES[path.suffix.lower()][0], path):
-                    yield from _converted(_READERS[path.suffix.lower()](path, signals, stamps, rows), signals, stamps)
+                with _read_by_package(path):
+                    read_rows, _ = _READERS[path.suffix.lower()]
+                    yield from _converted(read_rows(path, signals, stamps, rows), signals, stamps)
     elif is_stream(data):
         yield from stream_rows(data, signals, stamps)
     else:
@@ -358,9 +358,11 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _read_by(package: str, path: Path) -> Iterator[None]:
-    """Turn whatever a package raises about a file, which may be damaged in any place, into an error that names both.
-    What it would log is in that error."""
+def _read_by_package(path: Path) -> Iterator[None]:
+    """Turn whatever the package of a file raises about it, as it may be damaged in any place, into an error that names
+    both.  What the package would log is in that error."""
+    _require_beginning(path)
+    package = NEEDED_PACKAGES[path.suffix.lower()][0]
     import_module(package)
     loggers = [
         logging.getLogger(name) for name in (package, *logging.root.manager.loggerDict) if name.startswith(package)
@@ -625,20 +627,16 @@ def _require_beginning(path: Path) -> None:
             raise SpecError(f"{path} cannot be read: it is no {path.suffix} file.", path=str(path))
 
 
-_READERS: dict[str, Callable[[Path, Signals, Stamps, int], Iterator[Any]]] = {
-    ".parquet": _parquet,
-    ".tdms": _tdms,
-    ".mf4": _mdf,
-    ".mdf": _mdf,
-    ".dat": _mdf,
-}
-#: The names of all columns, of which some are wanted, the time first.
-_HEADERS: dict[str, Callable[[Path, Sequence[str]], list[str]]] = {
-    ".parquet": _parquet_names,
-    ".tdms": _tdms_names,
-    ".mf4": _mdf_names,
-    ".mdf": _mdf_names,
-    ".dat": _mdf_names,
+#: What yields the rows of a file, and what names all of its columns, of which some are wanted, the time first.
+_READERS: dict[
+    str,
+    tuple[Callable[[Path, Signals, Stamps, int], Iterator[Any]], Callable[[Path, Sequence[str]], list[str]]],
+] = {
+    ".parquet": (_parquet, _parquet_names),
+    ".tdms": (_tdms, _tdms_names),
+    ".mf4": (_mdf, _mdf_names),
+    ".mdf": (_mdf, _mdf_names),
+    ".dat": (_mdf, _mdf_names),
 }
 
 
@@ -738,10 +736,9 @@ def _header(data: Any, wanted: Sequence[str]) -> list[str]:
     input_file(path)
     if path.suffix.lower() in TEXT_SUFFIXES:
         return header_of(path, wanted)
-    with _readable(path):
-        _require_beginning(path)
-        with _read_by(NEEDED_PACKAGES[path.suffix.lower()][0], path):
-            return _HEADERS[path.suffix.lower()](path, wanted)
+    with _readable(path), _read_by_package(path):
+        _, names_of = _READERS[path.suffix.lower()]
+        return names_of(path, wanted)
 
 
 def parsed_rows(rows: str | slice | Sequence[int] | None, count: int) -> tuple[int, int]:
