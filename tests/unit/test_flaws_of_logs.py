@@ -284,7 +284,7 @@ def test_shipped_designs_are_compared(name: str) -> None:
     spec = obsynth.load_spec(f"designs/{name}/spec.yaml")
     scenario = replace(spec.scenario, horizon=min(spec.scenario.horizon, 120.0 if name == "wang2015" else 13.0))
     found = obsynth.compare(spec.plant, scenario=scenario, runs=1, methods=["fault-estimation-filter"])
-    assert np.isfinite(found.methods[0].rms)
+    assert np.isfinite(found.methods[0].relative_error)
 
 
 @pytest.mark.skipif(compiler() is None, reason="no C compiler")
@@ -614,8 +614,8 @@ def test_a_comparison_replays_a_log_with_flaws(flaw: str) -> None:
     plant = heated()
     scenario = obsynth.Scenario(horizon=10.0, faults={"f": obsynth.Step(size=0.5, start=0.0)})
     found = obsynth.compare(plant, scenario=scenario, runs=1, methods=["ui-pi-observer"], data=data)
-    assert np.isfinite(found.methods[0].rms)
-    assert found.methods[0].rms < 0.2
+    assert np.isfinite(found.methods[0].relative_error)
+    assert found.methods[0].faults[0].rms < 0.2
 
 
 def test_rows_after_a_missing_sample_count_by_no_more_than_the_observer_says() -> None:

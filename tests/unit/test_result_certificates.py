@@ -129,7 +129,7 @@ def smaller(where: Any) -> bool:
     [
         *(("robustness", name) for name in ("loop_radius", "largest_factor", "error_per_unit", "regular", "stable")),
         *(("tolerance study", name) for name in ("least_faults", "false_alarms", "runs", "fault")),
-        *(("comparison", name) for name in ("order", "rms", "fast_enough", "faults")),
+        *(("comparison", name) for name in ("order", "relative_error", "fast_enough", "faults")),
         ("comparison on a log", "faults"),
     ],
 )
@@ -202,7 +202,7 @@ def test_errors_on_a_log_are_assumed_or_compared(files: dict[str, Path], tmp_pat
         for fault in next(iter(body["result"]["methods"].values()))["faults"]:
             fault["rms"] *= 0.5
         entry = next(iter(body["result"]["methods"].values()))
-        entry["rms"] *= 0.5
+        entry["relative_error"] *= 0.5
 
     assert "figures" in failing(changed(file, tmp_path / "c.json", change), data=log)
 

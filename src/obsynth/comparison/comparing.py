@@ -10,7 +10,7 @@ What `obsynth.compare` returns: one row per method, one recommendation, one pict
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -78,6 +78,8 @@ class FaultComparison:
         In closed form, on the nominal plant.
     rms : float
         Root mean square of ``fhat - f`` over the drawn runs of the scenario, not shifted by any delay.
+    size : float
+        Root mean square of the fault itself in these runs; where it does not happen, the largest `rms` of any method.
     bias : float
         Largest absolute mean over the runs of the estimate without a fault: what tolerances and disturbances make.
     threshold : float
@@ -97,6 +99,7 @@ class FaultComparison:
 
     figures: FaultFigures
     rms: float
+    size: float
     bias: float
     threshold: float
     detection_delay: float
@@ -142,9 +145,15 @@ class ComparedMethod:
     estimates: FloatArray
 
     @property
-    def rms(self) -> float:
-        """Root mean square over all faults, each in its own unit."""
-        return float(np.sqrt(np.mean([found.rms**2 for found in self.faults]))) if self.faults else float("inf")
+    def relative_error(self) -> float:
+        """Root mean square over all faults of each one's error, as a share of its size: the same in all units."""
+        return relative_error([vars(found) for found in self.faults])
+
+
+def relative_error(faults: Sequence[Mapping[str, Any]]) -> float:
+    """Return the root mean square of ``rms / size`` over faults; infinite where there are none."""
+    shares = [fault["rms"] / fault["size"] if fault["rms"] else 0.0 for fault in faults]
+    return rms(shares) if shares else float("inf")
 
 
 #: Samples of the window on which the least threshold is looked for, at most.
@@ -307,7 +316,7 @@ class Comparison:
             entry.method: {
                 "order": entry.order,
                 "fast_enough": entry.fast_enough,
-                "rms": entry.rms,
+                "relative_error": entry.relative_error,
                 "faults": [
                     {**vars(fault.figures), **{k: v for k, v in vars(fault).items() if k != "figures"}}
                     for fault in entry.faults
@@ -427,18 +436,16 @@ class Comparison:
 def comparison_statement(claims: Mapping[str, Any], digests: Mapping[str, str], log: Mapping[str, Any] | None) -> str:
     """Return what the figures of a comparison come to; ``digests`` are those of the gain sets."""
     methods = claims["methods"]
-    errors = {
-        name: float(np.sqrt(np.mean([fault["rms"] ** 2 for fault in entry["faults"]])))
-        for name, entry in methods.items()
-    }
+    errors = {name: relative_error(entry["faults"]) for name, entry in methods.items()}
     best = min(methods, key=lambda name: (not methods[name]["fast_enough"], errors[name]))
     others = ", ".join(f"{errors[name]:.4g} of {name}" for name in methods if name != best)
     fast = "" if methods[best]["fast_enough"] else ", though none reaches 90 % of a step within the time asked for"
     where = "" if log is None else f", errors on {log['name']} (sha256 {log['sha256'][:SHOWN_DIGITS]})"
     kept = ", ".join(f"{name} {digest[:SHOWN_DIGITS]}" for name, digest in digests.items())
+    against = f" against {others}" if others else ""
     return (
-        f"Of the methods that exist, {best} has the least rms error of the fault estimates ({errors[best]:.4g}"
-        f"{f' against {others}' if others else ''}){fast}: {claims['setting']}{where}. Gain sets: {kept}."
+        f"Of the methods that exist, {best} has the least rms error of the fault estimates, as a share of each fault's "
+        f"size ({errors[best]:.4g}{against}){fast}: {claims['setting']}{where}. Gain sets: {kept}."
     )
 
 
@@ -673,7 +680,8 @@ def compare(
     """Design every method that exists for a plant and put them side by side, on one clock and the same draws.
 
     Methods are ranked by the root mean square error over the scenario, with disturbances, noise and tolerances drawn,
-    among those whose estimate reaches 90 % of a step within the time asked for.
+    as a share of the size of each fault there, so that units do not matter, among those whose estimate reaches 90 % of
+    a step within the time asked for.
 
     Parameters
     ----------
@@ -805,8 +813,10 @@ def side_by_side(
     limit = within if within is not None else settling_time(plant)
     bounds = largest_disturbances(happening, sampled.disturbance_names, followed, dt)
     kept = followed, feedback
-    compared = [_compared(entry, sampled, faulty, healthy, log, kept, limit, false_alarms, bounds) for entry in found]
-    compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.rms))
+    compared = _sized(
+        [_compared(entry, sampled, faulty, healthy, log, kept, limit, false_alarms, bounds) for entry in found]
+    )
+    compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.relative_error))
     setting = (
         f"{runs} runs of {happening.horizon:g} s, sampled every {dt:g} s, disturbances and noise drawn"
         + (", constants within their tolerances" if plant.uncertainty is not None else "")
@@ -852,8 +862,8 @@ def compared_again(
         # The errors on a log that is not given are assumed.
         for name, entry in result["methods"].items():
             for fault, stored in zip(entry["faults"], body["result"]["methods"][name]["faults"], strict=True):
-                fault["rms"] = float(stored["rms"])
-            entry["rms"] = rms([fault["rms"] for fault in entry["faults"]])
+                fault |= {name: float(stored[name]) for name in ("rms", "size")}
+            entry["relative_error"] = relative_error(entry["faults"])
     sampled = on_the_clock(plant, found.sample_time)
     others = [f"plant of {name}" for name, one in designs.items() if not _is_of(one, (plant, sampled))]
     digests = {name: inside["sha256"] for name, inside in body["gain_sets"].items()}
@@ -974,11 +984,12 @@ def _compared(
         fault = faulty.truth[:, column]
         response = responses[:, row, column]
         level, delay, smallest = alarms(found[:, :, row], quiet[:, :, row], fault, response, false_alarms, plant.dt)
-        error = found[:, :, row] - fault
+        error, truth = found[:, :, row] - fault, fault
         if replayed is not None and log is not None and log.known:
-            error = replayed[:, row] - log.truth[:, column]
+            truth = log.truth[:, column]
+            error = replayed[:, row] - truth
         bias = float(np.max(np.abs(np.mean(quiet[:, :, row], axis=1)), initial=0.0))
-        rows.append(FaultComparison(figures, rms(error), bias, level, delay, smallest, *beside[row]))
+        rows.append(FaultComparison(figures, rms(error), rms(truth), bias, level, delay, smallest, *beside[row]))
     shown = found[0] if replayed is None else replayed
     fast = all(fault.figures.reaches and fault.figures.most <= limit for fault in rows)
     own = np.column_stack([responses[:, i, plant.fault_names.index(f.fault)] for i, f in enumerate(entry.figures)])
@@ -995,13 +1006,24 @@ def _compared(
     )
 
 
+def _sized(compared: Sequence[ComparedMethod]) -> list[ComparedMethod]:
+    """Return the methods with a size for each fault that does not happen: the largest error of any method."""
+    largest: dict[str, float] = {}
+    for fault in (fault for entry in compared for fault in entry.faults):
+        largest[fault.figures.fault] = max(largest.get(fault.figures.fault, 0.0), fault.size or fault.rms)
+    return [
+        replace(entry, faults=tuple(replace(fault, size=largest[fault.figures.fault]) for fault in entry.faults))
+        for entry in compared
+    ]
+
+
 def _reason(best: ComparedMethod | None, compared: Sequence[ComparedMethod], plant: DescriptorSystem) -> str:
     if best is None:
         return compared[0].refused if compared else "no method was asked for"
     others = [entry for entry in compared if not entry.refused and entry is not best]
-    words = [f"rms error {best.rms:.3g}"]
-    if others and is_finite_number(others[0].rms):
-        words[0] += f" against {others[0].rms:.3g} of {others[0].method}"
+    words = [f"rms error {best.relative_error:.3g} of the size of the faults"]
+    if others and is_finite_number(others[0].relative_error):
+        words[0] += f" against {others[0].relative_error:.3g} by {others[0].method}"
     gain = max(fault.figures.unknown_input_gain for fault in best.faults)
     if plant.nd:
         words.append("decoupled from unknown inputs" if gain <= DECOUPLED else f"gain from unknown inputs {gain:.2g}")
