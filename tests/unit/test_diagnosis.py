@@ -82,6 +82,17 @@ def test_units_decide_nothing(seed: int, two_encoders: bool) -> None:
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("units", [(1.0, 1.0, 1.0), (2.0**-13, 2.0**3, 2.0**19), (1e5, 1e-6, 1.0)])
+def test_units_of_outputs_change_no_delay(units: tuple[float, float, float]) -> None:
+    # Sensors of one state, which the fault reaches a sample later: none is free of noise in any unit.
+    e, a = np.diag([1.0, 1.0, 0.0]), [[-0.1 / 3, 0, 0], [0, -0.3, 0.2], [-0.1, 0, 0.4]]
+    c = np.array([[1.7, 0, 0], [-1.3, 0, 0], [0.5, 0, 0]])
+    plant = obsynth.DescriptorSystem(e, a, C=np.array(units)[:, None] * c, Bf=[[-1.9], [0.7], [0.4]], dt=0.1)
+    found = obsynth.diagnose(plant)["f1"]
+    assert not found.exact
+    assert (found.order, found.filter_order) == (1, 1)
+
+
 def test_a_rank_at_the_point_is_not_enough() -> None:
     # y = s/(s+1) f: M_W loses rank at s = 0 itself, so the rank test there passes; a constant fault is hidden.
     plant = obsynth.DescriptorSystem(

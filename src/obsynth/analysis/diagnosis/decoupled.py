@@ -271,6 +271,11 @@ class DecoupledPlant:
         return int(self.E.shape[0])
 
     @property
+    def signals(self) -> FloatArray:
+        """Columns ``(k + p, nu + ny)`` of ``[u; y]`` in both equations, each in units of its size."""
+        return np.asarray(np.block([[self.Bu, self.By], [self.Du, -self.H]]) / self.signal_sizes)
+
+    @property
     def thinnest(self) -> RankDecision | None:
         """The least clear rank decision; ``None`` where nothing had to be decided."""
         return min(self.decisions, key=lambda decision: decision.gap, default=None)

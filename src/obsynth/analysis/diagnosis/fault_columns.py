@@ -100,7 +100,7 @@ class Removal:
             return {self.kept[place]: 0 for place in places}
         inverse = np.linalg.inv(plant.E * plant.time)
         units = (sizes * traces)[places]
-        known = np.block([[plant.Bu, plant.By], [plant.Du, -plant.H]]) / plant.signal_sizes
+        known = plant.signals
         found = residual_orders(
             inverse @ plant.A,
             plant.C,
@@ -399,8 +399,8 @@ def _order_at_infinity(plant: DecoupledPlant, f: FloatArray, g: FloatArray) -> i
     if n == 0:
         return 0
     inverse = np.linalg.inv(plant.E * plant.time)
-    a, f, known = inverse @ plant.A, inverse @ f, inverse @ np.hstack([-plant.By, plant.Bu])
-    rows = np.hstack([plant.C, g, plant.H, plant.Du])
+    a, f, known = inverse @ plant.A, inverse @ f, inverse @ plant.signals[:n]
+    rows = np.hstack([plant.C, g, plant.signals[n:]])
     independent = _rank(rows)
     for _ in range(n):
         full = np.linalg.norm(rows, 2)
