@@ -32,7 +32,6 @@ from obsynth.errors import SpecError
 from obsynth.methods.conic import lmi
 from obsynth.methods.designing import design_from_gains
 from obsynth.methods.placement.eigenstructure import checked_poles, place
-from obsynth.methods.riccati import lyapunov_factor
 from obsynth.methods.ui_pi_observer.augmented_plant import (
     AugmentedPlant,
     Decoupled,
@@ -51,6 +50,7 @@ from obsynth.numerics.matrix_equations import continuous_riccati, discrete_ricca
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
+from obsynth.proofs.contraction import prove_contraction
 from obsynth.results.design import ObserverDesign
 
 #: Conditions whose failure leaves an inequality that no matrices satisfy.
@@ -168,7 +168,8 @@ def augmented_problem(
     else:
         wanted = checked_poles(poles, na, np.zeros(0, dtype=np.complex128), plant.dt, of="ui-pi-observer")
         K = place(UA, shown, wanted, dt=plant.dt, objective="gain")[0]
-        X = np.asarray(np.linalg.inv(lyapunov_factor(UA - K @ shown, plant.dt)))
+        contraction = prove_contraction(UA - K @ shown, discrete=plant.is_discrete)
+        X = np.eye(na) if contraction is None else contraction.inverse
         variables, goal = {"P": P}, cp.trace(P)
         closed = np.linalg.solve(X, (UA - K @ shown) @ X)
         constraints["stability"] = atoms.region(closed, P, stable, margin=margin)[1]

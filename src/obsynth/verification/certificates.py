@@ -26,6 +26,7 @@ from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
 from obsynth.proofs.extended_balls import Enclosed, block, enclosed_eigenvalues
 from obsynth.results.checks import Check, CheckKind
+from obsynth.verification.error_system import contraction_of
 
 
 def prove_bounded_real(
@@ -152,6 +153,12 @@ def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessPr
         return -(half + half.T)
 
     return prove_positive_definite(formula)
+
+
+def stability_factor(observer: LinearObserver) -> FloatArray:
+    """Return Q, upper triangular, with which `prove_stable` succeeds: of a proved contraction, the identity without."""
+    found = contraction_of(observer)
+    return np.eye(observer.order) if found is None else found.Q
 
 
 def stability_row(a: FloatArray, factor: FloatArray, dt: float, source: str) -> Check:

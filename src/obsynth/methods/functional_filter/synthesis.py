@@ -37,7 +37,6 @@ from obsynth.methods.functional_filter.tracking import estimate_deviations, trac
 from obsynth.methods.method import Synthesis
 from obsynth.methods.placement.eigenstructure import checked_poles, place
 from obsynth.methods.refusals import require_all_told
-from obsynth.methods.riccati import lyapunov_factor
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, product_but_rounding, rounding_rank
 from obsynth.numerics.scaling import balanced_matrix
@@ -47,7 +46,7 @@ from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.proofs.extended_balls import arb_matrix
 from obsynth.proofs.products import EXPONENTIAL_BITS, as_ball
 from obsynth.results.design import Certificate
-from obsynth.verification.certificates import slowest_decay
+from obsynth.verification.certificates import slowest_decay, stability_factor
 
 #: A matrix larger than its eigenvalues by this is given in coordinates in which it is triangular.
 FAR_FROM_NORMAL = 1e3
@@ -236,7 +235,7 @@ def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Ca
         "Phi": model.Phi,
         "Cw": model.Cw,
         "walks": np.diag(walks),
-        "stability": lyapunov_factor(observer.Az, plant.dt),
+        "stability": stability_factor(observer),
         "tracking": tracking_map(plant, observer, t, model.Phi, model.Cw),
     }
     matrices["deviations"] = estimate_deviations(noisy, observer, matrices)

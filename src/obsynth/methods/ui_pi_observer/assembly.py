@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from obsynth.methods.method import Synthesis, plain
-from obsynth.methods.riccati import lyapunov_factor
 from obsynth.methods.ui_pi_observer.augmented_plant import ObserverGains, combinations_seen, realise
 from obsynth.methods.ui_pi_observer.placement_problem import (
     with_faults,
@@ -30,7 +29,7 @@ from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.proofs.covariances import certain_noise_covariance
 from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
 from obsynth.results.design import Certificate
-from obsynth.verification.certificates import slowest_decay
+from obsynth.verification.certificates import slowest_decay, stability_factor
 
 #: Poles of what is shipped that are this close to those asked for, relative to their size, are claimed as asked.
 SAME_AS_ASKED = 5e-5
@@ -77,7 +76,7 @@ def assembled(
         "Phi": model.Phi,
         "Cw": model.Cw,
         "poles": np.column_stack([poles.real, poles.imag])[order] if poles.size else np.zeros((0, 2)),
-        "stability": lyapunov_factor(observer.Az, plant.dt),
+        "stability": stability_factor(observer),
     }
     slowest = slowest_decay(observer.Az, plant.dt)
     claims = {"decay": slowest, "noise_amplification": noise_amplification(observer), **claims}
