@@ -57,7 +57,7 @@ def test_without_faults_the_state_is_observed() -> None:
 
 def test_where_nothing_exists_the_reason_and_the_sensor_are_given() -> None:
     plant = obsynth.DescriptorSystem(None, [[0.5, 0], [0, 0.8]], None, ["x1"], Bf=["x2"], Dw=[[0.1]], dt=1.0)
-    with pytest.raises(obsynth.PreconditionError, match=r"Add one of: x2\.$"):
+    with pytest.raises(obsynth.PreconditionError, match=r"Measure one of: x2\.$"):
         obsynth.design(plant)
 
 

@@ -57,3 +57,27 @@ def test_a_fault_that_cannot_be_told_is_said() -> None:
     assert any(text.startswith("A constant torque cannot be distinguished from load torque") for text in told)
     filter_ = obsynth.functional_filter(load_spec(DESIGNS / "motor" / "sampled.yaml").plant)
     assert design_warnings(filter_, followed_steps(filter_)) == ()
+
+
+def test_two_faults_that_only_an_unknown_input_makes_alike_are_said() -> None:
+    # A load on one state is what a bias of its sensor is; a load on both is the sum of a drop and a bias.
+    plant = obsynth.DescriptorSystem(
+        A=[[0.9, 0.0], [0.1, 0.8]],
+        C=[[1.0, 0.0], [0.0, 1.0]],
+        Bf=[[0.1, 0.0], [0.0, 0.0]],
+        Df=[[0.0, 0.0], [0.0, 1.0]],
+        Bd=[[0.0], [0.2]],
+        dt=0.1,
+        fault_names=["drop", "bias"],
+        disturbance_names=["load"],
+    )
+    design = obsynth.fault_estimation_filter(plant)
+    told = design_warnings(design, followed_steps(design))
+    assert [text.partition(":")[0] for text in told] == ["bias cannot be distinguished from load"]
+    mixed = plant.replace(Bf=[[0.1, 0.0], [0.0, 0.0]], Bd=[[0.1], [0.2]])
+    design = obsynth.fault_estimation_filter(mixed)
+    told = design_warnings(design, followed_steps(design))
+    assert [text.partition(":")[0] for text in told] == [
+        "A constant drop cannot be distinguished from load and bias together",
+        "A constant bias cannot be distinguished from load and drop together",
+    ]

@@ -58,7 +58,7 @@ def test_motor_with_one_encoder_names_the_load_and_the_sensor() -> None:
     assert (
         "a step of 1 in torque is output-nulling together with a step of -1 in load torque and states theta l = -0.02"
     ) in text
-    assert "Add one of: theta l." in text
+    assert "Measure one of: theta l." in text
     assert "omega l would make it detectable, but not estimable." in text
 
 
@@ -260,7 +260,7 @@ def test_a_method_whose_numbers_fail_is_a_row_of_check_and_not_its_end(error, mo
     }
 
 
-@pytest.mark.parametrize(("faults", "said"), [(16, "obsynth.sensor_sets searches"), (2, "Add one of: x1.")])
+@pytest.mark.parametrize(("faults", "said"), [(16, "obsynth.sensor_sets searches"), (2, "Measure one of: x1.")])
 def test_what_would_help_many_faults_is_left_to_the_search_for_sensors(faults: int, said: str) -> None:
     states = 30
     a = 0.5 * np.eye(states) + 0.25 * np.eye(states, k=-1)

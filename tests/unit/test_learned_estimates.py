@@ -121,7 +121,7 @@ def test_a_fault_that_the_estimate_follows_is_an_alarm() -> None:
     found = learned()
     assert found.columns == ("r[y]",)
     assert found.statistics.names[-2:] == ("GLR of a change of fhat[f]", "square of fhat[f]")
-    assert "and in changes of 1 fault(s)" in found.statement
+    assert "and in changes of 1 fault;" in found.statement
     alone = replace(found, statistics=replace(found.statistics, estimates=()), levels=found.levels[:-2])
     for one, wanted in ((found, True), (alone, False)):
         monitor = obsynth.online_monitor(pumped(), "learned", normal=one)

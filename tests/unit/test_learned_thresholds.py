@@ -363,7 +363,7 @@ def test_two_wrong_samples_in_a_row_do_not_raise_the_levels(kind: str) -> None:
     assert (found.pairs.number, wanted.pairs.number) == (1, 0)
     # Half the square of the share of wrong samples, those of the pair among them.
     assert found.pairs.chance == pytest.approx(0.5 * ((len(ALONE) + 2) / 3_000) ** 2, rel=0.01)
-    assert "1 pair(s) of wrong samples in a row count as not measured" in found.statement
+    assert "1 pair of wrong samples in a row, which count as not measured" in found.statement
     # Other alarms are rarer by a seventh, and the bootstrap draws other rows: a level moves by a tenth.
     ratios = found.levels / wanted.levels
     assert (ratios > 0.8).all()

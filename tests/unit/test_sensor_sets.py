@@ -164,7 +164,7 @@ def test_refusals_end_with_sensors_that_help(method: str) -> None:
     plant = obsynth.discretise(one_encoder(), 0.01).plant
     with pytest.raises(obsynth.PreconditionError) as caught:
         obsynth.design(plant, method)
-    assert str(caught.value).endswith("Add one of: theta l.")
+    assert str(caught.value).endswith("Measure one of: theta l.")
     assert caught.value.add == (("theta l",),)
     equipped = with_sensors(plant, [s for s in state_sensors(plant) if s.name == "theta l"])
     assert obsynth.design(equipped.replace(Dw=1e-3 * np.eye(3), Bw=None, noise_names=None), method).report.passed

@@ -141,7 +141,7 @@ def test_the_reason_why_nothing_was_eliminated_is_one_sentence() -> None:
         ui_pi_observer(plant)
     text = str(caught.value)
     assert "the algebraic states cannot be eliminated (the plant has index 2 or more): the states 'x1'" in text
-    assert "use a method that takes the descriptor form" not in text
+    assert "which methods take the descriptor form" not in text
 
 
 def test_given_exosystems_of_any_frequency() -> None:

@@ -68,6 +68,20 @@ def test_entrywise_tolerances_are_unknowns_of_their_own() -> None:
         obsynth.uncertain_system(plant.replace(uncertainty=None), tolerance={"Q": "2 %"})
 
 
+def test_a_constant_may_have_the_letter_of_a_matrix_where_an_entry_names_it() -> None:
+    # A capacitance: taken as a tolerance of the matrix C, its own entry was then an unknown name.
+    rows = {"E": [["C"]], "A": [["-1 / R"]], "C": [[1.0]]}
+    exact = obsynth.uncertain_system(rows, {"C": 2.0e-4, "R": {"nominal": 5.0, "tolerance": "2 %"}})
+    assert exact.E.tolist() == [[2.0e-4]]
+    assert exact.uncertainty.box.names == ("R",)
+    capacitance = {"nominal": 2.0e-4, "tolerance": "1 %"}
+    assert obsynth.uncertain_system(rows, {"C": capacitance, "R": 5.0}).uncertainty.box.names == ("C",)
+    # Where no entry names it, it is a tolerance of every entry, as before.
+    assert obsynth.uncertain_system({"E": None, "A": [[0.5]], "C": [[1.0]]}, {"C": "2 %"}).uncertainty.box.names == (
+        "C[1,1]",
+    )
+
+
 def test_new_tolerances_of_a_plant_keep_its_nominal_values() -> None:
     wider = obsynth.uncertain_system(drive(), {"k": {"tolerance": "10 %"}})
     assert wider.uncertainty.box.constants["k"].high == pytest.approx(22.0)

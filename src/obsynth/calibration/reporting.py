@@ -160,8 +160,9 @@ class Calibration:
 
     def __str__(self) -> str:
         rows = f"rows {self.log['rows'][0]}:{self.log['rows'][1]}"
+        what = "1 constant" if len(self.nominal) == 1 else f"{len(self.nominal)} constants"
         lines = [
-            f"Calibration of {len(self.nominal)} constants from {self.log['source'] or 'a log'}, {rows} ("
+            f"Calibration of {what} from {self.log['source'] or 'a log'}, {rows} ("
             f"{100 * self.box.level:g} % box, all at once{'' if self.box.stands else '; it DOES NOT STAND'})"
         ]
         if not self.nominal:

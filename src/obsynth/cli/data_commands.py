@@ -166,11 +166,12 @@ def summary_of_run(found: obsynth.types.DataRun, watched: obsynth.types.Monitor 
 
 def _alarm_table(found: obsynth.types.DataRun) -> list[str]:
     """Return lines of a table of all alarms."""
-    from obsynth.data.alarm_events import alarm_rows
+    from obsynth.data.alarm_events import alarm_notes, alarm_rows
 
     rows, more = alarm_rows(found.events, found.stamps.shown)
     lines = text_table(rows) if rows else []
-    return [f"  {line}" for line in (*lines, *([f"and {more} more"] if more else []))]
+    lines = [f"  {line}" for line in (*lines, *([f"and {more} more"] if more else []))]
+    return lines + alarm_notes(found.events)
 
 
 @contextmanager

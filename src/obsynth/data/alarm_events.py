@@ -17,11 +17,17 @@ from obsynth.observers.running import BAND_WIDTH
 NO_DECISION = "undecided"
 #: What stands for the fault of an alarm whose evidence does not distinguish the faults.
 NOT_DISTINGUISHED_YET = "not distinguished yet"
+#: Monitors of innovations: an alarm of theirs contradicts the stated noise and random walks, on which deviations rest.
+CONTRADICTING = ("nis", "learned")
+#: What a summary says where such an interval is in its table.
+NOT_VALID = (
+    "An interval is not valid where its alarm contradicts the stated noise and random walks: the fault may lie outside."
+)
 #: Why a row cannot alarm, by its status.
 REASONS = {
     WARM_UP: "the initial-condition response has not settled yet (--warm-up)",
     RECOVERING: "the effect of a gap before them has not settled yet (--warm-up)",
-    GAP: "samples are missing",
+    GAP: "samples are missing, or left out as outliers",
     REPEATED_STAMP: "their stamps are those of the rows before",
     OUT_OF_ORDER: "their stamps are earlier than those of the rows before",
     NO_DECISION: "the monitor takes no decision there: its window is not full, or a warm-up or a gap is not over",
@@ -71,9 +77,14 @@ class AlarmEvent:
         """Whether the fault's interval, where one is known, excludes zero: else another fault may be meant."""
         return bool(self.fault) and not self.low < 0.0 < self.high
 
+    @property
+    def valid(self) -> bool:
+        """Whether the interval is known and rests on nothing that the alarm itself contradicts."""
+        return not math.isnan(self.low) and self.by not in CONTRADICTING
+
     def as_dict(self) -> dict[str, Any]:
         """Return the event as plain data."""
-        return asdict(self)
+        return {**asdict(self), "interval_valid": self.valid}
 
 
 class AlarmLog:
@@ -166,16 +177,21 @@ def alarm_rows(events: Sequence[AlarmEvent], shown: Callable[[float], str]) -> t
     def number(value: float) -> str:
         return "" if math.isnan(value) else f"{value:.4g}"
 
-    rows = [("alarm by", "from", "to", "rows", "fault", "size", "interval", "of its threshold")]
+    rows = [("alarm by", "from", "to", "rows", "fault", "size", "interval", "peak / threshold")]
     for event in events[:MOST_LISTED_ALARMS]:
         interval = "" if math.isnan(event.low) else f"{number(event.low)} to {number(event.high)}"
+        interval += " (not valid)" if interval and not event.valid else ""
         ends = shown(event.start), shown(event.end)
-        evidence = f"{event.evidence:.3g} times"
         fault = event.fault if event.clear or not event.fault else f"{event.fault} (unclear)"
         fault = fault if event.distinguished else NOT_DISTINGUISHED_YET
-        rows.append((event.by, *ends, str(event.rows), fault, number(event.size), interval, evidence))
+        rows.append((event.by, *ends, str(event.rows), fault, number(event.size), interval, f"{event.evidence:.3g}"))
     kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows[1:])]
     return [tuple(row[i] for i in kept) for row in rows], len(events) - len(rows) + 1
+
+
+def alarm_notes(events: Sequence[AlarmEvent]) -> list[str]:
+    """Return what a reader of the table has to know about its intervals."""
+    return [NOT_VALID] if any(not math.isnan(event.low) and not event.valid for event in events) else []
 
 
 def silence(run: Any, by: str) -> list[str]:

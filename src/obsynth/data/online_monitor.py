@@ -696,8 +696,8 @@ def _whitened(
     reached = model.Bd.any(axis=0) | model.Dd.any(axis=0)
     if unknown is not None and reached.any():
         raise SpecError(
-            f"{kind} needs to know what disturbances are to be expected: give a scenario (a spec with one), or use "
-            "pointwise with disturbance bounds.",
+            f"{kind} needs to know what disturbances are to be expected: give a scenario (a spec with one, --system), "
+            "or use pointwise with disturbance bounds.",
             path="disturbances",
         )
     whitener, white = whitened(kind, model, window)

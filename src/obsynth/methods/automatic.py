@@ -91,14 +91,14 @@ def _refused(method: str, reason: str, spent: float = 0.0) -> Candidate:
 
 #: The condition that a refusal names, and what stands between it and what was found.
 _REFUSED_CONDITION = re.compile(r"(the condition '[^']+' fails) .*? Found: ")
-#: Letters of a message that are shown.
+#: Letters of a message to which further sentences are shown.
 MOST_LETTERS = 160
 
 
 def one_line(text: str) -> str:
     """Return the start of a message in one line, with what would help, which stands at its end."""
-    flat = _REFUSED_CONDITION.sub(r"\1: ", " ".join(text.split()))
-    for mark in ("Add one of:", "Leave out one of:"):
+    flat = _REFUSED_CONDITION.sub(r"\1: ", " ".join(text.replace("\n  - ", " ").split()))
+    for mark in ("Measure one of:", "Leave out one of:"):
         head, found, tail = flat.rpartition(mark)
         if found:
             return f"{_cut(head)} {mark}{tail}"
@@ -106,8 +106,13 @@ def one_line(text: str) -> str:
 
 
 def _cut(text: str) -> str:
-    short = text.removeprefix("No observer of this kind exists: ").strip()
-    return short if len(short) <= MOST_LETTERS else short[: MOST_LETTERS - 3].rstrip() + "..."
+    """Return so many whole sentences of a text as have room, and the first in any case."""
+    first, *others = re.split(r"(?<=[.]) (?=[A-Z])", text.removeprefix("No observer of this kind exists: ").strip())
+    for sentence in others:
+        if len(first) + len(sentence) >= MOST_LETTERS:
+            break
+        first += f" {sentence}"
+    return first
 
 
 def linear_methods() -> Sequence[type[Method]]:

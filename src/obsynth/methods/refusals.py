@@ -58,7 +58,7 @@ def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method
         return error
     sets = least_additions(plant, state_sensors(plant), holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
     if sets:
-        text = f"Add one of: {listed_sets(sets)}."
+        text = f"Measure one of: {listed_sets(sets)}."
     elif drops := _drops(plant, holds):
         text = f"Leave out one of: {', '.join(drops)}."
     elif error.condition in OF_THE_KIND:

@@ -136,7 +136,7 @@ class RankDecision:
     def describe(self) -> str:
         """Return one line for a report, such as ``rank 4 of 4 (gap 2.1e+09)``."""
         if self.means == "exact":
-            lost = "on the numbers as written; if their last digits are wrong, every gain is about 1e16"
+            lost = "on the numbers as written; if only rounding makes it so, every observer has gains of about 1e16"
             return f"rank {self.rank} of {self.expected} (exactly{self._margin if self.full else f', {lost}'})"
         if self.means == "unclear":
             return f"rank {self.expected} exactly, but less of data that differ by rounding{self._margin}"

@@ -438,7 +438,7 @@ class TimeVaryingDescriptorSystem:
             raise SpecError("The plant has feedthrough: pass y - D u as its output, with D = 0.", path="D")
         if plant.nd:
             raise SpecError(
-                "The plant has unknown disturbances, which these methods do not cover: remove Bd and Dd, or make them "
+                "The plant has unknown disturbances, which this method does not cover: remove Bd and Dd, or make them "
                 "faults.",
                 path="Bd",
             )

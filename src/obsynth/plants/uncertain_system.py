@@ -11,6 +11,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, require_mapping
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.expressions import parse_expression
 from obsynth.plants.constants import CalibratedBox, Constant, ConstantsBox, constant_of, constants_box, tolerance_share
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import (
@@ -223,8 +224,10 @@ def _boxed(
         options = own | {key: value for key, value in options.items() if value is not None}
         constants = constants.constants
     found, shares, more = dict[str, Any](), dict(tolerance or {}), dict[str, list[Entry]]()
+    # A capacitance may be called C: what an expression names is a constant, and no tolerance of that matrix.
+    named = frozenset[str]().union(*(parse_expression(text).names for found in entries.values() for *_, text in found))
     for name, value in (constants or {}).items():
-        if name in UNCERTAIN_MATRICES and name not in known and isinstance(value, (str, int, float)):
+        if name in UNCERTAIN_MATRICES and name not in {*known, *named} and isinstance(value, (str, int, float)):
             shares.setdefault(name, value)
         else:
             found[name] = value

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from obsynth.analysis.diagnosis.fault_columns import dc_point, question
+from obsynth.analysis.diagnosis.fault_columns import dc_point, others, question
 from obsynth.analysis.structure import questions
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.errors import ObsynthError, PreconditionError
@@ -320,12 +320,17 @@ def _undetectable(plant: DescriptorSystem, observer: LinearObserver) -> Iterator
     rest = dc_point(plant.dt)
     unknown = ", ".join(plant.disturbance_names)
     for name in observer.fault_names if plant.nd else ():
-        asked = question(plant, (), plant.fault_names.index(name))
+        number = plant.fault_names.index(name)
+        beside = others(plant, number)
+        asked, among, either = question(plant, (), number), unknown, "either"
         if asked.shows_at(rest):
-            continue
+            if not beside or question(plant, beside, number).shows_at(rest):
+                continue
+            among = f"{unknown} and {', '.join(plant.fault_names[i] for i in beside)} together"
+            either = "any of them"
         what = f"A constant {name}" if asked.visible else name
         yield (
-            f"{what} cannot be distinguished from {unknown}: the estimate may be an effect of either. See obsynth "
+            f"{what} cannot be distinguished from {among}: the estimate may be an effect of {either}. See obsynth "
             "check for the sensors that would distinguish them."
         )
 
@@ -548,7 +553,8 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[s
     yield from design_warnings(design, steps, told=told)
     for check in design.report.checks:
         if check.name.startswith("limit at "):
-            yield f"{check.name}: {check.claim}."
+            place = check.name.removeprefix("limit at ")
+            yield f"{check.claim.rpartition(': ')[0].replace('this zero', f'the zero {place}')}."
 
 
 def _wrapped(label: str, text: str, width: int) -> list[str]:

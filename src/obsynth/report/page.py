@@ -26,7 +26,7 @@ from rich.text import Text
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.calibration.diagnostics import Validation, draw_validation
 from obsynth.calibration.validating import states_innovations, validate
-from obsynth.data.alarm_events import alarm_rows, silence
+from obsynth.data.alarm_events import alarm_notes, alarm_rows, silence
 from obsynth.data.log_estimator import DECIDING
 from obsynth.data.run import DataRun
 from obsynth.errors import ObsynthError, SpecError
@@ -528,6 +528,7 @@ def data_section(design: ObserverDesign, run: DataRun, statement: str) -> Iterat
         yield "<h3>Alarms</h3>"
         yield from table_lines(rows[0], rows[1:])
         yield f"<p>and {more} more</p>" if more else ""
+        yield from (f"<p>{escape(text)}</p>" for text in alarm_notes(run.events))
     yield from (f'<p class="warning">Warning: {escape(text)}</p>' for text in run.warnings)
     yield from _statistics(design, run)
 

@@ -172,7 +172,7 @@ def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") ->
         else:
             yield method, f"{_verdict(failed)} for this plant{asked}: {_reason(failed)}", "bold red"
     if others:
-        yield "other plants", f"{', '.join(others)}: for another kind of plant", "dim"
+        yield "for other kinds of plants", ", ".join(others), "dim"
 
 
 def print_methods(methods: Mapping[str, VerificationReport], *, own: str, console: Console) -> None:
@@ -189,9 +189,13 @@ def _reason(failed: Sequence[Check]) -> str:
     if not failed:
         return "no condition was checked"
     first, *more = failed
-    told = f"{first.name.removeprefix('exists: ')} FAILS: {first.claim}"
-    told += f"; found {first.detail}" if first.detail else ""
-    return told.rstrip(".") + (f" (and {len(more)} more with -v)" if more else "")
+    told = f"the condition '{first.name.removeprefix('exists: ')}' FAILS. Needed: {first.claim}".rstrip(".")
+    told += f". Found: {first.detail}".rstrip(".") if first.detail else ""
+    return f"{told}." + (f" {_more_fail(len(more))}" if more else "")
+
+
+def _more_fail(count: int) -> str:
+    return "1 more condition fails (-v)." if count == 1 else f"{count} more conditions fail (-v)."
 
 
 _PLANT_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names")

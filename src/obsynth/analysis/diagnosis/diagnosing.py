@@ -517,9 +517,9 @@ def _suggestion(candidates: _Candidates, name: str, shown: Question, *, step: bo
     constant = () if step else candidates.additions(fault, rest, lambda changed: free(changed).shows_at_rest)
     texts = []
     if full:
-        texts.append(f"{name}: Add one of: {listed_sets(full)}.")
+        texts.append(f"{name}: Measure one of: {listed_sets(full)}.")
     elif constant:
-        texts.append(f"{name}: Add one of: {listed_sets(constant)} (then a step of it can be estimated).")
+        texts.append(f"{name}: Measure one of: {listed_sets(constant)} (then a step of it can be estimated).")
     if not shown.visible:
         showing = candidates.additions(fault, (), lambda changed: Question(Removal(changed, ()), fault).visible)
         more = [names for names in showing if names not in (*full, *constant)]

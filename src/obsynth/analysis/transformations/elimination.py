@@ -277,6 +277,11 @@ def equation_name(plant: DescriptorSystem, row: int) -> str:
     return f"{int(row) + 1} (of {plant.state_names[int(row)]!r})"
 
 
+#: What to do about constraints that have to be differentiated.
+INDEX_ADVICE = (
+    "Differentiate the constraints (a constraint 0 = a x becomes a x' = 0: move a from its row of A to that of E), or "
+    "do not eliminate: obsynth check says which methods take the descriptor form."
+)
 #: Arrays of plants from this size on, with at most this share of entries that are not zero, are treated as sparse.
 MANY_VARIABLES = 500
 SPARSE_PENCIL_SHARE = 0.05
@@ -479,7 +484,7 @@ def _dynamic_count(plant: DescriptorSystem) -> int:
     if pencil.index > 1:
         raise PreconditionError(
             f"The plant has index {pencil.index}: its algebraic equations cannot be solved for the algebraic states "
-            "without differentiating. Differentiate the constraints, or use a method that takes the descriptor form.",
+            f"without differentiating. {INDEX_ADVICE}",
             condition="index",
         )
     count = plant.nx - len(pencil.infinite_block_sizes)
@@ -746,8 +751,7 @@ def not_index_one(
     if said is not None and said.condition == "index":
         return PreconditionError(f"{said} {does[0].upper()}{does[1:]}.", condition="index", signals=names)
     return PreconditionError(
-        f"The plant has index 2 or more: {does} without differentiating. Differentiate the constraints, or use a "
-        "method that takes the descriptor form.",
+        f"The plant has index 2 or more: {does} without differentiating. {INDEX_ADVICE}",
         condition="index",
         signals=names,
     )

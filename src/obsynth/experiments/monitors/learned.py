@@ -177,9 +177,13 @@ class LearnedThresholds:
         model, lasting = self.statistics.model, self.every * self.dt
         text = (
             f"learned from {self.rows} rows without faults: at most one false alarm per {self.every:.6g} rows "
-            f"({_duration(lasting)}) on average, in {len(self.columns)} column(s), whitened by an autoregression of "
-            f"order {model.order}"
-            + (f", and in changes of {len(self.statistics.estimates)} fault(s)" if self.statistics.estimates else "")
+            f"({_duration(lasting)}) on average, in {_counted(len(self.columns), 'column')}, whitened by an "
+            f"autoregression of order {model.order}"
+            + (
+                f", and in changes of {_counted(len(self.statistics.estimates), 'fault')}"
+                if self.statistics.estimates
+                else ""
+            )
             + f"; alarms less than {HOLD} rows apart count as one"
             + (
                 "; the level was found from the second half of these rows"
@@ -189,8 +193,9 @@ class LearnedThresholds:
         )
         if self.pairs.number:
             text += (
-                f"; {self.pairs.number} pair(s) of wrong samples in a row count as not measured: one alarms when it "
-                f"comes, which is once per {1.0 / self.pairs.chance:.3g} rows by chance, and is among the false alarms"
+                f"; {_counted(self.pairs.number, 'pair')} of wrong samples in a row, which count as not measured: one "
+                f"alarms when it comes, which is once per {1.0 / self.pairs.chance:.3g} rows by chance, and is among "
+                "the false alarms"
             )
         if self.holds:
             return text
@@ -257,6 +262,10 @@ def _duration(seconds: float) -> str:
     name, size = next(((n, s) for n, s in reversed(UNITS.items()) if seconds >= s), ("second", 1.0))
     count = seconds / size
     return f"{count:.3g} {name}{'' if count == 1.0 else 's'}"
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 @arguments_checked

@@ -46,7 +46,7 @@ def with_stated_noise(
         return resolved
     if np.any(plant.Bw @ plant.Dw.T):
         raise SpecError(
-            "The plant's noise drives equations and outputs at once (Bw Dw' is not zero), which these methods do not "
+            "The plant's noise drives equations and outputs at once (Bw Dw' is not zero), which this method does not "
             "cover: state independent noises, or give Q and R.",
             path="Dw",
         )
