@@ -94,6 +94,38 @@ def test_outliers_in_c(form, name, tmp_path) -> None:
     assert_same(run_c(design, y, u, tmp_path), expected)
 
 
+@pytest.mark.parametrize("kind", ["gate", "huber"])
+@pytest.mark.parametrize("sizes", [None, [0.2, 0.0, 0.3]])
+def test_samples_that_the_others_of_their_row_exclude_in_c(kind, sizes, tmp_path) -> None:
+    """The plant may be anywhere in the next row: no sample stands out by its own deviation."""
+    model = obsynth.DAEModel(
+        {"way": "der(x) = drift + push"}, {"a": "x", "b": "2 * x", "c": "0.5 - x"}, states={"x": 0.0},
+        inputs={"push": 0.0}, parameters={"drift": 0.0},
+    )  # fmt: skip
+    design = dae_adaptive_observer(
+        model, dt=1.0, Q=[[1e-6]], R=1e-4 * (np.eye(3) + 0.3), form="augmented-kalman", random_walk=[[1.0]],
+        initial_covariance=[[1.0]], initial_parameter_covariance=[[1.0]], outliers=kind, outlier_sizes=sizes,
+    )  # fmt: skip
+    rng = np.random.default_rng(4)
+    y = np.outer(np.cumsum(rng.standard_normal(60)), [1.0, 2.0, -1.0]) + np.array([0.0, 0.0, 0.5])
+    y += 0.01 * rng.standard_normal((60, 3))
+    y[20, 0] += 0.4
+    y[25, 1] -= 0.5
+    y[30, 2], y[30, 1] = y[30, 2] + 0.4, np.nan
+    y[40:44, 2] += 0.4
+    expected = design.observer.run(y, np.zeros((60, 1)))
+    refused = state_after(design.observer, y).refused[1]
+    assert (refused > 0.0).all()
+    assert_same(run_c(design, y, np.zeros((60, 1)), tmp_path, quick=True), expected)
+
+
+def state_after(observer, y):
+    state = observer.init()
+    for sample in y:
+        state, _ = observer.advance(state, sample, np.zeros(1))
+    return state
+
+
 @pytest.mark.parametrize("asked", ["none", "huber"])
 def test_an_export_takes_outliers_as_a_run_is_told_to(asked, tmp_path) -> None:
     """C could not be told to use every sample, as `run --outliers none` does."""

@@ -12,6 +12,7 @@ from test_validate import designed
 
 import obsynth
 from obsynth import SolverError, SpecError, run_on_data, simulate_dae
+from obsynth.observers.outliers import beside_others
 from obsynth.observers.running import state_as_data, state_from_data
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
@@ -242,6 +243,77 @@ def test_an_outlier_after_missing_inputs_is_left_out_however_unsure_the_predicti
             state, _ = observer.advance(state, nothing, np.full_like(u[k], np.nan))
         assert observer.advance(state, wrong, u[at])[0].refused[1, 0] == lost
         assert observer.advance(state, y[at], u[at])[0].refused[1, 0] == 0.0
+
+
+@cache
+def unsure(kind):
+    """Return a plant that may be anywhere in the next row, with three sensors of it, and a record of 40 rows: in no row
+    does a sample stand out by its own deviation."""
+    rng, rows = np.random.default_rng(8), 40
+    x = np.cumsum(rng.standard_normal(rows))
+    y = np.outer(x, [1.0, 2.0, -1.0]) + 0.01 * rng.standard_normal((rows, 3))
+    common = {"R": 1e-4 * np.eye(3), "initial_covariance": [[1.0]], "outliers": "gate"}
+    if kind == "recursive":
+        plant = obsynth.TimeVaryingDescriptorSystem(
+            E=[[1.0]], A=[[1.0]], B=[[0.0]], C=[[1.0], [2.0], [-1.0]], dt=1.0, horizon=rows
+        )
+        return obsynth.descriptor_kalman(plant, Q=[[1.0]], initial_state=[0.0], **common), y, np.zeros((rows, 1))
+    model = obsynth.DAEModel(
+        {"way": "der(x) = drift"}, {"a": "x", "b": "2 * x", "c": "-x"}, states={"x": 0.0}, parameters={"drift": 0.0}
+    )
+    design = obsynth.dae_adaptive_observer(
+        model, dt=1.0, Q=[[1e-6]], form="augmented-kalman", random_walk=[[1.0]], initial_parameter_covariance=[[1.0]],
+        **common,
+    )  # fmt: skip
+    return design, y, np.zeros((rows, 0))
+
+
+@pytest.mark.parametrize("kind", ["recursive", "nonlinear"])
+def test_a_sample_that_the_others_of_its_row_exclude_is_left_out_where_the_prediction_is_unsure(kind):
+    """What a fault may have done since made a wrong sample 3.6 deviations: it was taken, and what came after it left
+    out."""
+    design, y, u = unsure(kind)
+    assert gate_counts(design.observer, y, u)[0][-1].sum() == 0.0
+    for sensor in range(3):
+        moved, hidden = y.copy(), y.copy()
+        moved[30, sensor] += 0.4
+        hidden[30, sensor] = np.nan
+        found, row = gate_counts(design.observer, moved, u)
+        assert np.flatnonzero(found[-1]).tolist() == [sensor]
+        assert np.diff(found[28:, sensor]).tolist() == [0.0, 1.0, *np.zeros(9)]
+        assert np.array_equal(row.x, gate_counts(design.observer, hidden, u)[1].x)
+    # A sensor that stays there is believed at its second sample, and one that is nearer than outliers are, at once.
+    moved = y.copy()
+    moved[30:, 0] += 0.4
+    assert np.diff(gate_counts(design.observer, moved[:32], u[:32])[0][29:, 0]).tolist() == [1.0, 0.0]
+    for size, lost in ((0.3, 1.0), (0.6, 0.0)):
+        known = replace(design.observer, outlier_sizes=[size, 0.0, 0.0])
+        assert gate_counts(known, moved[:31], u[:31])[0][-1, 0] == lost
+
+
+@pytest.mark.parametrize("kind", ["recursive", "nonlinear"])
+def test_what_moves_all_sensors_as_the_plant_does_is_believed(kind):
+    design, y, u = unsure(kind)
+    moved = y.copy()
+    moved[30:] += 1.5 * np.array([1.0, 2.0, -1.0])
+    found, row = gate_counts(design.observer, moved, u)
+    assert found[-1].sum() == 0.0
+    assert row.x[0] == pytest.approx(y[-1, 0] + 1.5, abs=0.05)
+
+
+@pytest.mark.parametrize("seen", [[0, 1, 2], [0, 2], [1]])
+def test_what_the_others_say_of_a_sample_is_its_conditional_mean(seen):
+    rng = np.random.default_rng(3)
+    root = rng.standard_normal((3, 3)) * [[1.0], [1e3], [1e-4]]
+    covariance, off = root @ root.T, np.full(3, np.nan)
+    off[seen] = (root @ rng.standard_normal(3))[seen]
+    apart, deviation = beside_others(off, covariance)
+    for i in range(3):
+        others = [j for j in seen if j != i]
+        gain = np.linalg.solve(covariance[np.ix_(others, others)], covariance[others, i])
+        wanted = off[i] - gain @ off[others], np.sqrt(covariance[i, i] - gain @ covariance[others, i])
+        assert np.array_equal(np.isnan([apart[i], deviation[i]]), [i not in seen] * 2)
+        assert i not in seen or np.allclose([apart[i], deviation[i]], wanted, rtol=1e-6, atol=0.0)
 
 
 def test_run_leaves_outliers_out_by_default_and_counts_them(tmp_path):

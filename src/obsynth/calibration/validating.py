@@ -177,8 +177,9 @@ def _recursive(observer: RecursiveObserver, log: Log, point: Mapping[str, float]
     e, deviations, rows = np.full(y.shape, np.nan), np.full(y.shape, np.nan), []
     for k in range(len(y)):
         if k:
-            mean, spread = observer.recursion.predicted(state, nothing, u[k])
-            e[k], deviations[k] = np.where(np.isfinite(spread), y[k] - mean, np.nan), spread
+            mean, covariance = observer.recursion.predicted(state, nothing, u[k])
+            deviations[k] = np.sqrt(np.diag(covariance))
+            e[k] = np.where(np.isfinite(deviations[k]), y[k] - mean, np.nan)
         state, row = observer.advance(state, y[k], u[k])
         rows.append(row)
     return _recorded(recursive_estimates(observer, rows), e, deviations)

@@ -1,6 +1,7 @@
 """What an observer does about samples that its prediction excludes, and about estimates beyond bounds of the states.
 
-Beyond the limit a sensor is left out (``gate``) or taken at the limit (``huber``; Huber 1964, Masreliez 1975).  Where
+Beyond the limit a sensor is left out (``gate``) or taken at the limit (``huber``; Huber 1964, Masreliez 1975): the
+limit of its prediction, and where this excludes no sample of a row, that of what its others say of it.  Where
 the outliers of a log show how far off they are, what is nearer may be the onset of a fault, however many deviations it
 is.  A projection brings the error nowhere further in its metric: the covariance stays an upper bound (Simon, Chia
 2002).
@@ -86,9 +87,11 @@ def robust_advance(
     held: FloatArray | None = None,
 ) -> tuple[State, Row]:
     """Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers:
-    those further off than so many deviations, and than ``sizes (ny,)`` where these are known.
-    ``predicted(state, received, u)``: mean and deviation of each output ``(ny,)`` from the samples that are received;
-    ``predicted_outputs(state, u)``: of outputs that determine the state; these may be `BLIND` times further off.
+    those further off than so many deviations, and than ``sizes (ny,)`` where these are known; where there are none, the
+    one that the others of its row exclude most.
+    ``predicted(state, received, u)``: mean ``(ny,)`` and covariance ``(ny, ny)`` of outputs from the samples that are
+    received; ``predicted_outputs(state, u)``: of outputs that determine the state; these may be `BLIND` times further
+    off.
     ``held (nu,)``, where inputs are missing: as they last were. What these exclude, by deviations alone, may be wrong,
     or the inputs have moved: it counts once the next sample goes on with it. So does what is as far off as outliers of
     its sensor are once inputs are known again, until a sample is nearer or goes on with those before."""
@@ -100,8 +103,8 @@ def robust_advance(
             after, row = plain(state, y, u)
             passes = float(row.nis) <= limit**2 and held is None and wary is None
             if passes and predicted_outputs is not None:
-                mean, deviation = predicted_outputs(state, u)
-                usual = limit * deviation
+                mean, covariance = predicted_outputs(state, u)
+                usual = limit * np.sqrt(np.diag(covariance))
                 reach = np.maximum(usual, least)
                 far = np.abs(y - mean) > BLIND * reach + PREDICTION_ROUNDING * (np.abs(y) + np.abs(mean).max())
         if passes and not far.any():
@@ -177,25 +180,48 @@ def _judged(
     u: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
     """Return the mean of each output, how far from it a sample may be by its deviation and at all, and which are
-    further. Where the model alone predicts nothing of an output, the others of the same sample do."""
+    further. Where the model alone predicts nothing of an output, or excludes no sample, the others of its row judge:
+    what a fault may have done makes deviations large, but it moves all sensors together."""
     with np.errstate(all="ignore"):
-        mean, deviation = predicted(state, np.full(len(y), np.nan), u)
-        usual = limit * deviation
+        mean, covariance = predicted(state, np.full(len(y), np.nan), u)
+        usual = limit * np.sqrt(np.diag(covariance))
         reach = np.maximum(usual, least)
         far = (np.abs(y - mean) > reach) | (np.abs(y) > NO_SQUARE)
-        ratios = np.zeros(len(y))
-        for i in np.flatnonzero(np.isinf(deviation) & ~np.isnan(y) & ~far):
+        ratios, unknown = np.zeros(len(y)), np.isinf(usual)
+        for i in np.flatnonzero(unknown & ~np.isnan(y) & ~far):
             others = np.where(far | (np.arange(len(y)) == i), np.nan, y)
             try:
-                means, deviations = predicted(state, others, u)
+                means, spread = predicted(state, others, u)
             except (SolverError, np.linalg.LinAlgError, ValueError):
                 continue
-            mean[i], reach[i] = means[i], max(limit * deviations[i], least[i])
+            mean[i], reach[i] = means[i], max(limit * np.sqrt(spread[i, i]), least[i])
             ratios[i] = np.abs(y[i] - means[i]) / reach[i]
         # Of those that accuse each other, the worst alone.
         worst = int(np.argmax(ratios))
         far[worst] |= bool(ratios[worst] > 1.0)
+        if not (far | unknown).any():
+            off, deviation = beside_others(y - mean, covariance)
+            worst = int(np.argmax(np.nan_to_num(np.abs(off) / deviation)))
+            if np.abs(off[worst]) > max(limit * deviation[worst], least[worst]):
+                mean[worst], usual[worst], far[worst] = y[worst] - off[worst], limit * deviation[worst], True
+                reach[worst] = max(usual[worst], least[worst])
     return mean, usual, reach, far
+
+
+def beside_others(off: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far each sample ``(ny,)`` is from what all others of its row say of it, and the deviation of that,
+    where they are ``off (ny,)`` their prediction by so much, with ``covariance (ny, ny)``; NaN of one that is missing,
+    and of all where the covariance is singular."""
+    found = np.full((2, len(off)), np.nan)
+    seen = np.flatnonzero(~np.isnan(off))
+    sizes = np.sqrt(np.diag(covariance)[seen])
+    try:
+        inverse = np.linalg.inv(covariance[np.ix_(seen, seen)] / np.outer(sizes, sizes))
+    except np.linalg.LinAlgError:
+        return found[0], found[1]
+    own = np.diag(inverse)
+    found[:, seen] = sizes * (inverse @ (off[seen] / sizes)) / own, sizes / np.sqrt(own)
+    return found[0], found[1]
 
 
 def checked_state_bounds(value: Any, names: Sequence[str]) -> FloatArray | None:

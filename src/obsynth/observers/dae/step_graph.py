@@ -44,7 +44,7 @@ class ObserverGraph:
 
     @cached_property
     def forecast(self) -> Any:
-        """From memory and row of a sample that nothing was seen of to mean and deviation of each output."""
+        """From memory and row of a sample that nothing was seen of to mean and covariance of its outputs."""
         return _forecast(self.settings, self.functions, self.memory, self.row)
 
     def over(self, samples: int) -> Any:
@@ -97,7 +97,7 @@ def _unknown(observer: DAESettings, functions: DAEFunctions, memory: Layout) -> 
 
 
 def _forecast(observer: DAESettings, functions: DAEFunctions, memory: Layout, row: Layout) -> Any:
-    """Return the function from memory and row of a sample to mean and deviation ``(ny,)`` of its outputs."""
+    """Return the function from memory and row of a sample to mean ``(ny,)`` and covariance of its outputs."""
     packed, said = ca.MX.sym("memory", memory.size), ca.MX.sym("said", row.size)
     found = {**memory.symbols(packed), **row.symbols(said)}
     spread = found["spread"]
@@ -105,7 +105,7 @@ def _forecast(observer: DAESettings, functions: DAEFunctions, memory: Layout, ro
     cross = found["cross"] if observer.form == "augmented-kalman" else found["Upsilon"] @ spread
     both = H @ cross @ L.T
     whole = H @ found["covariance"] @ H.T + both + both.T + L @ spread @ L.T + ca.DM(observer.R)
-    return ca.Function("forecast", [packed, said], [ca.densify(y), ca.densify(ca.sqrt(ca.diag(whole)))])
+    return ca.Function("forecast", [packed, said], [ca.densify(y), ca.densify(whole)])
 
 
 def _outcome(found: Arrays, memory: Layout, row: Layout) -> list[Any]:

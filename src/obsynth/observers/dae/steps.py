@@ -109,10 +109,10 @@ class Steps:
         return memory
 
     def predicted(self, state: DAEState, received: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean and deviation of each output ``(ny,)`` from what is received of the next sample."""
+        """Return mean ``(ny,)`` and covariance of outputs from what is received of the next sample."""
         after, row = self.plain(state, received, u)
-        mean, deviation = self._call("forecast", after.memory, row.said)
-        return mean[:, 0], deviation[:, 0]
+        mean, covariance = self._call("forecast", after.memory, row.said)
+        return mean[:, 0], covariance
 
     def plain(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
         """Take a sample as it is."""

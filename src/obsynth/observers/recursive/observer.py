@@ -427,40 +427,42 @@ class Recursion:
         )
 
     def predicted_outputs(self, state: RecursiveState, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean and deviation of each output ``(ny,)`` before the sample, with its own algebraic equations. They
+        """Return mean ``(ny,)`` and covariance of outputs before the sample, with its own algebraic equations. They
         come with the next step, but what they say of this sample is known now. Infinite where nothing is."""
         plant, k = self.settings.plant, state.k
         nothing = np.full(plant.ny, np.nan)
         if self._constraints is None or (plant.horizon is not None and k >= plant.horizon):
-            return nothing, np.full(plant.ny, np.inf)
+            return nothing, np.diag(np.full(plant.ny, np.inf))
         try:
             after, _ = self.plain(state, nothing, u)
             corrected, v, G = self._stepped(after, self._constraints.correction(k), np.zeros(0), after.u)
         except PreconditionError:
             # Equations without noise contradict each other within rounding: they judge nothing.
-            return nothing, np.full(plant.ny, np.inf)
+            return nothing, np.diag(np.full(plant.ny, np.inf))
         return self._outputs(self._estimate(corrected, v, G, v, nothing)._replace(k=k))
 
     def predicted(self, state: RecursiveState, received: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean and deviation of each output ``(ny,)`` from what is received of the next sample. The deviation is
+        """Return mean ``(ny,)`` and covariance of outputs from what is received of the next sample. The variance is
         infinite where nothing is known."""
         plant, k = self.settings.plant, state.k
         if k == 0:
-            return np.zeros(plant.ny), np.full(plant.ny, np.inf)
+            return np.zeros(plant.ny), np.diag(np.full(plant.ny, np.inf))
         return self._outputs(self.plain(state, received, u)[1])
 
     def _outputs(self, row: RawEstimate) -> tuple[FloatArray, FloatArray]:
-        """Return mean and deviation of each output ``(ny,)`` at what is known; infinite where nothing is."""
+        """Return mean ``(ny,)`` and covariance of outputs at what is known; the variance is infinite where nothing
+        is."""
         plant, k = self.settings.plant, row.k
         C = plant.C.at(k)
         mean, reach = C @ row.x, C @ row.factor
-        variances = np.einsum("ij,ij->i", reach, reach) + np.diag(self.settings.R.at(k))
+        covariance = reach @ reach.T + self.settings.R.at(k)
         if len(row.parameters.theta):
             Psi = plant.Psi.at(k - 1)
             moved = Psi @ row.parameters.spread
-            mean, variances = mean + Psi @ row.parameters.theta, variances + np.einsum("ij,ij->i", moved, moved)
+            mean, covariance = mean + Psi @ row.parameters.theta, covariance + moved @ moved.T
         unknown = (np.abs(C @ row.diffuse) > UNDETERMINED_SHARE).any(axis=1)
-        return mean, np.where(unknown, np.inf, np.sqrt(variances))
+        covariance[unknown, unknown] = np.inf
+        return mean, covariance
 
     @cached_property
     def _constraints(self) -> StepModel | None:

@@ -51,9 +51,9 @@ static int watched(const struct observer *state, const double *u, const double *
 }
 
 #if OUTLIERS
-/* Mean and deviation of each output, from what is remembered alone. */
+/* Mean and covariance of outputs, from what is remembered alone. */
 static int forecasted(const struct observer *state, const double *u, const double *variances, double *mean,
-                      double *deviation)
+                      double *covariance)
 {
     double nothing[NY];
     double after[MEMORY];
@@ -70,8 +70,55 @@ static int forecasted(const struct observer *state, const double *u, const doubl
     inputs[0] = after;
     inputs[1] = said;
     outputs[0] = mean;
-    outputs[1] = deviation;
+    outputs[1] = covariance;
     return call(forecast, inputs, 2, outputs, 2) == 0 ? 0 : 2;
+}
+
+/* How far each sample is from what all others of its row say of it, and the deviation of that; `off`: from its
+   prediction, NaN where it is missing. */
+static void beside_others(const double *off, const double *covariance, double *apart, double *deviation)
+{
+    double L[NY * NY];
+    double column[NY];
+    double sizes[NY];
+    int at[NY];
+    int n = 0;
+    int i, j, k;
+    for (i = 0; i < NY; i++) {
+        apart[i] = deviation[i] = NAN;
+        sizes[i] = sqrt(covariance[i * (NY + 1)]);
+        if (!isnan(off[i])) {
+            at[n++] = i;
+        }
+    }
+    for (i = 0; i < n; i++) {
+        for (j = 0; j <= i; j++) {
+            double sum = covariance[at[i] * NY + at[j]] / (sizes[at[i]] * sizes[at[j]]);
+            for (k = 0; k < j; k++) {
+                sum -= L[i * NY + k] * L[j * NY + k];
+            }
+            L[i * NY + j] = i == j ? sqrt(sum) : sum / L[j * NY + j];
+        }
+    }
+    for (i = 0; i < n; i++) {
+        double total = 0.0;
+        for (j = 0; j < n; j++) {
+            double sum = i == j ? 1.0 : 0.0;
+            for (k = 0; k < j; k++) {
+                sum -= L[j * NY + k] * column[k];
+            }
+            column[j] = sum / L[j * NY + j];
+        }
+        for (j = n - 1; j >= 0; j--) {
+            for (k = j + 1; k < n; k++) {
+                column[j] -= L[k * NY + j] * column[k];
+            }
+            column[j] /= L[j * NY + j];
+            total += column[j] * off[at[j]] / sizes[at[j]];
+        }
+        apart[at[i]] = sizes[at[i]] * total / column[i];
+        deviation[at[i]] = sizes[at[i]] / sqrt(column[i]);
+    }
 }
 
 /* Whether a sample goes on with what was off before: with what was believed, or as far as the one that was left out:
@@ -106,8 +153,13 @@ static int robust(const struct observer *state, const double *u, const double *v
 {
     double none[LENGTH(NU)];
     double mean[NY];
-    double deviation[NY];
+    double covariance[NY * NY];
     double off[NY];
+    double apart[NY];
+    double deviation[NY];
+    double worst = 0.0;
+    int accused = -1;
+    int any_far = 0;
     int far[NY];
     int gone[NY];
     int failed, any = 0;
@@ -139,14 +191,37 @@ static int robust(const struct observer *state, const double *u, const double *v
     for (i = 0; i < LENGTH(NU); i++) {
         none[i] = 0.0;
     }
-    if (forecasted(state, u, is_missing ? none : variances, mean, deviation) != 0) {
+    if (forecasted(state, u, is_missing ? none : variances, mean, covariance) != 0) {
         return 2;
     }
     for (i = 0; i < NY; i++) {
+        double most = OUTLIER_LIMIT * sqrt(covariance[i * (NY + 1)]);
+        off[i] = y[i] - mean[i];
+        any_far = any_far || fabs(off[i]) > (most < OUTLIER_SIZES[i] && !is_missing ? OUTLIER_SIZES[i] : most)
+                  || fabs(y[i]) > OVERFLOW_LIMIT;
+    }
+    /* Where the model excludes no sample, the others of its row judge: what a fault may have done makes deviations large,
+       but it moves all sensors together. Of those that accuse each other, the worst alone. */
+    if (!any_far) {
+        beside_others(off, covariance, apart, deviation);
+        for (i = 0; i < NY; i++) {
+            if (fabs(apart[i]) / deviation[i] > worst) {
+                worst = fabs(apart[i]) / deviation[i];
+                accused = i;
+            }
+        }
+        if (accused >= 0 && !(worst > OUTLIER_LIMIT && (is_missing || fabs(apart[accused]) > OUTLIER_SIZES[accused]))) {
+            accused = -1;
+        }
+    }
+    for (i = 0; i < NY; i++) {
         int huge = fabs(y[i]) > OVERFLOW_LIMIT;
-        double most = OUTLIER_LIMIT * deviation[i];
+        double most = OUTLIER_LIMIT * (i == accused ? deviation[i] : sqrt(covariance[i * (NY + 1)]));
         double reach = most < OUTLIER_SIZES[i] && !is_missing ? OUTLIER_SIZES[i] : most;
         double pulled;
+        if (i == accused) {
+            mean[i] = y[i] - apart[i];
+        }
         /* A second that is where the first was, and no further than it may be, goes on with it at once. */
         int again = state->left_out[i] != 0.0 && fabs(y[i] - mean[i]) <= reach
                     && fabs(y[i] - mean[i] - state->left_out[i]) <= OUTLIER_SIZES[i];
