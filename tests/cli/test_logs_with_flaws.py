@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import io
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import pandas as pd
 import pytest
 
 import obsynth
+from obsynth.calibration.logs import read_log
 from obsynth.cli.main import main
 
 ROOT = Path(__file__).parents[2]
@@ -207,3 +210,120 @@ def test_comparisons_and_calibrations_take_all_flaws_at_once(
     if kind != "nonlinear":
         call("compare", *given, "--out", tmp_path / "page.html")
     call("calibrate", *given, "--out", tmp_path / "found.json")
+
+
+@functools.cache
+def spec_of(kind: str) -> obsynth.Spec:
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "spec.yaml").write_text(KINDS[kind])
+        return obsynth.load_spec(Path(folder) / "spec.yaml")
+
+
+@functools.cache
+def errors(kind: str, flaw: str) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Return the error of each method on a log without a fault, and what is said of the log."""
+    data = flawed(clean(kind).assign(f=0.0)[["time", "u", "f", "ya", "yb"]], *([flaw] if flaw else []))
+    found = obsynth.compare(spec_of(kind).plant, data=data, runs=1, scenario=spec_of(kind).scenario)
+    return {entry.method: entry.faults[0].rms for entry in found.methods if not entry.refused}, found.notes
+
+
+@pytest.mark.one_in(6)
+@pytest.mark.parametrize("flaw", FLAWS)
+@pytest.mark.parametrize("kind", ["linear", "recursive"])
+def test_comparisons_have_the_errors_of_the_clean_log_with_each_flaw(kind: str, flaw: str) -> None:
+    wanted, nothing = errors(kind, "")
+    found, notes = errors(kind, flaw)
+    assert len(wanted) >= 3
+    assert found.keys() == wanted.keys()
+    assert nothing == ()
+    if flaw in ("outlier", "stuck sensor"):
+        # Linear designs take each sample as it is; so does the rest of the table.
+        assert found["fault-estimation-filter"] > 1.5 * wanted["fault-estimation-filter"]
+    else:
+        assert all(abs(rms / wanted[method] - 1.0) <= 0.05 for method, rms in found.items())
+    told = {"stuck sensor": "yb repeats one value in rows 150 to 219", "text cell": "'I/O Timeout' in row 141"}.get(
+        flaw
+    )
+    assert (len(notes), bool(told)) == (1 if told else 0, any(told in note for note in notes) if told else False)
+
+
+@pytest.mark.one_in(6)
+@pytest.mark.parametrize("flaw", FLAWS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_calibrations_find_the_noise_of_the_clean_log_with_each_flaw(folder: Path, kind: str, flaw: str) -> None:
+    plant = obsynth.load_spec(folder / f"{kind}.yaml").plant
+    data = flawed(clean(kind), flaw)
+    if flaw == "stuck sensor":
+        # A stuck sensor has noise no more: of that nothing can be found but that it is stuck.
+        (note,) = read_log(data, plant.input_names, plant.output_names).notes
+        assert "repeats one value in rows 150 to 219" in note
+        return
+    found = obsynth.calibrate(plant, data, {}, input_delay=0, starts=1)
+    told = " ".join(found.verdict)
+    true = 1e-6 if kind == "nonlinear" else 1e-4
+    assert all(0.75 * true <= variance <= 1.25 * true for variance in found.R.values())
+    assert found.log["dt"] == pytest.approx(1e-3 if kind == "nonlinear" else 0.1, rel=1e-4)
+    said = {"gap": "5 rows are missing", "jitter": "The stamps jitter", "text cell": "count as missing",
+            "repeated stamp": "1 row(s) are left out", "out of order": "1 row(s) are left out",
+            "outlier": "count as not measured", "blank row": "are missing: the ones before are held"}  # fmt: skip
+    assert said.get(flaw, "") in told
+
+
+def test_a_log_of_another_sampling_time_is_refused_by_calibrations_as_by_runs() -> None:
+    plant, data = spec_of("linear").plant, clean("linear")
+    with pytest.raises(obsynth.SpecError, match=r"a step takes 0\.1 s: the sampling time does not fit"):
+        obsynth.calibrate(plant, data.assign(time=2.0 * data["time"]), {})
+    # Rows that are left out are no other sampling time.
+    assert obsynth.calibrate(plant, data.drop(index=range(1, 60)), {}, input_delay=0, starts=1).R["ya"] > 5e-5
+
+
+@pytest.mark.parametrize("which", ["yb", "both in turn"])
+def test_calibrations_take_a_sensor_that_is_slower_than_the_rows(which: str) -> None:
+    """Numpy warned of differences that do not exist, and the noise of the sensor was taken as none."""
+    plant, data = spec_of("linear").plant, clean("linear")
+    data.loc[1::2, "yb"] = np.nan
+    if which != "yb":
+        data.loc[::2, "ya"] = np.nan
+    R = obsynth.calibrate(plant, data, {}, input_delay=0, starts=1).R
+    assert 0.7e-4 <= R["yb"] <= 1.3e-4
+
+
+def test_infinite_outputs_count_as_not_measured_and_rows_without_stamps_are_named() -> None:
+    plant, data = spec_of("linear").plant, clean("linear")
+    data.loc[60, "yb"] = np.inf
+    found = obsynth.calibrate(plant, data, {}, input_delay=0, starts=1)
+    assert "1 value(s) of yb are infinite and count as not measured." in found.verdict
+    data.loc[61, "time"] = np.nan
+    with pytest.raises(obsynth.SpecError, match="Row 61, counted from 0, has no time stamp"):
+        obsynth.calibrate(plant, data, {})
+
+
+def test_comparisons_refuse_signals_that_are_never_measured_and_show_truths_with_blanks(tmp_path: Path) -> None:
+    plant, data = spec_of("linear").plant, clean("linear").assign(f=0.5)
+    for name in ("u", "yb"):
+        with pytest.raises(obsynth.SpecError, match=f"'{name}' is never measured"):
+            obsynth.compare(plant, data=data.assign(**{name: np.nan}), runs=1)
+    data.loc[AT:, "f"] = np.nan
+    found = obsynth.compare(plant, data=data, runs=1, methods=["fault-estimation-filter"])
+    assert np.isfinite(found.methods[0].faults[0].rms)
+    # Limits of the panel were not numbers.
+    assert np.isfinite(found.plot().axes[1].get_ylim()).all()
+
+
+def test_only_faults_that_a_log_has_are_compared_on_it() -> None:
+    """The other one was taken to be zero in the log."""
+    plant = obsynth.DescriptorSystem(
+        None, np.diag([0.8, 0.7]), None, ["a", "b"], Bf=np.eye(2), dt=0.1, state_names=["a", "b"],
+        fault_names=["leak", "clog"], sensor_noise={"a": 0.01, "b": 0.01},
+    )  # fmt: skip
+    x, rows = np.zeros(2), []
+    for k in range(80):
+        rows.append([0.1 * k, *x, 1.0 * (k >= 20)])
+        x = plant.A @ x + plant.Bf @ [1.0 * (k >= 20), 40.0]
+    log = pd.DataFrame(rows, columns=["time", "a", "b", "leak"])
+    found, drawn = (
+        obsynth.compare(plant, data=data, runs=2, methods=["fault-estimation-filter"]).methods[0].faults
+        for data in (log, None)
+    )
+    assert found[0].rms != drawn[0].rms
+    assert found[1].rms == drawn[1].rms

@@ -231,18 +231,19 @@ def _on_grid(
     if stale.any() and not _longest(stale) > MOST_STALE:
         notes.append(f"{int(stale.sum())} row(s) are left out, as their stamps do not rise.")
         time, u, y = time[~stale], u[~stale], y[~stale]
-    if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
-        wrong = ~np.isfinite(time) if not np.isfinite(time).all() else np.diff(time, prepend=-np.inf) <= 0
-        bad = int(np.argmax(wrong))
-        raise bad_log(
-            "time",
-            f"Stamps must rise and be finite, but that of row {rows[0] + bad} is {time[bad]:g} s.",
-            path="log.time",
-        )
+    if not np.isfinite(time).all():
+        bad = int(np.argmin(np.isfinite(time)))
+        raise bad_log("time", f"Row {rows[0] + bad}, counted from 0, has no time stamp.", path="log.time")
+    if (np.diff(time) <= 0).any():
+        bad = int(np.argmax(np.diff(time, prepend=-np.inf) <= 0))
+        raise bad_log("time", f"Stamps must rise, but that of row {rows[0] + bad} is {time[bad]:g} s.", path="log.time")
     gaps = np.diff(time)
     step = float(np.median(gaps)) if dt is None and gaps.size else float(dt or 1.0)
     counts = np.round(gaps / step).astype(np.int64)
     jitter = np.abs(gaps / step - counts)
+    if dt is None and jitter.max(initial=0.0) > NOTED_JITTER and (counts >= 1).all():
+        step = _mean_step(time, counts)
+        jitter = np.abs(gaps / step - counts)
     irregular = jitter.max(initial=0.0) > LARGEST_JITTER
     if irregular and (counts >= 1).all():
         # Two stamps that are off the grid may be off each other by twice as much: against the grid itself.
@@ -255,6 +256,13 @@ def _on_grid(
             "irregular",
             f"The stamps are irregular: row {rows[0] + worst + 1} is {jitter[worst]:.0%} "
             f"of a step off the grid of {step:g} s. Resample the log.",
+            path="log.time",
+        )
+    if counts.size > 1 and counts.min() > 1:
+        raise bad_log(
+            "irregular",
+            f"No two rows are less than {counts.min() * step:.10g} s apart, but a step takes {step:.10g} s: the "
+            "sampling time does not fit.",
             path="log.time",
         )
     if jitter.max(initial=0.0) > NOTED_JITTER:
@@ -270,9 +278,11 @@ def _on_grid(
             u = u.copy()
             u[:, inputs.index(name)] = column[places]
     for name, column in zip(outputs, y.T, strict=True):
-        if np.isinf(column).any() or not np.isfinite(column).any():
-            what = "infinite" if np.isinf(column).any() else "nowhere finite"
-            raise bad_log("nan", f"The output {name!r} is {what} in these rows.", path=f"log.{name}")
+        if not np.isfinite(column).any():
+            raise bad_log("nan", f"The output {name!r} is nowhere finite in these rows.", path=f"log.{name}")
+        if np.isinf(column).any():
+            notes.append(f"{int(np.isinf(column).sum())} value(s) of {name} are infinite and count as not measured.")
+    y = np.where(np.isfinite(y), y, np.nan)
     places = np.concatenate([[0], np.cumsum(counts)])
     if (counts > 1).any():
         held = " and the inputs before them are held" if inputs else ""
@@ -287,10 +297,38 @@ def _on_grid(
                held=missing)  # fmt: skip
 
 
+def _mean_step(time: FloatArray, counts: NDArray[np.int64]) -> float:
+    """Return the step of a grid from stamps that jitter ``(n,)`` and the steps between them: their median is off by
+    its share of the jitter, which adds up over a log; in as few digits as the stamps know of it."""
+    places = np.concatenate([[0], np.cumsum(counts)]) - np.sum(counts) / 2.0
+    away = places - places.mean()
+    step = float(away @ time / (away @ away))
+    left = time - time.mean() - step * away
+    error = float(np.sqrt(left @ left / max(len(time) - 2, 1) / (away @ away)))
+    return next(
+        (short for short in (float(f"{step:.{digits}g}") for digits in range(1, 17)) if abs(short - step) <= error),
+        step,
+    )
+
+
 def _longest(true: NDArray[np.bool_]) -> int:
     """Return the length of the longest run of true values."""
     ends = np.flatnonzero(np.diff(np.concatenate([[0], true.astype(np.int64), [0]])))
     return int((ends[1::2] - ends[::2]).max(initial=0))
+
+
+def roughness(y: FloatArray) -> FloatArray:
+    """Return the deviation of white noise that differences of successive samples of sensors ``(n, ny)`` would show
+    ``(ny,)``: those of neighbouring rows, or of a sensor that is slower than the rows, of its samples."""
+    found = np.zeros(y.shape[1])
+    for j, column in enumerate(y.T):
+        changes = np.diff(column)
+        changes = changes[np.isfinite(changes)]
+        if changes.size < 2:
+            changes = np.diff(column[np.isfinite(column)])
+        if changes.size:
+            found[j] = float(np.std(changes)) / np.sqrt(2.0)
+    return found
 
 
 def quantum(column: FloatArray) -> float:

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations.linearisation import promoted
-from obsynth.calibration.logs import Log, refused
+from obsynth.calibration.logs import Log, refused, roughness
 from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import SMALLEST, FloatArray
@@ -513,7 +513,7 @@ class PlantWithNoise(CalibrationPlant):
 
     def _sizes(self, log: Log) -> FloatArray:
         """Return how large the further states may be: as sensors move, or as loads that make them move so."""
-        rough = np.nan_to_num(np.nanstd(np.diff(log.y, axis=0), axis=0)) / np.sqrt(2.0)
+        rough = roughness(log.y)
         moved = np.nan_to_num(np.nanstd(log.y, axis=0))
         moved = np.maximum(np.where(moved > 0.0, moved, 1.0), rough)
         large = dict(zip(log.output_names, moved, strict=True))

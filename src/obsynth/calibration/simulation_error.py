@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.calibration.likelihood import LARGEST_STEP_RESIDUAL
-from obsynth.calibration.logs import refused
+from obsynth.calibration.logs import refused, roughness
 from obsynth.calibration.problem import Problem
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import SMALLEST, FloatArray
@@ -193,9 +193,7 @@ def unexplained(problem: Problem, left: FloatArray) -> list[str]:
 def _shares(problem: Problem, left: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return what a fit leaves of each sensor, as a share of its deviation, and whether it moves."""
     deviations = np.nanstd(problem.y, axis=0)
-    with np.errstate(invalid="ignore"):
-        roughness = np.nan_to_num(np.nanstd(np.diff(problem.y, axis=0), axis=0)) / np.sqrt(2.0)
-    moves = deviations > MOVING_SIGNAL * np.maximum(roughness, np.sqrt(problem.floors))
+    moves = deviations > MOVING_SIGNAL * np.maximum(roughness(problem.y), np.sqrt(problem.floors))
     return left / np.maximum(deviations, SMALLEST), moves
 
 

@@ -21,6 +21,7 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.data.log_run import faults_on_rows
 from obsynth.data.signals import TIME_HEADER
 from obsynth.data.sources import log_table
+from obsynth.data.stuck_sensors import stuck_rows, stuck_texts
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.assumptions import Log
 from obsynth.experiments.monitors.residual_model import largest_disturbances
@@ -196,7 +197,7 @@ _FIGURE_MEANINGS = {
     "smallest": "step that half of the runs detect",
     "bound": "what the estimate never exceeds without a fault",
     "/ least": f"the bound, divided by the least of all tests with this delay on at most {LONGEST_WINDOW} samples",
-    "rms": "root mean square error in the runs",
+    "rms": "root mean square error in the runs, or on the log where it has a column of the fault",
     "ms": "milliseconds to design and verify",
 }
 
@@ -227,6 +228,8 @@ class Comparison:
         Plant, scenario and options, as plain data; empty where a log is in no file.
     log : mapping, optional
         The log by its name and digest, and how its columns were read.
+    notes : tuple of str, optional
+        What is to be said of the log: cells without numbers, rows that are left out, outputs that are stuck.
     """
 
     methods: tuple[ComparedMethod, ...]
@@ -239,6 +242,7 @@ class Comparison:
     setting: str
     asked: Mapping[str, Any] = field(default_factory=dict)
     log: Mapping[str, Any] | None = None
+    notes: tuple[str, ...] = ()
 
     def __getitem__(self, method: str) -> ComparedMethod:
         for found in self.methods:
@@ -305,6 +309,7 @@ class Comparison:
             "reason": self.reason,
             "sample_time": self.sample_time,
             "setting": self.setting,
+            "notes": list(self.notes),
             "refusals": list(self.refusals),
             "rows": [dict(zip(header, row, strict=True)) for row in rows],
             "methods": [{"method": name, **entry} for name, entry in self.claims()["methods"].items()],
@@ -402,13 +407,15 @@ class Comparison:
 
     def _reach(self, shown: Sequence[ComparedMethod], row: int) -> float:
         """Return how far the panel of a fault reaches on both sides of zero: what the best estimate needs."""
-        reach = 2.5 * (float(np.max(np.abs(self.truth[:, row]), initial=0.0)) or 1.0)
+        known = self.truth[np.isfinite(self.truth[:, row]), row]
+        reach = 2.5 * (float(np.max(np.abs(known), initial=0.0)) or 1.0)
         if row or not shown:
             return reach
         return max(reach, 1.5 * float(np.nanquantile(np.abs(shown[0].estimates[:, 0]), SHOWN_SAMPLES)))
 
     def __str__(self) -> str:
-        return "\n".join([self.setting, *text_table(self.rows(), left=2), self.meanings(), *self.refusals, self.advice])
+        table = text_table(self.rows(), left=2)
+        return "\n".join([self.setting, *self.notes, *table, self.meanings(), *self.refusals, self.advice])
 
     @property
     def advice(self) -> str:
@@ -417,7 +424,7 @@ class Comparison:
 
     def _repr_html_(self) -> str:
         return f"<p>{escape(self.setting)}</p>{html_table(self.rows())}" + "".join(
-            f"<p>{escape(text)}</p>" for text in (self.meanings(), *self.refusals, self.advice)
+            f"<p>{escape(text)}</p>" for text in (*self.notes, self.meanings(), *self.refusals, self.advice)
         )
 
     def page(self) -> str:
@@ -425,6 +432,7 @@ class Comparison:
         body = [
             f'<p class="verdict {"holds" if self.recommended else "fails"}">{escape(self.advice)}</p>',
             f"<p>{escape(self.setting)}</p>",
+            *(f"<p>{escape(text)}</p>" for text in self.notes),
             f'<div class="scroll figures">{html_table(self.rows())}</div>',
             f'<p class="soft">{escape(self.meanings())}</p>',
             *(f"<p>{escape(text)}</p>" for text in self.refusals),
@@ -543,8 +551,9 @@ class Record:
     times: FloatArray  # ``(steps,)``, seconds
     u: FloatArray
     y: FloatArray
-    truth: FloatArray  # ``(steps, nf)``: the faults, zero where they are not known
-    known: bool = True  # whether any of them is
+    truth: FloatArray  # ``(steps, nf)``: the faults, zero where a log has no column of one
+    known: tuple[str, ...] = ()  # the faults of which a log has a column
+    notes: tuple[str, ...] = ()  # what is to be said of a log
 
 
 def drawn_runs(
@@ -838,6 +847,7 @@ def side_by_side(
         setting,
         asked if data is None or from_file else {},
         Log.of(Path(data), columns, scales).as_dict() if from_file else None,
+        () if log is None else log.notes,
     )
 
 
@@ -925,7 +935,7 @@ def _log(
     wanted = {
         name: (columns or {}).get(name, name) for name in (*plant.input_names, *plant.output_names, *plant.fault_names)
     }
-    table, *_ = log_table(data, list(wanted.values()), (columns or {}).get(TIME_HEADER, TIME_HEADER))
+    table, _, said = log_table(data, list(wanted.values()), (columns or {}).get(TIME_HEADER, TIME_HEADER))
     frame = {name: table[column] for name, column in wanted.items() if column in table}
     shift = None if plant.uncertainty is None else plant.uncertainty.shift
     if shift and frame:
@@ -937,6 +947,9 @@ def _log(
     count = max(map(len, frame.values()), default=0)
     if not count:
         raise SpecError("The log has no rows.", path="data")
+    for name in (*plant.input_names, *plant.output_names):
+        if not np.isfinite(frame[name]).any():
+            raise SpecError(f"The column {wanted[name]!r} holds no number: {name!r} is never measured.", path="data")
 
     def signals(names: Sequence[str]) -> FloatArray:
         offsets = np.array([plant.operating_point.get(name, 0.0) for name in names])
@@ -951,7 +964,9 @@ def _log(
     u, y = signals(plant.input_names), signals(plant.output_names)
     u = u[np.clip(np.arange(count) - input_delay, 0, count - 1)]
     stamps = table.get((columns or {}).get(TIME_HEADER, TIME_HEADER))
-    return Record(_clock(count, plant.dt) if stamps is None else stamps, u, y, truth, bool(there))
+    stuck = {name: stuck_rows(values) for name, values in zip(plant.output_names, y.T, strict=True)}
+    times = _clock(count, plant.dt) if stamps is None else stamps
+    return Record(times, u, y, truth, tuple(there), (*said, *stuck_texts(stuck)))
 
 
 def _clock(samples: int, dt: float) -> FloatArray:
@@ -985,7 +1000,7 @@ def _compared(
         response = responses[:, row, column]
         level, delay, smallest = alarms(found[:, :, row], quiet[:, :, row], fault, response, false_alarms, plant.dt)
         error, truth = found[:, :, row] - fault, fault
-        if replayed is not None and log is not None and log.known:
+        if replayed is not None and log is not None and figures.fault in log.known:
             truth = log.truth[:, column]
             error = replayed[:, row] - truth
         bias = float(np.max(np.abs(np.mean(quiet[:, :, row], axis=1)), initial=0.0))

@@ -116,6 +116,8 @@ def comparison_report(found: Comparison, *, console: Console, file: Path | None 
         texts = [row[i] if wide or header[i] not in _NAME_COLUMNS else fill(row[i], _NAME_WIDTH) for i in kept]
         table.add_row(*map(Text, texts))
     console.print(Text(found.setting))
+    for note in found.notes:
+        console.print(Text(note, style="yellow"))
     if rows:
         print_section(console, "", table)
         console.print(Text(found.meanings([header[i] for i in kept]), style="dim"))
