@@ -350,7 +350,11 @@ class TestNames:
 def test_a_long_sum_is_no_deep_one(capsys):
     plant = "plant: {kind: time-varying, dt: 1.0, horizon: 20, constants: {x: 0.5}, E: [[1]], A: [['%s']], C: [[1]]}\n"
     method = "method: {id: descriptor-kalman, options: {Q: [[1.0e-4]], R: [[1.0e-3]]}}\n"
-    for sum_of, code in (("*".join(["x"] * 950), 0), ("+".join(["x/1000"] * 250), 0), ("(" * 60 + "x" + ")" * 60, 2)):
+    for sum_of, code in (
+        ("*".join(["x"] * 950), 0),
+        ("+".join(["x/1000"] * 250), 0),
+        ("abs(" * 60 + "x" + ")" * 60, 2),
+    ):
         Path("deep.yaml").write_text("schema_version: 1\nname: deep\n" + plant % sum_of + method, "utf-8")
         assert main(["check", "--system", "deep.yaml"]) == code
         told = capsys.readouterr().err

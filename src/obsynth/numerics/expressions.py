@@ -1,4 +1,4 @@
-"""A small arithmetic language for data: parsed into a tree of known operations, never executed as code.
+"""A small arithmetic language for data: Python parses it, and of its tree known operations are read, nothing else.
 
 Numbers, names, ``+ - * / **``, parentheses, a fixed list of functions, and ``where(a > b, c, d)``, which is c where
 a > b and d elsewhere; in equations of a DAE also ``der(...)``, the derivative with respect to time of any expression.
@@ -6,7 +6,9 @@ a > b and d elsewhere; in equations of a DAE also ``der(...)``, the derivative w
 
 from __future__ import annotations
 
+import ast
 import re
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
@@ -23,7 +25,10 @@ MAXIMUM_DEPTH = 50
 Translation: TypeAlias = Callable[[Callable[..., Any]], Callable[..., Any]]
 Evaluator: TypeAlias = Callable[[Mapping[str, Any], Translation], Any]
 
-_TOKEN = re.compile(r"\s*(?:((?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|([A-Za-z_]\w*)|(\*\*|[<>]=?|[-+*/(),]))", re.ASCII)
+#: Names have a prefix where Python's grammar reads them, so that its own words may be names as well.
+_NAME_IN_TEXT = re.compile(r"(?<![\w.])[A-Za-z_]\w*", re.ASCII)
+_NUMBER_IN_TEXT = re.compile(r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+_NAME_PREFIX = "name_"
 
 
 def step_function(value: Any) -> Any:
@@ -56,11 +61,18 @@ FUNCTIONS: Mapping[str, Callable[[Any], Any]] = {
 FUNCTIONS_OF_TWO: Mapping[str, Callable[[Any, Any], Any]] = {"min": np.minimum, "max": np.maximum}
 NAMED_NUMBERS: Mapping[str, float] = {"pi": float(np.pi)}
 #: What may stand in the first place of ``where``.
-COMPARISONS: Mapping[str, Callable[[Any, Any], Any]] = {
-    "<": np.less,
-    "<=": np.less_equal,
-    ">": np.greater,
-    ">=": np.greater_equal,
+COMPARISONS: Mapping[type[ast.cmpop], Callable[[Any, Any], Any]] = {
+    ast.Lt: np.less,
+    ast.LtE: np.less_equal,
+    ast.Gt: np.greater,
+    ast.GtE: np.greater_equal,
+}
+ARITHMETIC: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = {
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: np.divide,
+    ast.Pow: np.power,
 }
 #: Words that other languages decide with; names of these would be read as mistakes.
 DECIDING_WORDS = frozenset({"if", "else", "and", "or", "not"})
@@ -103,175 +115,112 @@ def parse_expression(text: str, *, rates: bool = False) -> Expression:
     """Parse a text into an expression."""
     if len(text) > MAXIMUM_LENGTH:
         raise SpecError(f"An expression has {len(text)} characters: at most {MAXIMUM_LENGTH} are read.")
-    parser = _Parser(text, rates=rates)
-    evaluator = parser.whole()
-    return Expression(text, frozenset(parser.names), evaluator, dict(parser.rates))
+    reader = _Reader(text, rates=rates)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            tree = ast.parse(reader.prefixed, mode="eval")
+    except SyntaxError as error:
+        raise reader.error(error.msg) from None
+    evaluator = reader.read(tree.body, 1)
+    return Expression(text, frozenset(reader.names), evaluator, dict(reader.rates))
 
 
-class _Parser:
-    """Recursive descent: sum, term, sign, power, atom."""
+class _Reader:
+    """Reads what the language knows of the tree that Python makes of a text."""
 
     def __init__(self, text: str, *, rates: bool) -> None:
-        self.text, self.tokens, self.names = text, _tokens(text), set[str]()
-        self.position = self.depth = 0
+        self.text, self.names = text, set[str]()
+        # Python would take what follows for a comment.
+        self.prefixed = _NAME_IN_TEXT.sub(rf"{_NAME_PREFIX}\g<0>", " ".join(text.split())).replace("#", "?")
         self.rates, self.rates_allowed = dict[str, Expression](), rates
-
-    def whole(self) -> Evaluator:
-        found = self.sum()
-        if self.peek():
-            raise self.error(f"{self.peek()!r} is not expected here")
-        return found
-
-    def peek(self) -> str:
-        return self.tokens[self.position] if self.position < len(self.tokens) else ""
-
-    def take(self, *wanted: str) -> str:
-        token = self.peek()
-        if token and token in wanted:
-            self.position += 1
-            return token
-        return ""
 
     def error(self, reason: str) -> SpecError:
         decides = " To decide, write where(a > b, c, d): c where a > b, d elsewhere."
-        hint = decides if DECIDING_WORDS.intersection(self.tokens) or COMPARISONS.keys() & set(self.tokens) else ""
+        asked = DECIDING_WORDS.intersection(_NAME_IN_TEXT.findall(self.text)) or re.search("[<>]", self.text)
+        power = " A power is written **." if "^" in self.text else ""
         return SpecError(
             f"{self.text!r} is no valid expression: {reason}. Allowed are numbers, names, + - * / **, parentheses "
-            f"and the functions {', '.join([*FUNCTIONS, *FUNCTIONS_OF_TWO, 'where'])}.{hint}"
+            f"and the functions {', '.join([*FUNCTIONS, *FUNCTIONS_OF_TWO, 'where'])}.{power}{decides if asked else ''}"
         )
 
-    def sum(self) -> Evaluator:
-        first, rest = self.term(), []
-        while operator := self.take("+", "-"):
-            rest.append((np.add if operator == "+" else np.subtract, self.term()))
-        return _chain(first, rest)
+    def written(self, node: ast.expr) -> str:
+        """Return a part of the text, without spaces."""
+        part = self.prefixed.encode()[node.col_offset : node.end_col_offset]
+        return part.decode().replace(_NAME_PREFIX, "").replace(" ", "")
 
-    def term(self) -> Evaluator:
-        first, rest = self.signed(), []
-        while operator := self.take("*", "/"):
-            rest.append((np.multiply if operator == "*" else np.divide, self.signed()))
-        return _chain(first, rest)
-
-    def signed(self) -> Evaluator:
-        self.depth += 1
-        if self.depth > MAXIMUM_DEPTH:
+    def read(self, node: ast.expr, depth: int) -> Evaluator:
+        """Return what evaluates a part of the tree."""
+        text = self.written(node)
+        if depth > MAXIMUM_DEPTH:
             raise self.error(f"it is nested more than {MAXIMUM_DEPTH} times")
-        sign = self.take("+", "-")
-        found = self.signed() if sign else self.power()
-        self.depth -= 1
-        return _unary(np.negative, found) if sign == "-" else found
+        match node:
+            case ast.BinOp():
+                return self.chain(node, depth + 1)
+            case ast.UnaryOp(op=ast.UAdd()):
+                return self.read(node.operand, depth + 1)
+            case ast.UnaryOp(op=ast.USub()):
+                return _operation(np.negative, self.read(node.operand, depth + 1))
+            case ast.Call(func=ast.Name(), keywords=[]):
+                return self.function(self.written(node.func), node.args, depth + 1)
+            case ast.Constant() if _NUMBER_IN_TEXT.fullmatch(text):
+                number = np.float64(text)
+                return lambda values, _: number
+            case ast.Name() if text in NAMED_NUMBERS:
+                return lambda values, _: NAMED_NUMBERS[text]
+            case ast.Name() if text not in DECIDING_WORDS:
+                self.names.add(text)
+                return lambda values, _: values[text]
+        raise self.error(f"{text!r} is not allowed")
 
-    def power(self) -> Evaluator:
-        base = self.atom()
-        return _binary(np.power, base, self.signed()) if self.take("**") else base
+    def chain(self, node: ast.expr, depth: int) -> Evaluator:
+        """Return what evaluates operations from left to right, in a loop: a long sum is no deep one."""
+        rest: list[tuple[Callable[[Any, Any], Any], Evaluator]] = []
+        while isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC:
+            rest.insert(0, (ARITHMETIC[type(node.op)], self.read(node.right, depth)))
+            node = node.left
+        if isinstance(node, ast.BinOp):
+            raise self.error(f"{self.written(node)!r} is not allowed")
+        first = self.read(node, depth)
 
-    def atom(self) -> Evaluator:
-        if self.take("("):
-            inner = self.sum()
-            self.close()
-            return inner
-        token = self.peek()
-        if not token or token in DECIDING_WORDS or not (token[0].isalnum() or token[0] in "._"):
-            raise self.error(f"{token!r} is not expected here" if token else "it ends too early")
-        self.position += 1
-        if token[0].isdigit() or token[0] == ".":
-            number = np.float64(token)
-            return lambda values, _: number
-        if self.take("("):
-            return self.function(token)
-        if token in NAMED_NUMBERS:
-            constant = NAMED_NUMBERS[token]
-            return lambda values, _: constant
-        self.names.add(token)
-        return lambda values, _: values[token]
+        def evaluated(values: Mapping[str, Any], translate: Translation) -> Any:
+            found = first(values, translate)
+            for operation, operand in rest:
+                found = translate(operation)(found, operand(values, translate))
+            return found
 
-    def function(self, name: str) -> Evaluator:
-        if name == "der" and self.rates_allowed:
-            return self.rate()
+        return evaluated
+
+    def function(self, name: str, arguments: Sequence[ast.expr], depth: int) -> Evaluator:
+        """Return what evaluates a function; of values that ``where`` does not choose none is wanted: they need not
+        exist."""
+        if name == "der" and self.rates_allowed and len(arguments) == 1:
+            return self.rate(arguments[0], depth)
+        operation, operands = FUNCTIONS.get(name) or FUNCTIONS_OF_TWO.get(name), list[Evaluator]()
+        count = 1 if name in FUNCTIONS else 2
         if name == "where":
-            return self.choice()
-        first = self.sum()
-        if name in FUNCTIONS:
-            self.close()
-            return _unary(FUNCTIONS[name], first)
-        if name not in FUNCTIONS_OF_TWO:
+            match arguments:
+                case [ast.Compare(ops=[operator], comparators=[right]) as first, _, _] if type(operator) in COMPARISONS:
+                    pair = self.read(first.left, depth), self.read(right, depth)
+                    operands.append(_operation(COMPARISONS[type(operator)], *pair))
+                case _:
+                    raise self.error("where needs a comparison (<, <=, >, >=) and two values")
+            operation, arguments = np.where, arguments[1:]
+        if operation is None:
             raise self.error(f"there is no function {name!r}")
-        if not self.take(","):
-            raise self.error(f"{name} needs two arguments")
-        second = self.sum()
-        self.close()
-        return _binary(FUNCTIONS_OF_TWO[name], first, second)
+        if len(arguments) != count:
+            raise self.error(f"{name} needs {'two arguments' if count == 2 else 'one argument'}")
+        return _operation(operation, *operands, *(self.read(argument, depth) for argument in arguments))
 
-    def choice(self) -> Evaluator:
-        """Read ``a > b, c, d)``; of the values that are not chosen none is wanted, so that they need not exist."""
-        left = self.sum()
-        operator = self.take(*COMPARISONS)
-        if not operator:
-            raise self.error("where needs a comparison (<, <=, >, >=) first")
-        condition = _binary(COMPARISONS[operator], left, self.sum())
-        values = []
-        for _ in range(2):
-            if not self.take(","):
-                raise self.error("where needs a comparison and two values")
-            values.append(self.sum())
-        self.close()
-        return _chosen(condition, *values)
-
-    def rate(self) -> Evaluator:
+    def rate(self, inner: ast.expr, depth: int) -> Evaluator:
         """Read what a derivative is taken of; it stands for a value of its own, found under its text."""
-        begin, outside = self.position, self.names
-        self.names, self.rates_allowed = set[str](), False
-        inner = self.sum()
-        text = "".join(self.tokens[begin : self.position])
-        self.close()
-        found = Expression(text, frozenset(self.names), inner)
+        outside, self.names, self.rates_allowed = self.names, set[str](), False
+        text, evaluator = self.written(inner), self.read(inner, depth)
+        found = Expression(text, frozenset(self.names), evaluator)
         self.names, self.rates_allowed = outside, True
         key = f"der({text})"
         self.rates[key] = found
         return lambda values, _: values[key]
 
-    def close(self) -> None:
-        if not self.take(")"):
-            raise self.error("a parenthesis is not closed")
 
-
-def _tokens(text: str) -> list[str]:
-    tokens, position = [], 0
-    stripped = text.rstrip()
-    while position < len(stripped):
-        match = _TOKEN.match(stripped, position)
-        if match is None:
-            sign = stripped[position:].strip()[0]
-            instead = ": write ** for a power" if sign == "^" else ""
-            raise SpecError(f"{text!r} is no valid expression: {sign!r} is not allowed{instead}.")
-        tokens.append(match.group(match.lastindex or 0))
-        position = match.end()
-    return tokens
-
-
-def _unary(operation: Callable[[Any], Any], inner: Evaluator) -> Evaluator:
-    return lambda values, translate: translate(operation)(inner(values, translate))
-
-
-def _binary(operation: Callable[[Any, Any], Any], left: Evaluator, right: Evaluator) -> Evaluator:
-    return lambda values, translate: translate(operation)(left(values, translate), right(values, translate))
-
-
-def _chain(first: Evaluator, rest: Sequence[tuple[Callable[[Any, Any], Any], Evaluator]]) -> Evaluator:
-    """Return operations from left to right, in a loop: a long sum is no deep one."""
-    if not rest:
-        return first
-
-    def evaluated(values: Mapping[str, Any], translate: Translation) -> Any:
-        found = first(values, translate)
-        for operation, operand in rest:
-            found = translate(operation)(found, operand(values, translate))
-        return found
-
-    return evaluated
-
-
-def _chosen(condition: Evaluator, first: Evaluator, second: Evaluator) -> Evaluator:
-    return lambda values, translate: translate(np.where)(
-        condition(values, translate), first(values, translate), second(values, translate)
-    )
+def _operation(operation: Callable[..., Any], *operands: Evaluator) -> Evaluator:
+    return lambda values, translate: translate(operation)(*(operand(values, translate) for operand in operands))
