@@ -12,7 +12,7 @@ import ctypes
 import json
 import re
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -121,8 +121,7 @@ def with_c_linkage(header: str, prefix: str) -> str:
 LARGE_TABLE = 1024
 #: At most this share of entries that are not zero makes a matrix sparse.
 SPARSE_C_SHARE = 0.25
-#: Columns that are added in one pass over the rows.
-UNROLLED = 4
+#: Forms of tables, by the names of the macros that add them.
 PLAIN, ENTRIES, COLUMNS_MACRO = "plain", "entries", "columns"
 ADVICE = (
     "Compile with -O3, and with -march=native where it runs on the same machine: the products are written so that rows "
@@ -282,7 +281,7 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
         *integer_table("monitor_places", [alarms.columns.index(name) for name in found.columns]),
         *integer_table("monitor_told", [faults.get(name, -1) for name in found.statistics.told]),
     ]
-    return "\n".join(lines) + template("learned.c").replace("PREFIX", prefix)
+    return "\n".join(lines) + filled_template("learned.c", prefix, {})
 
 
 def _state_struct(found: Realisation, prefix: str, alarms: Alarms) -> list[str]:
@@ -386,6 +385,7 @@ def source_text(found: Realisation, prefix: str, header: str, alarms: Alarms) ->
                 *integer_table("told", gap.told),
                 *integer_table("watched", alarms.places),
                 "",
+                template("products.c"),
                 *_products("say", ("z", "u", "y"), said, tuple(groups)),
                 *_products("next_of", tuple(found.transition), moved, ("next",)),
                 monitor_source(alarms, prefix),
@@ -421,13 +421,20 @@ def _sizes(found: Realisation) -> dict[str, int]:
 def _products(
     name: str, given: Sequence[str], blocks: dict[str, dict[str, FloatArray]], targets: Sequence[str]
 ) -> list[str]:
-    """Return a function that writes products of vectors into its targets."""
+    """Return a function that writes products of vectors into its targets, by the macros of ``products.c``."""
     arguments = [f"const REAL *{signal}" for signal in given] + [f"REAL *{target}" for target in targets]
     body = ["int i;", "int j;", *(f"(void){word};" for word in ("i", "j", *given, *targets))]
-    for target in targets:
-        if target in blocks:
-            body += _product(target, blocks[target])
-    return [*_function(f"static void {name}({', '.join(arguments)})", body), ""]
+    for target in (target for target in targets if target in blocks):
+        rows = max(map(len, blocks[target].values()))
+        parts = [(signal, _form(matrix), matrix.shape[1]) for signal, matrix in blocks[target].items() if matrix.size]
+        if all(form == PLAIN for _, form, _ in parts):
+            added = [f"    ADD_ROW({target}_{signal}, {signal}, {columns})" for signal, _, columns in parts]
+            loop = f"for (i = 0; i < {rows}; i++) {{"
+            body += [loop, "    REAL sum = 0;", *added, f"    {target}[i] = sum;", "}"]
+        else:
+            added = [f"    ADD_{form}({target}_{signal}, {signal}, {rows}, {n})" for signal, form, n in parts]
+            body += ["{", f"    REAL sum[{rows}] = {{0}};", *added, f"    SET({target}, {rows})", "}"]
+    return [f"static void {name}({', '.join(arguments)})", "{", *(f"    {line}" for line in body), "}", ""]
 
 
 def _step_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
@@ -436,48 +443,36 @@ def _step_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
     nu, ny = len(observer.input_names), len(observer.output_names)
     nx, nf, nr = len(observer.state_names), len(observer.fault_names), len(observer.residual_names)
     learned = alarms.learned is not None
-    copied = (("v", "u", nu), ("v + U_COUNT", "y", ny))
+    arguments = ", ".join(_step_arguments(found, prefix))
+    taken = (("v", "u", nu, 0), ("v + U_COUNT", "y", ny, nu))
     shown = (("faults", "shown", nf), ("residuals", "shown + FAULT_COUNT", nr))
-    parts = {
-        "STATES_SCRATCH": "" if nx else "REAL states[1] = {0};",
-        "COPY_IN": " ".join(f"copied({to}, {of}, {n});" for to, of, n in copied if n),
-        "COPY_OUT": " ".join(f"copied({to}, {of}, {n});" for to, of, n in shown if n),
-        "MONITOR_RESET": "monitor_reset(&s->monitor);" if learned else "",
-        "MONITOR_STEP": (
-            f"monitor_take(&s->monitor, shown, NULL, s->status == {prefix.upper()}_OK, -1);\n"
-            "    shown[SHOWN_COUNT] = s->monitor.statistic;"
-            if learned
-            else ""
-        ),
-        "STEP_ARGUMENTS": ", ".join(_step_arguments(found, prefix)).replace("*state", "*s", 1),
-    }
-    text = template("linear_step.c")
-    for word, value in parts.items():
-        text = text.replace(f"    {word}\n", f"    {value}\n" if value else "").replace(word, value)
-    given = ["state"]
-    body = ["REAL deviation[LENGTH(V_COUNT)] = {0};", "int i, missing;"]
-    for array, offset, count in (("u", "", nu), ("y", "U_COUNT + ", ny)):
-        if count:
-            body += _loop("i", count, [f"deviation[{offset}i] = {array}[i] - point_before[0][{offset}i];"])
-            given.append("deviation" if array == "u" else "deviation + U_COUNT")
-    given += [name for name, count in (("states", nx), ("faults", nf), ("residuals", nr)) if count]
-    body.append(f"missing = {prefix}_step({', '.join(given)});")
-    for array, offset, count in (("states", "", nx), ("faults", f"{nx} + ", nf)):
-        if count:
-            body += _loop("i", count, [f"{array}[i] += point_after[0][{offset}i];"])
-    body += ["(void)i;", "return missing;"]
-    take = _function(_step_signature(found, prefix, "take"), body)
-    return text.replace("PREFIX", prefix).replace("UPPER", prefix.upper()) + "\n" + "\n".join(take)
-
-
-def _function(signature: str, body: Iterable[str]) -> list[str]:
-    return [signature, "{", *(f"    {line}" for line in body), "}"]
-
-
-def _loop(index: str, end: int | str, body: Iterable[str], *, start: int | str = 0, step: int = 1) -> list[str]:
-    """Return the lines of a loop."""
-    advance = f"{index}++" if step == 1 else f"{index} += {step}"
-    return [f"for ({index} = {start}; {index} < {end}; {advance}) {{", *(f"    {line}" for line in body), "}"]
+    estimates = (("states", nx, 0), ("faults", nf, nx))
+    signals = [("deviation", nu), ("deviation + U_COUNT", ny), ("states", nx), ("faults", nf), ("residuals", nr)]
+    return filled_template(
+        "linear_step.c",
+        prefix,
+        {
+            "STATES_SCRATCH": "" if nx else "REAL states[1] = {0};",
+            "COPY_IN": " ".join(f"copied({to}, {of}, {n});" for to, of, n, _ in taken if n),
+            "COPY_OUT": " ".join(f"copied({to}, {of}, {n});" for to, of, n in shown if n),
+            "MONITOR_RESET": "monitor_reset(&s->monitor);" if learned else "",
+            "MONITOR_STEP": (
+                f"monitor_take(&s->monitor, shown, NULL, s->status == {prefix.upper()}_OK, -1);\n"
+                "    shown[SHOWN_COUNT] = s->monitor.statistic;"
+                if learned
+                else ""
+            ),
+            "STEP_ARGUMENTS": arguments.replace("*state", "*s", 1),
+            "TAKE_ARGUMENTS": arguments,
+            "TAKEN_SIGNALS": ", ".join(["state", *(name for name, n in signals if n)]),
+            "LESS_POINT": " ".join(
+                f"shifted(deviation + {at}, {of}, point_before[0] + {at}, -1, {n});" for _, of, n, at in taken if n
+            ),
+            "MORE_POINT": " ".join(
+                f"shifted({of}, {of}, point_after[0] + {at}, 1, {n});" for of, n, at in estimates if n
+            ),
+        },
+    )
 
 
 def _form(matrix: FloatArray) -> str:
@@ -485,49 +480,6 @@ def _form(matrix: FloatArray) -> str:
     if matrix.size < LARGE_TABLE:
         return PLAIN
     return ENTRIES if np.count_nonzero(matrix) <= SPARSE_C_SHARE * matrix.size else COLUMNS_MACRO
-
-
-def _product(target: str, parts: dict[str, FloatArray]) -> list[str]:
-    """Return the product of the rows of a target."""
-    # Large ones column by column, so that rows are independent and a compiler can use vectors; sums keep their order.
-    rows = next(iter(parts.values())).shape[0]
-    if not rows:
-        return []
-    if all(_form(matrix) == PLAIN for matrix in parts.values()):
-        sums = [
-            line
-            for signal, matrix in parts.items()
-            if matrix.size
-            for line in _row_sum("sum", f"{target}_{signal}", signal, matrix.shape[1])
-        ]
-        return _loop("i", rows, ["REAL sum = 0;", *sums, f"{target}[i] = sum;"])
-    lines = [f"REAL sum[{rows}];", *_loop("i", rows, ["sum[i] = 0;"])]
-    for signal, matrix in parts.items():
-        if matrix.size:
-            lines += _added(f"{target}_{signal}", signal, matrix)
-    lines += _loop("i", rows, [f"{target}[i] = sum[i];"])
-    return ["{", *(f"    {line}" for line in lines), "}"]
-
-
-def _row_sum(total: str, name: str, vector: str, columns: int) -> list[str]:
-    return _loop("j", columns, [f"{total} += {name}[i][j] * {vector}[j];"])
-
-
-def _added(name: str, vector: str, matrix: FloatArray) -> list[str]:
-    """Return the lines that add a matrix times a vector to the sums of all rows."""
-    rows, columns = matrix.shape
-    form = _form(matrix)
-    if form == PLAIN:
-        return _loop("i", rows, _row_sum("sum[i]", name, vector, columns))
-    if form == ENTRIES:
-        entry = f"sum[i] += {name}_value[j] * {vector}[{name}_column[j]];"
-        return _loop("i", rows, _loop("j", f"{name}_start[i + 1]", [entry], start=f"{name}_start[i]"))
-    whole = columns - columns % UNROLLED
-    terms = " + ".join(f"{name}[j + {k}][i] * {vector}[j + {k}]" for k in range(UNROLLED))
-    lines = _loop("j", whole, _loop("i", rows, [f"sum[i] = sum[i] + {terms};"]), step=UNROLLED)
-    if whole < columns:
-        lines += _loop("j", columns, _loop("i", rows, [f"sum[i] += {name}[j][i] * {vector}[j];"]), start=whole)
-    return lines
 
 
 def _tables(name: str, matrix: FloatArray) -> Iterator[str]:
@@ -607,6 +559,15 @@ def integer_table(name: str, values: Sequence[int]) -> list[str]:
 def template(name: str) -> str:
     """Return the text of a file of C that is written around tables."""
     return files("obsynth.exporting").joinpath("templates", name).read_text(encoding="utf-8")
+
+
+def filled_template(name: str, prefix: str, words: Mapping[str, str]) -> str:
+    """Return a file of C with its prefix and other words put in, each once; a line that holds an empty one goes."""
+    text = template(name)
+    for word in (word for word, value in words.items() if not value):
+        text = re.sub(rf"^ *{word}\n", "", text, flags=re.MULTILINE)
+    known = {**words, "PREFIX": prefix, "UPPER": prefix.upper()}
+    return re.sub("|".join(sorted(known, key=len, reverse=True)), lambda found: known[found.group()], text)
 
 
 #: A number of a table, or of a line that a macro names.
@@ -712,79 +673,42 @@ def dae_c_texts(
             _dae_step_text(prefix, model, alarms),
         ]
     )
-    declared = "\n".join(_dae_header(design, prefix, digest, alarms)) + "\n"
+    declared = _dae_header(design, prefix, digest, alarms)
     return in_precision(source, "double"), in_precision(declared, "double"), digest
 
 
 def _dae_step_text(prefix: str, model: DAEModel, alarms: Alarms) -> str:
     """Return the two functions of the header; without inputs, C has no array for them."""
-    parts = {
-        "ARGUMENTS": "const double u[NU], " if model.nu else "",
-        "INPUT": "u" if model.nu else "s->u",
-        "MONITOR_RESET": "monitor_reset(&s->monitor);" if alarms.learned is not None else "",
-        "WAITING_STEP": (
-            "double shown[UPPER_WATCHED];\n"
-            "    for (i = 0; i < UPPER_WATCHED; i++) {\n"
-            "        shown[i] = NAN;\n"
-            "    }\n"
-            "    monitor_take(&s->monitor, shown, NULL, 0, -1);".replace("UPPER", prefix.upper())
-            if alarms.learned is not None
-            else ""
-        ),
-        "MONITOR_STEP": (
-            "monitor_take(&s->monitor, shown, MONITOR_ESTIMATES > 0 ? after + AT_SPREAD : NULL, is_deciding,\n"
-            "                 sqrt(estimates->nis));\n"
-            "    shown[NQ + NY + 1] = s->monitor.statistic;"
-            if alarms.learned is not None
-            else ""
-        ),
-    }
-    text = template("dae_step.c").replace("PREFIX", prefix).replace("UPPER", prefix.upper())
-    for word, value in parts.items():
-        text = text.replace(f"    {word}\n", f"    {value}\n" if value else "").replace(word, value)
-    return text
+    learned = alarms.learned is not None
+    waiting = (
+        f"double shown[{prefix.upper()}_WATCHED];\n"
+        f"    for (i = 0; i < {prefix.upper()}_WATCHED; i++) {{\n"
+        "        shown[i] = NAN;\n"
+        "    }\n"
+        "    monitor_take(&s->monitor, shown, NULL, 0, -1);"
+    )
+    taking = (
+        "monitor_take(&s->monitor, shown, MONITOR_ESTIMATES > 0 ? after + AT_SPREAD : NULL, is_deciding,\n"
+        "                 sqrt(estimates->nis));\n"
+        "    shown[NQ + NY + 1] = s->monitor.statistic;"
+    )
+    return filled_template(
+        "dae_step.c",
+        prefix,
+        {
+            "ARGUMENTS": "const double u[NU], " if model.nu else "",
+            "INPUT": "u" if model.nu else "s->u",
+            "MONITOR_RESET": "monitor_reset(&s->monitor);" if learned else "",
+            "WAITING_STEP": waiting if learned else "",
+            "MONITOR_STEP": taking if learned else "",
+        },
+    )
 
 
-def _dae_header(design: ObserverDesign, prefix: str, digest: str, alarms: Alarms) -> Iterator[str]:
+def _dae_header(design: ObserverDesign, prefix: str, digest: str, alarms: Alarms) -> str:
+    """Return the header of the observer of a nonlinear plant."""
     model, observer = design.nonlinear
-    guard, upper = f"{prefix.upper()}_H", prefix.upper()
-    sizes = {
-        "states": model.nx,
-        "state_deviations": model.nx,
-        "faults": model.nq,
-        "fault_deviations": model.nq,
-        "residuals": model.ny,
-    }
-    watched = max(len(alarms.levels), 1)
-    yield comment(f"Observer {quoted(design.name)} by {quoted(design.method)}, written by obsynth.")
-    yield comment(quoted(verification_words(design)))
-    yield from map(comment, alarm_comments(alarms))
-    yield from (f"#ifndef {guard}", f"#define {guard}", "", comment("sha256 of the gain set"))
-    yield from (f'#define {upper}_SHA256 "{digest}"', comment("seconds between samples"))
-    yield from (f"#define {upper}_DT {observer.dt!r}", comment("outputs that may be watched"))
-    yield from (f"#define {upper}_WATCHED {len(alarms.levels)}", "", *status_lines(prefix), "")
-    yield from (*observer_struct(observer.steps, f"{prefix}_observer"), *monitor_struct(alarms, prefix))
-    yield from ("typedef struct {", comment("Read these after a step: what the row was, what passed its level."))
-    yield from ("    int status;", f"    int alarm[{watched}];", "    int any_alarm;")
-    yield comment("Set these after the reset: levels (0 for none), and seconds without alarms after the start.")
-    yield from (f"    double level[{watched}];", "    double warm_up;")
-    if alarms.learned is not None:
-        yield f"    {prefix}_monitor monitor;"
-    yield from (comment("Everything else is the observer's own."), f"    struct {prefix}_observer running;")
-    yield from (f"    double u[{max(model.nu, 1)}];", "    double time, from;", "    long k;")
-    yield f"    double spread[{max(model.nq, 1)}], usual[{max(model.nq, 1)}];"
-    yield from ("    int is_started, is_whole, phase;", f"}} {prefix}_state;", "")
-    yield comment("States after the measurement, parameters, their standard deviations; innovations (NaN where y is);")
-    yield comment("their square in units of their covariance; the residual of the step in sizes of the states.")
-    yield "typedef struct {"
-    yield from (f"    double {name}[{max(size, 1)}];" for name, size in sizes.items())
-    yield from ("    double nis;", "    double step_residual;", f"}} {prefix}_estimates;", "")
-    yield from (comment("Start as the design does."), f"void {prefix}_reset({prefix}_state *state);", "")
-    yield comment("Take one sample: y at this sample, and u during the step that ends at it; what is missing is NaN.")
-    yield comment("A missing output is replaced by its prediction, a missing input by its last value. Returns 0; 1 if")
-    yield comment("inputs are missing (status GAP; estimates are NaN before all of them have been known); 2 if the")
-    yield comment("step has no solution: state and estimates are left as they were then.")
-    for array, column, names in (
+    signals = (
         ("u", "", model.input_names),
         ("y", "", model.output_names),
         ("states", "xhat", model.state_names),
@@ -792,15 +716,26 @@ def _dae_header(design: ObserverDesign, prefix: str, digest: str, alarms: Alarms
         ("state_deviations", "sd xhat", model.state_names),
         ("fault_deviations", "sd fhat", model.parameter_names),
         ("residuals", "r", model.output_names),
-    ):
-        for i, name in enumerate(names):
-            unit = model.units.get(name)
-            told = quoted(f"{column}[{name}]" if column else name)
-            yield comment(f"{array}[{i}]: {told}" + (f", {quoted(unit)}" if unit else ""))
-    taken = [f"{prefix}_state *state", f"const double y[{model.ny}]", f"{prefix}_estimates *estimates"]
-    taken[1:1] = [f"const double u[{model.nu}]"] if model.nu else []
-    yield f"int {prefix}_step({', '.join(taken)});"
-    yield from ("", "#endif")
+    )
+    listed = [line for *signal, names in signals for line in _signal_comments(*signal, names, None, model.units)]
+    structs = [*observer_struct(observer.steps, f"{prefix}_observer"), *monitor_struct(alarms, prefix)]
+    words = {
+        "OBSERVER": f"Observer {quoted(design.name)} by {quoted(design.method)}, written by obsynth.",
+        "VERIFIED": quoted(verification_words(design)),
+        "ALARMS": "\n".join(map(comment, alarm_comments(alarms))),
+        "DIGEST": digest,
+        "SECONDS": repr(observer.dt),
+        "COUNT_OF_LEVELS": str(len(alarms.levels)),
+        "SOME_LEVELS": str(max(len(alarms.levels), 1)),
+        "STATUSES": "\n".join(status_lines(prefix)),
+        "STRUCTS": "\n".join(structs),
+        "MONITOR": f"{prefix}_monitor monitor;" if alarms.learned is not None else "",
+        "INPUTS": f"const double u[{model.nu}], " if model.nu else "",
+        "SIGNALS": "\n".join(listed),
+        **{word: str(size) for word, size in (("NX", model.nx), ("NY", model.ny))},
+        **{word: str(max(size, 1)) for word, size in (("SOME_NU", model.nu), ("SOME_NQ", model.nq))},
+    }
+    return filled_template("dae.h", prefix, words)
 
 
 def threshold_header(bound: AdaptiveBound, prefix: str) -> str:
@@ -875,7 +810,6 @@ def threshold_source(bound: AdaptiveBound, prefix: str) -> str:
         "later": later[None],
         "driven": np.array([bound.remainder_inputs], dtype=np.float64),
     }
-    text = template("adaptive_threshold.c")
     enumerated = ", ".join(f"{name} = {value}" for name, value in sizes.items())
     lines = [
         "",
@@ -885,7 +819,7 @@ def threshold_source(bound: AdaptiveBound, prefix: str) -> str:
         "",
         *(line for name, table in tables.items() for line in table_lines(f"thresholds_{name}", filled_table(table))),
     ]
-    return in_precision("\n".join(lines) + "\n" + text.replace("PREFIX", prefix), "double")
+    return in_precision("\n".join(lines) + "\n" + filled_template("adaptive_threshold.c", prefix, {}), "double")
 
 
 #: Newton in floats: a last step whose square is rounding, and a residual of some roundings of its terms.
@@ -910,30 +844,6 @@ _FLOAT_CONSTANTS = {
     "OVERFLOW_LIMIT": FLOAT_OVERFLOW,
     "MONITOR_LEAST": FLOAT_LEAST_ADDED,
 }
-_HARNESS = """
-#include "HEADER"
-int run(const float *in, double *out, int samples)
-{
-    static PREFIX_state state;
-    PREFIX_estimates found;
-    int k, i;
-    PREFIX_reset(&state);
-    for (k = 0; k < samples; k++) {
-        if (PREFIX_step(&state, ARGUMENTS, &found) == 2) {
-            return k;
-        }
-        for (i = 0; i < STATES; i++) {
-            out[i] = found.states[i];
-        }
-        for (i = 0; i < FAULTS; i++) {
-            out[STATES + i] = found.faults[i];
-        }
-        in += TAKEN;
-        out += STATES + FAULTS;
-    }
-    return samples;
-}
-"""
 
 
 def in_floats(text: str) -> str:
@@ -1018,13 +928,9 @@ def _compiled(
             "or clang, or what CC in the environment names). Install one, or leave precision at double.",
             path="precision",
         )
-    parts = {
-        "HEADER": "observer.h", "PREFIX": prefix, "ARGUMENTS": "in, in + " + str(nu) if nu else "in",
-        "STATES": str(counts[0]), "FAULTS": str(counts[1]), "TAKEN": str(nu + ny),
-    }  # fmt: skip
-    harness = _HARNESS
-    for word, value in parts.items():
-        harness = harness.replace(word, value)
+    given = f"in, in + {nu}" if nu else "in"
+    sizes = {"STATES": str(counts[0]), "FAULTS": str(counts[1]), "TAKEN": str(nu + ny)}
+    harness = filled_template("run_floats.c", prefix, {"ARGUMENTS": given, **sizes})
     own = re.sub(r'^#include ".*"$', '#include "observer.h"', source, count=1, flags=re.MULTILINE)
     texts = {"observer.h": declared, "observer.c": own, "run.c": harness}
     return ctypes.CDLL(str(shared_library(folder, texts, [*command, *FLAGS], path="precision")))

@@ -21,6 +21,7 @@ from obsynth.exporting.c_source import (
     c_identifier,
     comment,
     dae_alarms,
+    filled_template,
     header_text,
     in_precision,
     included,
@@ -203,7 +204,8 @@ def window_c_texts(found: Realisation, prefix: str, header: str) -> tuple[str, s
         "",
         "#endif",
     ]
-    body = _BODY.replace("PREFIX", prefix).replace("COPY_U", _COPY if nu else "").replace("SIGNATURE", signature)
+    copied = "for (i = 0; i < NU; i++) {\n        newest[i] = u[i];\n    }" if nu else ""
+    body = filled_template("window_test.c", prefix, {"SIGNATURE": signature, "COPY_INPUTS": copied})
     source = [
         comment(f"sha256 of the gain set: {found.digest}"),
         *([comment(quoted(found.mark))] if found.mark else []),
@@ -216,7 +218,7 @@ def window_c_texts(found: Realisation, prefix: str, header: str) -> tuple[str, s
         comment("by test: weights of inputs and outputs, the newest sample first"),
         *(line for name, table in tables.items() for line in table_lines(name, table)),
     ]
-    return "\n".join(source) + body, "\n".join(declared) + "\n"
+    return "\n".join([*source, "", body]), "\n".join(declared) + "\n"
 
 
 def _weights(found: Realisation, count: int, length: int) -> FloatArray:
@@ -225,62 +227,6 @@ def _weights(found: Realisation, count: int, length: int) -> FloatArray:
     newest, older = np.hstack([observer.Du, observer.Dy]), np.hstack([observer.Bu, observer.By])
     each = [np.vstack([newest[[k]], older[k * (length - 1) : (k + 1) * (length - 1)]]) for k in range(count)]
     return np.array([weights.ravel() for weights in each])
-
-
-_COPY = """\
-    for (i = 0; i < NU; i++) {
-        newest[i] = u[i];
-    }
-"""
-_BODY = """
-void PREFIX_reset(PREFIX_state *state)
-{
-    int i;
-    state->at = state->rows = 0;
-    for (i = 0; i < WIDTH; i++) {
-        state->largest[i] = 0.0;
-    }
-}
-
-SIGNATURE
-{
-    double *newest = state->window[state->at];
-    double most = 1.0;
-    int i, j, k, alarm = 0;
-COPY_U    for (i = NU; i < WIDTH; i++) {
-        newest[i] = y[i - NU];
-    }
-    state->rows = state->rows < LENGTH ? state->rows + 1 : LENGTH;
-    for (i = 0; i < WIDTH; i++) {
-        if (!isfinite(newest[i])) {
-            state->rows = 0;
-        } else if (fabs(newest[i]) > state->largest[i]) {
-            state->largest[i] = fabs(newest[i]);
-        }
-    }
-    for (k = 0; k < TESTS; k++) {
-        double sum = constants[0][k], threshold = limits[0][k];
-        for (i = 0; i < WIDTH; i++) {
-            threshold += rounding[k][i] * state->largest[i];
-        }
-        for (j = 0; j < LENGTH && state->rows == LENGTH; j++) {
-            const double *sample = state->window[(state->at + LENGTH - j) % LENGTH];
-            const double *weight = weights[k] + j * WIDTH;
-            for (i = 0; i < WIDTH; i++) {
-                sum += weight[i] * sample[i];
-            }
-        }
-        values[k] = state->rows == LENGTH ? sum : NAN;
-        thresholds[k] = threshold;
-        if (state->rows == LENGTH && fabs(sum) > most * threshold) {
-            most = threshold > 0.0 ? fabs(sum) / threshold : HUGE_VAL;
-            alarm = k + 1;
-        }
-    }
-    state->at = (state->at + 1) % LENGTH;
-    return alarm;
-}
-"""
 
 
 EXPORT_SUFFIXES = (".mat", ".npz", ".c", ".fmu")

@@ -553,3 +553,22 @@ int PREFIX_step(STEP_ARGUMENTS)
     COPY_OUT
     return missing;
 }
+
+/* Signals as they are, from deviations or to these. */
+static void shifted(REAL *to, const REAL *from, const REAL *point, int sign, int n)
+{
+    int i;
+    for (i = 0; i < n; i++) {
+        to[i] = sign > 0 ? from[i] + point[i] : from[i] - point[i];
+    }
+}
+
+int PREFIX_take(TAKE_ARGUMENTS)
+{
+    REAL deviation[LENGTH(V_COUNT)] = {0};
+    int missing;
+    LESS_POINT
+    missing = PREFIX_step(TAKEN_SIGNALS);
+    MORE_POINT
+    return missing;
+}
