@@ -24,7 +24,7 @@ def test_a_setting_is_the_option_of_its_name() -> None:
     by_name = read(*RUN, "--noise-bound", "4", "--disturbance", "d1=0.5", "--disturbance", "d[a=b]=2")
     assert by_set.noise_bound == by_name.noise_bound == 4.0
     assert by_set.disturbance == by_name.disturbance == [("d1", "0.5"), ("d[a=b]", "2")]
-    assert (by_set.window, by_set.gap) == (20, None)
+    assert (by_set.window, by_set.gap) == (None, None)
 
 
 def test_a_flag_is_true_or_false() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from obsynth.errors import SpecError
-from obsynth.experiments.monitors.options import CHANGE, FALSE_ALARMS, LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW
+from obsynth.experiments.monitors.options import FALSE_ALARMS, LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW
 
 
 class Argument(NamedTuple):
@@ -93,11 +93,6 @@ def read_settings(
             given += [f"--{name}"] if value.casefold() in ("true", "yes", "1") else []
         else:
             given.append(f"--{name}={value}")
-    # Once more without defaults: what is left was stated.
-    bare = _settings_parser(prog, settings_of(arguments))
-    for action in bare._actions:
-        action.default = argparse.SUPPRESS
-    options.stated = frozenset(vars(bare.parse_known_args([*given, *rest])[0]))
     return parser.parse_known_args([*given, *rest], namespace=options)[1]
 
 
@@ -157,19 +152,11 @@ positive = number_type("positive", float, lambda value: 0.0 < value < math.inf, 
 count = number_type("count", int, lambda value: value >= 1, "is less than 1")
 
 
-#: Settings with a default, which count as given only where they were stated.
-_WITH_DEFAULTS = ("false_alarms", "window", "change", "confidence", "state_every")
-
-
 def refuse_given(options: argparse.Namespace, names: Iterable[str], meant: str) -> None:
     """Refuse arguments that would do nothing; ``meant`` says what they are for."""
     for name in names:
-        if name in ("verb", "settings", "stated"):
-            continue
-        default = name in _WITH_DEFAULTS and name not in getattr(options, "stated", ())
-        if not default and getattr(options, name, None) not in (None, False, []):
-            flag = f"--{name.replace('_', '-')}"
-            raise SpecError(f"{flag} is for {meant}. Leave it out.", path=flag)
+        if name not in ("verb", "settings") and getattr(options, name, None) not in (None, False, []):
+            raise SpecError(f"{flag_of(name)} is for {meant}. Leave it out.", path=flag_of(name))
 
 
 def columns_of(options: argparse.Namespace) -> dict[str, str]:
@@ -240,17 +227,15 @@ MONITOR_SETTINGS = Settings(
         option(
             "--false-alarms",
             "P",
-            "statistical kinds: probability of a false alarm in the whole run (default: %(default)s)",
+            f"statistical kinds: probability of a false alarm in the whole run (default: {FALSE_ALARMS:g})",
             type=probability,
-            default=FALSE_ALARMS,
         ),
-        option("--window", "N", "length of the window in samples (default: %(default)s)", type=count, default=WINDOW),
+        option("--window", "N", f"length of the window in samples (default: {WINDOW})", type=count),
         option(
             "--change",
             "X",
             "cusum: change to detect, in standard deviations of the residual, or in parameter units (default: 1)",
             type=positive,
-            default=CHANGE,
         ),
     )
 )
@@ -315,32 +300,31 @@ def ranges_of(pairs: list[tuple[str, str]]) -> dict[str, float | tuple[float, fl
 
 #: Arguments of the command line that are not called as the options that they give.
 _CALLED = {"disturbance_bounds": "disturbance", "initial_set": "initial"}
-
-
 #: Options that are no settings of monitors on the command line.
-_ELSEWHERE = ("scenario", "sample_time", "constants", "gamma")
+_ELSEWHERE = {"scenario", "sample_time", "constants", "gamma"}
+#: Names of all settings of monitors.
+MONITOR_NAMES = sorted(
+    _CALLED.get(name, name)
+    for name in {name for table in (LINEAR_OPTIONS, PARAMETER_OPTIONS) for names in table.values() for name in names}
+    - _ELSEWHERE
+)
 
 
-def _settings_of(names: Iterable[str]) -> list[str]:
-    """Return what options are called on the command line."""
-    return [_CALLED.get(name, name) for name in names if name not in _ELSEWHERE]
+def flag_of(name: str) -> str:
+    """Return what an option is called on the command line."""
+    return f"--{_CALLED.get(name, name).replace('_', '-')}"
 
 
-def monitor_names() -> list[str]:
-    """Return the names of all settings of monitors."""
-    tables = (LINEAR_OPTIONS, PARAMETER_OPTIONS)
-    return sorted({name for table in tables for names in table.values() for name in _settings_of(names)})
-
-
-def refuse_other_kinds(options: argparse.Namespace, table: Mapping[str, tuple[str, ...]]) -> None:
-    """Refuse settings that do nothing for the kind of monitor that is asked for."""
-    if options.monitor not in table:
-        return  # who makes the monitor says which kinds there are
-    used = _settings_of(table[options.monitor])
-    # The window of ``run --prove`` is that of the proof.
-    proving = ("window",) if getattr(options, "prove", None) is not None else ()
-    names = [name for name in monitor_names() if name not in (*used, *proving) and hasattr(options, name)]
-    kinds = {name: [kind for kind, own in table.items() if name in _settings_of(own)] for name in names}
-    for name, others in kinds.items():
-        where = f"the monitor {' or '.join(others)}" if others else "designs of another kind"
-        refuse_given(options, (name,), f"{where}, not for {options.monitor}")
+def stated_settings(options: argparse.Namespace) -> dict[str, Any]:
+    """Return what a command line states of a monitor, by the names of the arguments of `obsynth.online_monitor`."""
+    return {
+        "disturbance_bounds": numbers_of(options.disturbance),
+        "noise_bound": options.noise_bound,
+        "initial_error": options.initial_error,
+        "window": options.window,
+        "false_alarms": options.false_alarms,
+        "change": options.change,
+        "initial_set": ranges_of(options.initial) or None,
+        "nominal": numbers_of(getattr(options, "nominal", [])),
+        "normal": getattr(options, "normal", None),
+    }

@@ -12,17 +12,18 @@ from typing import Any, TextIO
 
 import obsynth
 from obsynth.cli.arguments import (
+    MONITOR_NAMES,
     STREAM,
     columns_of,
-    monitor_names,
+    flag_of,
     numbers_of,
     ranges_of,
     refuse_given,
-    refuse_other_kinds,
+    stated_settings,
 )
 from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json, verified_again
 from obsynth.errors import SpecError, VerificationError
-from obsynth.experiments.monitors.options import LINEAR_OPTIONS, PARAMETER_OPTIONS
+from obsynth.experiments.monitors.options import LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW, refuse_idle
 from obsynth.files.inputs import protect, protect_stream
 from obsynth.files.outputs import FileKind, require_distinct, write_atomically
 from obsynth.files.tables import text_table
@@ -90,19 +91,14 @@ def monitor_settings(design: obsynth.ObserverDesign, options: argparse.Namespace
     """Return what the monitor of a design that is asked for is made of, by the names of the arguments of
     `obsynth.monitor`."""
     table = LINEAR_OPTIONS if isinstance(design.observer, obsynth.LinearObserver) else PARAMETER_OPTIONS
-    refuse_other_kinds(options, table)
-    given = {
-        "disturbance_bounds": numbers_of(options.disturbance),
-        "noise_bound": options.noise_bound,
-        "initial_error": options.initial_error,
-        "window": options.window,
-        "false_alarms": options.false_alarms,
-        "change": options.change,
-        "initial_set": ranges_of(options.initial) or None,
-        "constants": own_tolerances(design, options.monitor),
-    }
+    given = stated_settings(options)
+    if getattr(options, "prove", None) is not None:
+        del given["window"]  # it is that of the proof
+    refuse_idle(table, options.monitor, given, called=flag_of)
+    given["constants"] = own_tolerances(design, options.monitor)
     acting = table.get(options.monitor, ())
-    return {**{name: value for name, value in given.items() if name in acting}, "unverified": options.unverified}
+    settings = {name: value for name, value in given.items() if name in acting and value is not None}
+    return {**settings, "unverified": options.unverified}
 
 
 def monitor_of(
@@ -110,7 +106,7 @@ def monitor_of(
 ) -> obsynth.types.Monitor | None:
     """Return the monitor that is asked for."""
     if options.monitor is None:
-        of_monitors = (*(() if has_scenario else ("system",)), "sample_time", *monitor_names())
+        of_monitors = (*(() if has_scenario else ("system",)), "sample_time", *MONITOR_NAMES)
         refuse_given(options, of_monitors, "a monitor: name it with --monitor")
         return None
 
@@ -128,9 +124,7 @@ def monitor_of(
         design,
         options.monitor,
         scenario=scenario,
-        nominal=numbers_of(options.nominal),
         sample_time=options.sample_time,
-        normal=options.normal,
         **monitor_settings(design, options),
     )
 
@@ -240,7 +234,8 @@ def alarm_of_run(
     row = found.alarm_rows.get("pointwise")
     if row is None:
         return {"proved": False, "row": None, "statement": "No alarm: there is nothing to prove.", "file": None}
-    tried = [min(row + int(share * options.window), found.rows) for share in _LATER]
+    window = options.window or WINDOW
+    tried = [min(row + int(share * window), found.rows) for share in _LATER]
     for last in dict.fromkeys(max(number, 2) for number in tried):
         proof = proof_of(design, options, last)
         if proof.proved:
@@ -256,7 +251,7 @@ def proof_of(
         with_input_delay(design, options),
         Path(options.data),
         row,
-        window=options.window,
+        window=options.window or WINDOW,
         columns=columns_of(options),
         scales=numbers_of(options.scale),
         disturbance_bounds=numbers_of(options.disturbance),
@@ -364,7 +359,7 @@ def run_run(options: argparse.Namespace) -> int:
         smooth=options.smooth,
         lag=options.lag,
         state=options.state,
-        state_every=options.state_every,
+        **({} if options.state_every is None else {"state_every": options.state_every}),
     )
     proof = None if certificate is None else alarm_of_run(design, options, found, certificate)
     if options.json:

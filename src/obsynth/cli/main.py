@@ -286,7 +286,6 @@ VERBS = {
                         "P",
                         "confidence level of the intervals (default: 0.95)",
                         type=float,
-                        default=0.95,
                     ),
                     option("--plants", "N", "draw N plants from the tolerances, half of them vertices", type=int),
                     JOBS,
@@ -371,7 +370,6 @@ VERBS = {
                         "N",
                         "of a stream: save --state again after every N rows (default: 100)",
                         type=int,
-                        default=100,
                     ),
                 )
             ),

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import obsynth
-from obsynth.cli.arguments import columns_of, monitor_names, numbers_of, refuse_given, refuse_other_kinds
+from obsynth.cli.arguments import MONITOR_NAMES, columns_of, flag_of, numbers_of, refuse_given, stated_settings
 from obsynth.cli.commands import designed_or_loaded, spec_output
 from obsynth.cli.data_commands import (
     monitor_settings,
@@ -19,7 +19,7 @@ from obsynth.cli.data_commands import (
 from obsynth.cli.output import answer, output_file, progress, stdout_console
 from obsynth.cli.sweep import chosen_executor
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.experiments.monitors.options import PARAMETER_OPTIONS
+from obsynth.experiments.monitors.options import CHANGE, FALSE_ALARMS, PARAMETER_OPTIONS, refuse_idle
 from obsynth.files.inputs import protect
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.results.certificate_files import RESULT_FILE
@@ -110,7 +110,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
         return _run_tolerances(options)
     refuse_given(options, ("out", "force"), "the picture or certificate of --tolerances")
     if options.monitor is None:
-        refuse_given(options, monitor_names(), "a monitor: name it with --monitor")
+        refuse_given(options, MONITOR_NAMES, "a monitor: name it with --monitor")
     with progress(quiet=options.quiet) as report_stage:
         spec, scenario, _, design = _prepared(options, report_stage)
         report_stage("running")
@@ -128,8 +128,8 @@ def run_evaluate(options: argparse.Namespace) -> int:
                 monitor=watched,
                 executor=executor,
                 progress=lambda done, total: report_stage(f"{done} of {total} runs"),
-                confidence=options.confidence,
                 plants=options.plants,
+                **({} if options.confidence is None else {"confidence": options.confidence}),
             )
     from obsynth.comparison.comparing import design_beside_least, in_words
     from obsynth.report.scenarios import described, evaluation_report, final_threshold
@@ -157,9 +157,10 @@ def run_evaluate(options: argparse.Namespace) -> int:
 
 def _parameter_monitor(options: argparse.Namespace) -> obsynth.ParameterMonitor:
     """Return the decision on parameters that is asked for."""
-    refuse_other_kinds(options, {**PARAMETER_OPTIONS, "glr": ("false_alarms",)})
-    change = options.change if options.monitor == "cusum" else None
-    return obsynth.ParameterMonitor(options.monitor, false_alarms=options.false_alarms, change=change)
+    table = {**PARAMETER_OPTIONS, "glr": ("false_alarms",)}
+    refuse_idle(table, options.monitor, stated_settings(options), called=flag_of)
+    change = (options.change or CHANGE) if options.monitor == "cusum" else None
+    return obsynth.ParameterMonitor(options.monitor, false_alarms=options.false_alarms or FALSE_ALARMS, change=change)
 
 
 def _compared_delay(spec: obsynth.Spec, options: argparse.Namespace) -> int:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import obsynth
-from obsynth.cli.arguments import STREAM, monitor_names, numbers_of, refuse_given
+from obsynth.cli.arguments import MONITOR_NAMES, STREAM, numbers_of, refuse_given
 from obsynth.cli.output import output_file, print_json, progress, stdout_console
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
@@ -79,7 +79,7 @@ def run_many(options: argparse.Namespace) -> int:
     if given:
         names = ", ".join(f"--{name}" for name in given)
         raise SpecError(f"{names}: for one gain set; --gains is a folder of many.", path=f"--{given[0]}")
-    refuse_given(options, ("state_every", "sample_time", *monitor_names()), "one gain set: --gains is a folder of many")
+    refuse_given(options, ("state_every", "sample_time", *MONITOR_NAMES), "one gain set: --gains is a folder of many")
     folder = Path(options.out)
     if options.out == STREAM or (folder.exists() and not folder.is_dir()):
         raise SpecError("Many designs need a folder for their estimates: give one to --out.", path="--out")

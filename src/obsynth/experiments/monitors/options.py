@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from obsynth.errors import SpecError
@@ -31,8 +31,10 @@ PARAMETER_OPTIONS: Mapping[str, tuple[str, ...]] = {
 WINDOW, FALSE_ALARMS, CHANGE = 20, 0.01, 1.0
 
 
-def refuse_idle(table: Mapping[str, tuple[str, ...]], kind: str, given: Mapping[str, Any]) -> None:
-    """Raise `SpecError` where an option is given that does nothing for a kind of monitor."""
+def refuse_idle(
+    table: Mapping[str, tuple[str, ...]], kind: str, given: Mapping[str, Any], *, called: Callable[[str], str] = str
+) -> None:
+    """Raise `SpecError` where an option is given that does nothing for a kind of monitor, by what it is ``called``."""
     used = table.get(kind)
     if used is None:
         return  # who makes the monitor says which kinds there are
@@ -42,7 +44,7 @@ def refuse_idle(table: Mapping[str, tuple[str, ...]], kind: str, given: Mapping[
             continue
         kinds = [other for other, names in table.items() if name in names]
         where = f"the monitor {' or '.join(kinds)}" if kinds else "designs of another kind"
-        raise SpecError(f"{name} is for {where}, not for {kind}: leave it out.", path=name)
+        raise SpecError(f"{called(name)} is for {where}, not for {kind}: leave it out.", path=called(name))
 
 
 def checked_options(
