@@ -717,7 +717,9 @@ def _dae_header(design: ObserverDesign, prefix: str, digest: str, alarms: Alarms
         ("fault_deviations", "sd fhat", model.parameter_names),
         ("residuals", "r", model.output_names),
     )
-    listed = [line for *signal, names in signals for line in _signal_comments(*signal, names, None, model.units)]
+    listed = [
+        line for array, column, names in signals for line in _signal_comments(array, column, names, None, model.units)
+    ]
     structs = [*observer_struct(observer.steps, f"{prefix}_observer"), *monitor_struct(alarms, prefix)]
     words = {
         "OBSERVER": f"Observer {quoted(design.name)} by {quoted(design.method)}, written by obsynth.",
