@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from pathlib import Path
 
@@ -182,3 +183,12 @@ def test_bad_arguments(tmp_path: Path) -> None:
         obsynth.compare(plant, data=pd.DataFrame({"vy": [0.0]}), runs=1, methods=["functional-filter"])
     with pytest.raises(obsynth.SpecError, match="no faults"):
         obsynth.compare(plant.replace(Bf=None, Df=None, fault_names=None, units={}))
+
+
+def test_the_page_lists_meanings_and_refusals_and_names_units(bicycle: obsynth.Comparison) -> None:
+    page = bicycle.page()
+    assert "<td>steering (rad)</td>" in page
+    for refusal in bicycle.refusals:
+        assert f"<li>{html.escape(refusal)}</li>" in page
+        assert "..." not in refusal
+    assert "<li>s to alarm: median detection delay</li>" in page

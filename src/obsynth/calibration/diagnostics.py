@@ -295,6 +295,9 @@ def draw_validation(found: Validation, panels: Sequence[Axes]) -> None:
         band = BAND_WIDTH * found.deviations[:, i]
         said.fill_between(time, -band, band, **BAND_STYLE)
         said.plot(time, found.innovations[:, i], color="black", linewidth=0.8, marker=".", markersize=3)
+        # The band of an unknown start would leave the innovations a line.
+        reach = 1.1 * max(np.nanmax(np.abs(found.innovations[:, i]), initial=0.0), np.nanmedian(band))
+        said.set_ylim(-reach, reach)
         said.set_ylabel(f"innovation\nof {name}")
     for panel, (name, columns) in zip(panels[2 * len(names) :], found.estimates.items(), strict=True):
         value, band = columns[:, 0], BAND_WIDTH * columns[:, 1]

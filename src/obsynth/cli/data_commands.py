@@ -542,7 +542,7 @@ def _draw(found: obsynth.types.DataRun, design: obsynth.ObserverDesign, parts: l
     from obsynth.plotting.data import panel_count, plot_data
 
     if target is not None:
-        count = panel_count(found, parts)
+        count = panel_count(found, parts, design=design)
         written_picture(target, count, lambda axes: plot_data(found, design=design, show=parts, axes=axes))
         return
     import matplotlib as mpl

@@ -281,6 +281,15 @@ class Comparison:
                 )
         return (_HEADER, *rows)
 
+    def _rows_with_units(self) -> tuple[tuple[str, ...], ...]:
+        """Return the table with the unit of each fault, in which its figures are."""
+        head, *rows = self.rows()
+        return (head, *((method, with_unit(fault, self._units), *others) for method, fault, *others in rows))
+
+    @property
+    def _units(self) -> dict[str, str]:
+        return next((dict(entry.design.plant.units) for entry in self.methods if entry.design is not None), {})
+
     def meanings(self, columns: Sequence[str] = _HEADER) -> str:
         """Return what columns of numbers of the table mean, in one sentence.
 
@@ -370,7 +379,6 @@ class Comparison:
         from matplotlib.figure import Figure
 
         shown = [entry for entry in self.methods if entry.faults]
-        units = next((dict(entry.design.plant.units) for entry in shown if entry.design is not None), {})
         count = max(len(self.fault_names), 1)
         figure = Figure(figsize=(11.0, 2.8 * count), layout="constrained")
         axes = figure.subplots(count, 2, squeeze=False)
@@ -395,7 +403,7 @@ class Comparison:
             length = max((len(entry.responses) for entry in shown), default=2) * self.sample_time
             left.set_xlim(0.0, min(max([3.0 * max(times, default=length), 10.0 * self.sample_time]), length))
             left.set_ylabel(f"estimate of a unit step\nof {name}")
-            right.set_ylabel(with_unit(name, units))
+            right.set_ylabel(with_unit(name, self._units))
             right.set_ylim(-reach, reach)
             for panel in (left, right):
                 label_time(panel)
@@ -429,14 +437,18 @@ class Comparison:
 
     def page(self) -> str:
         """Return a page of HTML that stands alone, with table, picture, refusals and recommendation."""
+        picture = data_url(written(self.plot()))
+        meanings = "".join(f"<li>{escape(f'{name}: {text}')}</li>" for name, text in _FIGURE_MEANINGS.items())
+        refused = "".join(f"<li>{escape(text)}</li>" for text in self.refusals)
         body = [
             f'<p class="verdict {"holds" if self.recommended else "fails"}">{escape(self.advice)}</p>',
             f"<p>{escape(self.setting)}</p>",
             *(f"<p>{escape(text)}</p>" for text in self.notes),
-            f'<div class="scroll figures">{html_table(self.rows())}</div>',
-            f'<p class="soft">{escape(self.meanings())}</p>',
-            *(f"<p>{escape(text)}</p>" for text in self.refusals),
-            f'<figure><img alt="Estimates of each method" src="{data_url(written(self.plot()))}"></figure>',
+            f'<div class="scroll figures">{html_table(self._rows_with_units())}</div>',
+            f'<div class="scroll"><figure><img alt="Estimates of each method" src="{picture}"></figure></div>',
+            "<h2>What the columns mean</h2>",
+            f'<ul class="soft">{meanings}</ul>',
+            *(["<h2>Methods without a design</h2>", f"<ul>{refused}</ul>"] if refused else []),
         ]
         return standing_page("Comparison of methods", body, generator="obsynth compare")
 

@@ -23,6 +23,8 @@ CONTRADICTING = ("nis", "learned")
 NOT_VALID = (
     "An interval is not valid where its alarm contradicts the stated noise and random walks: the fault may lie outside."
 )
+#: How a run begins to say that nothing alarmed.
+NO_ALARM = "No alarm"
 #: Why a row cannot alarm, by its status.
 REASONS = {
     WARM_UP: "the initial-condition response has not settled yet (--warm-up)",
@@ -199,7 +201,7 @@ def silence(run: Any, by: str) -> list[str]:
     silent, found = sum(run.silent.values()), list[str]()
     if not run.alarms and silent < run.rows:
         told = f" in the {run.rows - silent} rows that could alarm" if silent else ""
-        found.append(f"No alarm by {by}{told}.")
+        found.append(f"{NO_ALARM} by {by}{told}.")
     if silent:
         found.append(f"{silent} of {run.rows} rows were without a decision: {'; '.join(silent_rows(run.silent))}.")
     return found

@@ -28,7 +28,7 @@ def shown(value: float, unit: str = "") -> str:
     """Return a number with all its digits, and its unit."""
     number = float(value)
     text = str(int(number)) if number.is_integer() and abs(number) < 10.0**WHOLE_DIGITS else repr(number)
-    return f"{text} {unit}".rstrip()
+    return f"{text} {'' if unit == '1' else unit}".rstrip()
 
 
 def deviations_told(count: float) -> str:

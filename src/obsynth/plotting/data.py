@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 #: Kinds of panels, in their order.
 PANELS = ("outputs", "faults", "residuals", "statistic", "shares")
-#: Letters in a line of the sentence below a picture.
-STATEMENT_LETTERS = 125
+#: Letters in a line of the sentence below a picture: what fits below panels of a page, in small print.
+STATEMENT_LETTERS = 105
 #: Signals of a kind that are drawn.
 MOST_DRAWN = 6
 #: A statistic this many times above its threshold gets a logarithmic axis.
@@ -92,7 +92,7 @@ def plot_data(
     unknown = [part for part in show if part not in PANELS]
     if isinstance(show, str) or unknown:
         raise SpecError(f"show is {show!r}: use some of {', '.join(PANELS)}.", path="show")
-    plans = _plans(run.table, run.measured, show)
+    plans = _plans(run.table, run.measured, show, design)
     panels = new_panels(axes, len(plans), size=(WIDTH, PANEL_HEIGHT * max(len(plans), 1) + 0.6))
     units = {} if design is None else dict(design.plant.units)
     # A marked alarm explains the red rows as well.
@@ -133,16 +133,20 @@ def plot_data(
     return panels
 
 
-def panel_count(run: DataRun, show: Sequence[str] = PANELS) -> int:
+def panel_count(run: DataRun, show: Sequence[str] = PANELS, *, design: ObserverDesign | None = None) -> int:
     """Return how many axes `plot_data` needs."""
-    return 0 if run.table is None or run.measured is None else len(_plans(run.table, run.measured, show))
+    return 0 if run.table is None or run.measured is None else len(_plans(run.table, run.measured, show, design))
 
 
-def _plans(table: pd.DataFrame, measured: pd.DataFrame, show: Sequence[str]) -> list[tuple[str, str]]:
+def _plans(
+    table: pd.DataFrame, measured: pd.DataFrame, show: Sequence[str], design: ObserverDesign | None
+) -> list[tuple[str, str]]:
     """Return part and signal of each panel."""
     columns = [str(name) for name in table.columns]
     estimated = {name[5:-1] for name in columns if name.startswith("xhat[")}
-    outputs = [str(name) for name in measured.columns if name != "time"]
+    # The input of a linearised plant that is one in every row is in no log.
+    shift = getattr(getattr(getattr(design, "plant", None), "uncertainty", None), "shift", None)
+    outputs = [str(name) for name in measured.columns if name not in ("time", shift)]
     # Known inputs come first and are no outputs; of these the estimated ones say more.
     outputs.sort(key=lambda name: name not in estimated)
     plans = [("outputs", name) for name in outputs[:MOST_DRAWN]]

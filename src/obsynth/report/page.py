@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from html import escape
 from itertools import groupby
@@ -26,7 +27,7 @@ from rich.text import Text
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.calibration.diagnostics import Validation, draw_validation
 from obsynth.calibration.validating import states_innovations, validate
-from obsynth.data.alarm_events import alarm_notes, alarm_rows, silence
+from obsynth.data.alarm_events import NO_ALARM, alarm_notes, alarm_rows, silence
 from obsynth.data.log_estimator import DECIDING
 from obsynth.data.run import DataRun
 from obsynth.errors import ObsynthError, SpecError
@@ -471,7 +472,11 @@ def agreement_section(design: ObserverDesign, run: DataRun, rows: str | None) ->
         yield f"<p>This log was not compared with the design: {escape(str(error))}</p>"
         return
     state = "holds" if found.passed else "fails"
-    sentence = "The log agrees with the design." if found.passed else "The log does not agree with the design."
+    if rows is None:
+        said = "The log agrees" if found.passed else "The log, taken as free of faults, does not agree"
+    else:
+        said = f"Rows {rows} of the log {'agree' if found.passed else 'do not agree'}"
+    sentence = f"{said} with the design."
     yield f'<p class="verdict {state}">{sentence}</p>'
     yield "<ul>"
     yield from (f"<li>{escape(text)}</li>" for text in found.verdict)
@@ -515,13 +520,14 @@ def _sensors(design: ObserverDesign, found: Validation) -> Table:
 
 def data_section(design: ObserverDesign, run: DataRun, statement: str) -> Iterator[str]:
     """Yield a picture of a run, what was counted, and statistics of estimates and residuals in decided rows."""
-    count = panel_count(run)
+    # The page itself tells what the threshold means.
+    shown, count = replace(run, statement=""), panel_count(run, design=design)
     if count:
         text = (
             "Measured outputs and their estimates, fault estimates, residuals and the monitor's statistic, as far "
             "as there are any. In grey rows nothing is decided; rows with an alarm are red."
         )
-        yield stacked("", text, count, lambda axes: plot_data(run, design=design, axes=axes)).html()
+        yield stacked("", text, count, lambda axes: plot_data(shown, design=design, axes=axes)).html()
     yield from fact_rows(_counts(run, statement))
     rows, more = alarm_rows(run.events, run.stamps.shown)
     if rows:
@@ -536,7 +542,8 @@ def data_section(design: ObserverDesign, run: DataRun, statement: str) -> Iterat
 def _counts(run: DataRun, statement: str) -> Iterator[tuple[str, str]]:
     yield "rows", f"{run.rows}: " + ", ".join(f"{count} {status}" for status, count in run.statuses.items())
     if statement or run.thresholds:
-        yield from (("alarms", text) for text in silence(run, "the monitor" if statement else "any threshold"))
+        for text in silence(run, "the monitor" if statement else "any threshold"):
+            yield "alarms" if text.startswith(NO_ALARM) else "undecided", text
     if statement:
         yield "threshold", statement
 

@@ -98,9 +98,9 @@ def _interval(item: Interval) -> str:
 #: Columns left out where the console is narrower than so many characters.
 NARROW = 130
 _LESS = ("order", "s to 50 %", "at horizon", "peak", "bias", "s to alarm", "smallest", "ms")
-#: Columns of names, and how wide they are there: eighty columns less six of numbers.
+#: Columns of names, how wide they are there (eighty columns less six of numbers), and how wide headings of numbers.
 _NAME_COLUMNS = ("method", "fault")
-_NAME_WIDTH = 11
+_NAME_WIDTH, _HEADING_WIDTH = 11, 8
 
 
 def comparison_report(found: Comparison, *, console: Console, file: Path | None = None) -> None:
@@ -108,10 +108,15 @@ def comparison_report(found: Comparison, *, console: Console, file: Path | None 
     header, *rows = found.rows()
     wide = console.width >= NARROW
     kept = [i for i, name in enumerate(header) if wide or name not in _LESS]
-    table = headed_table(*(header[i] for i in kept))
+    table = headed_table(
+        *(header[i] if wide else fill(header[i], _HEADING_WIDTH, break_long_words=False) for i in kept)
+    )
     # Only names break, and at their hyphens and blanks: a number that is cut is another number.
     for column, i in zip(table.columns, kept, strict=True):
         column.no_wrap = header[i] not in _NAME_COLUMNS
+        if not column.no_wrap:
+            words = [word for row in rows for word in row[i].replace("-", "- ").split()]
+            column.min_width = min(max(map(len, [header[i], *words])), _NAME_WIDTH)
     for row in rows:
         texts = [row[i] if wide or header[i] not in _NAME_COLUMNS else fill(row[i], _NAME_WIDTH) for i in kept]
         table.add_row(*map(Text, texts))
