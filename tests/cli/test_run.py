@@ -221,7 +221,7 @@ def test_files_that_are_not_there_or_not_right(gains, capsys):
     refused("There is no column 'f'", "--threshold", "f=1")
     refused("gap is for continuous-time designs", "--gap", "2")
     refused("cannot both go to stdout", "--json", out="-")
-    Path("log.csv").write_bytes(b"time,u1,u2,x2,x3,x4\n0,0,0,0,0,\xff\n")
+    Path("log.csv").write_bytes(b"time,u1,u2,x2,x3,x4\n0,0,0,0,0,\x81\n")
     refused("log.csv is no UTF-8 text")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,96 @@ def test_a_line_that_holds_no_units_of_time_is_a_row(design, frame, tmp_path, li
 def test_other_encodings_of_a_text(design, frame, tmp_path, encoding):
     (tmp_path / "log.csv").write_bytes(frame.to_csv(index=False).encode(encoding))
     same(design, tmp_path / "log.csv", frame)
+
+
+def test_a_text_of_windows_is_read_and_bytes_that_are_no_text_are_refused(design, frame, tmp_path):
+    text = frame.rename(columns={"level": "level [°C]"}).assign(remark="Prüfung").to_csv(index=False)
+    (tmp_path / "log.csv").write_bytes(text.encode("cp1252"))
+    same(design, tmp_path / "log.csv", frame)
+    # Some letters in UTF-8 beside it, as of a logger that writes names of its own.
+    (tmp_path / "log.csv").write_bytes(text.encode("cp1252").replace(b"remark", "Maß".encode()))
+    same(design, tmp_path / "log.csv", frame)
+    (tmp_path / "log.csv").write_bytes(text.encode("cp1252") + b"\x81")
+    with pytest.raises(SpecError, match="is no UTF-8 text"):
+        obsynth.run_on_data(design, tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize("kind", ["frame", "csv", "parquet", "calibrate"])
+def test_units_behind_names_are_left_out_and_say_what_the_times_are(design, frame, tmp_path, kind):
+    units = {"time": "time [ms]", "level": "level (m)", "flow": "flow[m3/h]"}
+    log = frame.assign(time=1000.0 * frame["time"]).rename(columns=units)
+    data = log if kind == "frame" else tmp_path / f"log.{kind.replace('calibrate', 'csv')}"
+    if kind == "parquet":
+        pytest.importorskip("pyarrow")
+        log.to_parquet(data)
+    elif kind != "frame":
+        log.to_csv(data, index=False)
+    if kind == "calibrate":
+        found, _, said = log_table(data, SIGNALS)
+        assert np.allclose(found["time"], frame["time"], rtol=0, atol=1e-9)
+        assert np.array_equal(found["flow"], frame["flow"])
+        assert "'time [ms]', 'level (m)', 'flow[m3/h]'" in said[0]
+        return
+    run = obsynth.run_on_data(design, data)
+    assert np.allclose(run.table["time"], frame["time"], rtol=0, atol=1e-9)
+    assert any("'level (m)'" in text for text in run.warnings)
+    same(design, data, frame)
+    # The name itself is meant where it is there; of two with units neither is.
+    same(design, log.assign(level=frame["level"]), frame)
+    with pytest.raises(SpecError, match="no column 'level'"):
+        obsynth.run_on_data(design, log.assign(**{"level (ft)": 0.0}))
+
+
+@pytest.mark.parametrize("name", ["level status", "level.Quality", "LEVEL_STATUS", "level [Quality]", "Status"])
+@pytest.mark.parametrize("kind", ["frame", "csv", "parquet"])
+def test_values_that_their_status_calls_bad_are_missing(design, frame, tmp_path, name, kind):
+    if kind == "parquet":
+        pytest.importorskip("pyarrow")
+    bad = (frame.index >= 12) & (frame.index < 15)
+    log = frame.copy()
+    log.insert(list(log.columns).index("level") + 1, name, np.where(bad, "Bad (no data)", "Good"))
+    data = log if kind == "frame" else tmp_path / f"log.{kind}"
+    if kind != "frame":
+        getattr(log, f"to_{kind}")(data, index=False)
+    same(design, data, frame.assign(level=frame["level"].where(~bad)))
+    (text,) = obsynth.run_on_data(design, data).warnings
+    assert text.startswith(
+        f"3 cell(s) of 'level' count as missing, as '{name}' says so, first 'Bad (no data)' in row 13"
+    )
+
+
+@pytest.mark.parametrize("words", [["Bad", "Bad"], ["on", "off"], ["192", "0"]])
+def test_other_columns_are_no_status(design, frame, words):
+    """One of another signal, words that do not say that a value is bad, and numbers, which have no common meaning."""
+    name = "pump status" if words[0] == "Bad" else "level status"
+    log = frame.assign(**{name: np.where(frame.index % 2, *words)})
+    same(design, log, frame)
+
+
+@pytest.mark.parametrize(
+    ("separator", "cells"),
+    [(";", ["1.234,5", "-12.345,25", "999,5"]), (";", ["1 234,5", "-12\u00a0345,25", "999,5"]),
+     (";", ["1'234.5", "-12'345.25", "999.5"]), (",", ["1,234.5", "-12,345.25", "999.5"]),
+     ("\t", ["1,234.5", "-12,345.25", "999.5"])],
+)  # fmt: skip
+def test_what_groups_thousands_is_left_out(design, frame, tmp_path, separator, cells):
+    log = frame.astype({"level": object})
+    log.loc[3:5, "level"] = cells
+    log.to_csv(tmp_path / "log.csv", sep=separator, index=False)
+    wanted = frame.copy()
+    wanted.loc[3:5, "level"] = [1234.5, -12345.25, 999.5]
+    same(design, tmp_path / "log.csv", wanted)
+
+
+@pytest.mark.parametrize("cells", [["1.234", "0,5"], ["999,5", "1.234"], ["1,234", "1,234.5"], ["1.234", "12.345,5"]])
+@pytest.mark.parametrize("across", [False, True])
+def test_a_mark_that_may_group_thousands_is_no_decimal_mark(design, frame, cells, across):
+    """1.234 was read as 1.234 where the numbers beside it have decimal commas."""
+    log = frame.round(0).astype(int).astype({name: object for name in SIGNALS})
+    log.loc[3, "level"] = cells[0]
+    log.loc[4, "flow" if across else "level"] = cells[1]
+    with pytest.raises(SpecError, match=r"the mark may group thousands.* Leave out what groups thousands"):
+        obsynth.run_on_data(design, io.StringIO(log.assign(time=frame["time"]).to_csv(sep=";", index=False)))
 
 
 def test_blank_lines_before_the_header_and_separators_behind_the_last_cell(design, frame, tmp_path):

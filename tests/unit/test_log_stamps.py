@@ -26,13 +26,26 @@ STAMPS: dict[str, Callable[[pd.Timestamp], str]] = {
     "year first": lambda at: at.strftime("%Y/%m/%d %H:%M:%S.%f"),
     "month first": lambda at: at.strftime("%m/%d/%Y %I:%M:%S.%f %p"),
     "day first": lambda at: at.strftime("%d/%m/%Y %H:%M:%S.%f"),
+    "day first with dashes": lambda at: at.strftime("%d-%m-%Y %H:%M:%S.%f"),
+    "parts without zeros": lambda at: f"{at.year}-{at.month}-{at.day} {at.hour}:{at:%M:%S.%f}",
+    "points with two digits": lambda at: at.strftime("%d.%m.%y %H:%M:%S,%f"),
+    "name of the month": lambda at: at.strftime("%d-%b-%Y %H:%M:%S.%f"),
+    "American with a name": lambda at: at.strftime("%B %d, %Y %I:%M:%S.%f %p"),
+    "two columns": lambda at: at.strftime("%H:%M:%S.%f"),
+    "two columns with PM": lambda at: at.strftime("%I:%M:%S.%f %p"),
+    **{
+        f"zone {zone}": lambda at, zone=zone: at.strftime(f"%Y-%m-%d %H:%M:%S.%f{zone}")
+        for zone in ("Z", " UTC", " GMT", "+00:00", " +00:00", "+0000", " UTC+0", " GMT-00:00")
+    },
+    "PM and a zone": lambda at: at.strftime("%m/%d/%Y %I:%M:%S.%f %p UTC"),
 }
 
 
 def stamped(kind: str) -> pd.DataFrame:
     data = log(fault=0.5)
     moments = BEGIN + pd.to_timedelta(np.round(data["time"] * 1e9).astype("int64"), unit="ns")
-    return data.assign(time=[STAMPS[kind](at) for at in moments])
+    data = data.assign(time=[STAMPS[kind](at) for at in moments])
+    return data.assign(Date=[at.strftime("%d.%m.%Y") for at in moments]) if kind.startswith("two columns") else data
 
 
 @pytest.mark.parametrize("kind", list(STAMPS))
@@ -49,6 +62,8 @@ def test_stamps_of_other_programs_are_read(tmp_path: Path, kind: str) -> None:
         assert table is not None
         assert wanted is not None
         found = pd.to_datetime(table["time"], unit="s" if numbers else None, format=None if numbers else "ISO8601")
+        assert (found.dt.tz is not None) == ("zone" in kind)
+        found = found.dt.tz_localize(None) if "zone" in kind else found
         # Seconds since 1970 in double precision are known to a quarter of a microsecond.
         assert abs((found - BEGIN).dt.total_seconds() - wanted["time"]).max() <= 1e-6
         assert table["status"].tolist() == wanted["status"].tolist()
@@ -93,3 +108,32 @@ def test_the_first_date_with_slashes_says_what_is_the_day() -> None:
     data.loc[40:, "time"] = [text.replace("26/12/2026", "12/26/2026") for text in data.loc[40:, "time"]]
     with pytest.raises(obsynth.SpecError, match=r"Row 41, .* is no time stamp"):
         obsynth.run_on_data(designed("ui-pi-observer"), data)
+
+
+@pytest.mark.parametrize("zone", ["+02:00", " +0200", "+2", " UTC+2", " GMT+02:00"])
+def test_an_offset_of_the_zone_is_kept(zone: str) -> None:
+    data = log()
+    moments = BEGIN + pd.to_timedelta(np.round(data["time"] * 1e9).astype("int64"), unit="ns")
+    data["time"] = [f"{at:%Y-%m-%d %H:%M:%S.%f}{zone}" for at in moments]
+    table = obsynth.run_on_data(designed("ui-pi-observer"), data).table
+    assert table is not None
+    assert str(table["time"].iloc[0]) == "2026-12-25 23:59:56.500000+02:00"
+
+
+@pytest.mark.parametrize("text", ["2026-12-25 23:59:56 CET", "2026-12-25 23:59:56 UTC+1:5", "25-Dez-2026 23:59:56",
+                                  "Foo Dec 2026", "24:61:00", "23:59", "31.02.26 08:00"])  # fmt: skip
+def test_what_is_nearly_a_stamp_is_refused(text: str) -> None:
+    data = log().astype({"time": object})
+    data.loc[0, "time"] = text
+    with pytest.raises(obsynth.SpecError, match="is no time stamp"):
+        obsynth.run_on_data(designed("ui-pi-observer"), data)
+
+
+@pytest.mark.parametrize("kind", ["hours", "beside dates"])
+def test_hours_minutes_and_seconds_alone_count_as_seconds_and_the_date_beside_them_only_then(kind: str) -> None:
+    data, wanted = log(fault=0.5), obsynth.run_on_data(designed("ui-pi-observer"), log(fault=0.5)).table
+    data = data.assign(Date="25.12.2026") if kind == "beside dates" else data
+    if kind == "hours":
+        data["time"] = [f"00:{at // 60:02.0f}:{at % 60:05.2f}" for at in data["time"]]
+    table = obsynth.run_on_data(designed("ui-pi-observer"), data).table
+    pd.testing.assert_frame_equal(table, wanted, atol=1e-12)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, tzinfo
 from typing import Any
@@ -20,10 +21,25 @@ from obsynth.numerics.arrays import FloatArray, read_only
 MISSING_TEXTS = frozenset({"", "nan", "na", "n/a", "null", "none"})
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _EXPECTED_TIMES = "seconds, such as 12.5, or a date and a time, such as 2026-05-01T08:30:00.5+02:00"
-#: Dates with points, which have the day first wherever they are written, and with slashes, which have no such rule but
-#: where the year is first.
-_POINTED = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(.*)")
-_SLASHED = re.compile(r"(\d{1,4})/(\d{1,2})/(\d{1,4})(.*)")
+#: Dates with points, which have the day first wherever they are written, and with slashes or dashes, which have no such
+#: rule but where the year is first; those with the name of a month.
+_POINTED = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4}|\d{2})(?!\d)(.*)")
+_SLASHED = re.compile(r"(\d{1,4})([/-])(\d{1,2})\2(\d{1,4})(.*)")
+_NAMED_MONTH = re.compile(
+    r"(?=.*\b\d{4}\b).*\b(?:jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*\b.*", re.IGNORECASE
+)
+#: A year of two digits is one of these hundred.
+_CENTURY = 2000
+#: A time of day that names its zone behind it.
+_ZONE = re.compile(
+    r"(.*?:\d{2}[^A-Za-z+-]*?(?:\s*[AaPp]\.?[Mm]\.?)?)\s*(UTC|GMT|Z)?\s*(?:([+-])(\d{1,2})(?::?(\d{2}))?)?",
+    re.IGNORECASE,
+)
+#: A time of day without its date, as it stands beside one; hours, minutes and seconds since a log began.
+_TIME_OF_DAY = re.compile(
+    r"\d{1,2}:\d{2}(?::\d{2}\S*)?(?:\s*[AaPp]\.?[Mm]\.?)?(?:\s*(?:UTC|GMT|Z|[+-]\d\S*))?", re.IGNORECASE
+)
+_ELAPSED = re.compile(r"(\d+):([0-5]\d):([0-5]\d(?:[.,]\d+)?)")
 #: A time of day, with AM or PM where the hours are counted to twelve.
 _CLOCK = re.compile(r"[ T]+(\d{1,2})(:\d{2}\S*?)(?:\s*([AaPp])\.?[Mm]\.?)?")
 _HALF_DAY = 12
@@ -70,6 +86,28 @@ def _clock(text: str) -> str:
     return f"T{hour % _HALF_DAY + _HALF_DAY * (half == 'p') if half else hour:02}{rest}"
 
 
+def _with_named_month(text: str) -> str:
+    """Return a date with the name of a month as ISO 8601 writes it; what is none as it is."""
+    import pandas as pd
+
+    try:
+        return str(pd.to_datetime(text).isoformat())
+    except ValueError:
+        return text
+
+
+def _zone(text: str) -> tuple[str, str]:
+    """Return a date and time without its zone, and the zone as ISO 8601 writes it, empty where there is none."""
+    clock = text.partition(":")[2]
+    if not clock or (clock[-1].isdigit() and "+" not in clock and "-" not in clock):
+        return text, ""
+    found = _ZONE.fullmatch(text)
+    if found is None or not any(found.groups()[1:]):
+        return text, ""
+    body, _, sign, hours, minutes = found.groups()
+    return body, f"{sign or '+'}{hours or '0':0>2}:{minutes or '00'}"
+
+
 class Stamps:
     """Which kind of stamps a log has, decided by its first one, and the zone in which they are written back."""
 
@@ -83,6 +121,11 @@ class Stamps:
         self.notes: list[str] = []  # what is to be said of the file
         #: Cells that hold a word instead of a number, which are missing, by column: how many; first row and text.
         self.words: dict[str, tuple[int, int, str]] = {}
+        #: Cells beside which a status says that they are bad, by column: how many; first row, text and its column.
+        self.bad: dict[str, tuple[int, int, str, str]] = {}
+        #: The decimal mark that numbers of a column have shown, and rows of cells that may group thousands instead.
+        self.decimals: dict[str, str] = {}
+        self.groups: dict[tuple[str, str], tuple[int, str]] = {}
         #: Columns that have shown a number: of the others words are no bad samples, but another kind of column.
         self.numeric: set[str] = set()
         #: Inputs ``(delay, nu)`` of the latest rows, where inputs act later than they are written.
@@ -96,7 +139,44 @@ class Stamps:
                 f"{count} cell(s) of {column!r} hold no number and count as missing, first {text!r} in row {row}."
                 for column, (count, row, text) in self.words.items()
             ),
+            *(
+                f"{count} cell(s) of {column!r} count as missing, as {status!r} says so, first {text!r} in row {row}."
+                for column, (count, row, text, status) in self.bad.items()
+            ),
         )
+
+    def take_bad(self, column: str, row: int, text: str, status: str, *, count: int = 1) -> None:
+        """Count cells that are bad by the column of their status, the first of which is in a row and says a text."""
+        known, first_row, first_text, _ = self.bad.get(column, (0, row, text, status))
+        self.bad[column] = (known + count, first_row, first_text, status)
+
+    def take_mark(self, column: str, row: int, cell: str, mark: str, *, may_group: bool) -> None:
+        """Take which decimal mark a number of a column has, or one that may group thousands instead: a log in which it
+        may mean both means neither."""
+        if may_group and (column, mark) not in self.groups:
+            self.groups[column, mark] = row, cell
+        elif not may_group and column not in self.decimals:
+            self.decimals[column] = mark
+        else:
+            return
+        for (name, seen), (first_row, first) in self.groups.items():
+            known = {self.decimals[name]} if name in self.decimals else set(self.decimals.values())
+            if known and seen not in known:
+                raise SpecError(
+                    f"Row {first_row}, column {name!r}: in {first!r} the mark may group thousands, as the decimals of "
+                    f"other numbers begin with {min(known)!r}. Leave out what groups thousands.",
+                    path=f"row {first_row}",
+                )
+
+    def take_header(self, header: Sequence[str], wanted: Sequence[str], places: Sequence[int]) -> None:
+        """Take the units that stand behind names of columns, which are called otherwise where they are ``wanted``."""
+        found = _WITH_UNIT.fullmatch(header[places[0]])
+        per_second = None if found is None else _UNITS_OF_TIME.get(found.group(2).strip().lower())
+        if per_second not in (None, 1.0):
+            self.per_second = per_second
+        named = [repr(header[place]) for name, place in zip(wanted, places, strict=True) if header[place] != name]
+        if named:
+            self.notes.append(f"Columns are found by their names without units: {', '.join(named)}.")
 
     def take_word(self, column: str, row: int, text: str) -> None:
         """Count a cell that holds a word instead of a number."""
@@ -139,12 +219,20 @@ class Stamps:
             if seconds is not None:
                 self.is_dated = False
                 return float(self.seconds(np.array([seconds]))[0])
+            elapsed = _ELAPSED.fullmatch(cell)
+            if elapsed is not None:
+                self.is_dated = False
+                hours, minutes, rest = elapsed.groups()
+                return 3600.0 * int(hours) + 60.0 * int(minutes) + float(rest.replace(",", "."))
         if self.is_dated is not False:
-            text_of_date = self._as_iso(cell, row, column)
-            try:
-                found = datetime.fromisoformat(text_of_date)
-            except ValueError:
-                found = None
+            text_of_date, found = cell, None
+            if cell[4:5] == "-":
+                with suppress(ValueError):
+                    found = datetime.fromisoformat(cell)
+            if found is None:
+                text_of_date = self._as_iso(cell, row, column)
+                with suppress(ValueError):
+                    found = datetime.fromisoformat(text_of_date)
             if found is not None:
                 if self.is_dated is None and _PART_OF_A_SECOND.search(text_of_date):
                     self.digits = "microseconds"
@@ -167,13 +255,15 @@ class Stamps:
     def _as_iso(self, cell: str, row: int, column: str) -> str:
         """Return a date as ISO 8601 writes it: one with points, such as 5.3.2026 08:30:00,5, has the day first; of one
         with slashes the first of the log must say what its parts are."""
+        cell, zone = _zone(cell)
         pointed, slashed = _POINTED.fullmatch(cell), _SLASHED.fullmatch(cell)
         if pointed is not None:
             day, month, year, time = pointed.groups()
+            year = year if len(year) > 2 else str(_CENTURY + int(year))
         elif slashed is not None and len(slashed.group(1)) > 2:
-            year, month, day, time = slashed.groups()
+            year, _, month, day, time = slashed.groups()
         elif slashed is not None:
-            one, two, year, time = slashed.groups()
+            one, _, two, year, time = slashed.groups()
             if self.day_first is None and max(int(one), int(two)) > _MONTHS:
                 self.day_first = int(one) > _MONTHS
             if self.day_first is None and one != two:
@@ -183,9 +273,11 @@ class Stamps:
                     path=f"row {row}",
                 )
             day, month = (one, two) if self.day_first else (two, one)
+        elif _NAMED_MONTH.fullmatch(cell):
+            return _with_named_month(cell) + zone
         else:
-            return cell[:10] + _clock(cell[10:])
-        return f"{year}-{month:0>2}-{day:0>2}{_clock(time)}"
+            return cell[:10] + _clock(cell[10:]) + zone
+        return f"{year}-{month:0>2}-{day:0>2}{_clock(time)}{zone}"
 
     def read_column(self, column: Any) -> FloatArray | None:
         """Return the seconds of a column of a data frame that holds dates, or no stamps; else `None`."""
@@ -302,17 +394,22 @@ class Signals:
 
     def positions(self, header: tuple[str, ...]) -> list[int]:
         """Return where in a header each column is that is read."""
-        missing = sorted({name for name in self.columns if name not in header})
+        found = [column_of(header, name) for name in self.columns]
+        missing = sorted({name for name, there in zip(self.columns, found, strict=True) if there is None})
         if missing:
             raise SpecError(
                 f"The data have no column {', '.join(map(repr, missing))}; they have "
                 f"{', '.join(map(repr, header)) or 'none'}. {_advice(header, missing)}",
                 path="data",
             )
-        repeated = sorted({name for name in self.columns if header.count(name) > 1})
+        there = [name for name in found if name is not None]
+        repeated = sorted({name for name in there if header.count(name) > 1})
         if repeated:
-            raise SpecError(f"The data have more than one column {', '.join(map(repr, repeated))}.", path="data")
-        return [header.index(name) for name in self.columns]
+            raise SpecError(
+                f"The data have more than one column {', '.join(map(repr, repeated))}: give each a name of its own.",
+                path="data",
+            )
+        return [header.index(name) for name in there]
 
     def estimates_point(self, observer: LogObserver) -> FloatArray:
         """Return what is added to the columns of estimates: the operating point of states and faults."""
@@ -322,8 +419,53 @@ class Signals:
         return np.array(values + [0.0] * (len(observer.columns) - len(values)))
 
 
-#: How columns of time stamps are often called.
-_TIME_NAMES = ("timestamp", "datetime", "date", "zeit", "time")
+#: A name of a column with a unit in brackets behind it.
+_WITH_UNIT = re.compile(r"(.*\S)\s*[\[(]([^\[\]()]*)[\])]")
+#: How the column of dates beside times of day may be called; that of a status beside a value, or behind its name.
+_DATE_NAMES = ("date", "datum", "day", "tag", "fecha")
+_STATUS_NAMES = ("status", "quality")
+#: How a status begins that says that a value is bad.
+BAD_STATUS = ("bad", "invalid", "not good")
+
+
+def column_of(header: Sequence[str], name: str) -> str | None:
+    """Return what a header calls a column: as it is called, or so with a unit in brackets behind it; `None` where no
+    column, or more than one of the latter, is called so."""
+    if name in header:
+        return name
+    found = [each for each in header if name in each and (unit := _WITH_UNIT.fullmatch(each)) and unit[1] == name]
+    return found[0] if len(found) == 1 else None
+
+
+def date_place(header: Sequence[str], places: Sequence[int]) -> int | None:
+    """Return where dates stand that times of day, which are the first of the columns that are read, may lack."""
+    found = [i for i, name in enumerate(header) if name.strip().lower() in _DATE_NAMES and i not in places]
+    return found[0] if len(found) == 1 else None
+
+
+def with_date(date: str, text: str) -> str:
+    """Return a time of day with the date beside it; what is none as it is."""
+    # A frame may show midnight behind its dates.
+    return f"{date.strip().removesuffix(' 00:00:00')} {text.strip()}" if _TIME_OF_DAY.fullmatch(text.strip()) else text
+
+
+def status_places(header: Sequence[str], places: Sequence[int]) -> list[int | None]:
+    """Return where the status of each column stands that is read ``(1 + nu + ny,)``: a column that is called as it with
+    a word such as ``status`` behind, or right of it by such a word alone."""
+    found: list[int | None] = [None]
+    lower = [name.strip().lower() for name in header]
+    for place in places[1:]:
+        unit = _WITH_UNIT.fullmatch(lower[place])
+        base = unit[1] if unit else lower[place]
+        own = [i for i, name in enumerate(lower)
+               if name.startswith(base) and name[len(base) :].strip(" ._-:()[]/") in _STATUS_NAMES]  # fmt: skip
+        beside = [place + 1] if place + 1 < len(lower) and lower[place + 1] in _STATUS_NAMES else []
+        found.append(next((i for i in (*own, *beside) if i not in places), None))
+    return found
+
+
+#: How columns of time stamps are often called; a column of dates stands beside one of times of day.
+_TIME_NAMES = ("timestamp", "datetime", "zeit", "uhrzeit", "time", "date")
 
 
 def _advice(header: tuple[str, ...], missing: list[str]) -> str:

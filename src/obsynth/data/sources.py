@@ -10,12 +10,13 @@ from __future__ import annotations
 import codecs
 import csv
 import gc
+import io
 import itertools
 import logging
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -23,7 +24,17 @@ from typing import TYPE_CHECKING, Any, TextIO, TypeAlias
 
 import numpy as np
 
-from obsynth.data.signals import MISSING_TEXTS, TIME_HEADER, Signals, Stamps
+from obsynth.data.signals import (
+    BAD_STATUS,
+    MISSING_TEXTS,
+    TIME_HEADER,
+    Signals,
+    Stamps,
+    column_of,
+    date_place,
+    status_places,
+    with_date,
+)
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, reason
 from obsynth.files.tables import unquoted
@@ -45,6 +56,15 @@ REMARK = "#"
 _OLD_LINES = re.compile(r"[^\r]*\r\n?|[^\r]+")
 
 
+#: What groups thousands: a blank of some kind or an apostrophe, or a point or comma that is not the decimal mark, or
+#: stands twice; and a number whose only mark may do so.
+_GROUPED = re.compile(
+    r"([+-]?\d{1,3}(?:([ '\u00a0\u2009\u202f\u2019])\d{3}(?:\2\d{3})*"
+    r"|(?:\.\d{3})+(?=,)|(?:,\d{3})+(?=\.)|(?:\.\d{3}){2,}|(?:,\d{3}){2,}))(?:([.,])(\d*))?"
+)
+_ONE_GROUP = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
+
+
 @dataclass(frozen=True)
 class Dialect:
     """How a log is written: what separates its columns, and whether numbers may have a decimal comma."""
@@ -64,7 +84,18 @@ class Dialect:
             return float("nan")
         try:
             found = number_in_text(cell.replace(",", ".") if self.comma and "." not in cell else cell)
+            if self.comma and stamps is not None and ("," in cell or "." in cell):
+                mark = "." if "." in cell else ","
+                if stamps.decimals.get(column) != mark:
+                    stamps.take_mark(column, row, cell, mark, may_group=bool(_ONE_GROUP.fullmatch(cell)))
         except ValueError:
+            grouped = _GROUPED.fullmatch(cell)
+            if grouped is not None and stamps is not None:
+                whole, mark, decimals = grouped[1], grouped[3] or "", grouped[4] or ""
+                if mark:
+                    stamps.take_mark(column, row, cell, mark, may_group=False)
+                stamps.numeric.add(column)
+                return float(re.sub(r"[^\d+-]", "", whole) + "." + decimals)
             if stamps is not None and ("#" in cell or not any(letter.isdigit() for letter in cell)):
                 stamps.take_word(column, row, cell)
                 return float("nan")
@@ -81,6 +112,19 @@ class Dialect:
         if stamps is not None:
             stamps.numeric.add(column)
         return found
+
+
+def _as_windows(error: UnicodeError) -> tuple[str, int]:
+    """Return bytes that are no UTF-8 as Windows writes western letters, such as the degree in a unit."""
+    if isinstance(error, UnicodeDecodeError) and error.encoding.lower().startswith("utf-8"):
+        with suppress(UnicodeDecodeError):
+            return error.object[error.start : error.end].decode("cp1252"), error.end
+    raise error
+
+
+#: The name by which texts are opened that may hold such bytes.
+_WINDOWS = "obsynth.windows"
+codecs.register_error(_WINDOWS, _as_windows)
 
 
 def encoding_of(path: Path) -> str:
@@ -107,7 +151,7 @@ def no_text(path: Path, error: UnicodeDecodeError) -> SpecError:
 
 def text_chunks(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
     """Yield ``(rows, 1 + nu + ny)`` of a file."""
-    with path.open(encoding=encoding_of(path), newline="") as stream:
+    with path.open(encoding=encoding_of(path), errors=_WINDOWS, newline="") as stream:
         if not stream.readline():
             raise SpecError(f"{path} cannot be read: it is empty.", path=str(path))
         stream.seek(0)
@@ -125,6 +169,8 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
     if not header:
         raise SpecError("The data are empty: their first line is the names of the columns.", path="data")
     places = signals.positions(header)
+    stamps.take_header(header, signals.columns, places)
+    date, states = date_place(header, places), status_places(header, places)
     row = 0
     for cells in table:
         if not any(cell.strip() for cell in cells):
@@ -137,8 +183,13 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
                 f"Row {row} has {len(cells)} cells, but the header has {len(header)}.", path=f"cells of row {row}"
             )
         cells = [*cells[: len(header)], *[""] * (len(header) - len(cells))]
-        time = stamps.read(cells[places[0]], row, header[places[0]], comma=dialect.comma)
+        stamp = cells[places[0]] if date is None else with_date(cells[date], cells[places[0]])
+        time = stamps.read(stamp, row, header[places[0]], comma=dialect.comma)
         values = [dialect.number(cells[place], row, header[place], stamps) for place in places[1:]]
+        for i, place in enumerate(states):
+            if place is not None and cells[place].strip().lower().startswith(BAD_STATUS):
+                stamps.take_bad(header[places[i]], row, cells[place].strip(), header[place])
+                values[i - 1] = float("nan")
         yield np.array([[time, *values]])
     if row == 0:
         raise SpecError("The data have no rows.", path="data")
@@ -147,7 +198,7 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
 def header_of(path: Path, wanted: Sequence[str]) -> list[str]:
     """Return the names of the columns of a file, of which some are wanted."""
     try:
-        with path.open(encoding=encoding_of(path), newline="") as stream:
+        with path.open(encoding=encoding_of(path), errors=_WINDOWS, newline="") as stream:
             return list(_opened(stream, wanted)[0])
     except UnicodeDecodeError as error:
         raise no_text(path, error) from error
@@ -162,7 +213,8 @@ def _opened(stream: TextIO, wanted: Sequence[str]) -> tuple[tuple[str, ...], Dia
     lines = _text_lines(stream)
     head = next(lines, "")
     while (head and not head.strip()) or (
-        head.startswith(REMARK) and not any(set(wanted) & set(_names(head, separator)) for separator in SEPARATORS)
+        head.startswith(REMARK)
+        and not any(column_of(_names(head, separator), name) for separator in SEPARATORS for name in wanted)
     ):
         head = next(lines, "")
     told = _SEPARATOR_LINE.fullmatch(head)
@@ -181,7 +233,7 @@ def _together(rows: Iterator[FloatArray], count: int) -> Iterator[FloatArray]:
 def _dialect_of(head: str, wanted: Sequence[str]) -> Dialect:
     """Return how a log is written: by the separator that finds the columns that are read, or that finds most."""
     found = {separator: _names(head, separator) for separator in SEPARATORS}
-    whole = next((s for s, names in found.items() if set(wanted) <= set(names)), None)
+    whole = next((s for s, names in found.items() if all(column_of(names, name) for name in wanted)), None)
     return Dialect(whole or max(SEPARATORS, key=lambda s: len(found[s])))
 
 
@@ -301,6 +353,8 @@ def _chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator
                     read_rows, _ = _READERS[path.suffix.lower()]
                     yield from _converted(read_rows(path, signals, stamps, rows), signals, stamps)
     elif is_stream(data):
+        if data is sys.stdin and isinstance(data, io.TextIOWrapper):
+            data.reconfigure(errors=_WINDOWS)
         yield from stream_rows(data, signals, stamps)
     else:
         import pandas as pd
@@ -396,9 +450,13 @@ def _parquet(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterato
     time = signals.columns[0]
     with pyarrow.parquet.ParquetFile(path) as file:
         header, own, counted = _parquet_header(file.schema_arrow, time)
-        signals.positions(tuple(header))
+        places = signals.positions(tuple(header))
+        more = [date_place(header, places), *status_places(header, places)]
         wanted = [
-            own if name == time else name for name in dict.fromkeys(signals.columns) if name != time or not counted
+            own if header[place] == time else header[place]
+            # In their order: a status stands right of its value.
+            for place in sorted({place for place in (*places, *more) if place is not None})
+            if header[place] != time or not counted
         ]
         done = 0
         for batch in file.iter_batches(batch_size=rows, columns=wanted):
@@ -441,6 +499,7 @@ def _only(path: Path, name: str, channels: Sequence[tuple[str, str, Any]]) -> An
     """Return the channel that is called so, or as its group and it, such as ``rig/level``; `None` where there is none.
     ``channels`` are groups, names and channels."""
     found = [(group, channel) for group, own, channel in channels if name in (own, f"{group}/{own}")]
+    found = found or [(group, channel) for group, own, channel in channels if column_of([own], name)]
     if len(found) > 1:
         groups = ", ".join(repr(group) for group, _ in found)
         raise SpecError(
@@ -657,16 +716,35 @@ def _with_time(frame: pd.DataFrame, signals: Signals) -> pd.DataFrame:
 def _converted(frames: Iterator[pd.DataFrame], signals: Signals, stamps: Stamps) -> Iterator[FloatArray]:
     done = 0
     for frame in frames:
-        places = signals.positions(tuple(str(name) for name in frame.columns))
-        times = _times(frame.iloc[:, places[0]], done, stamps)
-        yield np.column_stack([times, *(_numbers(frame.iloc[:, place], done, stamps) for place in places[1:])])
+        header = tuple(str(name) for name in frame.columns)
+        places = signals.positions(header)
+        if not done:
+            stamps.take_header(header, signals.columns, places)
+        date = date_place(header, places)
+        times = _times(frame.iloc[:, places[0]], done, stamps, None if date is None else frame.iloc[:, date])
+        values = []
+        for place, state in zip(places[1:], status_places(header, places)[1:], strict=True):
+            column = _numbers(frame.iloc[:, place], done, stamps)
+            states = None if state is None else frame.iloc[:, state]
+            values.append(column if states is None else _without_bad(column, header[place], states, done, stamps))
+        yield np.column_stack([times, *values])
         done += len(frame)
     if done == 0:
         raise SpecError("The data have no rows.", path="data")
 
 
-def _times(column: pd.Series, done: int, stamps: Stamps) -> FloatArray:
-    """Return a column of time stamps as seconds."""
+def _without_bad(values: FloatArray, name: str, states: pd.Series, done: int, stamps: Stamps) -> FloatArray:
+    """Return samples ``(n,)`` without those of which their status says that they are bad."""
+    said = [str(cell).strip() for cell in states]
+    bad = np.array([text.lower().startswith(BAD_STATUS) for text in said], dtype=bool)
+    if bad.any():
+        first = int(np.argmax(bad))
+        stamps.take_bad(name, done + first + 1, said[first], str(states.name), count=int(bad.sum()))
+    return np.where(bad, np.nan, values)
+
+
+def _times(column: pd.Series, done: int, stamps: Stamps, dates: pd.Series | None) -> FloatArray:
+    """Return a column of time stamps as seconds; ``dates`` may stand beside times of day."""
     import pandas as pd
 
     found = stamps.read_column(column)
@@ -676,6 +754,8 @@ def _times(column: pd.Series, done: int, stamps: Stamps) -> FloatArray:
         stamps.is_dated = False
         return stamps.seconds(_numbers(column, done))
     texts = ["" if pd.isna(cell) else str(cell) for cell in column]
+    if dates is not None:
+        texts = [with_date(str(date), text) for date, text in zip(dates, texts, strict=True)]
     return np.array([stamps.read(text, done + i + 1, str(column.name)) for i, text in enumerate(texts)])
 
 
@@ -706,20 +786,21 @@ def log_table(
     columns, and what is to be said of the cells; ``data`` is the name of a file or a data frame, ``time`` the column of
     the stamps."""
     header = _header(data, [time, *names])
-    there = [name for name in dict.fromkeys(names) if name in header and name != time]
+    there = [name for name in dict.fromkeys(names) if column_of(header, name) and name != time]
     # A log without stamps is read like others: a column stands where they would.
-    first = time if time in header else next(iter(there), None)
+    has_stamps = column_of(header, time) is not None
+    first = time if has_stamps else next(iter(there), None)
     if first is None:
         return {}, header, ()
     signals = Signals(tuple(there), (first, *there), np.ones(len(there)), np.zeros(len(there)), {})
     stamps = Stamps()
-    stamps.are_missing = time not in header
+    stamps.are_missing = not has_stamps
     rows = np.concatenate(list(chunks(data, signals, stamps, CHUNK_ROWS)))
     found, times = dict(zip(there, rows[:, 1:].T, strict=True)), rows[:, 0]
     if stamps.is_dated:
         # Seconds since 1970 in double precision have lost what is below a microsecond.
         times = np.round(times - times[0], SECOND_DECIMALS)
-    return {**({time: times} if time in header else {}), **found}, header, stamps.warnings()
+    return {**({time: times} if has_stamps else {}), **found}, header, stamps.warnings()
 
 
 def _header(data: Any, wanted: Sequence[str]) -> list[str]:
