@@ -48,6 +48,13 @@ def test_words_of_python_are_names_as_any_other() -> None:
     assert float(expression({"lambda": 2.0, "in": 3.0, "None": 4.0, "e1": 0.5})) == 5.0
 
 
+@pytest.mark.parametrize("name", ["name_x", "name_", "name_name_x", "x_name_y", "_name_", "name"])
+def test_no_name_is_taken_for_another(name: str) -> None:
+    expression = parse_expression(f"2 * {name} + der(sin({name}) - {name})", rates=True)
+    assert expression.names == {name}
+    assert set(expression.rates) == {f"der(sin({name})-{name})"}
+
+
 def test_arrays_and_names() -> None:
     expression = parse_expression("a * k ** 2 + step(k - 2)")
     assert expression.names == {"a", "k"}
@@ -57,12 +64,12 @@ def test_arrays_and_names() -> None:
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ("", "no valid expression"),
-        ("1 +", "no valid expression"),
+        ("", "ends too early"),
+        ("1 +", "ends too early"),
         ("(1", "never closed"),
-        ("1 2", "no valid expression"),
+        ("1 2", "at '2'"),
         ("1)", "unmatched"),
-        ("sin 1", "no valid expression"),
+        ("sin 1", "at '1'"),
         ("min(1)", "two arguments"),
         ("sin(1, 2)", "one argument"),
         ("eval(1)", "no function 'eval'"),
@@ -84,7 +91,7 @@ def test_arrays_and_names() -> None:
         ("1_000", "not allowed"),
         ("0x1F", "not allowed"),
         ("2j", "not allowed"),
-        ("1 # 2", "no valid expression"),
+        ("1 # 2", "'#' is not allowed"),
         ("2 ^ 3", "written **"),
         ("sin(*k)", "not allowed"),
         ("sin(x=1)", "not allowed"),
@@ -92,9 +99,13 @@ def test_arrays_and_names() -> None:
         ("True and 1", "where(a > b, c, d)"),
         ("k == 1", "not allowed"),
         ("1 // 2", "not allowed"),
-        ("²", "no valid expression"),
+        ("²", "'²' is not allowed"),
+        ("μ + 1", "'μ' is not allowed"),
+        ("\ud800", "is not allowed"),
+        ("1\x00", "no valid expression"),
         ("abs(" * 60 + "1" + ")" * 60, f"more than {MAXIMUM_DEPTH}"),
         ("-" * 60 + "1", f"more than {MAXIMUM_DEPTH}"),
+        ("-" * 1999 + "1", f"more than {MAXIMUM_DEPTH}"),
         ("1" * 3000, "3000 characters"),
     ],
 )

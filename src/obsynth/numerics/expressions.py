@@ -29,6 +29,9 @@ Evaluator: TypeAlias = Callable[[Mapping[str, Any], Translation], Any]
 _NAME_IN_TEXT = re.compile(r"(?<![\w.])[A-Za-z_]\w*", re.ASCII)
 _NUMBER_IN_TEXT = re.compile(r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _NAME_PREFIX = "name_"
+_PREFIX_IN_TEXT = re.compile(rf"\b{_NAME_PREFIX}", re.ASCII)
+_LEADING_ZEROS = re.compile(r"(?<![\w.])0+(?=\d)", re.ASCII)
+_TOO_DEEP = f"it is nested more than {MAXIMUM_DEPTH} times"
 
 
 def step_function(value: Any) -> Any:
@@ -120,7 +123,9 @@ def parse_expression(text: str, *, rates: bool = False) -> Expression:
         with warnings.catch_warnings(action="ignore"):
             tree = ast.parse(reader.prefixed, mode="eval")
     except SyntaxError as error:
-        raise reader.error(error.msg) from None
+        raise reader.misread(error) from None
+    except (RecursionError, MemoryError):  # Python's own limit of nesting
+        raise reader.error(_TOO_DEEP) from None
     evaluator = reader.read(tree.body, 1)
     return Expression(text, frozenset(reader.names), evaluator, dict(reader.rates))
 
@@ -130,9 +135,12 @@ class _Reader:
 
     def __init__(self, text: str, *, rates: bool) -> None:
         self.text, self.names = text, set[str]()
-        # Python would take what follows for a comment.
-        self.prefixed = _NAME_IN_TEXT.sub(rf"{_NAME_PREFIX}\g<0>", " ".join(text.split())).replace("#", "?")
         self.rates, self.rates_allowed = dict[str, Expression](), rates
+        # Python would take what follows a # for a comment, and a number that begins with 0 for a mistake.
+        if foreign := re.search(r"[^\x00-\x7f]|#", text):
+            raise self.error(f"{foreign[0]!r} is not allowed")
+        plain = _LEADING_ZEROS.sub("", " ".join(text.split()))
+        self.prefixed = _NAME_IN_TEXT.sub(rf"{_NAME_PREFIX}\g<0>", plain)
 
     def error(self, reason: str) -> SpecError:
         decides = " To decide, write where(a > b, c, d): c where a > b, d elsewhere."
@@ -143,16 +151,22 @@ class _Reader:
             f"and the functions {', '.join([*FUNCTIONS, *FUNCTIONS_OF_TWO, 'where'])}.{power}{decides if asked else ''}"
         )
 
+    def misread(self, error: SyntaxError) -> SpecError:
+        """Return the error of a text that Python cannot read, with what stands at the place."""
+        if not self.prefixed or self.prefixed[-1] in "+-*/,":
+            return self.error("it ends too early")
+        rest = _PREFIX_IN_TEXT.sub("", self.prefixed[(error.offset or 1) - 1 :])
+        return self.error(f"{error.msg}, at {rest!r}")
+
     def written(self, node: ast.expr) -> str:
         """Return a part of the text, without spaces."""
-        part = self.prefixed.encode()[node.col_offset : node.end_col_offset]
-        return part.decode().replace(_NAME_PREFIX, "").replace(" ", "")
+        return _PREFIX_IN_TEXT.sub("", self.prefixed[node.col_offset : node.end_col_offset]).replace(" ", "")
 
     def read(self, node: ast.expr, depth: int) -> Evaluator:
         """Return what evaluates a part of the tree."""
         text = self.written(node)
         if depth > MAXIMUM_DEPTH:
-            raise self.error(f"it is nested more than {MAXIMUM_DEPTH} times")
+            raise self.error(_TOO_DEEP)
         match node:
             case ast.BinOp():
                 return self.chain(node, depth + 1)
