@@ -30,6 +30,7 @@ from obsynth.plotting.panels import (
     legend_above,
     mark,
     new_panels,
+    one_panel,
     tidy,
     with_unit,
 )
@@ -304,7 +305,7 @@ def plot_residuals(
     curves = {name: _curve(value, name, steps) for name, value in named.items()}
     if len(curves) > len(THRESHOLD_STYLES):
         raise SpecError(f"{len(curves)} thresholds are too many for one picture: give at most 3.", path="threshold")
-    (panel,) = new_panels(None if axes is None else [axes], 1)
+    panel = one_panel(axes)
     time, size = dt * np.arange(steps), np.linalg.norm(estimates.residuals, axis=1)
     if positive := bool(np.any(size > 0.0)):
         panel.set_yscale("log")
@@ -361,7 +362,7 @@ def plot_decision(decision: Decision, *, dt: float = 1.0, axes: Axes | None = No
     SpecError
         Never for a decision as `obsynth.decide` makes it.
     """
-    (panel,) = new_panels(None if axes is None else [axes], 1)
+    panel = one_panel(axes)
     time = dt * np.arange(len(decision.values))
     shown = np.isfinite(decision.thresholds)
     floor = LEAST_SHARE * float(np.min(decision.thresholds[shown], initial=1.0))
@@ -477,7 +478,7 @@ def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None)
     SpecError
         Never for a detection as `obsynth.types.Monitor` makes it.
     """
-    (panel,) = new_panels(None if axes is None else [axes], 1)
+    panel = one_panel(axes)
     time = dt * np.arange(len(detection.values))
     deciding = np.isfinite(detection.threshold) & (detection.threshold > 0.0)
     shown = np.where(detection.values > 0.0, detection.values, np.nan)

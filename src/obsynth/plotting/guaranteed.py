@@ -10,7 +10,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.observers.running import Estimates
-from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH, label_time, legend_above, new_panels, tidy
+from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH, finish, one_panel, with_unit
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:
@@ -45,12 +45,10 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
         The design is by another method.
     """
     found = GuaranteedTest.of(design)
-    plant = found.plant
-    (panel,) = new_panels(None if axes is None else [axes], 1, size=(WIDTH, 1.6 * PANEL_HEIGHT))
+    panel = one_panel(axes, size=(WIDTH, 1.6 * PANEL_HEIGHT))
     table = found.trade_off[np.isfinite(found.trade_off[:, 1])]
     before = int(found.options["before"]) if found.options["course"] == "step" else 0
     seconds = (table[:, 0] - 1 - before) * found.observer.dt
-    unit = plant.units.get(found.fault, "")
     panel.plot(seconds, table[:, 1], color="black", marker="o", markersize=4, label="least threshold of any test")
     panel.fill_between(seconds, 0.0, table[:, 1], color="0.9", label="no test without false alarms exists here")
     panel.plot(
@@ -72,11 +70,7 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
         # What a few more samples bring is of interest where they are few.
         panel.set_xscale("log")
     after = "from the step to the last sample" if before else "from the first to the last sample"
-    panel.set_xlabel(f"{after} (s)")
-    panel.set_ylabel(f"{found.fault}{f' ({unit})' if unit else ''}")
-    legend_above(panel)
-    tidy(panel)
-    return panel
+    return finish(panel, with_unit(found.fault, found.plant.units), below=f"{after} (s)")
 
 
 @arguments_checked
@@ -103,8 +97,7 @@ def plot_intervals(design: ObserverDesign, estimates: Estimates, *, axes: Axes |
         The design is by another method.
     """
     found = GuaranteedTest.of(design)
-    plant = found.plant
-    (panel,) = new_panels(None if axes is None else [axes], 1, size=(WIDTH, 1.6 * PANEL_HEIGHT))
+    panel = one_panel(axes, size=(WIDTH, 1.6 * PANEL_HEIGHT))
     low, high = found.interval(estimates)
     seconds = np.arange(len(low)) * found.observer.dt
     panel.fill_between(seconds, low, high, color="0.85", label="interval")
@@ -113,12 +106,7 @@ def plot_intervals(design: ObserverDesign, estimates: Estimates, *, axes: Axes |
     alarms = np.flatnonzero(found.alarms(estimates))
     if alarms.size:
         panel.axvline(float(seconds[alarms[0]]), color="tab:red", linestyle="--", label="alarm")
-    unit = plant.units.get(found.fault, "")
-    label_time(panel)
-    panel.set_ylabel(f"{found.fault}{f' ({unit})' if unit else ''}")
-    legend_above(panel)
-    tidy(panel)
-    return panel
+    return finish(panel, with_unit(found.fault, found.plant.units))
 
 
 @arguments_checked
@@ -148,7 +136,7 @@ def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes
     plant, courses = found.plant, found.hidden_course(fault)
     if not courses:
         raise SpecError("No combination of signals hides this fault: there is none to draw.", path="fault")
-    (panel,) = new_panels(None if axes is None else [axes], 1, size=(WIDTH, 1.6 * PANEL_HEIGHT))
+    panel = one_panel(axes, size=(WIDTH, 1.6 * PANEL_HEIGHT))
     styles = dict.fromkeys(courses, "--")
     styles |= dict.fromkeys(plant.state_names, ":") | dict.fromkeys(found.fault_names, "-")
     sizes = {name: float(np.max(np.abs(course))) for name, course in courses.items()}
@@ -167,8 +155,4 @@ def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes
             label=f"{name}, up to {sizes[name]:.3g}{f' {unit}' if unit else ''}",
         )
     panel.axhline(0.0, color="0.4", linewidth=0.8)
-    panel.set_xlabel("time (s)")
-    panel.set_ylabel("relative to its largest value")
-    legend_above(panel)
-    tidy(panel)
-    return panel
+    return finish(panel, "relative to its largest value", below="time (s)")

@@ -124,10 +124,18 @@ def tidy(panel: Axes) -> None:
     names_as_they_are(panel)
 
 
-def finish(panel: Axes, label: str) -> Axes:
-    """Label the axes of a panel over the time, and give it a legend and a grid."""
+def one_panel(axes: Axes | None, *, size: tuple[float, float] | None = None) -> Axes:
+    """Return the axes that are given, or new ones."""
+    return axes if axes is not None else new_panels(None, 1, size=size)[0]
+
+
+def finish(panel: Axes, label: str, *, below: str = "") -> Axes:
+    """Label the axes of a panel over the time, or over what is told ``below``; give it a legend and a grid."""
     panel.set_ylabel(label)
-    label_time(panel)
+    if below:
+        panel.set_xlabel(below)
+    else:
+        label_time(panel)
     legend_above(panel)
     tidy(panel)
     return panel

@@ -24,7 +24,7 @@ from obsynth.numerics.spectra import boundary_points, eigenvalues
 from obsynth.observers.linear.derived import GRID_REACH, frequency_grid
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plotting.panels import WIDTH, new_panels, plain_decades, tidy
+from obsynth.plotting.panels import WIDTH, one_panel, plain_decades, tidy
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:
@@ -82,8 +82,7 @@ def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
     """
     plant, observer = design.linear
     sampled = observer.dt > 0.0
-    if axes is None:
-        (axes,) = new_panels(None, 1, size=(5.0, 5.4) if sampled else (WIDTH, 4.4))
+    axes = one_panel(axes, size=(5.0, 5.4) if sampled else (WIDTH, 4.4))
     poles = np.asarray(eigenvalues(observer.Az), dtype=complex)
     zeros = np.array([zero.value for zero in fault_zeros(plant)[0]], dtype=complex)
     axes.axhline(0.0, color="0.85", linewidth=0.8, zorder=0)
@@ -373,7 +372,7 @@ def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None 
         The design is recursive, or has no such output.
     """
     found, target = estimate_gains(design, to=to), TARGETS.get(to, "")
-    (panel,) = new_panels(None if axes is None else [axes], 1, size=(WIDTH, 4.0))
+    panel = one_panel(axes, size=(WIDTH, 4.0))
     panel.set_xscale("log")
     if to == "faults":
         panel.axhline(1.0, color="0.7", linewidth=0.8, zorder=0)
