@@ -191,12 +191,8 @@ class Intermittent(Additive):
         return np.where(turn - np.floor(turn) < self.duty, float(self.size), 0.0)
 
 
-class Failure(Profile):
-    """A failing actuator or sensor: no function of time, and a signal's only profile."""
-
-
 @dataclass(frozen=True, kw_only=True)
-class Stuck(Failure):
+class Stuck(Profile):
     """An actuator or a sensor that stays where it is.
 
     Parameters
@@ -211,7 +207,7 @@ class Stuck(Failure):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LostEffectiveness(Failure):
+class LostEffectiveness(Profile):
     """An actuator or a sensor that gives only a share of its signal.
 
     Parameters
@@ -308,14 +304,15 @@ PROFILE_KINDS: dict[str, type[Profile]] = {
 
 
 _ADDITIVE = tuple(kind for kind in PROFILE_KINDS.values() if issubclass(kind, Additive))
-_FAILING = tuple(kind for kind in PROFILE_KINDS.values() if issubclass(kind, Failure))
+#: A failing actuator or sensor: no function of time, and a signal's only profile.
+FAILURES = (Stuck, LostEffectiveness)
 _RANDOM = tuple(kind for kind in PROFILE_KINDS.values() if issubclass(kind, Random))
 #: What each group of signals may do.
 _ALLOWED: dict[str, tuple[type[Profile], ...]] = {
     "inputs": _ADDITIVE,
-    "faults": (*_ADDITIVE, *_FAILING),
+    "faults": (*_ADDITIVE, *FAILURES),
     "disturbances": (*_ADDITIVE, *_RANDOM),
-    "sensors": (*_ADDITIVE, *_FAILING),
+    "sensors": (*_ADDITIVE, *FAILURES),
 }
 #: The names of a plant's signals that each group speaks of; the faults of a plant with parameters are these.
 _GROUP_NAMES = {
@@ -520,7 +517,7 @@ def _checked_profiles(given: Any, group: str, kinds: tuple[type[Profile], ...]) 
                     f"{', '.join(kind.__name__ for kind in kinds)}.",
                     path=where,
                 )
-        if len(profiles) > 1 and any(isinstance(profile, Failure) for profile in profiles):
+        if len(profiles) > 1 and any(isinstance(profile, FAILURES) for profile in profiles):
             raise SpecError("Stuck and LostEffectiveness must be a signal's only profile.", path=where)
         found[str(name)] = profiles
     return found

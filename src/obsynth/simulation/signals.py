@@ -15,9 +15,9 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.validation import index_of
 from obsynth.simulation.scenario import (
+    FAILURES,
     SAMPLE_SLACK,
     Additive,
-    Failure,
     LostEffectiveness,
     Profile,
     Random,
@@ -114,7 +114,7 @@ def check_parameters(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Sc
     """Raise where a scenario says what a plant with parameters does not have."""
     scenario.check_names(plant)
     for name, profile in profiles_of(scenario, "faults"):
-        if isinstance(profile, Failure):
+        if isinstance(profile, FAILURES):
             raise SpecError(
                 "A parameter neither sticks nor loses effectiveness: give a step or another profile, which is added to "
                 "it.",

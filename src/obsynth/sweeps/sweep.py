@@ -296,7 +296,7 @@ class ResultFolder(Generic[_Result]):
         """Write what was made, then the result; return the result with the file."""
         file = write_atomically(self._file(item, self.ending), content) if content else None
         body = {name: getattr(result, name) for name in self.fields}
-        known = {"kind": self.kind, "key": item.key, "sha256": None if file is None else _digest_of(file)}
+        known = {"kind": self.kind, "key": item.key, "sha256": None if file is None else file_digest(file)}
         write_atomically(self._file(item, ".result.json"), json.dumps(plain({**known, **body}), indent=1) + "\n")
         return replace(result, file=file)  # type: ignore[type-var]
 
@@ -312,15 +312,11 @@ class ResultFolder(Generic[_Result]):
         if (body["kind"], body["key"]) != (self.kind, item.key):
             return None
         made = body["sha256"] is not None
-        if made and (not file.is_file() or _digest_of(file) != body["sha256"]):
+        if made and (not file.is_file() or file_digest(file) != body["sha256"]):
             return None
         values = {name: tuple(body[name]) if isinstance(body[name], list) else body[name] for name in self.fields}
         found: _Result = self.record(**{**values, **own}, file=file if made else None)
         return found
-
-
-def _digest_of(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 _SWEEP_KIND = "obsynth sweep result"
@@ -771,7 +767,7 @@ def _files(given: Any, endings: tuple[str, ...], what: str) -> list[Path]:
 
 def _pairs(gains: Sequence[Path], logs: Sequence[Path], options: Mapping[str, Any]) -> list[Work]:
     names = {path: path.name.removesuffix(GAINS_ENDING).removesuffix(".json") for path in gains}
-    digests = {path: hashlib.sha256(input_file(path).read_bytes()).hexdigest() for path in (*gains, *logs)}
+    digests = {path: file_digest(input_file(path)) for path in (*gains, *logs)}
     own = {log: log.stem for log in logs if log.stem in names.values()}
     said = json.dumps(options, sort_keys=True, default=str)
     return [
