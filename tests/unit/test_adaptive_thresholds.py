@@ -179,7 +179,7 @@ def test_refusals_name_their_reason() -> None:
     design = obsynth.fault_estimation_filter(drive())
     with pytest.raises(SpecError, match="no entry for the state 'x2'"):
         obsynth.online_monitor(design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, initial_set={"x1": 1.0})
-    with pytest.raises(SpecError, match="unknown state"):
+    with pytest.raises(SpecError, match="names 'x9', which is no state of the plant"):
         obsynth.online_monitor(design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, initial_set={"x9": 1.0})
     with pytest.raises(SpecError, match="appears in no matrix"):
         obsynth.online_monitor(design, constants={"spring": (1.0, 2.0)}, disturbance_bounds={"load": 0.1})

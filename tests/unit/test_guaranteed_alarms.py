@@ -86,7 +86,7 @@ def test_a_run_alarms_and_proves_it(proved: Path, tmp_path: Path, capsys: pytest
     assert "it points to leak 2" in capsys.readouterr().out
     assert main(["verify", str(tmp_path / "alarm.json"), "--data", str(proved / "log.csv")]) == 0
     assert main(["run", *arguments, "--monitor", "pointwise", "--noise-bound", "2"]) == 2
-    assert "noise_bound cannot be given to the monitor of a guaranteed test" in capsys.readouterr().err
+    assert "noise_bound cannot be given for a guaranteed test" in capsys.readouterr().err
 
 
 CHANGES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {

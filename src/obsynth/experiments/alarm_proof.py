@@ -27,6 +27,7 @@ from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.experiments.assumptions import Assumptions, Log
 from obsynth.experiments.monitors.adaptive import start_of
+from obsynth.experiments.monitors.guaranteed import refuse_bounds
 from obsynth.experiments.monitors.options import WINDOW
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.guaranteed_test.checks import while_inside
@@ -310,17 +311,6 @@ def _stated(affine: AffinePlant, given: Mapping[str, Any], steps: int) -> tuple[
     back = np.abs(2.0 * np.eye(len(names)) - affine.coordinates) @ sizes
     high = np.tile(back, (steps, 1))
     return -high, high
-
-
-def refuse_bounds(given: Mapping[str, Any]) -> None:
-    """Raise `SpecError` where bounds are given: those of the design count."""
-    stated = [name for name, value in given.items() if value]
-    if stated:
-        raise SpecError(
-            f"{', '.join(stated)} cannot be given for a guaranteed test: what is proved rests on the bounds of its "
-            "design. Design it again with others.",
-            path=stated[0],
-        )
 
 
 def rows_of_test(test: GuaranteedTest) -> int:

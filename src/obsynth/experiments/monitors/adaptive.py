@@ -38,6 +38,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.constants import ConstantsBox, shown
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import ELIMINATED, SAMPLED, Uncertainty
+from obsynth.plants.validation import require_known
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_zero_order_hold
 from obsynth.proofs.balls import rounded_up
 from obsynth.proofs.contraction import inverse_bound
@@ -785,12 +786,7 @@ def initial_box(plant: DescriptorSystem, given: Mapping[str, Any]) -> tuple[Floa
     require_mapping(given, "initial_set")
     center, radius = np.zeros(plant.nx), np.zeros(plant.nx)
     needed = np.abs(plant.E).max(axis=0, initial=0.0) > 0.0
-    unknown = sorted(set(given) - set(plant.state_names))
-    if unknown:
-        raise SpecError(
-            f"initial_set has the unknown state {unknown[0]!r}; there are {', '.join(plant.state_names)}.",
-            path="initial_set",
-        )
+    require_known(given, plant.state_names, what="initial_set", kind="state")
     for i, name in enumerate(plant.state_names):
         if name not in given:
             if needed[i]:

@@ -37,19 +37,24 @@ def is_guaranteed(design: ObserverDesign) -> bool:
     return design.method == METHOD
 
 
+def refuse_bounds(given: Mapping[str, Any]) -> None:
+    """Raise `SpecError` where bounds are given for a guaranteed test: those of its design count."""
+    # The command line gives a mapping without entries where nothing is stated.
+    stated = [name for name, value in given.items() if value is not None and value != {}]
+    if stated:
+        raise SpecError(
+            f"{', '.join(stated)} cannot be given for a guaranteed test: its bounds are those of its design. Design it "
+            "again with others.",
+            path=stated[0],
+        )
+
+
 def _checked(design: ObserverDesign, kind: str, given: Mapping[str, Any]) -> GuaranteedTest:
     if kind != "pointwise":
         raise SpecError(
             f"kind is {kind!r}: a guaranteed test has its own threshold, use pointwise (the default).", path="kind"
         )
-    # The command line gives a mapping without entries where nothing is stated.
-    stated = [name for name in STATED_BY_DESIGN if given[name] is not None and given[name] != {}]
-    if stated:
-        raise SpecError(
-            f"{', '.join(stated)} cannot be given to the monitor of a guaranteed test: its bounds are those of its "
-            "design. Design it again with others.",
-            path=stated[0],
-        )
+    refuse_bounds({name: given[name] for name in STATED_BY_DESIGN})
     test, constants, initial_set = GuaranteedTest.of(design), given["constants"], given["initial_set"]
     if isinstance(test.observer, WindowObserver):
         if constants is not None or initial_set is not None:

@@ -46,7 +46,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
 
 LEARNED_KIND = "obsynth learned thresholds"
-LEARNED_VERSION = 9
+LEARNED_VERSION = 8
 LEARNED = FileKind(
     "learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"', suffix=".json"
 )
@@ -224,7 +224,6 @@ class LearnedThresholds:
             "A": model.A,
             "whitener": model.whitener,
             "signatures": self.statistics.signatures,
-            "age_levels": self.statistics.levels_by_age,
             "told": list(self.statistics.told),
             "levels": self.levels,
             "every": self.every,
@@ -305,16 +304,16 @@ def load_thresholds(path: str | Path) -> LearnedThresholds:
 
 def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
     columns, m = tuple(map(str, data["columns"])), len(data["columns"])
-    parts = ("offset", "A", "whitener", "signatures", "age_levels", "levels")
-    offset, a, whitener, signatures, by_age, levels = (np.asarray(data[name], dtype=np.float64) for name in parts)
+    offset, a, whitener, signatures, levels = (
+        np.asarray(data[name], dtype=np.float64) for name in ("offset", "A", "whitener", "signatures", "levels")
+    )
     told, estimates = (tuple(map(str, data[name])) for name in ("told", "estimates"))
-    statistics = Statistics(Autoregression(offset, a, whitener), signatures, told, estimates, by_age)
+    statistics = Statistics(Autoregression(offset, a, whitener), signatures, told, estimates)
     shapes = (offset.shape, a.shape[1:], whitener.shape, signatures.shape[1:], levels.shape)
     fits = shapes == ((m,), (m, m), (m, m), (m,), (len(statistics.names),)) and len(told) == len(signatures)
-    fits &= by_age.shape == (2 * len(told), len(AGES)) and bool((by_age > 0.0).all() and (levels > 0.0).all())
-    if not (fits and all(np.isfinite(part).all() for part in (offset, a, whitener, signatures, by_age))):
+    if not (fits and all(np.isfinite(part).all() for part in (offset, a, whitener, signatures)) and (levels > 0).all()):
         raise ValueError("its parts do not fit together")
-    for part in (offset, a, whitener, signatures, by_age):
+    for part in (offset, a, whitener, signatures):
         part.setflags(write=False)
     return LearnedThresholds(
         columns,
@@ -442,7 +441,7 @@ def thresholds_from_rows(
     if conformal:
         statistics, levels = conformal_levels(x, others, statistics, scores)
     else:
-        statistics, levels = learned_levels(x, others, statistics, seed, scores)
+        levels = learned_levels(x, others, statistics, seed, scores)
     return LearnedThresholds(
         told,
         statistics,
