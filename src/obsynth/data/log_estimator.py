@@ -167,9 +167,10 @@ class Clock:
                 "need a continuous-time design.",
                 path=f"row {row}",
             )
-        if count > 1 and self.longest == 0.0:
+        # One gap may be the first interval of a log.
+        if count > 1 and self.longest == 0.0 and self.count > 0:
             raise SpecError(
-                f"Row {row}: the data begin with an interval of {step:.10g} s, but the design has dt = "
+                f"Row {row}: the data begin with intervals of {step:.10g} s and the like, but the design has dt = "
                 f"{self.dt:.10g} s: the sampling time does not fit.",
                 path=f"row {row}",
             )
