@@ -109,3 +109,37 @@ def test_malformed_constants_are_refused(tmp_path, capsys, old: str, new: str, w
     (tmp_path / "spec.yaml").write_text(DRIVE.read_text())
     assert main(["check", "--system", str(tmp_path / "spec.yaml")]) == 2
     assert words in capsys.readouterr().err
+
+
+HOIST = """
+schema_version: 1
+name: hoist
+plant:
+  dt: 0
+  constants: {Jm: 0.01, Jd: 2, n: 10, k: K, m: 100, r: 0.2}
+  state_names: [wm, wd, tau, F, v]
+  E: [[Jm, 0, 0, 0, 0], [0, Jd, 0, 0, 0], [1, -n, 0, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, m]]
+  A: [[-0.02, 0, -1, 0, 0], [0, 0, n, -r, 0], [0, 0, 0, 0, 0], [0, k * r, 0, 0, -k], [0, 0, 0, 1, -300]]
+  B: [[1], [0], [0], [0], [0]]
+  C: {outputs: [wm, F, v]}
+  Bf: [[-1], [0], [0], [0], [0]]
+  sensor_noise: {wm: 0.05, F: 2, v: 0.005}
+  transform: {eliminate_algebraic_states: true, sample_time: 0.01}
+method: {id: fault-estimation-filter}
+"""
+
+
+def test_constants_without_a_tolerance_are_an_exact_model_and_rounding_is_no_tolerance(tmp_path, capsys) -> None:
+    # A rigid gear, differentiated: E is singular by a combination of its rows, which is known up to rounding.
+    data = tmp_path / "log.csv"
+    data.write_text("time,u1,wm,F,v\n" + "".join(f"{k / 100},0,0,0,0\n" for k in range(50)), encoding="utf-8")
+    for k, code, said in (("5000", 0, "assumes an exact model"), ("{nominal: 5000, tolerance: 2 %}", 3, "by hand")):
+        spec, gains, out = tmp_path / "spec.yaml", str(tmp_path / "g.json"), str(tmp_path / "out.csv")
+        spec.write_text(HOIST.replace("k: K", f"k: {k}"), encoding="utf-8")
+        assert main(["design", "--system", str(spec), "--output", gains, "--force", "--quiet"]) == 0
+        capsys.readouterr()
+        run = ["run", "--gains", gains, "--data", str(data), "--out", out, "--force", "--monitor", "pointwise"]
+        assert main([*run, "--noise-bound", "3"]) == code
+        printed = capsys.readouterr()
+        assert said in " ".join((printed.out + printed.err).split())
+        assert "Give E no tolerance" not in printed.err

@@ -84,7 +84,9 @@ def own_tolerances(design: obsynth.ObserverDesign, kind: str | None) -> obsynth.
         return None
     if kind != "pointwise" or not isinstance(plant, obsynth.DescriptorSystem) or (plant.nu and not plant.is_discrete):
         return None
-    return plant.uncertainty if isinstance(design.observer, obsynth.LinearObserver) else None
+    own = plant.uncertainty if isinstance(design.observer, obsynth.LinearObserver) else None
+    # Constants without a tolerance leave nothing to adapt to: the model is exact.
+    return own if own is not None and own.box.names else None
 
 
 def monitor_settings(design: obsynth.ObserverDesign, options: argparse.Namespace) -> dict[str, Any]:

@@ -397,7 +397,7 @@ def _without_pairs(
     return hidden if len(wrong) == len(pairs) else again(wrong), WrongPairs(len(wrong), chance)
 
 
-_AFTER_WARM_UP = ", once the initial-condition response has settled (the warm-up)"
+_AFTER_WARM_UP = "; it holds once the initial-condition response has settled (the warm-up)"
 _AFTER_A_GAP = " (after a gap likewise)"
 _FROM_THE_FIRST = "; from the first row on; after a gap, once settled"
 _GROWS = "; after missing outputs it is larger by the possible error of the plant's model"

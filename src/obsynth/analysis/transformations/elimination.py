@@ -279,8 +279,9 @@ def equation_name(plant: DescriptorSystem, row: int) -> str:
 
 #: What to do about constraints that have to be differentiated.
 INDEX_ADVICE = (
-    "Differentiate the constraints (a constraint 0 = a x becomes a x' = 0: move a from its row of A to that of E), or "
-    "do not eliminate: obsynth check says which methods take the descriptor form."
+    "Combine the equations in which the force of a constraint acts so that it drops out, or differentiate the "
+    "constraint (0 = a x becomes a x' = 0: move a from its row of A to that of E; this adds an integrator). Without "
+    "elimination, obsynth check says which methods take the descriptor form."
 )
 #: Arrays of plants from this size on, with at most this share of entries that are not zero, are treated as sparse.
 MANY_VARIABLES = 500

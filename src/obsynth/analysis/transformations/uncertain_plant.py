@@ -186,7 +186,7 @@ def reduced_matrices(
     nd = dynamic.shape[1]
     v = np.eye(nd) if basis is None else basis
     e = matrices["E"].after(rows)
-    _require_algebraic(e[nd:, :], e @ algebraic)
+    _require_algebraic(e[nd:, :], e @ algebraic, ROW_ROUNDING_SHARE * float(np.abs(e.center).max(initial=0.0)))
     whole = affine_block(
         [[matrices["A"] @ np.hstack([dynamic @ v, algebraic]), *(matrices[k] for k in _INPUT_MATRICES)]]
     )
@@ -218,8 +218,9 @@ def reduced_matrices(
     return {"E": ahead, **found, **read}
 
 
-def _require_algebraic(rows: AffineMatrix, columns: AffineMatrix) -> None:
-    """Refuse a box that puts a derivative into an algebraic row, or of an algebraic state."""
+def _require_algebraic(rows: AffineMatrix, columns: AffineMatrix, rounding: float) -> None:
+    """Refuse a box that puts a derivative into an algebraic row, or of an algebraic state; what is at most
+    ``rounding`` comes from combining rows or columns of an E that the constants may not touch at all."""
     advice = {
         "row": "The tolerances put a derivative into an algebraic equation (row {} of those that have none at the "
         "nominal values): the plant's order would change in the box. Give E no tolerance there.",
@@ -228,7 +229,15 @@ def _require_algebraic(rows: AffineMatrix, columns: AffineMatrix) -> None:
         "constant, or give E no tolerance there.",
     }
     for what, found, axis in (("row", rows, 1), ("state", columns, 0)):
-        moving = (np.abs(found.center) + found.spread + found.radius).any(axis=axis)
+        size = np.abs(found.center) + found.spread + found.radius
+        moving = size.any(axis=axis)
+        if moving.any() and size.max() <= rounding:
+            raise PreconditionError(
+                f"E is singular, but not by {what}s of zeros: which of its combinations vanish is known up to rounding "
+                "alone, which tolerances do not allow. Combine the equations by hand so that each algebraic one has a "
+                "row of zeros in E, and each algebraic state a column of zeros.",
+                condition="algebraic rows",
+            )
         if moving.any():
             numbers = ", ".join(str(i + 1) for i in np.flatnonzero(moving))
             raise PreconditionError(advice[what].format(numbers), condition="algebraic rows")

@@ -814,7 +814,7 @@ def adaptive_statement(plan: AdaptivePlan, assumed: Assumptions) -> str:
     uncertain, box = assumed.plant.uncertainty, assumed.box
     kept = assumed.bounds_phrase if box is None else assumed.phrase()
     outside = "" if box is None else f": an alarm is a fault, or {box.sentence}"
-    text = f"never passed without a fault since the start{f', with {kept}' if kept else ''}{outside}"
+    text = f"never passed without a fault{f', with {kept}' if kept else ''}{outside}"
     if box is None:
         return text + NO_TOLERANCE
     steps = () if uncertain is None else uncertain.steps
@@ -828,7 +828,8 @@ def adaptive_statement(plan: AdaptivePlan, assumed: Assumptions) -> str:
     if plan.sample_time is not None:
         apart = shown(plan.sample_time)
         held = f"; known inputs are held between rows, {apart} s apart, disturbances may move in between"
-    missing = "" if plan.intervals or not plan.fault_names else f"; no guaranteed interval of faults: {plan.reason}"
+    why = (plan.reason[:1].lower() + plan.reason[1:]).partition(": ")[0].rstrip(".")
+    missing = "" if plan.intervals or not plan.fault_names else f"; no guaranteed interval of faults: {why}"
     linear = "" if uncertain is None or not uncertain.not_covered else f"; {uncertain.not_covered}"
     return f"{text}{kept}{held}{ever}{missing}{linear}"
 
