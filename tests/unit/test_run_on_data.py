@@ -538,3 +538,24 @@ def test_rows_in_one_piece_are_those_of_single_steps_bit_for_bit(continuous, mon
         np.testing.assert_array_equal(ours.values, theirs.values, err_msg=str(number))
     for name, value in run.as_dict()["observer"].items():
         np.testing.assert_array_equal(value, single.as_dict()["observer"][name], err_msg=name)
+
+
+def test_an_alarm_of_the_initial_condition_response_is_told_with_a_warm_up_that_is_long_enough():
+    plant = obsynth.DescriptorSystem(
+        A=[[0.98]], B=[[0.02]], C=["level"], Bf=[[0.02]], dt=1.0, state_names=["level"], sensor_noise={"level": 1e-3}
+    )
+    design = obsynth.ui_pi_observer(plant)
+    rows = pd.DataFrame({"time": np.arange(400.0), "u1": 10.0, "level": 10.0})
+    levels = {"fhat[f1]": 0.01}
+    (told,) = run_on_data(design, rows, thresholds=levels).warnings
+    assert "level begins 1e+04 deviations of its noise from zero (no operating point is stated)" in told
+    longer = float(told.rpartition("--warm-up ")[2].rstrip(")."))
+    quiet = run_on_data(design, rows, thresholds=levels, warm_up=longer)
+    assert (quiet.alarms, quiet.warnings) == ({}, ())
+    # At its operating point it alarms of nothing, and an alarm that comes later is a fault.
+    known = design.replace(plant=plant.replace(operating_point={"u1": 10.0, "level": 10.0}))
+    assert run_on_data(known, rows, thresholds=levels).warnings == ()
+    late = rows.assign(level=rows["level"] + np.where(rows["time"] > 300.0, 0.5, 0.0))
+    found = run_on_data(design, late, thresholds=levels, warm_up=longer)
+    assert found.alarms
+    assert found.warnings == ()

@@ -101,3 +101,18 @@ def test_no_page_names_an_audit_that_no_reader_has():
         str(page) for page in pages if re.search(r"\bthe audit\b", page.read_text(encoding="utf-8"), re.IGNORECASE)
     ]
     assert found == []
+
+
+@pytest.mark.parametrize("example", ["buck", "reactor"])
+def test_a_spec_of_a_how_to_is_designed_and_simulated(example, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    spec = str(DOCS / "examples" / example / "spec.yaml")
+    assert main(["design", "--system", spec, "--quiet"]) == 0
+    assert "Verified" in capsys.readouterr().out
+    simulate = ["simulate", "--system", spec, "--gains", f"{example}.gains.json", "--out", "log.csv", "--quiet"]
+    assert main(simulate) == 0
+    design = obsynth.load(f"{example}.gains.json")
+    fault, size = {"buck": ("sag", 0.5), "reactor": ("UA", 3.5)}[example]
+    run = obsynth.run_on_data(design, "log.csv")
+    assert run.table[f"fhat[{fault}]"].iloc[-1] == pytest.approx(size, rel=0.05)
+    assert "examples/" + example in "".join(path.read_text(encoding="utf-8") for path in DOCS.glob("howto/*.md"))

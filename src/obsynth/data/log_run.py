@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations.recovery import StateRecovery
-from obsynth.data.alarm_events import NO_DECISION, AlarmLog
+from obsynth.data.alarm_events import NO_DECISION, AlarmEvent, AlarmLog
 from obsynth.data.linear_log import log_observer
 from obsynth.data.log_estimator import DECIDING, RECOVERING, STALE, Clock, LogObserver, Row
 from obsynth.data.signals import TIME_HEADER, Signals, Stamps
@@ -27,7 +27,10 @@ from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.numerics.arguments import is_finite_number, is_number, real_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.derived import SETTLED_TO, transient
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.running import BY_COLUMNS
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
 from obsynth.results.certificate_files import sealed
 from obsynth.results.design import ObserverDesign
@@ -144,11 +147,13 @@ class OperatingPointCheck:
     def __init__(self, signals: Signals) -> None:
         self._signals = signals
         self._begin: float | None = None
+        self._start = np.full(len(signals.names), np.nan)
         self._sum, self._count = np.zeros(len(signals.names)), np.zeros(len(signals.names))
 
     def take(self, time: float, deviations: FloatArray) -> None:
         """Take one row: seconds, and deviations ``(nu + ny,)`` of which some may be missing."""
-        self._begin = time if self._begin is None else self._begin
+        if self._begin is None:
+            self._begin, self._start = time, np.array(deviations)
         if time - self._begin <= FIRST_SECONDS:
             known = np.isfinite(deviations)
             self._sum[known] += deviations[known]
@@ -160,6 +165,32 @@ class OperatingPointCheck:
             if self._begin is not None and not time - self._begin <= FIRST_SECONDS:
                 break
             self.take(time, row)
+
+    def alarm_of_the_start(self, design: ObserverDesign, alarms: Sequence[AlarmEvent]) -> tuple[str, ...]:
+        """Return a text where an alarm of a linear design may be its initial-condition response: when the warm-up
+        ends, `SETTLED_TO` of it are left, which is more than the noise where the outputs begin far from the start."""
+        observer, plant = design.observer, design.plant
+        if not (isinstance(observer, LinearObserver) and isinstance(plant, DescriptorSystem)) or self._begin is None:
+            return ()
+        noise = np.linalg.norm(plant.Dw, axis=1)
+        started = np.abs(self._start[len(self._start) - observer.By.shape[1] :])
+        if len(noise) != len(started) or not np.any(known := np.isfinite(started) & (noise > 0.0)):
+            return ()
+        shares = np.where(known, started, 0.0) / np.where(known, noise, 1.0)
+        worst = int(np.argmax(shares))
+        if shares[worst] * SETTLED_TO <= 1.0:
+            return ()
+        lasting = transient(observer) * math.log(shares[worst]) / -math.log(SETTLED_TO)
+        if not any(event.start < self._begin + lasting for event in alarms):
+            return ()
+        name = plant.output_names[worst]
+        where = "its operating point" if name in self._signals.point else "zero (no operating point is stated)"
+        return (
+            f"An alarm in the first {lasting:.3g} s may be the initial-condition response: {name} begins "
+            f"{shares[worst]:.3g} deviations of its noise from {where}, and when the warm-up ends "
+            f"{100.0 * SETTLED_TO:g} % of that response are left. State the operating point at which the log "
+            f"begins, or a longer warm-up (--warm-up {lasting:.3g}).",
+        )
 
     def warnings(self) -> tuple[str, ...]:
         """Return a text for each signal with a stated operating point, not zero, that begins far from it."""

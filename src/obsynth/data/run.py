@@ -380,8 +380,9 @@ def run_on_data(
     )
     _smoothed(run, data, smooth=smooth, lag=lag, state=state)
     digest = gain_set_digest(design)
-    if state is not None and Path(state).exists():
-        resume_state(Path(state), run, digest)
+    resumed = state is not None and Path(state).exists()
+    if resumed:
+        resume_state(Path(str(state)), run, digest)
     room = len(data) if isinstance(data, Sized) and not isinstance(data, str) else CHUNK_ROWS
     kept = FrameSink((TIME_HEADER, *run.signals.names), stamps, room) if out is None else None
     # What has left a stream cannot be taken back: there the state is saved however the run ends.
@@ -406,6 +407,7 @@ def run_on_data(
     shown = {} if run.recovered is None else dict(run.recovered.flags)
     found = zip(run.observer.output_names, run.repeated.stuck(), strict=True)
     stuck = {name: tuple((first + 1, last + 1) for first, last in runs) for name, runs in found if runs}
+    start = () if resumed else run.first.alarm_of_the_start(design, run.events.events())
     return DataRun(
         run.rows,
         dict(run.statuses),
@@ -413,7 +415,7 @@ def run_on_data(
         run.isolated,
         shown,
         dict(getattr(run.observer, "outliers", {})),
-        (*run.observer.notes, *stamps.warnings(), *run.first.warnings(), *stuck_texts(stuck)),
+        (*run.observer.notes, *stamps.warnings(), *run.first.warnings(), *start, *stuck_texts(stuck)),
         digest,
         table,
         None if kept is None else kept.frame(),

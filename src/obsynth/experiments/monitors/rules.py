@@ -429,11 +429,11 @@ PARAMETER_KINDS = ("chi-square", "cusum", "nis")
 ANY_LENGTH = " (the run may have any length)"
 _PARAMETER_STATEMENTS = {
     "chi-square": "distance of the parameters from their nominal values in the metric of their covariance: passed in a "
-    "run without a change with at most the stated probability, for Gaussian noise as stated",
+    "run without a change with a probability of {} at most, for Gaussian noise as stated",
     "cusum": "cumulative sum of the whitened innovation for a change of the stated size: passed in a run without a "
-    "change with at most the stated probability, for Gaussian noise as stated",
-    "nis": "squared innovations of 20 samples: passed in a run of the plant as modelled with at most the stated "
-    "probability, for Gaussian noise as stated",
+    "change with a probability of {} at most, for Gaussian noise as stated",
+    "nis": "squared innovations of 20 samples: passed in a run of the plant as modelled with a probability of {} at "
+    "most, for Gaussian noise as stated",
 }
 
 
@@ -533,7 +533,7 @@ def parameter_monitor(
     rule = ParameterRule(kind, theta, np.full(len(theta), float(change)), false_alarms)
     return Monitor(
         kind,
-        _PARAMETER_STATEMENTS[kind] + ANY_LENGTH,
+        _PARAMETER_STATEMENTS[kind].format(f"{false_alarms:g}") + ANY_LENGTH,
         rule,
         residuals=observer.innovation_count,
         fault_names=names,
