@@ -148,11 +148,11 @@ def header_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
     """Return the header."""
     observer, upper = found.observer, prefix.upper()
     before, after = found.operating_point
-    units = found.units
+    units: Mapping[str, str] = found.design.plant.units
     lines = [
         comment(f"Observer {quoted(found.design.name)} by {quoted(found.design.method)}, written by obsynth."),
         *([comment(found.note)] if found.note else []),
-        comment(quoted(found.status)),
+        comment(quoted(verification_words(found.design))),
         *(comment(line) for line in alarm_comments(alarms)),
         f"#ifndef {upper}_H",
         f"#define {upper}_H",
@@ -358,7 +358,7 @@ def source_text(found: Realisation, prefix: str, header: str, alarms: Alarms) ->
         "\n".join(
             [
                 comment(f"sha256 of the gain set: {found.digest}"),
-                comment(quoted(found.status)),
+                comment(quoted(verification_words(found.design))),
                 f'#include "{included(header)}"',
                 "",
                 "#include <math.h>",
@@ -383,7 +383,7 @@ def source_text(found: Realisation, prefix: str, header: str, alarms: Alarms) ->
                 *tables,
                 *(line for name, table in constants.items() for line in table_lines(name, filled_table(table))),
                 *integer_table("told", gap.told),
-                *integer_table("watched", alarms.places),
+                *integer_table("watched", range(len(alarms.levels))),
                 "",
                 template("products.c"),
                 *_products("say", ("z", "u", "y"), said, tuple(groups)),

@@ -154,17 +154,6 @@ class Realisation:
         )  # fmt: skip
 
     @property
-    def units(self) -> Mapping[str, str]:
-        """Units of signals by name."""
-        found: Mapping[str, str] = self.design.plant.units
-        return found
-
-    @property
-    def status(self) -> str:
-        """What every file says of the verification of the design."""
-        return verification_words(self.design)
-
-    @property
     def mark(self) -> str:
         """What every file says of a design that fails its verification; empty where it holds."""
         return unverified_mark(self.design.report)
@@ -173,11 +162,6 @@ class Realisation:
     def inputs(self) -> tuple[str, ...]:
         """Names of the inputs: known inputs, then outputs of the plant."""
         return self.observer.input_names + self.observer.output_names
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs, ``xhat[...]``, ``fhat[...]``, ``r[...]``."""
-        return self.observer.row_names
 
     @property
     def operating_point(self) -> tuple[FloatArray, FloatArray]:
@@ -205,7 +189,7 @@ class Realisation:
             "output_point": after,
             "delays": np.array([*observer.state_delays, *observer.fault_delays], dtype=np.float64),
             "input_names": list(self.inputs),
-            "output_names": list(self.outputs),
+            "output_names": list(observer.row_names),
             "name": self.design.name,
             "method": self.design.method,
             "sha256": self.digest,
@@ -278,11 +262,6 @@ class Alarms:
         if learned is not None:
             levels[STATISTIC] = 1.0
         return cls(levels, tuple(columns), tuple(fault_names), warm_up, learned)
-
-    @property
-    def places(self) -> tuple[int, ...]:
-        """Where each watched output stands, in order."""
-        return tuple(range(len(self.levels)))
 
 
 def finite_warm_up(seconds: float) -> float:
