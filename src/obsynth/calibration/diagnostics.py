@@ -272,15 +272,10 @@ class Validation:
 
     def plot(self) -> Figure:
         """Return a picture: measured and predicted signals, innovations in their band, estimates."""
-        return _figure(self)
-
-
-def _figure(found: Validation) -> Figure:
-    """Return measured and predicted signals, innovations in their band, and each estimate with its own."""
-    count = 2 * len(found.sensors) + len(found.estimates)
-    figure, panels = new_figure(count, size=(WIDTH, 0.6 + 1.5 * count))
-    draw_validation(found, panels)
-    return figure
+        count = 2 * len(self.sensors) + len(self.estimates)
+        figure, panels = new_figure(count, size=(WIDTH, 0.6 + 1.5 * count))
+        draw_validation(self, panels)
+        return figure
 
 
 def draw_validation(found: Validation, panels: Sequence[Axes]) -> None:

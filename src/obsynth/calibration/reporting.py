@@ -241,25 +241,20 @@ class Calibration:
 
     def plot(self) -> Figure:
         """Return a picture: each constant in its box, and the innovations of each sensor in deviations."""
-        return _figure(self)
-
-
-def _figure(found: Calibration) -> Figure:
-    """Return each constant in its box, and the whitened innovations of each sensor."""
-    heights = [0.6 + 0.35 * len(found.names), *[1.7] * len(found.output_names)]
-    figure, panels = new_figure(len(heights), size=(WIDTH, 0.5 + sum(heights)), heights=heights)
-    _boxes(panels[0], found)
-    time = found.log["rows"][0] + np.arange(len(found.innovations))
-    for panel, name, column in zip(panels[1:], found.output_names, found.innovations.T, strict=True):
-        panel.axhspan(-BAND_WIDTH, BAND_WIDTH, **BAND_STYLE)
-        panel.plot(time, column, color="black", linewidth=0.8, marker=".", markersize=3)
-        panel.set_ylabel(f"{name}\n(deviations)")
-        tidy(panel)
-        if found.change is not None:
-            panel.axvline(found.change, color="tab:red", linestyle="--", linewidth=1.2)
-    panels[1].set_title("Innovations; 95 % lie in the band", fontsize=10, loc="left")
-    panels[-1].set_xlabel("row of the log")
-    return figure
+        heights = [0.6 + 0.35 * len(self.names), *[1.7] * len(self.output_names)]
+        figure, panels = new_figure(len(heights), size=(WIDTH, 0.5 + sum(heights)), heights=heights)
+        _boxes(panels[0], self)
+        time = self.log["rows"][0] + np.arange(len(self.innovations))
+        for panel, name, column in zip(panels[1:], self.output_names, self.innovations.T, strict=True):
+            panel.axhspan(-BAND_WIDTH, BAND_WIDTH, **BAND_STYLE)
+            panel.plot(time, column, color="black", linewidth=0.8, marker=".", markersize=3)
+            panel.set_ylabel(f"{name}\n(deviations)")
+            tidy(panel)
+            if self.change is not None:
+                panel.axvline(self.change, color="tab:red", linestyle="--", linewidth=1.2)
+        panels[1].set_title("Innovations; 95 % lie in the band", fontsize=10, loc="left")
+        panels[-1].set_xlabel("row of the log")
+        return figure
 
 
 def _boxes(panel: Axes, found: Calibration) -> None:

@@ -81,7 +81,21 @@ class Validity:
 
     def plot(self) -> Figure:
         """Return a picture: both outputs, and their difference in deviations, by sensor."""
-        return _figure(self)
+        names = list(self.by_sensor)
+        figure, panels = new_figure(2 * len(names), size=(WIDTH, 0.6 + 3.0 * len(names)))
+        for i, name in enumerate(names):
+            signals, apart = panels[2 * i : 2 * i + 2]
+            signals.plot(self.time, self.nonlinear[:, i], label="nonlinear", **TRUE_STYLE)
+            signals.plot(self.time, self.linear[:, i], label="linear", **ESTIMATE_STYLE)
+            signals.set_ylabel(name)
+            legend_above(signals)
+            apart.axhspan(-1.0, 1.0, **BAND_STYLE)
+            apart.plot(self.time, (self.linear - self.nonlinear)[:, i] / self.deviations[name], **RESIDUAL_STYLE)
+            apart.set_ylabel(f"difference of\n{name} (deviations)")
+        for panel in panels:
+            tidy(panel)
+        label_time(panels[-1])
+        return figure
 
 
 @arguments_checked
@@ -197,22 +211,3 @@ def _linear_outputs(linear: DescriptorSystem, log: Log, start: FloatArray) -> Fl
         z = z + log.dt * (ending @ slopes)
         found.append(linear.C @ z)
     return np.array(found)
-
-
-def _figure(found: Validity) -> Figure:
-    """Return outputs of plant and linear model, and their difference in deviations of the sensor."""
-    names = list(found.by_sensor)
-    figure, panels = new_figure(2 * len(names), size=(WIDTH, 0.6 + 3.0 * len(names)))
-    for i, name in enumerate(names):
-        signals, apart = panels[2 * i : 2 * i + 2]
-        signals.plot(found.time, found.nonlinear[:, i], label="nonlinear", **TRUE_STYLE)
-        signals.plot(found.time, found.linear[:, i], label="linear", **ESTIMATE_STYLE)
-        signals.set_ylabel(name)
-        legend_above(signals)
-        apart.axhspan(-1.0, 1.0, **BAND_STYLE)
-        apart.plot(found.time, (found.linear - found.nonlinear)[:, i] / found.deviations[name], **RESIDUAL_STYLE)
-        apart.set_ylabel(f"difference of\n{name} (deviations)")
-    for panel in panels:
-        tidy(panel)
-    label_time(panels[-1])
-    return figure
