@@ -20,7 +20,7 @@ import math
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import flint
 import numpy as np
@@ -31,6 +31,7 @@ from obsynth.numerics.doubling import symmetric_product
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_up
+from obsynth.proofs.covariances import enclosed_sum
 from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.proofs.extended_balls import Enclosed, arb_matrix, block
 from obsynth.proofs.products import exponential
@@ -49,7 +50,7 @@ STATES_FOR_DOUBLED_SUMS = 200
 #: Beside sums up to so large rounding hides no identity matrix: 1e-16 of them is 1e-7 of it.
 LARGEST_SUM = 1e9
 #: Where both lose it the sum is formed in so many digits, in bits, up to so many states.
-PRECISE_BITS, MOST_STATES_PRECISELY = 512, 20
+PRECISE_BITS, MOST_STATES_PRECISELY = 1024, 20
 #: The same where the rate itself is what is asked for.
 TIGHT_RATES = (0.01, 0.1)
 
@@ -241,22 +242,14 @@ def _precise_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray
         return None
     balanced, scale = balanced_matrix(a)
     with flint.ctx.workprec(PRECISE_BITS):
-        one, matrix = arb_matrix(np.eye(n)), arb_matrix(balanced)
-        if discrete:
-            power, total = matrix * (1 / flint.arb(rate)), one
-        else:
-            shifted = matrix + one * flint.arb(rate)
-            size = flint.arb(largest_singular_value(balanced) + rate)
-            try:
-                inverse = (one * size - shifted).inv()
-            except ZeroDivisionError:
-                return None
-            power, total = inverse * (one * size + shifted), inverse.transpose() * inverse
+        one, turned = arb_matrix(np.eye(n)), arb_matrix(balanced.T)
+        moving = turned * (1 / flint.arb(rate)) if discrete else turned + one * flint.arb(rate)
+        total = one
         for _ in range(2):
-            found = _precisely_summed(power, total)
+            found = enclosed_sum(moving, total, largest_singular_value(balanced) + rate, discrete=discrete)
             if found is None:
                 return None
-            total = found
+            total = found.mid()
         rows = total.tolist()
         for k in range(n):
             if not rows[k][k] > 0:
@@ -267,20 +260,6 @@ def _precise_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray
                 rows[i] = [value - rows[k][i] * other for value, other in zip(rows[i], rows[k], strict=True)]
         factor = np.array([[float(value.mid()) for value in row] for row in rows])
     return np.asarray(np.triu(factor / scale[None, :]))
-
-
-def _precisely_summed(power: Any, total: Any) -> Any | None:
-    """Return the sum of ``(A^k)' W A^k`` over all k; ``None`` where it does not settle."""
-    for _ in range(MOST_SUM_DOUBLINGS):
-        later = power.transpose() * total * power
-        total = (total + later).mid()
-        sizes = [(float(later[i, i]), float(total[i, i])) for i in range(int(total.nrows()))]
-        if not all(math.isfinite(size) for _, size in sizes):
-            return None
-        if all(added <= SUMS_SETTLED * size for added, size in sizes):
-            return total
-        power = (power * power).mid()
-    return None
 
 
 def _summed(power: FloatArray, factor: FloatArray) -> FloatArray | None:

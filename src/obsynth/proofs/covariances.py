@@ -52,7 +52,8 @@ def enclosed_noise_covariance(
     a, b, c = balanced_realisation(a, b, c)
     for bits in TRIED_BITS:
         with flint.ctx.workprec(bits):
-            states = _enclosed(arb_matrix(a), arb_matrix(b), dt, largest_singular_value(a) or 1.0)
+            driven = arb_matrix(b) * arb_matrix(b).transpose()
+            states = enclosed_sum(arb_matrix(a), driven, largest_singular_value(a) or 1.0, discrete=dt > 0.0)
             if states is None:
                 continue
             shown = arb_matrix(c) * states * arb_matrix(c).transpose()
@@ -67,11 +68,12 @@ def enclosed_noise_covariance(
     return None
 
 
-def _enclosed(a: Any, b: Any, dt: float, size: float) -> Any | None:
-    """Return the covariance of the states; ``None`` where the powers do not decay."""
+def enclosed_sum(a: Any, weight: Any, size: float, *, discrete: bool) -> Any | None:
+    """Return X with ``X = a X a' + weight`` (``a X + X a' + weight = 0``) of ``flint.arb_mat`` as balls; ``None`` where
+    powers do not decay.  ``size``: of a, any positive number will do."""
     n = a.nrows()
-    states, power = b * b.transpose(), a
-    if not dt > 0.0:
+    states, power = weight, a
+    if not discrete:
         one = flint.arb_mat(n, n, [float(i == j) for i in range(n) for j in range(n)]) * flint.arb(size)
         try:
             inverse = (one - a).inv()
