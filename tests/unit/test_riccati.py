@@ -16,7 +16,6 @@ from obsynth.methods.fault_estimation_filter.central_filter import (
     search_central_filter,
 )
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection
-from obsynth.methods.riccati import bounded_real_matrix
 from obsynth.numerics.doubling import (
     FIRST_POWER,
     RankWatch,
@@ -24,6 +23,7 @@ from obsynth.numerics.doubling import (
     continuous_riccati_solution,
     doubled_riccati_solution,
 )
+from obsynth.numerics.matrix_equations import bounded_real_matrix
 from obsynth.numerics.norms import hinf_norm, largest_peak, spectral_radius
 
 

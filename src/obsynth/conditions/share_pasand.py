@@ -16,7 +16,6 @@ a U of full rank, unless E_sharp, C_sharp and G of (10), (11) are given; several
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -46,7 +45,8 @@ from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.methods.ui_pi_observer.placement_problem import with_faults
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.matrix_equations import continuous_riccati, discrete_riccati
+from obsynth.numerics.doubling import is_positive
+from obsynth.numerics.matrix_equations import continuous_solution, discrete_solution
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
@@ -214,16 +214,14 @@ def _coordinates(F: FloatArray, C: FloatArray, where: LMIRegion, *, discrete: bo
     found = [x for x in (_REAL_NUMBERS if discrete else _REAL_RATES) if where.contains(x)]
     if not found:
         return np.eye(n)
-    solve, moved = (
-        (discrete_riccati, F / max(np.abs(found))) if discrete else (continuous_riccati, F - max(found) * np.eye(n))
-    )
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            # What comes of it is a scale alone.
-            covariance = solve(moved.T, C.T, np.eye(n), np.eye(len(C)))
-            return np.asarray(np.linalg.cholesky(0.5 * (covariance + covariance.T)))
-    except (np.linalg.LinAlgError, ValueError):
+    if discrete:
+        covariance = discrete_solution(F / max(np.abs(found)), C, np.eye(n), np.eye(len(C)))
+    else:
+        covariance = continuous_solution(F - max(found) * np.eye(n), C, np.eye(n), np.eye(len(C)))
+    if covariance is None or not is_positive(covariance):
         return np.eye(n)
+    # What comes of it is a scale alone.
+    return np.asarray(np.linalg.cholesky(0.5 * (covariance + covariance.T)))
 
 
 def _decoupling(plant: DescriptorSystem, E_sharp: Any, C_sharp: Any, G: Any) -> Decoupled:

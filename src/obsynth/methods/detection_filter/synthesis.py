@@ -21,8 +21,8 @@ from obsynth.methods.detection_filter.norm_proofs import (
     sensitivity_is_proved,
 )
 from obsynth.methods.method import Synthesis
-from obsynth.methods.riccati import continuous_solution
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.matrix_equations import continuous_solution
 from obsynth.numerics.norms import response
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.spectra import abscissa

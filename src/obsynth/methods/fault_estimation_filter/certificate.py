@@ -7,10 +7,10 @@ from itertools import islice, product
 
 import numpy as np
 
-from obsynth.methods.riccati import bounded_real_matrix, normalising_change
 from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.doubling import FEWEST_STATES
+from obsynth.numerics.matrix_equations import bounded_real_matrix, normalising_change
 from obsynth.numerics.norms import output_covariance, state_units
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem

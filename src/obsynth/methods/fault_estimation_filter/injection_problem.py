@@ -12,9 +12,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from obsynth.errors import SolverError
-from obsynth.methods.riccati import bounded_real_matrix, normalising_change, stabilising_gain
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.doubling import FEWEST_STATES
+from obsynth.numerics.matrix_equations import bounded_real_matrix, normalising_change, stabilising_gain
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import (
     highest_gain_found,

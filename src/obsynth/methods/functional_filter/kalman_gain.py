@@ -14,9 +14,13 @@ import numpy as np
 
 from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled
 from obsynth.errors import PreconditionError, SolverError
-from obsynth.methods.riccati import continuous_solution, riccati_solution
 from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value
-from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
+from obsynth.numerics.matrix_equations import (
+    continuous_lyapunov,
+    continuous_solution,
+    discrete_lyapunov,
+    riccati_solution,
+)
 from obsynth.numerics.ranks import RANK_TOLERANCE, rank_from
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.numerics.spectra import abscissa

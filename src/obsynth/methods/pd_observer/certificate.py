@@ -11,10 +11,9 @@ import warnings
 import numpy as np
 
 from obsynth.methods.pd_observer.checks.certificate import prove_gain
-from obsynth.methods.riccati import continuous_solution
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.continuous import spectral_abscissa
-from obsynth.numerics.matrix_equations import continuous_lyapunov
+from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_solution
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import Ball
 

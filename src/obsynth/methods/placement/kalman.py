@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.doubling import continuous_riccati_solution, doubled_riccati_solution
+from obsynth.numerics.doubling import continuous_riccati_solution
+from obsynth.numerics.matrix_equations import continuous_solution, discrete_solution, doubled_solution
 from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_covariance
 
 #: Times the Riccati equation is solved, each time in the coordinates of the last solution, which improve it.
@@ -112,11 +113,9 @@ def _filtered(
             moved, noise = inverse @ f @ change, inverse @ driven @ inverse.T
             moved = moved / bound if dt > 0.0 else moved - bound * np.eye(len(f))
             noise = 0.5 * (noise + noise.T)
-            for equation in (
-                (_by_doubling, _by_the_library) if len(f) >= MOST_STATES_FOR_PENCILS else (_by_the_library,)
-            ):
-                found, covariance = equation(moved, c @ change, noise, measured, dt)
-                gain = change @ (bound * found if dt > 0.0 else found)
+            for doubled in (True, False) if len(f) >= MOST_STATES_FOR_PENCILS else (False,):
+                gain, covariance = _solved(moved, c @ change, noise, measured, dt, doubled=doubled)
+                gain = change @ (bound * gain if dt > 0.0 else gain)
                 values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
                 if np.all(np.isfinite(gain)) and abscissa(f - gain @ c, dt) < bound:
                     break
@@ -128,32 +127,20 @@ def _filtered(
     return np.asarray(gain), np.asarray(change @ (vectors * np.sqrt(np.maximum(values, floor))))
 
 
-def _by_doubling(
-    f: FloatArray, c: FloatArray, noise: FloatArray, measured: FloatArray, dt: float
+def _solved(
+    f: FloatArray, c: FloatArray, noise: FloatArray, measured: FloatArray, dt: float, *, doubled: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Return gain and error covariance of a Kalman filter; NaN where the doubling breaks down."""
-    nothing = np.full((len(f), len(c)), np.nan)
+    """Return gain and error covariance of a Kalman filter, NaN where the equation is not solved: by doubling, or by the
+    QZ algorithm, which takes several times as long and hardly ever breaks down."""
     if dt > 0.0:
-        y = doubled_riccati_solution(f, c, noise, measured, np.zeros_like(nothing))
-        if y is None:
-            return nothing, np.eye(len(f))
-        return np.asarray(np.linalg.solve(c @ y @ c.T + measured, c @ y @ f.T).T), y
-    y = continuous_riccati_solution(f, c, noise, measured)
+        y = (doubled_solution if doubled else discrete_solution)(f, c, noise, measured, np.zeros((len(f), len(c))))
+    else:
+        y = (continuous_riccati_solution if doubled else continuous_solution)(f, c, noise, measured)
     if y is None:
-        return nothing, np.eye(len(f))
+        return np.full((len(f), len(c)), np.nan), np.eye(len(f))
+    if dt > 0.0:
+        return np.asarray(np.linalg.solve(c @ y @ c.T + measured, c @ y @ f.T).T), y
     return np.asarray(np.linalg.solve(measured, c @ y).T), y
-
-
-def _by_the_library(
-    f: FloatArray, c: FloatArray, noise: FloatArray, measured: FloatArray, dt: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the same by the QZ algorithm, which takes several times as long and hardly ever breaks down."""
-    import control
-
-    # By scipy, so that no gain depends on whether slycot is there.
-    solve = control.dlqe if dt > 0.0 else control.lqe
-    found, covariance, _ = solve(f, np.eye(len(f)), c, noise, measured, method="scipy")
-    return np.asarray(found), np.asarray(covariance)
 
 
 #: The default pays at most this factor in noise, against the quietest Kalman filter, for being fast.
