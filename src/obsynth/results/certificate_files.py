@@ -220,14 +220,20 @@ def _differences(found: Mapping[str, Any], again: Mapping[str, Any]) -> list[str
 
 def _same_range(one: Any, item: Mapping[str, Any]) -> bool:
     """Whether a constant of a file is that of the calibration done again; what is malformed is not."""
-    if not isinstance(one, dict) or any(one.get(key) != item[key] for key in ("open", "unit")):
-        return False
-    (low, high), ends = item["range"], one.get("range")
-    if not isinstance(ends, list) or len(ends) != 2 or not all(map(is_finite_number, [*ends, one.get("nominal")])):
+    stated, (low, high) = _stated_range(one), item["range"]
+    if not stated or any(one.get(key) != item[key] for key in ("open", "unit")):
         return False
     slack = SAME_WIDTH * (high - low)
-    pairs = zip([*ends, one["nominal"]], (low, high, item["nominal"]), strict=True)
-    return all(abs(a - b) <= slack for a, b in pairs)
+    return all(abs(a - b) <= slack for a, b in zip(stated, (low, item["nominal"], high), strict=True))
+
+
+def _stated_range(item: Any) -> list[float]:
+    """Return low end, nominal value and high end of a constant of a file; nothing of what is malformed."""
+    ends = item.get("range") if isinstance(item, dict) else None
+    if not isinstance(ends, list) or len(ends) != 2:
+        return []
+    stated = [ends[0], item.get("nominal"), ends[1]]
+    return stated if all(map(is_finite_number, stated)) else []
 
 
 def _misfits(found: Mapping[str, Any]) -> list[str]:
@@ -236,13 +242,8 @@ def _misfits(found: Mapping[str, Any]) -> list[str]:
     constants = found.get("constants")
     if not isinstance(constants, dict):
         return [*wrong, "constants"]
-    for name, item in constants.items():
-        ends = item.get("range") if isinstance(item, dict) else None
-        nominal = item.get("nominal") if isinstance(item, dict) else None
-        fits = isinstance(ends, list) and len(ends) == 2 and all(map(is_finite_number, [*ends, nominal]))
-        if not (fits and isinstance(ends, list) and float(ends[0]) <= float(nominal or 0.0) <= float(ends[1])):
-            wrong.append(str(name))
-    return wrong
+    stated = {str(name): _stated_range(item) for name, item in constants.items()}
+    return wrong + [name for name, values in stated.items() if not values or sorted(values) != values]
 
 
 def box_row(box: Any, path: Path) -> Check:
