@@ -259,8 +259,6 @@ def simulate_time_varying(
     PreconditionError
         The state is not determined at some k: the index is higher than one there.
     """
-    if plant.ne != plant.nx:
-        raise SpecError(f"{plant.ne} equations do not determine {plant.nx} states.", path="E")
     nq, samples = plant.nq, whole_number(samples, "samples", "the length of the record")
     given = np.zeros(nq) if parameters is None else real_array(parameters, "parameters")
     whole = np.broadcast_to(given, (samples, nq)) if given.shape == (nq,) else given

@@ -9,6 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar
 
@@ -397,8 +398,10 @@ class Scenario:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what makes it again in another process: read-only mappings do not travel."""
-        given = {name: dict(value) if isinstance(value, Mapping) else value for name, value in vars(self).items()}
-        return _made, (given,)
+        given: dict[str, Any] = {
+            name: dict(value) if isinstance(value, Mapping) else value for name, value in vars(self).items()
+        }
+        return partial(Scenario, **given), ()
 
     def replace(self, **changes: Any) -> Scenario:
         """Return the scenario with some fields changed, such as its seed.
@@ -496,10 +499,6 @@ def observer_start(scenario: Scenario, order: int) -> FloatArray:
     if given is not None and len(given) != order:
         raise SpecError(f"observer_state needs {order} numbers, not {len(given)}.", path="observer_state")
     return np.zeros(order) if given is None else np.array(given)
-
-
-def _made(given: dict[str, Any]) -> Scenario:
-    return Scenario(**given)
 
 
 def _checked_profiles(given: Any, group: str, kinds: tuple[type[Profile], ...]) -> dict[str, tuple[Profile, ...]]:
