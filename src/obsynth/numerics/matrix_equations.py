@@ -103,8 +103,21 @@ def bounded_real_matrix(
         return np.zeros((0, 0))
     weight = c.T @ c + slack * np.eye(n)
     cross, gap = c.T @ d, d.T @ d - level**2 * np.eye(b.shape[1])
+    exceeded, last = False, np.zeros(n)
+
+    def possible(found: FloatArray) -> bool:
+        """Whether the gain may still be below the level after the steps of a solution."""
+        nonlocal exceeded, last
+        left, sizes = -(gap + b.T @ found @ b), found.diagonal().copy()
+        if np.isfinite(left).all():
+            # Over more steps the solution grows: one that does not is behind a level that was exceeded in between.
+            shrunk = (sizes < last - REFUTED * last.max(initial=0.0)).any()
+            exceeded, last = bool(shrunk) or is_clearly_negative(left, b, found), sizes
+        return not exceeded
+
     if b.shape[1]:
-        p = riccati_solution(a.T, b.T, weight, gap, cross, impossible=_Exceeded(b, gap))
+        p = doubled_solution(a.T, b.T, weight, gap, cross, possible=possible)
+        p = p if exceeded or p is not None else discrete_solution(a.T, b.T, weight, gap, cross)
     else:
         p = lyapunov_solution(a, weight)
     if p is None:
@@ -113,49 +126,17 @@ def bounded_real_matrix(
     return p if np.all(np.isfinite(p)) and is_positive(p) else None
 
 
-class _Exceeded:
-    """Says whether the gain exceeds the level over the steps of a solution; ``b (n, m)``, ``gap``: D'D - level^2 I."""
-
-    def __init__(self, b: FloatArray, gap: FloatArray) -> None:
-        self.b, self.gap = b, gap
-        self.last: FloatArray | None = None
-
-    def __call__(self, p: FloatArray) -> bool:
-        left, sizes = -(self.gap + self.b.T @ p @ self.b), p.diagonal()
-        if not np.isfinite(left).all():
-            return False
-        # Over more steps the solution grows: one that does not is behind a level that was exceeded in between.
-        shrunk = self.last is not None and (sizes < self.last - REFUTED * self.last.max(initial=0.0)).any()
-        self.last = sizes.copy()
-        return bool(shrunk) or is_clearly_negative(left, self.b, p)
-
-
 def lyapunov_solution(a: FloatArray, weight: FloatArray) -> FloatArray | None:
     """Return ``P = a' P a + weight``, however badly conditioned; None where there is none."""
     return _attempted(discrete_lyapunov, a.T, weight)
 
 
 def riccati_solution(
-    a: FloatArray,
-    h: FloatArray,
-    process: FloatArray,
-    weight: FloatArray,
-    cross: FloatArray,
-    *,
-    impossible: Callable[[FloatArray], bool] | None = None,
+    a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray
 ) -> FloatArray | None:
     """Return the stabilising solution by doubling, or where that breaks down by SciPy; ``None`` without one."""
-    ended = False
-
-    def possible(found: FloatArray) -> bool:
-        nonlocal ended
-        ended = impossible is not None and impossible(found)
-        return not ended
-
-    doubled = doubled_solution(a, h, process, weight, cross, possible=possible)
-    if ended or doubled is not None:
-        return None if ended else doubled
-    return discrete_solution(a, h, process, weight, cross)
+    found = doubled_solution(a, h, process, weight, cross)
+    return discrete_solution(a, h, process, weight, cross) if found is None else found
 
 
 def doubled_solution(
