@@ -107,14 +107,6 @@ class PlantNumbers:
         """Return a matrix by its name, or some of its columns."""
         return self.matrices[name] if kept is None else picked_columns(self.matrices[name], kept)
 
-    def independent_columns(self, matrix: Any, count: int) -> list[int]:
-        """Return the columns, from the left, that are no combination of those before them."""
-        kept: list[int] = []
-        for column in range(count):
-            if self.rank(picked_columns(matrix, [*kept, column])) == len(kept) + 1:
-                kept.append(column)
-        return kept
-
     def with_matrices(self, changes: Mapping[str, Any], *, rational: Mapping[str, fmpq_mat]) -> PlantNumbers:
         """Return the same with some matrices replaced, and what is rational of those of a sampled plant."""
         own = {**self.rational, **(changes if self.exact else rational)}

@@ -175,11 +175,13 @@ class Evaluator:
 
     @cached_property
     def kept_disturbances(self) -> list[int]:
-        """The unknown inputs that are no combinations of those before them; all where the numbers are not known."""
-        numbers, count = self.numbers, self.plant.nd
-        if numbers is None:
-            return list(range(count))
-        return numbers.independent_columns(blocks([[numbers.matrices["Bd"]], [numbers.matrices["Dd"]]]), count)
+        """The unknown inputs that are no combinations of those before them."""
+        kept = list[int]()
+        for column in range(self.plant.nd):
+            said = FullRank([["Bd"], ["Dd"]], {name: [*kept, column] for name in ("Bd", "Dd")})
+            if self.rank_itself(said) == len(kept) + 1:
+                kept.append(column)
+        return kept
 
     @cached_property
     def terms(self) -> DescriptorSystem | None:

@@ -16,7 +16,6 @@ Whether a fault model can be distinguished from states and unknown inputs: (D3),
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -52,7 +51,6 @@ from obsynth.analysis.zeros import (
     system_pencil,
     system_zeros,
     zero_at,
-    zeros_of_system,
 )
 from obsynth.errors import PreconditionError
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
@@ -500,9 +498,7 @@ _D2_SOURCE = "Share Pasand, Lemma 4 (9.2)"
 
 
 def _zero_condition(judge: Evaluator, plant: DescriptorSystem, units: PlantUnits) -> Condition:
-    """Decide (D2) on the numbers of the plant as given, or in floating point on the scaled one."""
-    if judge.numbers is None:
-        return _zero_condition_in_floating_point(plant, units)
+    """Decide (D2) on the numbers of the plant as given, or in floating point."""
     kept = judge.kept_disturbances
     inputs, direct = plant.Bd[:, kept], plant.Dd[:, kept]
 
@@ -511,7 +507,9 @@ def _zero_condition(judge: Evaluator, plant: DescriptorSystem, units: PlantUnits
 
     def lost(facts: SystemFacts) -> Condition:
         if not facts.full:
-            return _hidden_trajectories(facts.normal_rank, facts.columns)
+            rank, full = facts.normal_rank, facts.columns
+            detail = f"normal rank {rank} of {full}: whole trajectories of the plant are output-nulling."
+            return _zeros(False, rank, full, detail)
         point = units.rate * max(facts.outside, key=lambda value: instability(value, plant.dt))
         return _zero_failure(plant, units, zero_at(plant.E, plant.A, point, inputs, plant.C, direct), inputs, direct)
 
@@ -520,26 +518,6 @@ def _zero_condition(judge: Evaluator, plant: DescriptorSystem, units: PlantUnits
 
 def _zeros(holds: bool, value: float, bound: float, detail: str) -> Condition:
     return Condition("(D2) zeros", _D2, holds, float(value), float(bound), _D2_SOURCE, detail)
-
-
-def _worst(outside: Sequence[Zero], dt: float) -> Zero:
-    return max(outside, key=lambda zero: instability(zero.value, dt))
-
-
-def _hidden_trajectories(rank: int, full: int) -> Condition:
-    detail = f"normal rank {rank} of {full}: whole trajectories of the plant are output-nulling."
-    return _zeros(False, rank, full, detail)
-
-
-def _zero_condition_in_floating_point(plant: DescriptorSystem, units: PlantUnits) -> Condition:
-    inputs, direct = independent_disturbances(plant)
-    found, zeros, outside = zeros_of_system(plant.E, plant.A, inputs, plant.C, direct, dt=plant.dt)
-    full = plant.nx + inputs.shape[1]
-    if found.normal_rank < full:
-        return _hidden_trajectories(found.normal_rank, full)
-    if outside:
-        return _zero_failure(plant, units, _worst(outside, plant.dt), inputs, direct)
-    return _zeros(True, found.normal_rank, full, f"{len(zeros)} stable zero(s)")
 
 
 def _zero_failure(
