@@ -33,9 +33,9 @@ from obsynth import (
     pd_observer,
     verify,
 )
-from obsynth.methods.pd_observer.checks.certificate import prove_gain
 from obsynth.proofs.balls import Ball
 from obsynth.spec import load_spec
+from obsynth.verification.certificates import prove_gain
 from obsynth.verification.claims import WITNESS_CLAIMS
 
 PAPER = Path(__file__).parents[2] / "designs" / "filasova" / "spec.yaml"
@@ -50,7 +50,6 @@ RATE, NOISE, BOUND = (
     "fault rate in the fault estimate", "noise and its derivative in the fault estimate", "gain bound",
 )  # fmt: skip
 FITS = "fits the plant"
-
 
 # The good designs.
 

@@ -22,10 +22,8 @@ from obsynth.methods.pd_observer.certificate import (
 )
 from obsynth.methods.pd_observer.checks.certificate import (
     error_inputs,
-    prove_gain,
     prove_gains,
     prove_shipped_stability,
-    prove_symmetric_positive,
 )
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 from obsynth.methods.pd_observer.limits import least_noise_gain
@@ -33,6 +31,7 @@ from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_
 from obsynth.numerics.continuous import ContinuousNorms
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
+from obsynth.verification.certificates import prove_gain, prove_symmetric_positive
 
 FOLDER = Path(__file__).parents[2] / "designs" / "filasova"
 PLANT = load_spec(FOLDER / "spec.yaml").plant

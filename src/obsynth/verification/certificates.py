@@ -22,6 +22,7 @@ from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.observers.linear.derived import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
 from obsynth.proofs.extended_balls import Enclosed, block, enclosed_eigenvalues
@@ -125,6 +126,40 @@ def _formed(
             [cs, -d, zero(nf, core), exact(np.eye(nf))],
         ]
     )
+
+
+def prove_symmetric_positive(matrix: FloatArray) -> DefinitenessProof:
+    """Try to prove that a matrix is symmetric, exactly, and positive definite."""
+    if not np.array_equal(matrix, matrix.T):
+        return unproved("the matrix is not symmetric")
+    return prove_positive_definite(matrix)
+
+
+def prove_gain(
+    a: FloatArray | Ball,
+    b: FloatArray | Ball,
+    c: FloatArray | Ball,
+    P: FloatArray,
+    gain: float,
+    *,
+    direct: FloatArray | Ball | None = None,
+) -> DefinitenessProof:
+    """Try to prove that ``x' = a x + b v``, ``z = c x + direct v`` is stable, and of an H-infinity norm below ``gain``:
+    ``P > 0``, ``[P a + a' P, P b, c'; b' P, -gain^2 I, direct'; c, direct, -I] < 0``."""
+    positive = prove_symmetric_positive(P)
+    if not positive.proved:
+        return unproved(f"P itself: {positive.reason}")
+    states, inputs, outputs = Ball.of(a), Ball.of(b), Ball.of(c)
+    through = Ball.of(np.zeros((outputs.shape[0], inputs.shape[1])) if direct is None else direct)
+
+    def formula(kind: type[Enclosed]) -> Enclosed:
+        p, shown, d = kind.exact(P), kind.of(outputs), kind.of(through)
+        moved, entering = p @ kind.of(states), p @ kind.of(inputs)
+        level = kind.exact(np.eye(inputs.shape[1])).scaled(gain).scaled(gain)
+        identity = kind.exact(np.eye(outputs.shape[0]))
+        return block([[-(moved + moved.T), -entering, shown.T], [-entering.T, level, d.T], [shown, d, identity]])
+
+    return prove_positive_definite(formula)
 
 
 #: A claimed rate is proved for all but this share of it.

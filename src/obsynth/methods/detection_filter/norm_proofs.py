@@ -25,7 +25,7 @@ from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, rounded_up
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.proofs.exact_arithmetic import nearest_doubles, stored_matrix
-from obsynth.proofs.extended_balls import Enclosed, block
+from obsynth.verification.certificates import prove_gain
 from obsynth.verification.error_system import contraction_of
 
 #: Intervals that a range may take, the share of an interval's reach that is used, and its first guess.
@@ -87,20 +87,9 @@ def _equal_shares(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
 
 def gain_is_proved(transfer: Transfer, bound: float, p: FloatArray) -> bool:
     """Prove by a matrix p ``(n, n)`` that the system is stable and its H-infinity norm at most a bound."""
-    if not transfer.order:
-        corner = Ball.exact(bound**2 * np.eye(transfer.D.shape[0])) - transfer.D @ transfer.D.T
-        return prove_positive_definite(corner).proved
-    p = 0.5 * (p + p.T)
-
-    def inequality(kind: type[Enclosed]) -> Enclosed:
-        parts = transfer.dynamics, transfer.B, transfer.C, transfer.D
-        closed, into, out, through = (kind.of(part) for part in parts)
-        moved = closed @ kind.exact(p)
-        corner = kind.exact(bound**2 * np.eye(transfer.D.shape[0])) - through @ through.T
-        side = kind.exact(p) @ out.T + into @ through.T
-        return block([[-(moved + moved.T) - into @ into.T, -side], [-side.T, corner]])
-
-    return prove_positive_definite(inequality).proved and prove_positive_definite(p).proved
+    # Of the transposed system, of which p proves it.
+    a, b, c, d = (part.T for part in (transfer.dynamics, transfer.C, transfer.B, transfer.D))
+    return prove_gain(a, b, c, 0.5 * (p + p.T), bound, direct=d).proved
 
 
 def sensitivity_is_proved(transfer: Transfer, level: float, low: float, high: float) -> bool:

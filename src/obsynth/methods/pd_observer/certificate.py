@@ -10,12 +10,12 @@ import warnings
 
 import numpy as np
 
-from obsynth.methods.pd_observer.checks.certificate import prove_gain
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_solution
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import Ball
+from obsynth.verification.certificates import prove_gain
 
 #: delta is moved by this factor when -1/delta is close to an eigenvalue, where the construction breaks down.
 DELTA_STEP = 1.7

@@ -36,7 +36,6 @@ from obsynth.methods.pd_observer.checks.certificate import (
     error_inputs,
     prove_gains,
     prove_shipped_stability,
-    prove_symmetric_positive,
 )
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
 from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve
@@ -52,6 +51,7 @@ from obsynth.numerics.scaling import balancing_factors
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
+from obsynth.verification.certificates import prove_symmetric_positive
 
 #: Beside the given units of signals that of time is the power of two nearest to this many times the inverse of the
 #: plant's fastest mode, where the objective weighs J and L as it does for a plant with modes of a few 1/s in seconds.

@@ -24,11 +24,11 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball
-from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
+from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite
 from obsynth.proofs.extended_balls import Enclosed, block
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.certificates import proof_row
+from obsynth.verification.certificates import proof_row, prove_gain, prove_symmetric_positive
 
 
 def prove_shipped_stability(
@@ -70,13 +70,6 @@ def prove_gains(
     return prove_positive_definite(formula)
 
 
-def prove_symmetric_positive(matrix: FloatArray) -> DefinitenessProof:
-    """Try to prove that a matrix is symmetric, exactly, and positive definite."""
-    if not np.array_equal(matrix, matrix.T):
-        return unproved("the matrix is not symmetric")
-    return prove_positive_definite(matrix)
-
-
 def error_inputs(plant: DescriptorSystem, J: FloatArray, L: FloatArray, kind: Literal["rate", "noise"]) -> Ball:
     """Return B ``(nx + nf, *)`` of f', or of ``[w; w']``, in ``eps' = Az eps + B v``; ``J, L (nx + nf, ny)``."""
     if kind == "rate":
@@ -84,29 +77,6 @@ def error_inputs(plant: DescriptorSystem, J: FloatArray, L: FloatArray, kind: Li
     process = Ball.exact(np.vstack([plant.Bw, np.zeros((plant.nf, plant.nw))]))
     sensor = Ball.exact(plant.Dw)
     return block([[process - Ball.exact(J) @ sensor, -(Ball.exact(L) @ sensor)]])
-
-
-def prove_gain(a: FloatArray, b: Ball, c: FloatArray, P: FloatArray, gain: float) -> DefinitenessProof:
-    """Try to prove ``P > 0``, ``a' P + P a + c' c + P b b' P / gain^2 < 0``: stable, l2 gain below ``gain``."""
-    positive = prove_symmetric_positive(P)
-    if not positive.proved:
-        return unproved(f"P itself: {positive.reason}")
-    inputs, outputs = b.shape[1], c.shape[0]
-
-    def formula(kind: type[Enclosed]) -> Enclosed:
-        p, shown = kind.exact(P), kind.exact(c)
-        through, entering = p @ kind.exact(a), p @ kind.of(b)
-        level = kind.exact(np.eye(inputs)).scaled(gain).scaled(gain)
-        none = kind.exact(np.zeros((inputs, outputs)))
-        return block(
-            [
-                [-(through + through.T), -entering, shown.T],
-                [-entering.T, level, none],
-                [shown, none.T, kind.exact(np.eye(outputs))],
-            ]
-        )
-
-    return prove_positive_definite(formula)
 
 
 def _inequality(moving: Enclosed, still: Enclosed, p: Enclosed, delta: float) -> Enclosed:
