@@ -92,3 +92,44 @@ def test_another_log_shows_its_own_offset(folder: Path) -> None:
     assert main([*asked, "--out", str(written), "--quiet"]) == 0
     value, deviation = json.loads(written.read_text())["found_offsets"]["y"]
     assert abs(value - OFFSET - 0.1) <= 3.0 * deviation
+
+
+def of_two_states(seed: int, offset: float) -> pd.DataFrame:
+    """Return a log of a linear plant, whose first sensor shows too much."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-1.0, 1.0, ROWS // 20), 20)
+    A, B, x, shown = np.array([[0.9, 0.05], [0.0, 0.8]]), np.array([0.1, 0.2]), np.zeros(2), np.zeros((ROWS, 2))
+    for k in range(ROWS):
+        shown[k] = x + [offset, 0.0] + 0.01 * rng.standard_normal(2)
+        x = A @ x + B * u[k] + 1e-3 * rng.standard_normal(2)
+    return pd.DataFrame({"time": np.arange(float(ROWS)), "u": u, "ya": shown[:, 0], "yb": shown[:, 1]})
+
+
+LINEAR = {
+    "schema_version": 1,
+    "name": "two",
+    "plant": {
+        "dt": 1.0, "A": [[0.9, 0.05], [0.0, 0.8]], "B": [[0.1], [0.2]], "C": [[1, 0], [0, 1]],
+        "Bw": [[0.001, 0.0], [0.0, 0.001]], "input_names": ["u"], "output_names": ["ya", "yb"],
+        "offset": {"ya": "unknown"}, "sensor_noise": {"ya": 0.01, "yb": 0.01}, "operating_point": {"ya": 0.2},
+    },
+    "method": {"id": "descriptor-kalman"},
+    "calibrate": {"input_delay": 0},
+}  # fmt: skip
+
+
+def test_an_offset_of_a_linear_plant_is_part_of_its_operating_point(tmp_path: Path) -> None:
+    """The filter took hundreds of samples of each run to find it, from a deviation of 0.1 on."""
+    of_two_states(1, 0.5).to_csv(tmp_path / "normal.csv", index=False)
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(LINEAR, sort_keys=False))
+    asked = ["calibrate", "--system", str(tmp_path / "spec.yaml"), "--data", str(tmp_path / "normal.csv")]
+    assert main([*asked, "--write-spec", str(tmp_path / "found.yaml"), "--quiet"]) == 0
+    plant = yaml.safe_load((tmp_path / "found.yaml").read_text())["plant"]
+    assert plant["offset"]["ya"] <= 0.003
+    assert abs(plant["operating_point"]["ya"] - 0.5) <= 4.0 * plant["offset"]["ya"]
+    spec = obsynth.load_spec(tmp_path / "found.yaml")
+    design = obsynth.design(spec.plant, spec.method, **dict(spec.options))
+    table = obsynth.run_on_data(design, of_two_states(3, 0.5)).table
+    assert table is not None
+    # From the first row on.
+    assert np.abs(table["xhat[offset_ya]"]).max() <= 0.01

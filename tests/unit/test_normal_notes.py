@@ -115,6 +115,21 @@ def test_quantised_signals_are_not_stuck_until_they_are(seed: int, memory: float
     assert stuck_rows(values) == [(1_000, last)]
 
 
+@pytest.mark.parametrize(("step", "least"), [(1.0, 13), (2.0, 16), (3.0, 16)])
+def test_coarse_sensors_that_stick_are_told_in_noise(step: float, least: int) -> None:
+    """Steps in deviations of the noise.  Three single steps before were taken for a course that comes to rest: of these
+    logs 11, 5 and none were told."""
+    told = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        course = np.sin(np.arange(3000) * rng.uniform(0.01, 0.1)) + rng.standard_normal(3000)
+        shown, first = step * np.round(course / step), int(rng.integers(200, 2500))
+        assert stuck_rows(shown) == []
+        shown[first : first + 200] = shown[first]
+        told += any(run.first <= first and run.last >= first + 199 for run in stuck_rows(shown))
+    assert told >= least
+
+
 def test_what_never_or_rarely_changes_is_not_stuck() -> None:
     assert stuck_rows(np.full(500, 2.0)) == []
     assert stuck_rows(np.repeat(np.arange(30.0), 20)) == []

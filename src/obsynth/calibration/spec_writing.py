@@ -71,6 +71,8 @@ def calibrated_spec(path: Path, found: Calibration, *, calibration: Path | None 
             options |= _nonlinear_options(found)
             if found.found_offsets:
                 options["initial_state"] = _started(plant, options.get("initial_state"), found)
+        elif plant.get("kind") != "dae":
+            _set_offsets(plant, found)
     told = {"unknown": {}, **(document.get("calibrate") or {}), "digest": found.box.digest}
     told |= {"input_delay": int(found.input_delay)}
     whole = {**document, "plant": plant, "method": {**method, "options": options}, "calibrate": told}
@@ -137,6 +139,17 @@ def _set_noise(plant: dict[str, Any], found: Calibration, *, linear: bool) -> No
         rows[found.own_equations.index(name), column] = value
     if own:
         plant["Bw"] = rows.tolist()
+
+
+def _set_offsets(plant: dict[str, Any], found: Calibration) -> None:
+    """Put the offsets that were found into the operating point of a linear plant: its designs know of no first state,
+    and those with a steady state took a thousand samples to find one."""
+    point = dict(plant.get("operating_point") or {})
+    for name, (value, deviation) in found.found_offsets.items():
+        point[name] = float(point.get(name, 0.0) + value)
+        plant["offset"][name] = float(deviation)
+    if found.found_offsets:
+        plant["operating_point"] = point
 
 
 def _started(plant: Mapping[str, Any], stated: Any, found: Calibration) -> dict[str, float]:

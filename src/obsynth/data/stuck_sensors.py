@@ -26,6 +26,9 @@ NOISY_REVERSALS = 0.5
 #: its rounding, equal within the second share; what was at rest begins with changes to one side.  So many are looked
 #: at.
 RESTING_CHANGE, SAME_STEP, LAST_CHANGES = 0.1, 0.01, 3
+#: Where noise makes the changes, at least this share of them turns back the one before.  If a sensor is so coarse that
+#: they are single steps, only what goes to one side, and takes longer from step to step, comes to rest.
+TURNED_SHARE = 0.5
 #: Stretches in which an output is stuck that a note names.
 MOST_RUNS_TOLD = 3
 #: Rows of a stream that wait to be looked at together.
@@ -45,7 +48,8 @@ class _Repeats(NamedTuple):
     length: int
     first: int
     last: int
-    before: tuple[float, ...]
+    before: tuple[float, ...]  # the last changes, of which the latest begins it
+    lengths: tuple[int, ...]  # of the runs between these
 
 
 class _Output:
@@ -57,6 +61,7 @@ class _Output:
         self._opening, self._tail = np.zeros(0), np.zeros(0)  # first changes; last samples
         self._sizes, self._step = Counter[int](), np.inf  # of changes: how many of which power of two; the smallest
         self._reversals, self._pairs = 0, 0  # of third differences
+        self._turns = 0  # changes that go back on the one before
 
     def take(self, numbers: FloatArray, values: FloatArray) -> None:
         """Take samples ``(n,)`` that were measured in the rows of these ``numbers (n,)``."""
@@ -76,7 +81,9 @@ class _Output:
         self._step = float(np.min(np.abs(changes), initial=self._step))
         before = () if self._run is None else self._run.before
         said = np.concatenate([before, changes])
+        self._turns += int(np.sum(said[max(len(before), 1) :] * said[max(len(before), 1) - 1 : -1] < 0.0))
         self._opening = np.concatenate([self._opening, changes])[:LAST_CHANGES]
+        earlier = () if self._run is None else self._run.lengths
         edges = np.append(begins, len(values))
         if self._run is not None and edges[0]:
             self._run = self._run._replace(length=self._run.length + int(edges[0]), last=int(numbers[edges[0] - 1]))
@@ -85,13 +92,15 @@ class _Output:
             # All but the last are over, and what went on before them is.
             if self._run is not None:
                 self._end(self._run)
-            shift = len(said) - len(begins) + 1
+                earlier = (*earlier, self._run.length)
+            shift, runs = len(said) - len(begins) + 1, [*earlier, *lengths.tolist()]
             for i in [*np.flatnonzero(lengths[:-1] >= LEAST_RUN), len(lengths) - 1]:
                 run = _Repeats(
                     int(lengths[i]),
                     int(numbers[edges[i]]),
                     int(numbers[edges[i + 1] - 1]),
                     tuple(said[max(i + shift - LAST_CHANGES, 0) : i + shift].tolist()),
+                    tuple(runs[max(i + len(earlier) - LAST_CHANGES + 1, 0) : i + len(earlier)]),
                 )
                 if i < len(lengths) - 1:
                     self._long.append(run)
@@ -139,10 +148,14 @@ class _Output:
         sizes = np.abs(changes)
         if (sizes <= RESTING_CHANGE * self._usual_change()).all():
             return True
+        is_to_one_side = bool((changes > 0.0).all() or (changes < 0.0).all())
         if not run.before:
-            return bool((changes > 0.0).all() or (changes < 0.0).all())
+            return is_to_one_side
+        single = sizes <= (1.0 + SAME_STEP) * self._step
+        if single.all() and self._turns >= TURNED_SHARE * self._sizes.total():
+            return is_to_one_side and bool((np.diff(run.lengths) > 0).all())
         slower = sizes[1:] <= (1.0 + SAME_STEP) * sizes[:-1]
-        return bool(slower.all() and sizes[-1] <= (1.0 + SAME_STEP) * self._step)
+        return bool(slower.all() and single[-1])
 
     def _usual_change(self) -> float:
         """Return the median change, as the power of two below it."""
