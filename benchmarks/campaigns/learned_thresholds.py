@@ -99,7 +99,7 @@ def learned(normal: np.ndarray, every: float, seed: int) -> tuple[Statistics, Le
     statistics = Statistics(fitted_autoregression(normal), signatures, told)
     if is_conformal(len(normal), every):
         return conformal_levels(normal, every, statistics)
-    return statistics, learned_levels(normal, every, statistics, seed)
+    return learned_levels(normal, every, statistics, seed)
 
 
 def ratios(statistics: Statistics, levels: Levels, x: np.ndarray) -> np.ndarray:

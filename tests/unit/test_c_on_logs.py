@@ -16,7 +16,7 @@ import pytest
 
 import obsynth
 from obsynth.experiments.monitors.learned import LearnedThresholds, watched_names
-from obsynth.experiments.monitors.learned_levels import Statistics, parameter_walk
+from obsynth.experiments.monitors.learned_levels import AGES, Statistics, parameter_walk
 from obsynth.exporting.c_source import c_identifier
 from obsynth.numerics.autoregression import Autoregression
 from obsynth.observers.dae.observer import DAEObserver
@@ -86,7 +86,8 @@ def told(design: obsynth.ObserverDesign) -> LearnedThresholds:
     signatures = np.vstack([np.eye(m), np.ones(m)])
     shown = (*columns, f"fault {design.observer.fault_names[-1]}" if nf else "both")
     estimates = names[:nf] if parameter_walk(design.observer) is not None else ()
-    statistics = Statistics(model, signatures, shown, estimates)
+    by_age = np.geomspace(2.0, 0.5, len(AGES)) * np.linspace(0.8, 1.2, 2 * len(shown))[:, None]
+    statistics = Statistics(model, signatures, shown, estimates, by_age)
     levels = np.linspace(8.0, 20.0, len(statistics.names))
     dt = design.observer.dt or SAMPLE_TIME
     return LearnedThresholds(columns, statistics, levels, 500.0, 1000, 500, dt, np.zeros(nf), np.ones(nf),

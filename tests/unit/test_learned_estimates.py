@@ -353,7 +353,8 @@ def rate(learned_rows: int, every: float, seed: int, memory: float, *, conformal
         statistics, levels = conformal_levels(x, every, statistics, scores)
         centre = scores.chosen(slice(learned_rows // 2)).centre()
     else:
-        levels, centre = learned_levels(x, every, statistics, seed, scores), scores.centre()
+        statistics, levels = learned_levels(x, every, statistics, seed, scores)
+        centre = scores.centre()
     assert len(levels.own) == len(statistics.names)
     later = scored(rng, fresh_rows, memory)
     changes = change_ratios(later.away(centre), np.einsum("kii->ki", later.information), AGES)

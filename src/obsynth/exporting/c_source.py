@@ -262,7 +262,7 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
         "monitor_flat": straight[:, 0],
         "monitor_slopes": slopes,
         "monitor_early": (shapes - straight).reshape(-1, model.channels),
-        "monitor_weights": 1.0 / np.maximum(powers, SMALLEST),
+        "monitor_weights": 1.0 / (np.maximum(powers, SMALLEST) * found.statistics.levels_by_age),
         "monitor_centres": found.centres[None],
         "monitor_scales": found.scales[None],
         "monitor_walk": np.zeros((0, 0)) if alarms.walk is None else alarms.walk,

@@ -46,7 +46,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
 
 LEARNED_KIND = "obsynth learned thresholds"
-LEARNED_VERSION = 8
+LEARNED_VERSION = 9
 LEARNED = FileKind(
     "learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"', suffix=".json"
 )
@@ -224,6 +224,7 @@ class LearnedThresholds:
             "A": model.A,
             "whitener": model.whitener,
             "signatures": self.statistics.signatures,
+            "age_levels": self.statistics.levels_by_age,
             "told": list(self.statistics.told),
             "levels": self.levels,
             "every": self.every,
@@ -304,16 +305,16 @@ def load_thresholds(path: str | Path) -> LearnedThresholds:
 
 def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
     columns, m = tuple(map(str, data["columns"])), len(data["columns"])
-    offset, a, whitener, signatures, levels = (
-        np.asarray(data[name], dtype=np.float64) for name in ("offset", "A", "whitener", "signatures", "levels")
-    )
+    parts = ("offset", "A", "whitener", "signatures", "age_levels", "levels")
+    offset, a, whitener, signatures, by_age, levels = (np.asarray(data[name], dtype=np.float64) for name in parts)
     told, estimates = (tuple(map(str, data[name])) for name in ("told", "estimates"))
-    statistics = Statistics(Autoregression(offset, a, whitener), signatures, told, estimates)
+    statistics = Statistics(Autoregression(offset, a, whitener), signatures, told, estimates, by_age)
     shapes = (offset.shape, a.shape[1:], whitener.shape, signatures.shape[1:], levels.shape)
     fits = shapes == ((m,), (m, m), (m, m), (m,), (len(statistics.names),)) and len(told) == len(signatures)
-    if not (fits and all(np.isfinite(part).all() for part in (offset, a, whitener, signatures)) and (levels > 0).all()):
+    fits &= by_age.shape == (2 * len(told), len(AGES)) and bool((by_age > 0.0).all() and (levels > 0.0).all())
+    if not (fits and all(np.isfinite(part).all() for part in (offset, a, whitener, signatures, by_age))):
         raise ValueError("its parts do not fit together")
-    for part in (offset, a, whitener, signatures):
+    for part in (offset, a, whitener, signatures, by_age):
         part.setflags(write=False)
     return LearnedThresholds(
         columns,
@@ -441,7 +442,7 @@ def thresholds_from_rows(
     if conformal:
         statistics, levels = conformal_levels(x, others, statistics, scores)
     else:
-        levels = learned_levels(x, others, statistics, seed, scores)
+        statistics, levels = learned_levels(x, others, statistics, seed, scores)
     return LearnedThresholds(
         told,
         statistics,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.experiments.monitors.learned_levels import HOLD, Scores, Statistics, normal_statistics
+from obsynth.experiments.monitors.learned_levels import AGES, HOLD, Scores, Statistics, normal_statistics
 from obsynth.numerics.arrays import FloatArray
 
 #: Parts of a log whose largest statistics are compared, the share of them that is taken as usual, and how many times
@@ -84,9 +84,9 @@ def factors(
             (name for name in others.names if name.startswith("MEWMA")), float((other_whole / whole).max())
         ),
     }
-    for told, power, other in zip(statistics.told, whole, other_whole, strict=True):
-        gains |= {f"GLR of a {shape} in {told}": float(other / power) for shape in ("step", "ramp")}
-    names = statistics.names
+    names, by_age = statistics.names, (others.levels_by_age / statistics.levels_by_age)[:, AGES.index(HOLD)]
+    ratios = names[len(gains) : len(gains) + len(by_age)]
+    gains |= dict(zip(ratios, (np.tile(other_whole / whole, 2) / by_age).tolist(), strict=True))
     # What samples say of faults is in the observer's own deviations, whatever rows were learned from.
     return {
         name: float(np.sqrt(a / b * gains.get(name, 1.0)))

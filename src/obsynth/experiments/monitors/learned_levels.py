@@ -19,7 +19,7 @@ and the estimates themselves, in units of their deviations, pass their level ear
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -201,6 +201,14 @@ HOLD = 20
 #: Ages of a step, in rows, and how far the exponentially weighted means look back.
 AGES = (1, 2, 3, 5, 8, 12, 20, 32, 50, 80, 130, 200)
 FORGETTING = (0.3, 0.1)
+#: How far the level of each age is its own at one rate for all of them (one), or the same for all (zero).  In noise of
+#: heavy tails old steps need a lower level than new ones, which one wrong row makes likely.  With 1, 30 logs of 2,000
+#: rows told a third of a deviation after .44 (5 degrees of freedom) to .95 (ARMA) times the rows, but a deviation of a
+#: resonance after 1.16, and three deviations in three signals after 1.22 times; so .73 to .98, 1.05 and 1.03 times.
+OWN_LEVEL_SHARE = 0.5
+#: Streams from which that is found, and how many times the oldest age there are rows for each alarm in them at least:
+#: ratios of old steps stay above their level for as long.
+AGE_STREAMS, AGES_APART = 8, 5
 #: Rows at the begin of a stream in which the statistics are not those of a long one.
 SETTLING = 100
 #: Streams of the bootstrap, their share in which the rate is to hold, and the rows that each is judged on.
@@ -233,13 +241,20 @@ class Statistics:
     and of a ramp; beside these those of a change of each fault of ``estimates``, and the square of its estimate, of
     which `change_ratios` and `Scores.followed` are apart.
 
-    ``signatures (s, m)``: directions of a step, and of a ramp, in the signals as they are; ``told``: what they show.
+    ``signatures (s, m)``: directions of a step, and of a ramp, in the signals as they are; ``told``: what they show;
+    ``age_levels (2 s, ages)``: what likelihood ratios of steps, then ramps, of each age are divided by, by default one.
     """
 
     model: Autoregression
     signatures: FloatArray
     told: tuple[str, ...]
     estimates: tuple[str, ...] = ()
+    age_levels: FloatArray | None = None
+
+    @property
+    def levels_by_age(self) -> FloatArray:
+        """What likelihood ratios are divided by, ``(2 s, ages)``."""
+        return np.ones((2 * len(self.told), len(AGES))) if self.age_levels is None else self.age_levels
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -268,7 +283,7 @@ class Statistics:
 
     def templates(self) -> FloatArray:
         """Return weights of the last ``max(AGES)`` rows of e, oldest first, for steps and ramps of each signature and
-        age, of norm 1: ``(2 s, ages, rows, m)``."""
+        age, of which the squares add up to one over the level of this age: ``(2 s, ages, rows, m)``."""
         shapes, slopes = self.responses()
         later = shapes[:, -1:] + np.arange(1, max(AGES))[:, None] * slopes[:, None, :]
         long = np.concatenate([shapes, later], axis=1)[:, : max(AGES)]
@@ -277,7 +292,7 @@ class Statistics:
             part = long[:, :age]
             size = np.sqrt(np.maximum(np.sum(part**2, axis=(1, 2)), SMALLEST))
             found[:, i, max(AGES) - age :] = part / size[:, None, None]
-        return found
+        return np.asarray(found / np.sqrt(self.levels_by_age)[:, :, None, None])
 
     def of_rows(self, e: FloatArray) -> FloatArray:
         """Return the statistics of white rows ``(runs, n, m)``: all but those of estimates, ``(k, runs, n)``."""
@@ -287,13 +302,17 @@ class Statistics:
         for share in FORGETTING:
             smooth = lfilter([share], [1.0, share - 1.0], e, axis=1)
             found.append((2.0 - share) / share * np.sum(smooth**2, axis=-1))
-        found.extend(_likelihood_ratios(e, *response) for response in zip(*self.responses(), strict=True))
+        for shape, slope, levels in zip(*self.responses(), self.levels_by_age, strict=True):
+            largest = np.zeros(e.shape[:2])
+            for ratio, level in zip(_likelihood_ratios(e, shape, slope), levels, strict=False):
+                np.maximum(largest, ratio / level, out=largest)
+            found.append(largest)
         return np.array(found)
 
 
-def _likelihood_ratios(e: FloatArray, shape: FloatArray, slope: FloatArray) -> FloatArray:
-    """Return twice the largest log likelihood ratio over the ages of a step or ramp ``(runs, n)``, whose response is
-    ``shape (p + 1, m)`` and grows by ``slope (m,)`` in each row after these."""
+def _likelihood_ratios(e: FloatArray, shape: FloatArray, slope: FloatArray) -> Iterator[FloatArray]:
+    """Yield twice the log likelihood ratio ``(runs, n)`` of a step or ramp of each age that the rows are long enough
+    for, whose response is ``shape (p + 1, m)`` and grows by ``slope (m,)`` in each row after these."""
     runs, n, _ = e.shape
     last = len(shape) - 1
     # As if it had been straight from its first row on, by running sums; then what its first rows are besides.
@@ -302,7 +321,6 @@ def _likelihood_ratios(e: FloatArray, shape: FloatArray, slope: FloatArray) -> F
     weighted = _sums((e @ slope) * np.arange(n))
     early, begun = np.zeros((runs, n)), 0
     extra = [e @ (shape[j] - straight[j]) for j in range(last)]
-    largest = np.zeros((runs, n))
     rows = [shape[j] if j <= last else shape[-1] + (j - last) * slope for j in range(max(AGES))]
     power = np.cumsum([float(row @ row) for row in rows])
     for age in AGES:
@@ -315,8 +333,23 @@ def _likelihood_ratios(e: FloatArray, shape: FloatArray, slope: FloatArray) -> F
         if slope.any():
             fit += weighted[:, age:] - weighted[:, :-age]
             fit -= np.arange(n - age + 1) * (rising[:, age:] - rising[:, :-age])
-        np.maximum(largest[:, age - 1 :], fit**2 / max(power[age - 1], SMALLEST), out=largest[:, age - 1 :])
-    return largest
+        ratio = np.zeros((runs, n))
+        ratio[:, age - 1 :] = fit**2 / max(power[age - 1], SMALLEST)
+        yield ratio
+
+
+def _levels_by_age(parts: Sequence[tuple[Statistics, FloatArray]], every: float) -> FloatArray:
+    """Return what likelihood ratios of each age are to be divided by, ``(2 s, ages)``, of mean one over ages, from
+    normal streams: statistics and white rows ``(1, n, m)`` of each."""
+    rate = min(max(every * RARER[0], AGES_APART * max(AGES)), sum(e.shape[1] - SETTLING for _, e in parts) / OBSERVED)
+    found = []
+    for i in range(2 * len(parts[0][0].told)):
+        runs = [list(_likelihood_ratios(e, *(part[i] for part in judged.responses()))) for judged, e in parts]
+        own = [level_of(np.concatenate(ages), rate) for ages in zip(*runs, strict=True)]
+        # Ages for which the streams are too short are as the oldest of them.
+        found.append(own + own[-1:] * (len(AGES) - len(own)))
+    levels = np.maximum(found, SMALLEST) ** OWN_LEVEL_SHARE
+    return read_only(levels / levels.mean(axis=1, keepdims=True))
 
 
 def _sums(values: FloatArray) -> FloatArray:
@@ -456,6 +489,10 @@ def conformal_levels(
     half = len(x) // 2
     model = fitted_autoregression(x[:half])
     found = replace(statistics, model=model)
+    rng, e = np.random.default_rng(0), model.whitened(x[:half])
+    e = e[np.isfinite(e).all(axis=1)]
+    whites = drawn_rows(e, drawn_places(len(e), AGE_STREAMS, LEAST_STREAM_ROWS, rng), rng)
+    found = replace(found, age_levels=_levels_by_age([(found, white[None]) for white in whites], every))
     usual = None if scores is None else _usual(scores.chosen(slice(half)))
     runs = normal_statistics(x, found, scores, usual)[:, None]
     first, second = (np.moveaxis(part, 1, 0) for part in (runs[..., :half], runs[..., half:]))
@@ -480,9 +517,9 @@ def _usual(scores: Scores) -> tuple[FloatArray, FloatArray]:
 
 def learned_levels(
     x: FloatArray, every: float, statistics: Statistics, seed: int = 0, scores: Scores | None = None
-) -> Levels:
-    """Return the levels for one alarm per ``every`` rows from rows ``(n, m)`` without faults; ``scores``: what these
-    rows say of faults."""
+) -> tuple[Statistics, Levels]:
+    """Return statistics with levels by age, and the levels for one alarm per ``every`` rows from rows ``(n, m)``
+    without faults; ``scores``: what these rows say of faults."""
     rng = np.random.default_rng(seed)
     model, n = statistics.model, len(x)
     rows = int(np.clip(ROWS_PER_ALARM * every, LEAST_STREAM_ROWS, MOST_STREAM_ROWS))
@@ -499,12 +536,15 @@ def learned_levels(
         of_faults = beside.drawn([drawn_rows(part, places, rng) for part in others], np.flatnonzero(known)[places])
     known = np.asarray(np.isfinite(x).all(axis=1))
     normal = np.arange(BURN_IN_ROWS, BURN_IN_ROWS + n)[known]
-    found = []
-    for i, stream in enumerate(streams):
+    parts = []
+    for stream in streams:
         seen = np.where(known[:, None], stream[BURN_IN_ROWS : BURN_IN_ROWS + n], np.nan)
         again = fitted_autoregression(seen, order=model.order)
-        judged = Statistics(again, statistics.signatures, statistics.told)
-        values = judged.of_rows(again.whitened(stream[None, -rows:]))[:, 0]
+        parts.append((replace(statistics, model=again, estimates=()), again.whitened(stream[None, -rows:])))
+    by_age = _levels_by_age(parts[:AGE_STREAMS], every)
+    statistics, found = replace(statistics, age_levels=by_age), []
+    for i, (judged, e) in enumerate(parts):
+        values = replace(judged, age_levels=by_age).of_rows(e)[:, 0]
         if of_faults is not None:
             score, information, followed = (part[i] for part in of_faults)
             said = Scores(score, information, followed, np.ones_like(followed))
@@ -531,7 +571,7 @@ def learned_levels(
     usual = None if scores is None else _usual(scores)
     itself = (normal_statistics(x, statistics, scores, usual) / own[:, None]).max(axis=0)[None]
     shown_there = exchangeable_level(itself, itself[:, SETTLING:].size, every)
-    return Levels(_of_deviations(own, usual), max(level * sure, shown_there), every > seen_rate)
+    return statistics, Levels(_of_deviations(own, usual), max(level * sure, shown_there), every > seen_rate)
 
 
 def exchangeable_level(values: FloatArray, rows: int, every: float) -> float:
