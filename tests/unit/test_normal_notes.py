@@ -75,6 +75,42 @@ def test_wild_rows_of_noise_with_heavy_tails_are_no_event(seed: int) -> None:
     assert learned(log(seed, freedom=4.0)).notes == ()
 
 
+def noise_that_follows_itself(seed: int) -> pd.DataFrame:
+    """Return rows without faults whose noise has a variance that is .95 of what it was on average."""
+    rng, variance = np.random.default_rng(seed), np.ones(2)
+    table, noise = log(seed), rng.standard_normal((ROWS, 2))
+    for k in range(ROWS):
+        noise[k] *= np.sqrt(variance)
+        variance = 0.05 + 0.1 * noise[k] ** 2 + 0.85 * variance
+    quiet = log(seed, memory=0.0)
+    drawn = np.random.default_rng(seed).standard_normal((ROWS, 2))
+    table[["ya", "yb"]] = quiet[["ya", "yb"]].to_numpy() + 0.01 * (noise - drawn)
+    return table
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_whose_variance_follows_itself_is_told(seed: int) -> None:
+    found, usual = learned(noise_that_follows_itself(seed)), learned(log(seed))
+    assert found.lasting > 0.05
+    assert "the size of the residuals follows itself" in found.statement
+    assert (usual.lasting, "follows itself" in usual.statement) == (0.0, False)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_errors_of_the_model_where_inputs_move_are_told(seed: int) -> None:
+    """What sensors read as well while a held input moves, once in 25 rows; a held input without it is none."""
+    for wrong, told in ((0.0, 0), (0.1, 1)):
+        rng = np.random.default_rng(seed)
+        u = np.repeat(rng.standard_normal(ROWS // 25), 25)
+        plant, x, found = heated().plant, np.zeros(2), []
+        for k, moved in enumerate(np.diff(u, prepend=u[0])):
+            found.append([k * DT, u[k], *(x + 0.01 * rng.standard_normal(2) + wrong * moved)])
+            x = plant.A @ x + plant.B @ u[k : k + 1]
+        notes = learned(pd.DataFrame(found, columns=["time", "u", "ya", "yb"])).notes
+        assert sum(note.startswith("Where inputs move") for note in notes) == told
+        assert told or not notes
+
+
 def test_an_event_that_raises_the_levels_by_little_is_none() -> None:
     data = log(0)
     data.loc[EVENT.start : EVENT.stop - 1, "ya"] += 0.07

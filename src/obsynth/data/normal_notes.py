@@ -1,5 +1,5 @@
 """What in rows without faults is to be looked at before a monitor is learned from them: events that raise the levels,
-and outputs that are stuck."""
+outputs that are stuck, and residuals that are larger where inputs move."""
 
 from __future__ import annotations
 
@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from obsynth.data.signals import Signals, Stamps
 from obsynth.data.stuck_sensors import stuck_rows, stuck_texts
 from obsynth.experiments.monitors.learned import Raised
+from obsynth.experiments.monitors.learned_levels import CHANCE_DEVIATIONS, normal_scores
 from obsynth.numerics.arrays import FloatArray
+
+#: An input moves where it changes by more than so many times what is usual for it: one that is held moves where it
+#: changes at all, a sine nowhere.
+MOVES = 5.0
+#: Rows from a move on whose residuals are compared with those of as many rows without one, the least number of moves,
+#: the share of the residuals that counts as large, and how many times as large these must be to be told.
+AFTER_A_MOVE, LEAST_MOVES, LARGE_SHARE, LARGER = 3, 20, 0.1, 2.0
 
 
 def notes_of_normal_rows(
@@ -42,3 +50,33 @@ def notes_of_normal_rows(
         yield from stuck_texts(stuck, shown, "; if it was, blank it in these rows, or give another log")
 
     return tuple(found())
+
+
+def notes_of_sizes(white: FloatArray, inputs: FloatArray) -> tuple[str, ...]:
+    """Return what is to be known where whitened residuals ``(n, m)`` are larger after moves of ``inputs (n, nu)``."""
+    count, ratio = _larger_at_moves(np.sum(white**2, axis=1), inputs)
+    if ratio < LARGER:
+        return ()
+    return (
+        f"Where inputs move, and in the {AFTER_A_MOVE - 1} rows after, large residuals are {ratio:.2g} times as "
+        f"large as elsewhere ({count} moves): errors of the model raise the levels, more than noise does. A "
+        "design that follows the plant there has lower levels: with calibrated constants, or a nonlinear observer "
+        "in place of that of a linearised plant.",
+    )
+
+
+def _larger_at_moves(sizes: FloatArray, inputs: FloatArray) -> tuple[int, float]:
+    """Return how many moves of ``inputs (n, nu)`` there are, and how many times as large residuals of squares ``sizes
+    (n,)`` are after these; zero where that may be chance."""
+    windows = np.lib.stride_tricks.sliding_window_view(sizes, AFTER_A_MOVE).mean(axis=1)
+    changes = np.abs(np.diff(inputs, axis=0, prepend=inputs[:1]))
+    moves = np.any(changes > MOVES * np.nanmedian(changes, axis=0), axis=1)
+    close = np.convolve(moves, np.ones(2 * AFTER_A_MOVE - 1), mode="same") > 0.0
+    known = np.isfinite(windows)
+    after, others = windows[known & moves[: len(windows)]], windows[known & ~close[: len(windows)]]
+    count = len(after)
+    if min(count, len(others)) < LEAST_MOVES:
+        return count, 0.0
+    lead = float(normal_scores(np.concatenate([after, others]))[:count].mean() * np.sqrt(count))
+    large = 1.0 - LARGE_SHARE
+    return count, float(np.sqrt(np.quantile(after, large) / np.quantile(others, large))) * (lead > CHANCE_DEVIATIONS)

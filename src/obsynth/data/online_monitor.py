@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from obsynth.data.log_estimator import DECIDING, STALE, Row
 from obsynth.data.log_run import LogRun
-from obsynth.data.normal_notes import notes_of_normal_rows
+from obsynth.data.normal_notes import notes_of_normal_rows, notes_of_sizes
 from obsynth.data.signals import TIME_HEADER, Stamps
 from obsynth.data.sources import CHUNK_ROWS, Data, chunks, parsed_rows
 from obsynth.data.step_log import SteppingLogObserver
@@ -48,6 +48,7 @@ from obsynth.experiments.monitors.learned import (
     settling_rows,
     thresholds_from_rows,
     watched_names,
+    watched_rows,
     watched_values,
 )
 from obsynth.experiments.monitors.learned_levels import AGES, Scores, before_any, parameter_walk, sample_score
@@ -193,7 +194,8 @@ def learn_thresholds(
     -------
     LearnedThresholds
         For `obsynth.online_monitor`; ``statement`` says what they mean, and ``holds`` whether the rows suffice;
-        ``notes`` name rows to be looked at: events that raise the levels, outputs that are stuck.
+        ``notes`` name rows to be looked at: events that raise the levels, outputs that are stuck, and whether errors of
+        the model where inputs move raise them.
 
     Raises
     ------
@@ -239,7 +241,9 @@ def learn_thresholds(
     )
     raised = raised_levels(design, found, watched, scores, **given)
     notes = notes_of_normal_rows(raised, said.numbers[chosen], log, slice(first, last), first_run.signals, stamps)
-    return replace(found, notes=notes)
+    white = found.statistics.model.whitened(watched_rows(design, found, watched))
+    inputs = log[said.numbers[chosen], 1 : 1 + first_run.signals.inputs]
+    return replace(found, notes=notes + notes_of_sizes(white, inputs))
 
 
 def _sized(

@@ -18,12 +18,15 @@ from obsynth.experiments.monitors.learned_levels import (
     AGES,
     FORGETTING,
     HOLD,
+    RARER_WHERE_SIZES_LAST,
     SETTLING,
+    SIZE_LAGS,
     Scores,
     Statistics,
     before_any,
     conformal_levels,
     is_conformal,
+    lasting_sizes,
     learned_levels,
     most_likely_change,
     parameter_walk,
@@ -144,8 +147,12 @@ class LearnedThresholds:
     outlier_sizes : FloatArray, optional
         ``(ny,)``: how far off the outliers of each output are at least, by these rows, in place of what the design
         says; without them, what it says agrees with these rows.
+    lasting : float
+        Mean autocorrelation of the size of the residuals, where it follows itself so that large ones come together and
+        levels are those of a lower rate; otherwise zero.
     notes : tuple of str
-        What in these rows is to be looked at: events that raise the levels, outputs that are stuck.
+        What in these rows is to be looked at: events that raise the levels, outputs that are stuck, errors of the model
+        where inputs move.
     """
 
     columns: tuple[str, ...]
@@ -164,6 +171,7 @@ class LearnedThresholds:
     pairs: WrongPairs = NO_PAIRS
     innovation: float = 1.0
     outlier_sizes: FloatArray | None = None
+    lasting: float = 0.0
     notes: tuple[str, ...] = ()
 
     @property
@@ -191,6 +199,12 @@ class LearnedThresholds:
                 else ""
             )
         )
+        if self.lasting:
+            text += (
+                f"; the size of the residuals follows itself (mean autocorrelation over {SIZE_LAGS} rows "
+                f"{self.lasting:.2g}), so that large ones come together: the levels are those of a rate "
+                f"{RARER_WHERE_SIZES_LAST:g} times as low, and single logs may alarm more often than stated"
+            )
         if self.pairs.number:
             text += (
                 f"; {_counted(self.pairs.number, 'pair')} of wrong samples in a row, which count as not measured: one "
@@ -239,6 +253,7 @@ class LearnedThresholds:
             "innovation": self.innovation,
             "estimates": list(self.statistics.estimates),
             "outlier_sizes": self.outlier_sizes,
+            "lasting": self.lasting,
             "notes": list(self.notes),
         }
 
@@ -333,8 +348,8 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         WrongPairs(int(data["pairs"]["number"]), float(data["pairs"]["chance"])),
         float(data["innovation"]),
         None if data["outlier_sizes"] is None else read_only(np.asarray(data["outlier_sizes"], dtype=np.float64)),
-        # Files of before have none.
-        tuple(map(str, data.get("notes", ()))),
+        float(data["lasting"]),
+        tuple(map(str, data["notes"])),
     )
 
 
@@ -439,10 +454,13 @@ def thresholds_from_rows(
         centres = scores.chosen(slice(len(rows) // 2 if conformal else None)).centre()
     found = signatures(design, kept, np.sqrt(np.nanvar(x, axis=0))) if like is None else like.statistics.directions
     statistics = Statistics(model, *found, estimates=() if scores is None else names[:faults])
+    lasting = 0.0
     if conformal:
         statistics, levels = conformal_levels(x, others, statistics, scores)
     else:
-        statistics, levels = learned_levels(x, others, statistics, seed, scores)
+        lasting = lasting_sizes(model.whitened(x)) if like is None else like.lasting
+        rarer = RARER_WHERE_SIZES_LAST if lasting else 1.0
+        statistics, levels = learned_levels(x, others * rarer, statistics, seed, scores)
     return LearnedThresholds(
         told,
         statistics,
@@ -460,6 +478,7 @@ def thresholds_from_rows(
         pairs,
         innovation,
         outlier_sizes,
+        lasting,
     )
 
 
@@ -479,8 +498,7 @@ def raised_levels(
     `thresholds_from_rows`: no events where none do by much."""
     known = np.asarray(np.isfinite(rows).all(axis=1))
     said = _usual_scores(scores, known) if found.statistics.estimates and scores is not None else None
-    places = [watched_names(design).index(name) for name in found.columns]
-    x = np.where(known[:, None], rows[:, places], np.nan)
+    x = watched_rows(design, found, rows)
     events = events_of(x, found.columns, found.statistics, found.levels, said, found.centres)
     left = without_events(rows, events)
     count = int(np.isfinite(left).all(axis=1).sum())
@@ -493,6 +511,12 @@ def raised_levels(
     each = factors(found.statistics, found.levels, other.statistics, other.levels)
     most = max(each, key=lambda name: each[name])
     return Raised(events, most, each[most]) if each[most] >= TOLD_LEVEL_FACTOR else Raised()
+
+
+def watched_rows(design: ObserverDesign, found: LearnedThresholds, rows: FloatArray) -> FloatArray:
+    """Return the columns that are watched of ``rows (n, m)``, NaN in rows of which a part is not known."""
+    places = [watched_names(design).index(name) for name in found.columns]
+    return np.where(np.asarray(np.isfinite(rows).all(axis=1))[:, None], rows[:, places], np.nan)
 
 
 def _usual_scores(scores: Scores, known: NDArray[np.bool_]) -> Scores | None:
