@@ -165,17 +165,20 @@ def _doubles(numbers: ExactNumbers) -> SimpleNamespace:
 
 def _difference(first: object, second: object, names: tuple[str, ...]) -> float:
     """Return the largest relative difference between matrices of the same name; infinite for another shape."""
-    worst = 0.0
-    for name in names:
-        a, b = np.asarray(getattr(first, name)), np.asarray(getattr(second, name))
-        if a.shape != b.shape:
-            return np.inf
-        if not a.size:
-            continue
-        size = np.maximum(np.abs(a), np.abs(b))
-        scale = np.minimum(np.max(size, axis=1, keepdims=True), np.max(size, axis=0, keepdims=True))
-        missed = np.abs(a - b)
-        worst = max(worst, float(np.max(np.where(missed > 0.0, missed / np.where(scale > 0.0, scale, 1.0), 0.0))))
+    pairs = [(np.asarray(getattr(first, name)), np.asarray(getattr(second, name))) for name in names]
+    return float(np.max([_relative_difference(one, other) for one, other in pairs]))
+
+
+def _relative_difference(one: FloatArray, other: FloatArray, radius: FloatArray | float = 0.0) -> float:
+    """Return by how much matrices differ beyond a radius, relative to the largest entry of row or column; infinite for
+    another shape, NaN where a number is not finite."""
+    if one.shape != other.shape:
+        return np.inf
+    if not one.size:
+        return 0.0
+    size, missed = np.maximum(np.abs(one), np.abs(other)), np.maximum(np.abs(one - other) - radius, 0.0)
+    scale = np.minimum(np.max(size, axis=1, keepdims=True), np.max(size, axis=0, keepdims=True))
+    worst = float(np.max(missed / np.where(scale > 0.0, scale, 1.0)))
     return worst if np.isfinite(worst) else np.nan
 
 
@@ -340,21 +343,14 @@ def _family_difference(plant: DescriptorSystem, uncertain: Uncertainty) -> float
     box = uncertain.box
     alone = {name: replace(item, low=item.nominal, high=item.nominal) for name, item in box.constants.items()}
     family = affine_plant(plant, replace(box, constants=alone))
-    worst = 0.0
     if len(family.coordinates) != plant.nx:
         return float("inf")
+    found = []
     for name in UNCERTAIN_MATRICES:
-        found, stored = family.matrices[name], np.asarray(dense(getattr(plant, name)))
+        stored, middle = np.asarray(dense(getattr(plant, name))), family.matrices[name]
         wanted = stored @ family.coordinates if name in ("E", "A", "C") else stored
-        if wanted.shape != found.center.shape:
-            return float("inf")
-        if not wanted.size:
-            continue
-        missed = np.maximum(np.abs(wanted - found.center) - found.radius, 0.0)
-        size = np.maximum(np.abs(wanted), np.abs(found.center))
-        scale = np.minimum(size.max(axis=1, keepdims=True), size.max(axis=0, keepdims=True))
-        worst = max(worst, float(np.max(missed / np.where(scale > 0.0, scale, 1.0))))
-    return worst if np.isfinite(worst) else float("nan")
+        found.append(_relative_difference(wanted, middle.center, middle.radius))
+    return float(np.max(found))
 
 
 #: What both plants say of the signals that neither elimination nor sampling touches.
