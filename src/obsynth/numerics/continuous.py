@@ -19,15 +19,7 @@ from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import HinfNorm, hinf_norm
 from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
-
-
-def spectral_abscissa(a: FloatArray) -> float:
-    """Return the largest real part of an eigenvalue of ``a (n, n)``; minus infinity for no states, NaN for NaN."""
-    if not a.size:
-        return -np.inf
-    if not np.all(np.isfinite(a)):
-        return float("nan")
-    return float(np.max(np.linalg.eigvals(a).real))
+from obsynth.numerics.spectra import abscissa
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +90,7 @@ def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
 
     if not a.size or not b.shape[1]:
         return np.zeros(b.shape[1])
-    if not spectral_abscissa(a) < 0.0:
+    if not abscissa(a, 0.0) < 0.0:
         raise SpecError("The observer is not stable: its residual has no bound.", path="observer")
     a, b, c = _in_lyapunov_norm(a, b, c)
     second = a @ a

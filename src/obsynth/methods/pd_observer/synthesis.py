@@ -43,11 +43,11 @@ from obsynth.methods.pd_observer.limits import default_delta, fastest_mode, requ
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
-from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.doubling import EQUATION_TOLERANCE, continuous_riccati_solution, symmetric
 from obsynth.numerics.matrix_equations import continuous_solution
 from obsynth.numerics.ranks import NEGLIGIBLE_SHARE
 from obsynth.numerics.scaling import balancing_factors
+from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
@@ -442,7 +442,7 @@ class PdGains:
     @property
     def abscissa(self) -> float:
         """Largest real part of an eigenvalue of the error system, 1/seconds."""
-        return spectral_abscissa(self.observer.Az)
+        return abscissa(self.observer.Az, 0.0)
 
 
 def certified(
@@ -617,13 +617,13 @@ def _riccati_gain(a: FloatArray, c: FloatArray, record: Mapping[str, Any]) -> Fl
 
     n, one = len(a), np.eye(len(a))
     p = _doubled(a, c)
-    if p is not None and spectral_abscissa(a - p @ c.T @ c) < 0.0:
+    if p is not None and abscissa(a - p @ c.T @ c, 0.0) < 0.0:
         return np.asarray(p @ c.T)
     try:
         _, basis, stable = schur(np.block([[a.T, -c.T @ c], [-one, -a]]), sort="lhp")
         p = np.linalg.solve(basis[:n, :n].T, basis[n:, :n].T)
         gain = np.asarray(0.5 * (p + p.T) @ c.T)
-        if stable == n and spectral_abscissa(a - gain @ c) < 0.0:
+        if stable == n and abscissa(a - gain @ c, 0.0) < 0.0:
             return gain
     except np.linalg.LinAlgError:
         pass

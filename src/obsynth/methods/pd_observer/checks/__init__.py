@@ -15,11 +15,10 @@ from obsynth.methods.pd_observer.checks.certificate import fitting_claims, proof
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 from obsynth.methods.pd_observer.realisation import PdErrorSystem, solved, with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
-from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.norms import HinfNorm
 from obsynth.numerics.ranks import RANK_TOLERANCE, rounding_rank
 from obsynth.numerics.scaling import balanced_matrix
-from obsynth.numerics.spectra import eigenvalues, pole_text
+from obsynth.numerics.spectra import abscissa, abscissa_of, eigenvalues, pole_text
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import listed
@@ -137,11 +136,11 @@ def _spectra(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
         detail=f"inverse of its condition number; the determinant is {1.0 / np.linalg.det(errors.estimate):.6g}",
     )
     poles = _poles(errors.Az)
-    abscissa = _slowest(poles)
+    slowest = abscissa_of(poles, 0.0)
     yield _negative(
         "error system",
         "every eigenvalue of the error system has a negative real part",
-        abscissa,
+        slowest,
         source="Filasova et al., eq. (33)",
         detail=f"eigenvalues {spectrum_text(poles)}; computed, their proof is the row 'LMI'",
     )
@@ -150,7 +149,7 @@ def _spectra(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
         yield upper_bound_check(
             "decay rate",
             "errors decay at the claimed rate (largest real part of an eigenvalue, 1/s)",
-            abscissa,
+            slowest,
             -decay,
             source="ours: the theorem for A + alpha I",
         )
@@ -180,14 +179,14 @@ def _parts(plant: DescriptorSystem, errors: PdErrorSystem) -> Iterator[Check]:
     yield information(
         "state error alone",
         "spectral abscissa of (I + L C)^-1 (A - J C), 1/s",
-        _slowest(together),
+        abscissa_of(together, 0.0),
         source="Filasova et al., eq. (28)",
         detail=f"eigenvalues {spectrum_text(together)}",
     )
     yield information(
         "proportional part alone",
         "spectral abscissa of A - J C, 1/s: neither theorem guarantees that it is negative",
-        _slowest(apart),
+        abscissa_of(apart, 0.0),
         source="Filasova et al., eq. (27)",
         detail=f"eigenvalues {spectrum_text(apart)}",
     )
@@ -196,11 +195,6 @@ def _parts(plant: DescriptorSystem, errors: PdErrorSystem) -> Iterator[Check]:
 def _poles(matrix: FloatArray) -> ComplexArray:
     """Return the eigenvalues of a matrix, NaN for one that is not finite."""
     return eigenvalues(matrix) if np.all(np.isfinite(matrix)) else np.full(len(matrix), np.nan, dtype=np.complex128)
-
-
-def _slowest(values: ComplexArray) -> float:
-    """Return the largest real part; minus infinity for no states."""
-    return float(np.max(values.real, initial=-np.inf))
 
 
 def spectrum_text(values: ComplexArray) -> str:
@@ -218,11 +212,11 @@ def _pencil_row(design: ObserverDesign, augmented: DescriptorSystem) -> Check:
     # E* = [I 0; 0 0], A* = [0 I; A - J C, -(I + L C)]: impulse-free where the lower right block is nonsingular.
     moved, shown = augmented.A - gain_j @ augmented.C, np.eye(augmented.nx) + gain_l @ augmented.C
     impulse_free = rounding_rank(_balanced(shown)) == augmented.nx
-    abscissa = spectral_abscissa(_balanced(solved(shown, moved))) if impulse_free else float("nan")
+    slowest = abscissa(_balanced(solved(shown, moved)), 0.0) if impulse_free else float("nan")
     return _negative(
         "descriptor pair",
         "(E*, A*) of the listed gains is admissible: regular, impulse-free, stable",
-        abscissa,
+        slowest,
         source="Filasova et al., eqs. (38), (39), Definition 1",
         detail=f"{augmented.nx} finite modes of {2 * augmented.nx}" if impulse_free else "I + L C is singular",
     )
