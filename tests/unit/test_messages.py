@@ -101,3 +101,35 @@ def test_a_name_that_is_like_no_other_is_told_what_there_is() -> None:
         index_of("Tc", ["coil", "zone"], what="Q")
     with pytest.raises(SpecError, match=r"Q has no signal named 'cool'\. Did you mean 'coil'\?"):
         index_of("cool", ["coil", "zone"], what="Q")
+
+
+@pytest.mark.parametrize(
+    ("equation", "said"),
+    [
+        ("area * d(level) = inflow", "A derivative in an equation is written der(x)."),
+        ("area * level' = inflow", "A derivative in an equation is written der(x)."),
+        ("area * der(level) == inflow", "An equation has a single =."),
+    ],
+)
+def test_how_an_equation_is_written_is_told_where_it_is_not(equation: str, said: str) -> None:
+    with pytest.raises(SpecError) as found:
+        obsynth.DAEModel({"balance": equation}, {"gauge": "level"}, states={"level": 1.0}, inputs={"inflow": 0.1})
+    assert said in str(found.value)
+
+
+def test_a_constant_with_its_unit_in_a_text_is_told_as_no_number() -> None:
+    with pytest.raises(SpecError, match="'L' is the text '100e-6 H', which is no number"):
+        obsynth.uncertain_system({"E": [["L"]], "A": [[-1.0]], "C": [[1.0]]}, {"L": "100e-6 H"})
+
+
+def test_a_setting_that_cannot_be_read_names_its_command_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["run", "--gains", "g.json", "--data", "log.csv", "--threshold", "fhat[leak]"])
+    printed = capsys.readouterr().err
+    assert printed == "obsynth run: error: argument --threshold: 'fhat[leak]' is not of the form NAME=VALUE\n"
+
+
+def test_a_gain_set_in_place_of_a_spec_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    obsynth.fault_estimation_filter(obsynth.DescriptorSystem(**PLANT)).save(tmp_path / "gains.json")
+    assert main(["design", "--system", str(tmp_path / "gains.json")]) == 2
+    assert "This is a gain set: give the spec that it was made from." in " ".join(capsys.readouterr().err.split())

@@ -114,5 +114,6 @@ def test_a_spec_of_a_how_to_is_designed_and_simulated(example, tmp_path, monkeyp
     design = obsynth.load(f"{example}.gains.json")
     fault, size = {"buck": ("sag", 0.5), "reactor": ("UA", 3.5)}[example]
     run = obsynth.run_on_data(design, "log.csv")
+    assert not [text for text in run.warnings if "begins" in text]
     assert run.table[f"fhat[{fault}]"].iloc[-1] == pytest.approx(size, rel=0.05)
     assert "examples/" + example in "".join(path.read_text(encoding="utf-8") for path in DOCS.glob("howto/*.md"))

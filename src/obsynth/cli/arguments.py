@@ -76,7 +76,7 @@ def add_settings(parser: argparse.ArgumentParser, settings: Sequence[Argument]) 
 
 
 def _settings_parser(prog: str, settings: Sequence[Argument]) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=prog, add_help=False)
+    parser = argparse.ArgumentParser(prog=prog, usage=argparse.SUPPRESS, add_help=False)
     add_arguments(parser, settings)
     return parser
 
@@ -156,7 +156,7 @@ def refuse_given(options: argparse.Namespace, names: Iterable[str], meant: str) 
     """Refuse arguments that would do nothing; ``meant`` says what they are for."""
     for name in names:
         if name not in ("verb", "settings") and getattr(options, name, None) not in (None, False, []):
-            raise SpecError(f"{flag_of(name)} is for {meant}. Leave it out.", path=flag_of(name))
+            raise SpecError(f"{flag_of(name)} is for {meant}. Otherwise leave it out.", path=flag_of(name))
 
 
 def columns_of(options: argparse.Namespace) -> dict[str, str]:

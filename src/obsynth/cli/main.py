@@ -792,7 +792,7 @@ def _collected_rarely() -> Iterator[None]:
 def _options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
     """Return the arguments of a command line, settings among them."""
     options, rest = parser.parse_known_args(sys.argv[1:] if arguments is None else arguments)
-    rest = read_settings(parser.prog, VERBS[options.verb].arguments, options, rest)
+    rest = read_settings(f"{parser.prog} {options.verb}", VERBS[options.verb].arguments, options, rest)
     if rest:
         _refuse_words(parser.prog, options.verb, rest)
     return options

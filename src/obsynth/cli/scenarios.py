@@ -48,7 +48,10 @@ def run_simulate(options: argparse.Namespace) -> int:
         spec, scenario, target, design = _prepared(options, report_stage, SIMULATED_SIGNALS)
         report_stage("simulating")
         found = simulate(design, scenario)
-        written = None if target is None else str(found.write_csv(target))
+        # A log as run reads it; a bias of a sensor is a deviation of its own.
+        point = {**getattr(design.plant, "operating_point", {})}
+        point = {name: value for name, value in point.items() if name not in getattr(design.plant, "sensor_faults", ())}
+        written = None if target is None else str(found.write_csv(target, operating_point=point))
     from obsynth.report.scenarios import simulation_report
 
     answer(

@@ -133,8 +133,8 @@ def _kept(recovery: StateRecovery, observer: LogObserver, name: str) -> bool:
     return bool(np.array_equal(recovery.from_state[row], own)) and not any(matrix[row].any() for matrix in others)
 
 
-#: Seconds of data that are compared with the operating point.
-FIRST_SECONDS = 1.0
+#: Seconds of data that are compared with the operating point, and rows at most: a fast plant moves in a second.
+FIRST_SECONDS, MOST_FIRST_ROWS = 1.0, 100
 #: Rows that are taken in one piece at most.
 ROWS_AT_ONCE = 4096
 #: A signal is far from its operating point when its mean differs by this share of it.
@@ -147,6 +147,7 @@ class OperatingPointCheck:
     def __init__(self, signals: Signals) -> None:
         self._signals = signals
         self._begin: float | None = None
+        self._taken = 0
         self._start = np.full(len(signals.names), np.nan)
         self._sum, self._count = np.zeros(len(signals.names)), np.zeros(len(signals.names))
 
@@ -154,7 +155,8 @@ class OperatingPointCheck:
         """Take one row: seconds, and deviations ``(nu + ny,)`` of which some may be missing."""
         if self._begin is None:
             self._begin, self._start = time, np.array(deviations)
-        if time - self._begin <= FIRST_SECONDS:
+        if time - self._begin <= FIRST_SECONDS and self._taken < MOST_FIRST_ROWS:
+            self._taken += 1
             known = np.isfinite(deviations)
             self._sum[known] += deviations[known]
             self._count[known] += 1.0
@@ -162,7 +164,7 @@ class OperatingPointCheck:
     def take_rows(self, times: Sequence[float], deviations: FloatArray) -> None:
         """Take rows, as `take` one by one."""
         for time, row in zip(times, deviations, strict=True):
-            if self._begin is not None and not time - self._begin <= FIRST_SECONDS:
+            if self._begin is not None and not (time - self._begin <= FIRST_SECONDS and self._taken < MOST_FIRST_ROWS):
                 break
             self.take(time, row)
 
@@ -184,12 +186,13 @@ class OperatingPointCheck:
         if not any(event.start < self._begin + lasting for event in alarms):
             return ()
         name = plant.output_names[worst]
-        where = "its operating point" if name in self._signals.point else "zero (no operating point is stated)"
+        known = name in self._signals.point
+        where = "its operating point" if known else "zero (no operating point is stated)"
+        advice = "Give" if known else "State the operating point at which the log begins, or give"
         return (
             f"An alarm in the first {lasting:.3g} s may be the initial-condition response: {name} begins "
             f"{shares[worst]:.3g} deviations of its noise from {where}, and when the warm-up ends "
-            f"{100.0 * SETTLED_TO:g} % of that response are left. State the operating point at which the log "
-            f"begins, or a longer warm-up (--warm-up {lasting:.3g}).",
+            f"{100.0 * SETTLED_TO:g} % of that response are left. {advice} a longer warm-up (--warm-up {lasting:.3g}).",
         )
 
     def warnings(self) -> tuple[str, ...]:

@@ -566,7 +566,8 @@ def _require_linear_kind(kind: str, nominal: Mapping[str, float] | None) -> None
     if kind not in MONITOR_KINDS:
         hint = " glr is a decision on parameters, which a linear design has none of: cusum is nearest to it."
         raise SpecError(
-            f"kind is {kind!r}: for this design use one of {', '.join(MONITOR_KINDS)}.{hint if kind == 'glr' else ''}",
+            f"The monitor {kind!r} is not for this design: use one of {', '.join(MONITOR_KINDS)}, learned."
+            f"{hint if kind == 'glr' else ''}",
             path="kind",
         )
     if nominal:

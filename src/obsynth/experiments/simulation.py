@@ -6,10 +6,11 @@ Designs and scenarios side by side, ready to run: plant, signals and observer, o
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, cast, overload
 
 import numpy as np
@@ -330,6 +331,10 @@ def _squares(innovations: FloatArray, regressors: FloatArray, parameters: FloatA
 SIMULATED_SIGNALS = FileKind("a table of simulated signals", rb"\Atime,(?!status,)[^\n]*x(hat)?\[", suffix=".csv")
 
 
+#: Columns beside inputs and outputs that hold deviations from an operating point.
+_OF_THE_POINT = ("x[{}]", "xhat[{}]", "f[{}]", "fhat[{}]", "d[{}]")
+
+
 @dataclass(frozen=True, eq=False)
 class Simulation:
     """A plant and its observer over a scenario, one row per sample; arrays are read-only.
@@ -448,15 +453,20 @@ class Simulation:
                 found[name if plain else form.format(name)] = values[:, i]
         return found
 
-    def write_csv(self, path: str | Path) -> Path:
+    def write_csv(self, path: str | Path, *, operating_point: Mapping[str, float] = MappingProxyType({})) -> Path:
         """Write `columns` as comma-separated text, atomically, floats with all their digits.
 
         Parameters
         ----------
         path : path
             Of the file.
+        operating_point : mapping, optional
+            Values by signal that are added, so that the file is a log as `run_on_data` reads it; nothing by default.
         """
         table, text = self.columns(), io.StringIO()
+        for form, name in [(f, n) for n in operating_point for f in ("{}", "y[{}]", *_OF_THE_POINT)]:
+            if (column := form.format(name)) in table:
+                table[column] = table[column] + operating_point[name]
         table_writer(text, table)(zip(*(column.tolist() for column in table.values()), strict=True))
         return write_atomically(path, text.getvalue())
 

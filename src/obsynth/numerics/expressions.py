@@ -25,6 +25,8 @@ MAXIMUM_DEPTH = 50
 Translation: TypeAlias = Callable[[Callable[..., Any]], Callable[..., Any]]
 Evaluator: TypeAlias = Callable[[Mapping[str, Any], Translation], Any]
 
+#: How derivatives are often written.
+_DERIVATIVES = re.compile(r"\b(?:d|dt|ddt|dot|diff|deriv|derivative|Der|D)\(|'\s*(?:$|[-+*/=])")
 #: Names have a prefix where Python's grammar reads them, so that its own words may be names as well.
 _NAME_IN_TEXT = re.compile(r"(?<![\w.])[A-Za-z_]\w*", re.ASCII)
 _NUMBER_IN_TEXT = re.compile(r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
@@ -146,6 +148,8 @@ class _Reader:
         decides = " To decide, write where(a > b, c, d): c where a > b, d elsewhere."
         asked = DECIDING_WORDS.intersection(_NAME_IN_TEXT.findall(self.text)) or re.search("[<>]", self.text)
         power = " A power is written **." if "^" in self.text else ""
+        power += " An equation has a single =." if "==" in self.text else ""
+        power += " A derivative in an equation is written der(x)." if _DERIVATIVES.search(self.text) else ""
         return SpecError(
             f"{self.text!r} is no valid expression: {reason}. Allowed are numbers, names, + - * / **, parentheses "
             f"and the functions {', '.join([*FUNCTIONS, *FUNCTIONS_OF_TWO, 'where'])}.{power}{decides if asked else ''}"

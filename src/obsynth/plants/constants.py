@@ -278,6 +278,12 @@ def constant_of(name: str, given: Any, *, nominal: float | None = None) -> Const
         return Constant(name, given.nominal, given.low, given.high, given.unit)
     if is_number(given) and nominal is None:
         return Constant(name, float(given), float(given), float(given))
+    if isinstance(given, str) and nominal is None:
+        raise SpecError(
+            f"{name!r} is the text {given!r}, which is no number: give a number, or nominal, tolerance and unit by "
+            "these keys.",
+            path=path,
+        )
     if isinstance(given, str) or is_number(given):
         given = {"tolerance": given}
     if isinstance(given, (tuple, list)):

@@ -238,7 +238,9 @@ def _check_version(document: Mapping[str, Any], problems: DocumentProblems) -> N
 
     version = document.get("schema_version")
     if is_whole(version) and version != SPEC_VERSION:
-        problems.add("schema_version", f"version {version} is unknown; this obsynth reads version {SPEC_VERSION}.")
+        other = " This is a gain set: give the spec that it was made from." if "design" in document else ""
+        told = f"version {version} is unknown; this obsynth reads version {SPEC_VERSION}.{other}"
+        problems.add("schema_version", told)
         problems.raise_if_any()
 
 

@@ -516,7 +516,8 @@ def parameter_monitor(
     if kind not in PARAMETER_KINDS:
         hint = _whole_record(observer) if kind == "glr" else ""
         raise SpecError(
-            f"kind is {kind!r}: for a recursive or nonlinear design use one of {', '.join(PARAMETER_KINDS)}.{hint}",
+            f"The monitor {kind!r} is not for a recursive or nonlinear design: use one of "
+            f"{', '.join(PARAMETER_KINDS)}, learned.{hint}",
             path="kind",
         )
     names = observer.fault_names
