@@ -149,7 +149,7 @@ def test_parquet_holds_the_columns_as_well(gains, tmp_path, monkeypatch, capsys)
         (["--noise-bound", "3"], "--noise-bound is for a monitor"),
         (["--disturbance", "w=1"], "--disturbance is for a monitor"),
         (["--monitor", "pointwise"], "No bound is given on "),
-        (["--monitor", "nis"], "for this design use one of"),
+        (["--monitor", "nis"], "for this design: use one of"),
         (["--monitor", "pointwise", "--system", "bare.yaml"], "has no scenario"),
         (["--monitor", "pointwise", "--system", FILASOVA], "other signals"),
     ],

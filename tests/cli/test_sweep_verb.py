@@ -75,3 +75,17 @@ def test_a_claim_of_any_method_is_taken_where_the_method_is_chosen_or_varied(spe
     assert "no design claims 'decay'" in capsys.readouterr().err
     assert (tmp_path / "other" / "table.csv").is_file()
     assert not (tmp_path / "other" / "sweep.png").exists()
+
+
+def test_the_table_on_a_narrow_terminal_cuts_nothing_and_says_what_it_leaves_out(spec, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "24")
+    assert main(["sweep", "--system", spec, "--set", "gamma_margin=[0.05, 0.1]", "--out", str(tmp_path / "s")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines[:-1])) <= 24
+    assert "…" not in "".join(lines)
+    header = next(csv.reader((tmp_path / "s" / "table.csv").read_text().splitlines()))
+    told = " ".join(" ".join(lines).split())
+    assert "In all of them: status designed" in told
+    missing = told.partition("In table.csv alone: ")[2].partition(".")[0].split(", ")
+    assert missing
+    assert set(missing) < set(header)

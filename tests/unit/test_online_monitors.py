@@ -428,7 +428,7 @@ def test_quiet_runs_have_no_alarm(kind, share):
     ("make", "message"),
     [
         (lambda wang, noisy: obsynth.online_monitor(None), "design is missing"),
-        (lambda wang, noisy: obsynth.online_monitor(wang, "nis"), "for this design use one of"),
+        (lambda wang, noisy: obsynth.online_monitor(wang, "nis"), "for this design: use one of"),
         (lambda wang, noisy: obsynth.online_monitor(wang, "glr"), "cusum is nearest to it"),
         (lambda wang, noisy: obsynth.online_monitor(wang), "No bound is given on w "),
         (lambda wang, noisy: obsynth.online_monitor(wang, disturbance_bounds={"w": 0.0}), "its bound would be zero"),
@@ -437,7 +437,7 @@ def test_quiet_runs_have_no_alarm(kind, share):
         (lambda wang, noisy: obsynth.online_monitor(wang, nominal={"x": 1.0}), "nominal is for recursive"),
         (lambda wang, noisy: obsynth.online_monitor(wang, sample_time=1.0), "for continuous designs"),
         (lambda wang, noisy: obsynth.online_monitor(noisy, disturbance_bounds={"d1": 1.0}), "noise_bound"),
-        (lambda wang, noisy: obsynth.online_monitor(adaptive(), "pointwise"), "or nonlinear design use one of"),
+        (lambda wang, noisy: obsynth.online_monitor(adaptive(), "pointwise"), "or nonlinear design: use one of"),
         (lambda wang, noisy: obsynth.online_monitor(adaptive(), "glr"), r"a whole record: obsynth.decide\(.*use cusum"),
         (lambda wang, noisy: obsynth.online_monitor(filtering(), "chi-square"), "estimates none: use nis"),
         (lambda wang, noisy: obsynth.online_monitor(adaptive(), "cusum", nominal={"x": 1.0}), "no signal named 'x'"),

@@ -145,7 +145,7 @@ def test_which_sensors_may_fail() -> None:
     assert found.sets[0].sensors == ()
     assert found.may_be_lost == ("i",)
     assert found.lost_without == {"theta m": ("torque",), "theta l": ("torque",), "i": ()}
-    assert "Without theta l: torque lost." in str(found)
+    assert "If theta l fails, the goal is lost for torque." in str(found)
 
 
 def test_which_sensor_is_needed_for_which_fault() -> None:

@@ -145,7 +145,8 @@ def _tell(options: argparse.Namespace, found: Any, files: tuple[Path, ...], what
         print_json({"command": options.verb, "counts": found.counts, what: cases, "files": [str(f) for f in files]})
         return
     console = stdout_console()
-    console.print(_shown_cases(found) if what == "cases" else _shown_runs(found))
+    shown = _shown_cases if what == "cases" else _shown_runs
+    console.print(shown(found, console.width))
     console.print(f"Written: {', '.join(map(str, files))}", soft_wrap=True)
 
 
@@ -210,31 +211,59 @@ def _png_of(plot: Callable[[], Any]) -> bytes | None:
     return picture
 
 
-def _shown(found: Any, header: Sequence[str], rows: Iterable[Sequence[str]]) -> Any:
-    """Return a table for people; its title counts what became of the cases."""
-    from rich.table import Table
-
-    table = Table(title=", ".join(f"{count} {status}" for status, count in found.counts.items()), title_justify="left")
-    for name in header:
-        table.add_column(name, overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    return table
+#: Blanks between columns.
+_BLANKS_BETWEEN = 2
 
 
-def _shown_cases(found: Any) -> Any:
+def _shown(found: Any, header: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> Any:
+    """Return a table for people, below what became of the cases, what is the same in all, and what has no room."""
+    from rich.console import Group
+    from rich.text import Text
+
+    from obsynth.results.layout import headed_table
+
+    listed = [tuple("" if cell == "nan" else cell for cell in row) for row in rows]
+    columns = dict(zip(header, zip(*listed, strict=True), strict=True)) if listed else {}
+    filled = {name: column for name, column in columns.items() if any(column)}
+    same = {name: column[0] for name, column in filled.items() if len(listed) > 1 and len(set(column)) == 1}
+    shown, widths, missing, room = dict[str, tuple[str, ...]](), dict[str, int](), list[str](), width + _BLANKS_BETWEEN
+    for name, column in filled.items():
+        if name not in same:
+            # Texts fold at blanks; a number that is cut is another number.
+            words = [word for text in (name.replace(".", ". "), *column) for word in text.split()]
+            wide = max(map(len, words)) + _BLANKS_BETWEEN
+            if wide <= room:
+                shown[name], widths[name], room = column, wide - _BLANKS_BETWEEN, room - wide
+            else:
+                missing.append(name)
+    lines = [", ".join(f"{count} {status}" for status, count in found.counts.items())]
+    if same:
+        lines.append(f"In all of them: {', '.join(f'{name} {value}' for name, value in same.items())}.")
+    if missing:
+        lines.append(f"In table.csv alone: {', '.join(missing)}.")
+    table = headed_table(*(name.replace(".", ". ") for name in shown))
+    for place, (name, cells) in zip(table.columns, shown.items(), strict=True):
+        # What room is left goes to the first texts that could use it.
+        more = min(max(map(len, cells)) - widths[name], room)
+        place.width, room = widths[name] + max(more, 0), room - max(more, 0)
+    for row in zip(*shown.values(), strict=True):
+        table.add_row(*(Text(cell or "-") for cell in row))
+    return Group(*map(Text, lines), Text(), table)
+
+
+def _shown_cases(found: Any, width: int) -> Any:
     """Return the table of a sweep for people: without message and file."""
     header, rows = found.rows()
     kept = [i for i, name in enumerate(header) if name not in ("message", "file")]
     told = ([f"{row[i]:.4g}" if isinstance(row[i], float) else str(row[i]) for i in kept] for row in rows)
-    return _shown(found, [header[i] for i in kept], told)
+    return _shown(found, [header[i] for i in kept], told, width)
 
 
-def _shown_runs(found: Any) -> Any:
+def _shown_runs(found: Any, width: int) -> Any:
     """Return the table of runs for people: the first alarm of each, and why one was not made."""
     rows = []
     for run in found.runs:
         first = min(run.alarms, key=lambda name: run.alarms[name], default="")
         alarm = f"{first} at {run.alarms[first]:g} s" if first else "-"
         rows.append((run.name, run.status, str(run.rows), str(run.statuses.get("ok", 0)), alarm, run.message))
-    return _shown(found, ("run", "status", "rows", "ok", "first alarm", "why not"), rows)
+    return _shown(found, ("run", "status", "rows", "ok", "first alarm", "why not"), rows, width)

@@ -188,9 +188,13 @@ class SensorSets:
 
     def failures(self) -> tuple[str, ...]:
         """Return a sentence for each output whose failure loses a fault, and one for those that may fail."""
-        lost = [f"Without {name}: {', '.join(faults)} lost." for name, faults in self.lost_without.items() if faults]
+        lost = [
+            f"If {name} fails, the goal is lost for {', '.join(faults)}."
+            for name, faults in self.lost_without.items()
+            if faults
+        ]
         free = [name for name, faults in self.lost_without.items() if not faults]
-        return (*lost, *([f"May fail, one at a time, without losing any fault: {', '.join(free)}."] if free else []))
+        return (*lost, *([f"The goal is kept if one of these fails: {', '.join(free)}."] if free else []))
 
     def _repr_html_(self) -> str:
         texts = "".join(f"<p>{escape(text)}</p>" for text in (*self.out_of_reach, *self.failures(), *self.notes))
@@ -333,10 +337,13 @@ def _by_threshold(
 ) -> SensorSets:
     """Return the cheapest sets with which the least threshold of a fault is at most ``below``."""
     if fault is None or not (is_finite_number(below) and float(below or 0.0) > 0.0):
-        raise SpecError("goal threshold needs fault, and below, a positive number in its unit.", path="below")
+        raise SpecError(
+            "goal threshold needs fault (--fault) and below (--below), a positive number in the unit of the fault.",
+            path="below",
+        )
     fault_numbers(plant, [fault], "fault")
     if any(sensor.deviation is None for sensor in sensors):
-        raise SpecError("goal threshold needs the noise of each candidate (noise).", path="noise")
+        raise SpecError("goal threshold needs the noise of each candidate (noise, --set noise).", path="noise")
     times = [] if sample_time is None else list(np.atleast_1d(np.asarray(sample_time, dtype=np.float64)))
     if bool(times) == plant.is_discrete:
         raise SpecError("sample_time is for continuous plants, which need one.", path="sample_time")
@@ -399,7 +406,7 @@ def _note(search: SensorSearch, exact: bool, bound: int, most: int, count: int) 
     if exact and not count:
         return f"No set of at most {bound} of {len(search.sensors)} candidates does it: all were tried."
     if exact:
-        return f"All inclusion-minimal sets of at most {bound} of {len(search.sensors)} candidates."
+        return f"These are all sets of at most {bound} of {len(search.sensors)} candidates that no sensor can leave."
     if count >= most:
         return f"The first {most} inclusion-minimal sets found, the most sensitive at a generic point first."
     plain = search.goal == "detect"

@@ -130,7 +130,10 @@ def read_json(
         if _HALF_CHARACTER.search(text):
             json.dumps(document, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
-        raise SpecError(f"{path} is no JSON document ({error}).", path=place) from error
+        what = (
+            ": files that obsynth wrote are expected here" if path.suffix.lower() in (".yaml", ".yml", ".csv") else ""
+        )
+        raise SpecError(f"{path} is no JSON document ({error}){what}.", path=place) from error
     return document
 
 

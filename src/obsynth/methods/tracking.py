@@ -25,7 +25,8 @@ def tracking_of(design: ObserverDesign, affine: AffinePlant) -> Tracking:
         )
     if observer.state_names != plant.state_names:
         raise PreconditionError(
-            "The design does not estimate the full state, which a bound over tolerances needs.",
+            "The design does not estimate the full state, which a bound over tolerances needs: take a "
+            "fault-estimation-filter or a ui-pi-observer, or state no tolerances.",
             condition="full state estimate",
         )
     model = error_model(design)

@@ -554,7 +554,8 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[s
     for check in design.report.checks:
         if check.name.startswith("limit at "):
             place = check.name.removeprefix("limit at ")
-            yield f"{check.claim.rpartition(': ')[0].replace('this zero', f'the zero {place}')}."
+            limit = check.claim.rpartition(": ")[0].replace("at this zero", f"At the zero {place}")
+            yield f"{limit.replace('cannot follow', 'cannot follow a fault of that mode')}."
 
 
 def _wrapped(label: str, text: str, width: int) -> list[str]:
