@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.methods.detection_filter.norm_proofs import missed
 from obsynth.numerics.continuous import ContinuousNorms
+from obsynth.verification.error_system import ErrorModel
 
 
 def plant(seed: int = 0) -> obsynth.DescriptorSystem:
@@ -192,7 +192,7 @@ def test_gain_is_proved_for_the_stored_numbers_only_where_it_holds(name: str) ->
         + sum(Fraction(observer.By[i, k]) * Fraction(system.C[k, j]) for k in range(2))
         for i in range(2) for j in range(2)
     ]  # fmt: skip
-    k, _ = missed(system, observer)
+    k = ErrorModel(system, observer, np.eye(system.nx)).remainder.K
     pairs = zip(exact, k.midpoint.ravel(), k.radius.ravel(), strict=True)
     assert all(abs(Fraction(middle) - value) <= Fraction(radius) for value, middle, radius in pairs)
     assert any(value != 0 for value in exact)

@@ -21,12 +21,11 @@ from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, rounded_up
+from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, rounded_up
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.definiteness import prove_positive_definite
-from obsynth.proofs.exact_arithmetic import nearest_doubles, stored_matrix
 from obsynth.verification.certificates import prove_gain
-from obsynth.verification.error_system import contraction_of
+from obsynth.verification.error_system import ErrorModel, contraction_of
 
 #: Intervals that a range may take, the share of an interval's reach that is used, and its first guess.
 MOST_INTERVALS, REACH, FIRST_SHARE = 20_000, 0.9, 1e-3
@@ -197,10 +196,6 @@ def _is_above_at(work: Transfer, level: float, frequency: float) -> bool:
     return prove_positive_definite(shown.T @ shown - Ball.exact(least)).proved
 
 
-#: With more states what the stored numbers miss is enclosed, not computed exactly.
-MOST_EXACT_STATES = 64
-
-
 def error_transfer(plant: DescriptorSystem, observer: LinearObserver, b: FloatArray, d: FloatArray) -> Transfer:
     """Return the transfer of a signal that enters by b and d to the residuals, if ``Az = A - By C, Cz = -Dy C``."""
     direct, out = Ball.exact(d), Ball.exact(observer.Dy)
@@ -209,29 +204,13 @@ def error_transfer(plant: DescriptorSystem, observer: LinearObserver, b: FloatAr
     )
 
 
-def missed(plant: DescriptorSystem, observer: LinearObserver) -> tuple[Ball, Ball]:
-    """Return ``K = Az + By C - A`` and ``J = Cz + Dy C``: zero but for the rounding of the stored numbers."""
-    parts = observer.Az, observer.By, plant.A, observer.Cz, observer.Dy, plant.C
-    if plant.nx > MOST_EXACT_STATES:
-        az, by, a, cz, dy, c = (Ball.exact(part) for part in parts)
-        return az + by @ c - a, cz + dy @ c
-    stored = [stored_matrix(part) for part in parts]
-    k, j = stored[0] + stored[1] * stored[5] - stored[2], stored[3] + stored[4] * stored[5]
-    return _enclosed(nearest_doubles(k)), _enclosed(nearest_doubles(j))
-
-
-def _enclosed(rounded: FloatArray) -> Ball:
-    """Return what holds a matrix each entry of which was rounded once; exact zeros stay so."""
-    radius = rounded_up(np.abs(rounded) * (2.0 * UNIT_ROUNDOFF), 1) + UNDERFLOW
-    return Ball(rounded, np.where(rounded == 0.0, 0.0, radius))
-
-
 def added_gain(plant: DescriptorSystem, observer: LinearObserver, b: FloatArray, d: FloatArray) -> float:
     """Return a proved bound on what the stored numbers add to the transfer of a signal; infinite where none is proved.
 
     The plant's state x moves z - x by K and the residuals by J: ``(Cz (s - Az)^-1 K + J) (s - A)^-1 b``.
     """
-    k, j = missed(plant, observer)
+    channel = ErrorModel(plant, observer, np.eye(plant.nx)).remainder
+    k, j = channel.K, channel.J
     if not any(part.midpoint.any() or part.radius.any() for part in (k, j)):
         return 0.0
     own, plant_itself = contraction_of(observer), prove_contraction(plant.A, discrete=False)
