@@ -14,16 +14,23 @@ from obsynth.methods.detection_filter.norm_proofs import (
     sensitivity_is_proved,
 )
 from obsynth.numerics.spectra import abscissa
-from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, fitting_check, information
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.identities import Identity, equality, relative_tolerance
+from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.identities import equality, relative_tolerance, tracking_identities
 from obsynth.verification.plant import condition_rows, plant_information
 
 #: The row on the plant together with the stored filter.
 TOGETHER = "with stored numbers"
 _SOURCE = "Ding et al. 2000; proofs ours"
+#: What makes the error obey equations of its own.
+_DETECTION_IDENTITIES = {
+    "dynamics": ("state in the error", "Az = A - By C"),
+    "inputs": ("inputs in the error", "Bu = B - By D"),
+    "residual": ("state in the residuals", "Cz = -Dy C"),
+    "input feedthrough": ("inputs in the residuals", "Du = -Dy D"),
+}
 _DETECTION_CLAIMS = ("disturbance_gain", "fault_sensitivity", "band_from", "band_to")
 
 
@@ -37,8 +44,9 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         return
     yield from condition_rows(conditions(plant))
     tolerance = relative_tolerance(printed_digits, plant.nx + plant.ny + observer.order)
-    for name, claim, identity in _identities(plant, observer):
-        yield equality(name, claim, identity.residual(), _SOURCE, bound=tolerance)
+    identities = tracking_identities(ErrorModel(plant, observer, np.eye(plant.nx)))
+    for key, (name, claim) in _DETECTION_IDENTITIES.items():
+        yield equality(name, claim, identities[key].residual(), _SOURCE, bound=tolerance)
     yield from _norm_rows(design)
 
 
@@ -66,17 +74,6 @@ def _fits(design: ObserverDesign) -> bool:
         and float(claims["disturbance_gain"]) > 0.0
         and float(claims["fault_sensitivity"]) >= 0.0
     )
-
-
-def _identities(plant: DescriptorSystem, observer: LinearObserver) -> Iterator[tuple[str, str, Identity]]:
-    """Yield what makes the error obey equations of its own: name, claim, terms."""
-    az, bu, by, cz, du, dy = observer.Az, observer.Bu, observer.By, observer.Cz, observer.Du, observer.Dy
-    state = Identity((az, by @ plant.C, -plant.A), ((az,), (by, plant.C), (plant.A,)))
-    yield "state in the error", "Az = A - By C", state
-    inputs = Identity((bu, by @ plant.D, -plant.B), ((by, plant.D), (plant.B,)))
-    yield "inputs in the error", "Bu = B - By D", inputs
-    yield "state in the residuals", "Cz = -Dy C", Identity((cz, dy @ plant.C), ((dy, plant.C),))
-    yield "inputs in the residuals", "Du = -Dy D", Identity((du, dy @ plant.D), ((dy, plant.D),))
 
 
 def _norm_rows(design: ObserverDesign) -> Iterator[Check]:
