@@ -55,3 +55,18 @@ def test_the_options_are_few() -> None:
     counts = {name: len(parser._actions) - 1 for name, parser in parsers.choices.items()}
     assert sum(counts.values()) <= 130
     assert max(counts.values()) <= 16
+
+
+@pytest.mark.parametrize("verb", ["run", "sweep", "evaluate"])
+def test_help_is_folded_to_the_terminal(
+    verb: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "72")
+    with pytest.raises(SystemExit):
+        main([verb, "--help"])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 72
+    if verb == "run":
+        # What follows the first line of an item hangs below its text.
+        place = lines.index("  gap         a sample is missing: fault estimates are held, the plant")
+        assert lines[place + 1] == "              model stands in, no alarms"

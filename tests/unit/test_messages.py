@@ -126,7 +126,9 @@ def test_a_setting_that_cannot_be_read_names_its_command_alone(capsys: pytest.Ca
     with pytest.raises(SystemExit):
         main(["run", "--gains", "g.json", "--data", "log.csv", "--threshold", "fhat[leak]"])
     printed = capsys.readouterr().err
-    assert printed == "obsynth run: error: argument --threshold: 'fhat[leak]' is not of the form NAME=VALUE\n"
+    usage, said = printed.splitlines()
+    assert usage == "usage: obsynth run --set NAME=VALUE (see obsynth run --help)"
+    assert said == "obsynth run: error: argument --threshold: 'fhat[leak]' is not of the form NAME=VALUE"
 
 
 def test_a_gain_set_in_place_of_a_spec_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

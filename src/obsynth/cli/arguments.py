@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -52,6 +53,27 @@ def settings_of(arguments: Iterable[Argument | Group | Settings]) -> tuple[Argum
     return tuple(one for item in arguments if isinstance(item, Settings) for one in item.arguments)
 
 
+#: An item of a list in help texts: its name with two blanks behind it, or nothing such, as in settings.
+_ITEM = re.compile(r"  (\S.{0,12}? {2,})?(?=\S)")
+#: How far the rest of an item without a name hangs, and the widest lines of help texts.
+_HANGING, _WIDEST_HELP = 6, 110
+
+
+class Folded(argparse.RawDescriptionHelpFormatter):
+    """Help whose lines stay lines, folded to the terminal: the rest of an item hangs below its text."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        lines = list[str]()
+        for line in text.splitlines():
+            item = _ITEM.match(line)
+            hang = "" if item is None else " " * (len(item.group()) if item.group(1) else _HANGING)
+            folded = textwrap.wrap(
+                line, min(width, _WIDEST_HELP), subsequent_indent=indent + hang, break_on_hyphens=False
+            )
+            lines += folded or [""]
+        return "\n".join(lines)
+
+
 def add_settings(parser: argparse.ArgumentParser, settings: Sequence[Argument]) -> None:
     """Let a parser take ``--set`` and know the defaults of settings; its help lists them at the end."""
     parser.add_argument(
@@ -70,13 +92,13 @@ def add_settings(parser: argparse.ArgumentParser, settings: Sequence[Argument]) 
         name = action.option_strings[0].removeprefix("--")
         value = action.metavar or ("true" if action.const else "|".join(map(str, action.choices or ("VALUE",))))
         told = (action.help or "") % {"default": action.default}
-        lines += textwrap.wrap(f"{name}={value}: {told}", 100, initial_indent="  ", subsequent_indent="      ")
-    parser.epilog = "\n".join([*([parser.epilog] if parser.epilog else []), *lines])
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+        lines.append(f"  {name}={value}: {told}")
+    parser.epilog = "\n".join([*([parser.epilog, ""] if parser.epilog else []), *lines])
+    parser.formatter_class = Folded
 
 
 def _settings_parser(prog: str, settings: Sequence[Argument]) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=prog, usage=argparse.SUPPRESS, add_help=False)
+    parser = argparse.ArgumentParser(prog=prog, usage="%(prog)s --set NAME=VALUE (see %(prog)s --help)", add_help=False)
     add_arguments(parser, settings)
     return parser
 
@@ -212,7 +234,8 @@ LOG_OPTIONS = (
     ),
 )
 #: What a monitor is made of.
-MONITOR = Group("monitor", (option("--monitor", "KIND", "compare the residual (or the parameters) with a threshold"),))
+_WHAT_A_MONITOR_DOES = "compare the residual (or the parameters) with a threshold; obsynth run --help lists the kinds"
+MONITOR = Group("monitor", (option("--monitor", "KIND", _WHAT_A_MONITOR_DOES),))
 #: What its threshold is made of, where the scenario does not say it.
 MONITOR_SETTINGS = Settings(
     (

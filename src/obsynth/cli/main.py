@@ -38,6 +38,7 @@ from obsynth.cli.arguments import (
     TIME_COLUMN,
     UNVERIFIED,
     Argument,
+    Folded,
     Group,
     Settings,
     add_arguments,
@@ -73,44 +74,43 @@ exit codes:
   5  a solver gave up: inconclusive
   6  a check of the shipped gains failed
 """
+# Lines that end in a backslash go on: help is folded to the terminal.
 _SWEEP_DETAILS = """\
-A value list is a YAML list: --set gamma='[0.1, 0.2]' --set plant.transform.sample_time='[0.01, 0.02]'
---set plant.C.outputs='[[omega 1], [omega 1, omega 2]]'.  A name that begins with no section of a spec is an option of
-its method.  The folder keeps every gain set and result: the same command continues a sweep that was interrupted.
-"""
+A value list is a YAML list: --set gamma='[0.1, 0.2]' --set plant.transform.sample_time='[0.01, 0.02]' --set \
+plant.C.outputs='[[omega 1], [omega 1, omega 2]]'. A name that begins with no section of a spec is an option of \
+its method. The folder keeps every gain set and result: the same command continues a sweep that was interrupted."""
 _RUN_DETAILS = """\
-The data have a column 'time', in seconds or as dates and times (ISO 8601), and one for each known input and output,
-by name. Columns of text are separated by commas, semicolons, tabs or bars; numbers may have a decimal comma where
-commas separate nothing.
+The data have a column 'time', in seconds or as dates and times (ISO 8601), and one for each known input and \
+output, by name. Columns of text are separated by commas, semicolons, tabs or bars; numbers may have a decimal \
+comma where commas separate nothing.
 Each row of estimates has a status:
   ok          nothing is missing
   warm-up     the initial-condition response has not settled yet
   gap         a sample is missing: fault estimates are held, the plant model stands in, no alarms
   partial     recursive and nonlinear designs: some outputs are missing, the others are used
   recovering  after a gap: an alarm needs a value that passes its threshold by more than the gap can have caused
-  repeated stamp, out of order
-              the time stamp is not later than the last one: the row is left out (more than 10 in a row are an error)
-Designs with a sampling time allow a time stamp to be off by 0.45 of it, and by 0.25 on average. A longer interval means
-missing rows: an interval of three sampling times, for example, means that two rows are missing.
+  repeated stamp, out of order: the time stamp is not later than the last one: the row is left out (more than 10\
+ in a row are an error)
+Designs with a sampling time allow a time stamp to be off by 0.45 of it, and by 0.25 on average. A longer \
+interval means missing rows: an interval of three sampling times, for example, means that two rows are missing.
 An estimate with a delay has a column 'time of ...' with the time that it is the estimate for.
 
---monitor KIND adds columns 'statistic', 'threshold' and 'alarm', with the fault that the alarm points to. The
+--monitor KIND adds columns 'statistic', 'threshold' and 'alarm', with the fault that the alarm points to. The \
 thresholds hold however long the data are. KIND is one of
-  pointwise   linear designs: the residual's peak bound, for disturbances and noise within bounds; where the plant's
-              constants have tolerances, it adapts to the signals and holds for every plant within them, with columns
-              for each threshold, the guaranteed interval of each fault, and the share of each constant
-  window      the same for its l2 norm over a window
-  paper       linear, discrete: eq. (66) of Wang et al. 2015; no bound
+  pointwise   linear designs: the residual's peak bound, for disturbances and noise within bounds; where the \
+plant's constants have tolerances, it adapts to the signals and holds for every plant within them, with columns \
+for each threshold, the guaranteed interval of each fault, and the share of each constant
+  window      the same for the l2 norm of the residual over a window
+  paper       linear, discrete: eq. (66) of Wang et al. 2015, which guarantees nothing
   chi-square  linear: a window of the residual against its covariance; recursive: the parameters against theirs
   cusum       small changes of the residual, or of a parameter
   nis         recursive and nonlinear designs: innovations too large for the model
   learned     every design: thresholds from rows without faults (--normal), whatever noise the model assumes
-If --gains is a folder, every gain set in it is run on --data, which is a log or a folder of logs, on --jobs processes
-or on a cluster; a log with the name of a gain set is for that gain set alone. --out is then a folder for the estimates,
-table.csv and fleet.png; the same command continues a run that was interrupted.
-
 The scenario of --system, or the options, state which disturbances and noise to expect.
-"""
+
+If --gains is a folder, every gain set in it is run on --data, which is a log or a folder of logs, on --jobs \
+processes or on a cluster; a log with the name of a gain set is for that gain set alone. --out is then a folder \
+for the estimates, table.csv and fleet.png; the same command continues a run that was interrupted."""
 _LOG = "text (.csv, .tsv), Parquet, TDMS or MDF file; - for text on standard input"
 _EXPECTED_SCENARIO = option(
     "--system", "FILE", "spec (YAML) whose scenario states the disturbances and noise to expect", type=Path
@@ -139,7 +139,7 @@ VERBS = {
         "Analyse the plant of a spec, and check for every method whether a design can exist.",
         (
             SYSTEM,
-            flag("--whole-bank", "list every structured residual for more than 6 faults, up to 12"),
+            flag("--whole-bank", "list every structured residual where there are 7 to 12 faults, too"),
             verbose("the structure of the plant and every condition"),
             JSON,
         ),
@@ -309,7 +309,13 @@ VERBS = {
         "Design and verify for every combination of specs and values; a design that fails is a row of the table.",
         (
             option("--system", "FILE", "a spec (YAML), or several", type=Path, required=True, nargs="+"),
-            option("--set", "PATH=LIST", "an entry of the specs and its values", action="append", default=[]),
+            option(
+                "--set",
+                "PATH=LIST",
+                "an entry of the specs and the list of its values; may be repeated",
+                action="append",
+                default=[],
+            ),
             option("--out", "FOLDER", "folder for gain sets, results and table.csv", type=Path, required=True),
             option("--claim", "NAME", "the claim that the picture shows (default: the most frequent one)"),
             JOBS,
@@ -648,7 +654,7 @@ def obsynth_parser(asked: Collection[str] | None = None) -> argparse.ArgumentPar
             add_help=asked is None or name in asked,
             description=fill(verb.told, width=78),
             epilog=verb.epilog,
-            formatter_class=argparse.RawDescriptionHelpFormatter if verb.epilog else argparse.HelpFormatter,
+            formatter_class=Folded if verb.epilog else argparse.HelpFormatter,
         )
         if asked is None or name in asked:
             _fill(name, own)
@@ -665,7 +671,7 @@ def _parser(name: str, told: str) -> argparse.ArgumentParser:
         prog=name,
         description=fill(told, width=78),
         epilog=EXIT_CODES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=Folded,
     )
     parser.add_argument("--version", action="version", version=f"obsynth {__version__}")
     return parser
