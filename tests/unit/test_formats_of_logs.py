@@ -342,6 +342,35 @@ def test_columns_that_a_log_need_not_have_are_found_missing_in_every_format(fram
     assert np.array_equal(table["time"], frame["time"])
 
 
+@of_asammdf
+@pytest.mark.parametrize("version", ["2.14", "3.30", "4.00", "4.20"])
+def test_all_versions_of_mdf_are_read(design, frame, tmp_path, version):
+    asammdf = pytest.importorskip("asammdf")
+    log = asammdf.MDF(version=version)
+    log.append([channel(frame, name) for name in SIGNALS])
+    log.save(tmp_path / f"log.{'mf4' if version >= '4' else 'mdf'}")
+    log.close()
+    (path,) = tmp_path.iterdir()
+    same(design, path, frame)
+
+
+@of_asammdf
+def test_a_channel_outside_of_its_records_is_refused_before_asammdf_reads_it(design, frame, tmp_path):
+    """Its code in C read there: the process ended."""
+    asammdf = pytest.importorskip("asammdf")
+    path = mdf(tmp_path / "log.mf4", [channel(frame, name) for name in SIGNALS])
+    with asammdf.MDF(path) as file:
+        places = [one.address + 24 + 8 * one.links_nr for one in file.groups[0].channels]
+    whole = bytearray(path.read_bytes())
+    for place in places:
+        # The offset in bytes stands four bytes behind the links of the block.
+        damaged = whole.copy()
+        damaged[place + 4 : place + 8] = (1 << 30).to_bytes(4, "little")
+        path.write_bytes(damaged)
+        with pytest.raises(SpecError, match=r"its channel '\w+' lies outside of its records"):
+            obsynth.run_on_data(design, path)
+
+
 def damaged(whole: bytes, rng: np.random.Generator, kinds: int) -> bytes:
     """A file that lacks its end, some bytes in between, or has other ones."""
     place, kind = int(rng.integers(8, len(whole))), int(rng.integers(kinds))
@@ -374,8 +403,7 @@ def test_damaged_files_are_read_or_refused_in_a_sentence(design, frame, tmp_path
     whole, rng = log.read_bytes(), np.random.default_rng(5)
     kept = {"tank.gains.json", log.name}
     for _ in range(15):
-        # Of other damage asammdf makes lengths that its C code believes: 2 of 400 such files end the process.
-        log.write_bytes(damaged(whole, rng, 1 if suffix == ".mf4" else 4))
+        log.write_bytes(damaged(whole, rng, 4))
         out.unlink(missing_ok=True)
         capfd.readouterr()
         code = main(["run", "--gains", str(tmp_path / "tank.gains.json"), "--data", str(log), "--out", str(out)])

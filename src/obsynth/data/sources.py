@@ -627,7 +627,28 @@ def _mdf_file(path: Path) -> Iterator[Any]:
     finally:
         sys.unraisablehook = hook
     with file:
+        _require_channels_within_records(path, file)
         yield file
+
+
+def _require_channels_within_records(path: Path, file: Any) -> None:
+    """Raise `SpecError` for an MDF file with a channel outside of its records, as changed bytes make them: code of
+    asammdf in C would read there, and end the process."""
+    for group in file.groups:
+        bits = 8 * (group.channel_group.samples_byte_nr + getattr(group.channel_group, "invalidation_bytes_nr", 0))
+        for channel in group.channels:
+            # Version 4, and those before.
+            start = (
+                8 * channel.byte_offset + channel.bit_offset
+                if hasattr(channel, "byte_offset")
+                else 8 * getattr(channel, "additional_byte_offset", 0) + channel.start_offset
+            )
+            if start + channel.bit_count > bits:
+                raise SpecError(
+                    f"{path} cannot be read: its channel {channel.name!r} lies outside of its records. The file is "
+                    "damaged: copy it or export it again.",
+                    path=str(path),
+                )
 
 
 def _on_raster(file: Any, name: str, place: tuple[int, int], raster: FloatArray) -> Any:
