@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from obsynth.numerics.modal_response import SAFE_RECIPROCAL_CONDITION, ModalResponse, Modes, level_crossings
+from obsynth.numerics.modal_response import ModalResponse, Modes, level_crossings
 from obsynth.numerics.norms import frequency_response, highest_gain_found, hinf_norm
 
 
@@ -84,9 +84,9 @@ def test_crossings_next_to_zero_and_to_the_highest_frequency(side):
     for angle in (1e-3, 0.5, 2.0, np.pi - 1e-3):
         level = 1.0 / abs(np.exp(1j * angle) - a)
         matrices = (np.full((1, 1), value) for value in (a, 1.0, 1.0, 0.0))
-        crossings, _ = level_crossings(*matrices, level)
+        crossings = level_crossings(*matrices, level)
         assert np.min(np.abs(crossings - angle)) < 1e-6
     # At the peak itself the pencil is singular at z = 1 or -1.
-    crossings, distance = level_crossings(*(np.full((1, 1), v) for v in (a, 1.0, 1.0, 0.0)), 2.0)
-    assert distance < np.sqrt(SAFE_RECIPROCAL_CONDITION)
+    crossings = level_crossings(*(np.full((1, 1), v) for v in (a, 1.0, 1.0, 0.0)), 2.0)
+    assert crossings.size
     assert np.all(np.minimum(crossings, np.pi - crossings) < 1e-3)

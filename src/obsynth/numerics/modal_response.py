@@ -204,10 +204,8 @@ CIRCLE_TOLERANCE = 1e-3
 SAFE_RECIPROCAL_CONDITION = 1e-7
 
 
-def level_crossings(
-    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float
-) -> tuple[FloatArray, float]:
-    """Return the angles in [0, pi] at which a singular value equals ``level``, and the distance of the closest miss.
+def level_crossings(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float) -> FloatArray:
+    """Return the angles in [0, pi] at which a singular value equals ``level``.
 
     There ``z [I 0; C'C + C'D R^-1 D'C, A' + C'D R^-1 B'] - [A + B R^-1 D'C, B R^-1 B'; 0 I]``, ``R = g^2 I - D'D``, is
     singular.
@@ -227,7 +225,7 @@ def level_crossings(
     miss = np.abs(np.abs(alpha) - np.abs(beta)) / np.where(size == 0.0, 1.0, 0.5 * size)
     miss[size == 0.0] = 0.0
     near = miss < CIRCLE_TOLERANCE
-    return np.abs(np.angle(alpha[near] * np.conj(beta[near]))), float(np.min(miss))
+    return np.abs(np.angle(alpha[near] * np.conj(beta[near])))
 
 
 def _pencil_eigenvalues(right: FloatArray, left: FloatArray) -> tuple[ComplexArray, ComplexArray]:

@@ -35,14 +35,12 @@ class HinfNorm:
     """The H-infinity norm of a system: ``value`` is attained, at ``frequency`` in rad/s (infinite: feedthrough).
 
     In discrete time in radians per sample. ``upper``: level at which the symplectic pencil has no eigenvalue on the
-    circle, or a Riccati equation a solution (computed, not proved); ``distance``: of the closest eigenvalue from the
-    circle, NaN without a pencil of its own.
+    circle, or a Riccati equation a solution (computed, not proved).
     """
 
     value: float
     upper: float
     frequency: float
-    distance: float = np.nan
 
 
 def spectral_radius(a: FloatArray) -> float:
@@ -69,12 +67,12 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, mod
     Raise the level to the largest gain found and look between the crossings of that level, until there are none.
     """
     if b.shape[1] == 0 or c.shape[0] == 0:
-        return HinfNorm(0.0, 0.0, 0.0, np.inf)
+        return HinfNorm(0.0, 0.0, 0.0)
     if not all(np.isfinite(part).all() for part in (a, b, c, d)):
-        return HinfNorm(np.inf, np.inf, np.nan, 0.0)
+        return HinfNorm(np.inf, np.inf, np.nan)
     modes = Modes.of(a) if modes is None else modes
     if modes.radius >= 1.0:
-        return HinfNorm(np.inf, np.inf, np.nan, 0.0)
+        return HinfNorm(np.inf, np.inf, np.nan)
     a, b, c, modes = _balanced(a, b, c, modes)
     if a.shape[0] > STATES_OF_PENCIL:
         found = _norm_of_many_states(a, b, c, d, modes)
@@ -82,21 +80,20 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, mod
             return found
     best, angle = _highest_peak(a, b, c, d, modes)
     if best == 0.0 or not np.isfinite(best) or a.shape[0] == 0:
-        return HinfNorm(best, best, angle, np.inf)
-    distance = 0.0
+        return HinfNorm(best, best, angle)
     for _ in range(MAXIMUM_ROUNDS):
         level = best * (1.0 + NORM_TOLERANCE)
-        crossings, distance = level_crossings(a, b, c, d, level)
+        crossings = level_crossings(a, b, c, d, level)
         if not crossings.size:
-            return HinfNorm(best, level, angle, distance)
+            return HinfNorm(best, level, angle)
         ordered = np.sort(np.concatenate([[0.0], crossings, [np.pi]]))
         candidates = np.concatenate([crossings, 0.5 * (ordered[1:] + ordered[:-1])])
         higher, where = _peak(a, b, c, d, candidates)
         if higher <= level:
             # The pencil's eigenvalues touch the circle only within rounding: no gain there exceeds the level.
-            return HinfNorm(max(best, higher), level, angle, distance)
+            return HinfNorm(max(best, higher), level, angle)
         best, angle = higher, where
-    return HinfNorm(best, np.inf, angle, distance)
+    return HinfNorm(best, np.inf, angle)
 
 
 def norm_is_at_most(
