@@ -225,7 +225,7 @@ def level_crossings(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, 
     miss = np.abs(np.abs(alpha) - np.abs(beta)) / np.where(size == 0.0, 1.0, 0.5 * size)
     miss[size == 0.0] = 0.0
     near = miss < CIRCLE_TOLERANCE
-    return np.abs(np.angle(alpha[near] * np.conj(beta[near])))
+    return np.asarray(np.abs(np.angle(alpha[near] * np.conj(beta[near]))))
 
 
 def _pencil_eigenvalues(right: FloatArray, left: FloatArray) -> tuple[ComplexArray, ComplexArray]:
