@@ -124,6 +124,17 @@ def test_a_text_of_windows_is_read_and_bytes_that_are_no_text_are_refused(design
         obsynth.run_on_data(design, tmp_path / "log.csv")
 
 
+def test_a_text_of_windows_comes_through_standard_input_too(design, frame, monkeypatch):
+    text = frame.rename(columns={"level": "level [°C]"}).to_csv(index=False)
+    stdin = io.TextIOWrapper(io.BytesIO(text.encode("cp1252")), encoding="utf-8")
+    monkeypatch.setattr("sys.stdin", stdin)
+    out = io.StringIO()
+    obsynth.run_on_data(design, stdin, out)
+    pd.testing.assert_frame_equal(
+        pd.read_csv(io.StringIO(out.getvalue())), same(design, frame, frame), check_dtype=False
+    )
+
+
 @pytest.mark.parametrize("kind", ["frame", "csv", "parquet", "calibrate"])
 def test_units_behind_names_are_left_out_and_say_what_the_times_are(design, frame, tmp_path, kind):
     units = {"time": "time [ms]", "level": "level (m)", "flow": "flow[m3/h]"}
