@@ -95,7 +95,7 @@ def test_outliers_in_c(form, name, tmp_path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["gate", "huber"])
-@pytest.mark.parametrize("sizes", [None, [0.2, 0.0, 0.3]])
+@pytest.mark.parametrize("sizes", [None, [0.2, 0.0, 0.3], [0.02, 0.02, 0.02]])
 def test_samples_that_the_others_of_their_row_exclude_in_c(kind, sizes, tmp_path) -> None:
     """The plant may be anywhere in the next row: no sample stands out by its own deviation."""
     model = obsynth.DAEModel(

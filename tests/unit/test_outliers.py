@@ -286,6 +286,11 @@ def test_a_sample_that_the_others_of_its_row_exclude_is_left_out_where_the_predi
     moved = y.copy()
     moved[30:, 0] += 0.4
     assert np.diff(gate_counts(design.observer, moved[:32], u[:32])[0][29:, 0]).tolist() == [1.0, 0.0]
+    # What comes after one is beyond outliers of any sensor by its own prediction, and where the others say.
+    wrong = y.copy()
+    wrong[30, 0] += 0.4
+    known = replace(design.observer, outlier_sizes=[0.02, 0.02, 0.02])
+    assert gate_counts(known, wrong, u)[0][-1].tolist() == [1.0, 0.0, 0.0]
     for size, lost in ((0.3, 1.0), (0.6, 0.0)):
         known = replace(design.observer, outlier_sizes=[size, 0.0, 0.0])
         assert gate_counts(known, moved[:31], u[:31])[0][-1, 0] == lost

@@ -114,11 +114,12 @@ def robust_advance(
     if not far.any():
         # Beside a missing input nearer samples wait for the next one as well: no fault is told of in this row.
         least, u_taken = (least, u) if held is None else (np.zeros(len(y)), held)
-        mean, usual, reach, far = _judged(limit, least, predicted, state, y, u_taken)
+        mean, usual, reach, far, apart = _judged(limit, least, predicted, state, y, u_taken)
         if wary is not None:
-            # A second that is where the first was, and no further than it may be, goes on with it at once.
+            # A second that is where the first was, and no further than it may be, goes on with it at once; so does one
+            # that is where the others of its row say.
             again = (np.abs(y - mean) <= reach) & (np.abs(y - mean - state.refused[2]) <= least)
-            wary &= np.isfinite(reach) & ~(again & (state.refused[2] != 0.0))
+            wary &= np.isfinite(reach) & ~(again & (state.refused[2] != 0.0)) & ~(np.abs(apart) <= least)
             reach = np.where(wary, least, reach)
             far |= wary & (np.abs(y - mean) > reach)
     off, gone = np.where(far, y - mean, 0.0), far
@@ -178,10 +179,11 @@ def _judged(
     state: State,
     y: FloatArray,
     u: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Return the mean of each output, how far from it a sample may be by its deviation and at all, and which are
-    further. Where the model alone predicts nothing of an output, or excludes no sample, the others of its row judge:
-    what a fault may have done makes deviations large, but it moves all sensors together."""
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, FloatArray]:
+    """Return the mean of each output, how far from it a sample may be by its deviation and at all, which are further,
+    and how far each is from what the others of its row say, NaN where they do not know it. Where the model alone
+    predicts nothing of an output, or excludes no sample, the others of its row judge: what a fault may have done makes
+    deviations large, but it moves all sensors together."""
     with np.errstate(all="ignore"):
         mean, covariance = predicted(state, np.full(len(y), np.nan), u)
         usual = limit * np.sqrt(np.diag(covariance))
@@ -199,13 +201,14 @@ def _judged(
         # Of those that accuse each other, the worst alone.
         worst = int(np.argmax(ratios))
         far[worst] |= bool(ratios[worst] > 1.0)
-        if not (far | unknown).any():
-            off, deviation = beside_others(y - mean, covariance)
-            worst = int(np.argmax(np.nan_to_num(np.abs(off) / deviation)))
-            if np.abs(off[worst]) > max(limit * deviation[worst], least[worst]):
-                mean[worst], usual[worst], far[worst] = y[worst] - off[worst], limit * deviation[worst], True
+        apart = np.full(len(y), np.nan)
+        if not unknown.any():
+            apart, deviation = beside_others(y - mean, covariance)
+            worst = int(np.argmax(np.nan_to_num(np.abs(apart) / deviation)))
+            if not far.any() and np.abs(apart[worst]) > max(limit * deviation[worst], least[worst]):
+                mean[worst], usual[worst], far[worst] = y[worst] - apart[worst], limit * deviation[worst], True
                 reach[worst] = max(usual[worst], least[worst])
-    return mean, usual, reach, far
+    return mean, usual, reach, far, apart
 
 
 def beside_others(off: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -202,8 +202,8 @@ static int robust(const struct observer *state, const double *u, const double *v
     }
     /* Where the model excludes no sample, the others of its row judge: what a fault may have done makes deviations large,
        but it moves all sensors together. Of those that accuse each other, the worst alone. */
+    beside_others(off, covariance, apart, deviation);
     if (!any_far) {
-        beside_others(off, covariance, apart, deviation);
         for (i = 0; i < NY; i++) {
             if (fabs(apart[i]) / deviation[i] > worst) {
                 worst = fabs(apart[i]) / deviation[i];
@@ -222,10 +222,11 @@ static int robust(const struct observer *state, const double *u, const double *v
         if (i == accused) {
             mean[i] = y[i] - apart[i];
         }
-        /* A second that is where the first was, and no further than it may be, goes on with it at once. */
+        /* A second that is where the first was, and no further than it may be, goes on with it at once; so does one that
+           is where the others of its row say. */
         int again = state->left_out[i] != 0.0 && fabs(y[i] - mean[i]) <= reach
                     && fabs(y[i] - mean[i] - state->left_out[i]) <= OUTLIER_SIZES[i];
-        reach = wary[i] && !again ? OUTLIER_SIZES[i] : reach;
+        reach = wary[i] && !again && !(fabs(apart[i]) <= OUTLIER_SIZES[i]) ? OUTLIER_SIZES[i] : reach;
         pulled = mean[i] + reach * (y[i] > mean[i] ? 1.0 : -1.0);
         far[i] = fabs(y[i] - mean[i]) > reach || huge;
         off[i] = y[i] - mean[i];
