@@ -79,11 +79,11 @@ name = "loss of torque"
 axes[0].fill_between(table["time"], table[f"lowest {name}"], table[f"highest {name}"], color="0.85", label="guaranteed")
 axes[0].plot(table["time"], table[f"fhat[{name}]"], label="estimate")
 axes[0].plot(table["time"] - dt, np.where(table["time"] - dt >= 4.0, -1.5, 0.0), "k--", label="true fault")
-axes[0].set_ylabel("N m")
+axes[0].set_ylabel(f"{name} (N m)")
 axes[0].legend()
 shares = [f"share {constant}" for constant in box.names]
 axes[1].stackplot(table["time"], table[shares].to_numpy().T, labels=box.names)
-axes[1].set(xlabel="s", ylabel="share of the interval")
+axes[1].set(xlabel="time (s)", ylabel="share of the interval")
 axes[1].legend(ncol=5)
 figure.tight_layout()
 

@@ -111,6 +111,28 @@ def test_errors_of_the_model_where_inputs_move_are_told(seed: int) -> None:
         assert told or not notes
 
 
+@pytest.mark.parametrize("offset", [True, False])
+def test_an_offset_that_each_start_divides_anew_is_told(offset: bool) -> None:
+    """The bias of a sensor beside its unknown offset: the estimate stays where the start has left it."""
+    model, q = obsynth.DAEModel(
+        {"tank": "der(h) = q - a * h"}, {"LT": "h + bias", "L2": "h"}, states={"h": 1.0}, inputs={"q": 0.1},
+        parameters={"bias": 0.0}, constants={"a": 0.1},
+    ), np.diag([4e-6])  # fmt: skip
+    if offset:
+        model, q = obsynth.with_noise(model, offset=["LT"])[0], np.diag([4e-6, 0.0])
+    design = obsynth.dae_adaptive_observer(
+        model, dt=1.0, Q=q, R=1e-4 * np.eye(2), form="augmented-kalman", random_walk=[[1e-8]],
+        initial_parameter_covariance=[[1e-4]], integration="backward-euler",
+    )  # fmt: skip
+    rng, h, rows = np.random.default_rng(2), 1.0, []
+    for k, flow in enumerate(np.repeat(rng.uniform(0.05, 0.15, 75), 20)):
+        h = (h + flow) / 1.1 + 0.002 * rng.standard_normal() if k else h
+        rows.append([float(k), flow, h + 0.1 * offset + 0.01 * rng.standard_normal(), h + 0.01 * rng.standard_normal()])
+    data = pd.DataFrame(rows, columns=["time", "q", "LT", "L2"])
+    notes = obsynth.learn_thresholds(design, data, false_alarms="1 per 1000 rows").notes
+    assert [note.startswith("The estimate of bias stays what the start") for note in notes] == [True] * offset
+
+
 def test_an_event_that_raises_the_levels_by_little_is_none() -> None:
     data = log(0)
     data.loc[EVENT.start : EVENT.stop - 1, "ya"] += 0.07

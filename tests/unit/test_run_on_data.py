@@ -559,3 +559,22 @@ def test_an_alarm_of_the_initial_condition_response_is_told_with_a_warm_up_that_
     found = run_on_data(design, late, thresholds=levels, warm_up=longer)
     assert found.alarms
     assert found.warnings == ()
+
+
+def test_a_log_that_begins_at_other_states_than_a_nonlinear_design_is_told_of_where_it_alarms():
+    tank = obsynth.DAEModel(
+        {"balance": "2.0 * der(level) = inflow - c * sqrt(level)"},
+        {"gauge": "level"},
+        states={"level": 1.0},
+        inputs={"inflow": 0.1},
+        parameters={"c": 0.1},
+    )
+    walk = {"random_walk": 1e-8, "initial_parameter_covariance": 1e-6}
+    design = obsynth.dae_adaptive_observer(tank, dt=1.0, Q=1e-8, R=1e-6, **walk)
+    monitor = obsynth.online_monitor(design, "nis")
+    for level, told in ((1.0, 0), (2.0, 1)):
+        inflow = 0.1 * np.sqrt(level)
+        log = pd.DataFrame({"time": np.arange(60.0), "inflow": inflow, "gauge": level})
+        found = run_on_data(design, log, monitor=monitor)
+        assert bool(found.alarms) == bool(told)
+        assert sum("begin at other states than the design" in text for text in found.warnings) == told

@@ -17,11 +17,12 @@ import numpy as np
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.data.alarm_events import NO_DECISION, AlarmEvent, AlarmLog
 from obsynth.data.linear_log import log_observer
-from obsynth.data.log_estimator import DECIDING, RECOVERING, STALE, Clock, LogObserver, Row
+from obsynth.data.log_estimator import DECIDING, GAP, RECOVERING, STALE, Clock, LogObserver, Row
 from obsynth.data.signals import TIME_HEADER, Signals, Stamps
 from obsynth.data.stuck_sensors import RepeatedValues
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.learned import LearnedRule, as_learned
+from obsynth.experiments.monitors.learned_levels import HOLD
 from obsynth.experiments.monitors.monitor import LinearSample, Monitor, Sample
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
@@ -147,6 +148,7 @@ class OperatingPointCheck:
     def __init__(self, signals: Signals) -> None:
         self._signals = signals
         self._begin: float | None = None
+        self.status = ""  # of the first row
         self._taken = 0
         self._start = np.full(len(signals.names), np.nan)
         self._sum, self._count = np.zeros(len(signals.names)), np.zeros(len(signals.names))
@@ -170,8 +172,16 @@ class OperatingPointCheck:
 
     def alarm_of_the_start(self, design: ObserverDesign, alarms: Sequence[AlarmEvent]) -> tuple[str, ...]:
         """Return a text where an alarm of a linear design may be its initial-condition response: when the warm-up
-        ends, `SETTLED_TO` of it are left, which is more than the noise where the outputs begin far from the start."""
+        ends, `SETTLED_TO` of it are left, which is more than the noise where the outputs begin far from the start.
+        Other designs leave out the first row as an outlier where it is so far away."""
         observer, plant = design.observer, design.plant
+        refused = self.status == GAP and bool(np.isfinite(self._start).all())
+        if refused and any(event.first_row <= HOLD for event in alarms):
+            return (
+                f"All outputs of the first row are left out as outliers, and an alarm comes within {HOLD} rows: the "
+                "log may begin at other states than the design. State those at which it begins (states, or "
+                "initial_state), or a larger initial_covariance.",
+            )
         if not (isinstance(observer, LinearObserver) and isinstance(plant, DescriptorSystem)) or self._begin is None:
             return ()
         noise = np.linalg.norm(plant.Dw, axis=1)
@@ -335,6 +345,8 @@ class LogRun:
                     continue
             found.append(self._single(times[done], values[done], self.rows + done + 1))
             at.append(self.clock.at(times[done]))
+        if found and self.rows == 0:
+            self.first.status = found[0].status
         self.rows += len(found)
         self.first.take_rows(times, values)
         return [

@@ -3,7 +3,7 @@ outputs that are stuck, and residuals that are larger where inputs move."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,16 @@ def notes_of_sizes(white: FloatArray, inputs: FloatArray) -> tuple[str, ...]:
         f"large as elsewhere ({count} moves): errors of the model raise the levels, more than noise does. A "
         "design that follows the plant there has lower levels: with calibrated constants, or a nonlinear observer "
         "in place of that of a linearised plant.",
+    )
+
+
+def notes_of_starts(divided: Mapping[str, float]) -> tuple[str, ...]:
+    """Return what is to be known of faults that are ``divided`` from the offset of a sensor anew at each start."""
+    return tuple(
+        f"The estimate of {name} stays what the start of this log made of it and of the unknown offset of a sensor: it "
+        f"varies by {share:.2g} of its standard deviation here. A run with another start may alarm without a fault: go "
+        "on from the state of this log (--state), or state the offset."
+        for name, share in divided.items()
     )
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from obsynth.data.log_estimator import DECIDING, STALE, Row
 from obsynth.data.log_run import LogRun
-from obsynth.data.normal_notes import notes_of_normal_rows, notes_of_sizes
+from obsynth.data.normal_notes import notes_of_normal_rows, notes_of_sizes, notes_of_starts
 from obsynth.data.signals import TIME_HEADER, Stamps
 from obsynth.data.sources import CHUNK_ROWS, Data, chunks, parsed_rows
 from obsynth.data.step_log import SteppingLogObserver
@@ -40,6 +40,7 @@ from obsynth.experiments.monitors.learned import (
     NO_PAIRS,
     LearnedThresholds,
     WrongPairs,
+    divided_at_starts,
     has_innovations_by_sensor,
     learned_monitor,
     load_thresholds,
@@ -243,7 +244,8 @@ def learn_thresholds(
     notes = notes_of_normal_rows(raised, said.numbers[chosen], log, slice(first, last), first_run.signals, stamps)
     white = found.statistics.model.whitened(watched_rows(design, found, watched))
     inputs = log[said.numbers[chosen], 1 : 1 + first_run.signals.inputs]
-    return replace(found, notes=notes + notes_of_sizes(white, inputs))
+    divided = notes_of_starts(divided_at_starts(design.observer, scores if found.statistics.estimates else None))
+    return replace(found, notes=(*notes, *notes_of_sizes(white, inputs), *divided))
 
 
 def _sized(

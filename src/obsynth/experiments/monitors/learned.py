@@ -40,10 +40,12 @@ from obsynth.methods.registry import error_model
 from obsynth.numerics.arguments import arguments_checked, is_finite_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
+from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import changed
 from obsynth.observers.windows import WindowObserver
+from obsynth.plants.noise_model import offset_state
 from obsynth.results.certificate_files import opened, sealed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
@@ -59,6 +61,8 @@ MOST_WATCHED, LEAST_NEW = 8, 1e-6
 OWN_DIRECTION = 0.99
 #: Rows without faults below which nothing is learned.
 LEAST_NORMAL = 100
+#: Estimates that vary by less than this share of their deviation in a log have most of it from its start.
+ONE_START_SHARE = 0.5
 #: Seconds of the units of time in which a rate is told.
 UNITS = {
     "second": 1.0,
@@ -480,6 +484,18 @@ def thresholds_from_rows(
         outlier_sizes,
         lasting,
     )
+
+
+def divided_at_starts(observer: Any, scores: Scores | None) -> dict[str, float]:
+    """Return the faults between which and the offset of a sensor each start divides what it sees, and how much of the
+    deviation that the observer states their estimates vary by in one log: little, as they stay what a start made."""
+    if scores is None or not isinstance(observer, DAEObserver):
+        return {}
+    if not any(offset_state(name) in observer.plant.state_names for name in observer.plant.output_names):
+        return {}
+    shares = np.nanstd(scores.theta / scores.deviations, axis=0)
+    found = zip(observer.fault_names, shares.tolist(), strict=True)
+    return {name: share for name, share in found if share < ONE_START_SHARE}
 
 
 class Raised(NamedTuple):
