@@ -90,6 +90,13 @@ def test_new_tolerances_of_a_plant_keep_its_nominal_values() -> None:
         obsynth.uncertain_system(drive(), {"k": {"nominal": 25.0, "tolerance": "10 %"}})
 
 
+def test_tolerances_of_entries_are_stated_anew() -> None:
+    """The name of an entry, such as A[1,1], is no expression: stating another variation ended in an error of that."""
+    plant = obsynth.uncertain_system(wang(), tolerance={"A": "2 %"})
+    again = obsynth.uncertain_system(plant, variation="varying")
+    assert (again.uncertainty.box.variation, again.uncertainty.used) == ("varying", plant.uncertainty.used)
+
+
 def test_a_box_says_where_it_comes_from() -> None:
     plant = drive(source="calibrated", level=0.95, digest="ab" * 32)
     assert plant.uncertainty.box.sentence == "a constant outside its 95 % box of the log abababababab"

@@ -225,7 +225,10 @@ def _boxed(
         constants = constants.constants
     found, shares, more = dict[str, Any](), dict(tolerance or {}), dict[str, list[Entry]]()
     # A capacitance may be called C: what an expression names is a constant, and no tolerance of that matrix.
-    named = frozenset[str]().union(*(parse_expression(text).names for found in entries.values() for *_, text in found))
+    texts = [
+        text for matrix, given in entries.items() for row, column, text in given if text != _entry(matrix, row, column)
+    ]
+    named = frozenset[str]().union(*(parse_expression(text).names for text in texts))
     for name, value in (constants or {}).items():
         if name in UNCERTAIN_MATRICES and name not in {*known, *named} and isinstance(value, (str, int, float)):
             shares.setdefault(name, value)
