@@ -159,8 +159,8 @@ def test_the_report_on_a_log_says_whether_it_agrees(folder, gains, capsys):
         assert main(arguments) == 0
         text = page.read_text(encoding="utf-8")
         shown.append(text[text.index('id="comparison-with-your-data"') :].partition("</section>")[0])
-    assert "The log agrees" in shown[0]
+    assert "Rows 0:56 of the log agree with the design." in shown[0]
     assert "NIS" in shown[0]
     assert shown[0].count("<img") == 1
-    assert "does not agree" in shown[1]
+    assert "The log, taken as free of faults, does not agree" in shown[1]
     assert "not free of faults" in shown[1]
