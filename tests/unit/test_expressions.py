@@ -102,7 +102,7 @@ def test_arrays_and_names() -> None:
         ("²", "'²' is not allowed"),
         ("μ + 1", "'μ' is not allowed"),
         ("\ud800", "is not allowed"),
-        ("1\x00", "no valid expression"),
+        ("1\x00", "'\\x00' is not allowed"),
         ("abs(" * 60 + "1" + ")" * 60, f"more than {MAXIMUM_DEPTH}"),
         ("-" * 60 + "1", f"more than {MAXIMUM_DEPTH}"),
         ("-" * 1999 + "1", f"more than {MAXIMUM_DEPTH}"),

@@ -139,7 +139,7 @@ class _Reader:
         self.text, self.names = text, set[str]()
         self.rates, self.rates_allowed = dict[str, Expression](), rates
         # Python would take what follows a # for a comment, and a number that begins with 0 for a mistake.
-        if foreign := re.search(r"[^\x00-\x7f]|#", text):
+        if foreign := re.search(r"[^\x01-\x7f]|#", text):
             raise self.error(f"{foreign[0]!r} is not allowed")
         plain = _LEADING_ZEROS.sub("", " ".join(text.split()))
         self.prefixed = _NAME_IN_TEXT.sub(rf"{_NAME_PREFIX}\g<0>", plain)
