@@ -6,10 +6,8 @@ realisation and certificate of these gains made as for any others.  `verify` kno
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -31,13 +29,12 @@ from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_co
 from obsynth.methods.pd_observer.given_gains import synthesis_from_gains as pd_from_gains
 from obsynth.methods.pd_observer.limits import default_delta
 from obsynth.methods.pd_observer.method import PdObserver
-from obsynth.methods.placement.region import Region
 from obsynth.methods.refusals import require_all_told
 from obsynth.methods.ui_pi_observer.assembly import synthesis_from_gains as ui_pi_from_gains
 from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.regions import LMIRegion, checked_region, disk
+from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane, sector
 from obsynth.observers.linear.derived import averaged
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -181,9 +178,17 @@ def _region_of_poles(asked: UiPiObserver, dt: float) -> LMIRegion | None:
     given = dict(asked.region) if isinstance(asked.region, Mapping) else {}
     if asked.region is not None and not given:
         return checked_region(asked.region)
-    found = asked.checked_region(dt) or (Region(asked.decay) if asked.decay else None)
-    parts = [] if found is None else found.parts(dt)
-    return reduce(operator.and_, parts) if parts else None
+    checked = asked.checked_region(dt)
+    decay = asked.decay if checked is None else checked.decay
+    parts = [] if not decay else [disk(0.0, float(np.exp(-decay * dt))) if dt > 0.0 else half_plane(decay)]
+    if checked is not None and checked.radius is not None:
+        parts.append(disk(0.0, checked.radius))
+    if checked is not None and checked.damping is not None:
+        parts.append(sector(checked.damping))
+    whole = None
+    for part in parts:
+        whole = part if whole is None else whole & part
+    return whole
 
 
 def _require_origin(where: LMIRegion) -> None:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
-from obsynth.conditions.atoms import region as region_of
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.conic import lmi
 from obsynth.methods.placement.kalman import KalmanProblem
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value
-from obsynth.numerics.regions import LMIRegion, disk, half_plane, sector
-from obsynth.numerics.spectra import eigenvalues
+from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
+from obsynth.numerics.spectra import eigenvalues, speeds
 
 #: The inequalities are asked for a region smaller by this share, so that a solution on its boundary still counts.
 INNER_SHARE = 1e-3
@@ -23,8 +23,6 @@ INNER_SHARE = 1e-3
 STATE_WEIGHT = 1e-3
 #: The matrix of the Lyapunov function stays above this multiple of the identity, in scaled states.
 LEAST_LYAPUNOV = 1e-6
-#: A sector of damping one is empty: that of so much is as good as the negative real axis.
-LARGEST_DAMPING = 1.0 - 1e-12
 #: Above this many states the inequality moves only those poles that a Kalman gain leaves outside the region.
 MOST_MOVED_STATES = 20
 
@@ -65,21 +63,26 @@ class Region:
         """Return the region with rates per ``unit`` (seconds) instead of per second."""
         return replace(self, decay=unit * self.decay, radius=None if self.radius is None else unit * self.radius)
 
-    def parts(self, dt: float, *, room: float = 0.0) -> list[LMIRegion]:
-        """Return the regions whose intersection it is, each smaller by a share ``room``."""
-        if dt > 0.0:
-            return [disk(0.0, float(np.exp(-self.decay * dt)) * (1.0 - room * min(1.0, self.decay * dt)))]
-        found = [half_plane((1.0 + room) * self.decay)] if self.decay else []
-        if self.radius is not None:
-            found.append(disk(0.0, (1.0 - room) * self.radius))
-        if self.damping is not None:
-            found.append(sector(min((1.0 + room) * self.damping, LARGEST_DAMPING)))
-        return found
+    def shrunk(self) -> Region:
+        """Return the region inside of which poles count as well within it."""
+        return replace(
+            self,
+            decay=(1.0 + 0.5 * INNER_SHARE) * self.decay,
+            radius=None if self.radius is None else (1.0 - 0.5 * INNER_SHARE) * self.radius,
+            damping=None if self.damping is None else min((1.0 + 0.5 * INNER_SHARE) * self.damping, 1.0),
+        )
 
-    def holds(self, values: Any, dt: float, *, room: float = 0.0) -> bool:
-        """Whether all ``values`` lie in the region, smaller by a share ``room``, and are stable."""
-        stable = [] if self.decay or dt > 0.0 else [half_plane(0.0)]
-        return all(part.contains(values) for part in (*stable, *self.parts(dt, room=room)))
+    def holds(self, values: Any, dt: float) -> bool:
+        """Whether all ``values`` lie in the region."""
+        poles = np.asarray(values, dtype=np.complex128)
+        if dt > 0.0:
+            return bool(np.all(np.abs(poles) < np.exp(-self.decay * dt)))
+        inside = np.all(poles.real < -self.decay) if self.decay else np.all(poles.real < 0.0)
+        if self.radius is not None:
+            inside = inside and np.all(speeds(poles, dt) <= self.radius)
+        if self.damping is not None:
+            inside = inside and np.all(-poles.real >= self.damping * np.abs(poles))
+        return bool(inside)
 
 
 def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
@@ -122,10 +125,9 @@ def _partly(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[Flo
     gain = problem.gain((1.0 + INNER_SHARE) * region.decay)
     if gain is None:
         raise SolverError("The Riccati equation has no usable solution: give poles=, or a slower region.")
+    inner = region.shrunk()
     triangular, turn, good = schur(
-        problem.F - gain @ problem.C,
-        output="real",
-        sort=lambda re, im: region.holds([complex(re, im)], problem.dt, room=0.5 * INNER_SHARE),
+        problem.F - gain @ problem.C, output="real", sort=lambda re, im: inner.holds([complex(re, im)], problem.dt)
     )
     if good == len(triangular):
         return gain, {}
@@ -146,8 +148,7 @@ def _partly(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[Flo
 
 def _by_inequality(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
     n, dt = problem.F.shape[0], problem.dt
-    # In states in which the errors of a Kalman filter of the same rate are alike.
-    _, change = problem.solved(region.decay, np.eye(n))
+    change = _scaling(problem, region)
     inverse = np.linalg.inv(change)
     f, c = inverse @ problem.F @ change, problem.C @ change
     estimates = problem.estimates @ change
@@ -165,9 +166,53 @@ def _by_inequality(problem: KalmanProblem, region: Region, *, solver: str) -> tu
         lmi.at_least(lmi.symmetric_blocks([[z], [noise, p]])),
     ]
     if dt > 0.0:
-        constraints.append(lmi.at_least(lmi.symmetric_blocks([[p - weight], [moved, p]])))
+        radius = float(np.exp(-region.decay * dt)) * (1.0 - INNER_SHARE * min(1.0, region.decay * dt))
+        constraints += [
+            lmi.at_least(lmi.symmetric_blocks([[p - weight], [moved, p]])),
+            lmi.at_least(lmi.symmetric_blocks([[radius * p], [moved, radius * p]])),
+        ]
     else:
         constraints.append(lmi.at_most(moved + moved.T + weight, 0.0))
-    constraints += [region_of(f, p, part, Y=y, Cy=c, margin=0.0)[1] for part in region.parts(dt, room=INNER_SHARE)]
+        constraints += _continuous_region(region, p, moved)
     record = lmi.minimise(lmi.trace(z), constraints, what="poles in a region", solver=solver)
     return np.asarray(change @ np.linalg.solve(lmi.value_of(p), lmi.value_of(y))), record
+
+
+def _continuous_region(region: Region, p: Any, moved: Any) -> list[Any]:
+    found = []
+    if region.decay:
+        found.append(lmi.at_most(moved + moved.T + 2.0 * region.decay * (1.0 + INNER_SHARE) * p, 0.0))
+    if region.radius is not None:
+        radius = region.radius * (1.0 - INNER_SHARE)
+        found.append(lmi.at_least(lmi.symmetric_blocks([[radius * p], [moved, radius * p]])))
+    if region.damping is not None:
+        cosine = min(region.damping * (1.0 + INNER_SHARE), 1.0)
+        sine = float(np.sqrt(1.0 - cosine**2))
+        both, turned = sine * (moved + moved.T), cosine * (moved.T - moved)
+        found.append(lmi.at_most(lmi.symmetric_blocks([[both], [turned, both]]), 0.0))
+    return found
+
+
+def _scaling(problem: KalmanProblem, region: Region) -> FloatArray:
+    """Return a state change in which the error covariance of a filter of the same rate is the identity."""
+
+    gain = problem.gain(region.decay)
+    if gain is None:
+        return np.eye(problem.F.shape[0])
+    closed, entering = problem.F - gain @ problem.C, problem.B - gain @ problem.D
+    noise = entering @ entering.T + problem.drive @ problem.drive.T
+    noise = noise + gain @ problem.background @ problem.background.T @ gain.T
+    with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
+        # A poor scaling is judged by what the solver makes of it.
+        if problem.dt > 0.0:
+            radius = np.exp(-region.decay * problem.dt)
+            covariance = discrete_lyapunov(closed / radius, noise)
+        else:
+            covariance = continuous_lyapunov(closed + region.decay * np.eye(len(closed)), -noise)
+    if not np.all(np.isfinite(covariance)):
+        return np.eye(len(closed))
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    if values[-1] <= 0.0:
+        return np.eye(len(closed))
+    floor = float(np.finfo(np.float64).eps) * values[-1]
+    return np.asarray(vectors * np.sqrt(np.maximum(values, floor)))
