@@ -231,40 +231,7 @@ def _on_grid(
     if stale.any() and not _longest(stale) > MOST_STALE:
         notes.append(f"{int(stale.sum())} row(s) are left out, as their stamps do not rise.")
         time, u, y = time[~stale], u[~stale], y[~stale]
-    if not np.isfinite(time).all():
-        bad = int(np.argmin(np.isfinite(time)))
-        raise bad_log("time", f"Row {rows[0] + bad}, counted from 0, has no time stamp.", path="log.time")
-    if (np.diff(time) <= 0).any():
-        bad = int(np.argmax(np.diff(time, prepend=-np.inf) <= 0))
-        raise bad_log("time", f"Stamps must rise, but that of row {rows[0] + bad} is {time[bad]:g} s.", path="log.time")
-    gaps = np.diff(time)
-    step = float(np.median(gaps)) if dt is None and gaps.size else float(dt or 1.0)
-    counts = np.round(gaps / step).astype(np.int64)
-    jitter = np.abs(gaps / step - counts)
-    if dt is None and jitter.max(initial=0.0) > NOTED_JITTER and (counts >= 1).all():
-        step = _mean_step(time, counts)
-        jitter = np.abs(gaps / step - counts)
-    irregular = jitter.max(initial=0.0) > LARGEST_JITTER
-    if irregular and (counts >= 1).all():
-        # Two stamps that are off the grid may be off each other by twice as much: against the grid itself.
-        away = time - time[0] - step * np.concatenate([[0], np.cumsum(counts)])
-        jitter = np.abs(away - np.median(away))[1:] / step
-        irregular = jitter.max() > LARGEST_STAMP_OFFSET
-    if irregular or (counts < 1).any():
-        worst = int(np.argmax(jitter))
-        raise bad_log(
-            "irregular",
-            f"The stamps are irregular: row {rows[0] + worst + 1} is {jitter[worst]:.0%} "
-            f"of a step off the grid of {step:g} s. Resample the log.",
-            path="log.time",
-        )
-    if counts.size > 1 and counts.min() > 1:
-        raise bad_log(
-            "irregular",
-            f"No two rows are less than {counts.min() * step:.10g} s apart, but a step takes {step:.10g} s: the "
-            "sampling time does not fit.",
-            path="log.time",
-        )
+    step, counts, jitter = _grid(time, dt, rows[0])
     if jitter.max(initial=0.0) > NOTED_JITTER:
         notes.append(f"The stamps jitter by {jitter.max():.1%} of a step.")
     missing = ~np.isfinite(u)
@@ -295,6 +262,46 @@ def _on_grid(
         y, time = wide, time[0] + step * whole
     return Log(read_only(time), read_only(u), read_only(y), step, inputs, outputs, rows, source, tuple(notes),
                held=missing)  # fmt: skip
+
+
+def _grid(time: FloatArray, dt: float | None, first: int) -> tuple[float, NDArray[np.int64], FloatArray]:
+    """Return the step of the grid of stamps ``(n,)`` which begin in row ``first``, the steps between them, and how far
+    each is off, in steps; refuse stamps that are on none."""
+    if not np.isfinite(time).all():
+        bad = int(np.argmin(np.isfinite(time)))
+        raise bad_log("time", f"Row {first + bad}, counted from 0, has no time stamp.", path="log.time")
+    if (np.diff(time) <= 0).any():
+        bad = int(np.argmax(np.diff(time, prepend=-np.inf) <= 0))
+        raise bad_log("time", f"Stamps must rise, but that of row {first + bad} is {time[bad]:g} s.", path="log.time")
+    gaps = np.diff(time)
+    step = float(np.median(gaps)) if dt is None and gaps.size else float(dt or 1.0)
+    counts = np.round(gaps / step).astype(np.int64)
+    jitter = np.abs(gaps / step - counts)
+    if dt is None and jitter.max(initial=0.0) > NOTED_JITTER and (counts >= 1).all():
+        step = _mean_step(time, counts)
+        jitter = np.abs(gaps / step - counts)
+    irregular = jitter.max(initial=0.0) > LARGEST_JITTER
+    if irregular and (counts >= 1).all():
+        # Two stamps that are off the grid may be off each other by twice as much: against the grid itself.
+        away = time - time[0] - step * np.concatenate([[0], np.cumsum(counts)])
+        jitter = np.abs(away - np.median(away))[1:] / step
+        irregular = jitter.max() > LARGEST_STAMP_OFFSET
+    if irregular or (counts < 1).any():
+        worst = int(np.argmax(jitter))
+        raise bad_log(
+            "irregular",
+            f"The stamps are irregular: row {first + worst + 1} is {jitter[worst]:.0%} "
+            f"of a step off the grid of {step:g} s. Resample the log.",
+            path="log.time",
+        )
+    if counts.size > 1 and counts.min() > 1:
+        raise bad_log(
+            "irregular",
+            f"No two rows are less than {counts.min() * step:.10g} s apart, but a step takes {step:.10g} s: the "
+            "sampling time does not fit.",
+            path="log.time",
+        )
+    return step, counts, jitter
 
 
 def _mean_step(time: FloatArray, counts: NDArray[np.int64]) -> float:

@@ -196,9 +196,9 @@ class OperatingPointCheck:
         if not any(event.start < self._begin + lasting for event in alarms):
             return ()
         name = plant.output_names[worst]
-        known = name in self._signals.point
-        where = "its operating point" if known else "zero (no operating point is stated)"
-        advice = "Give" if known else "State the operating point at which the log begins, or give"
+        is_stated = name in self._signals.point
+        where = "its operating point" if is_stated else "zero (no operating point is stated)"
+        advice = "Give" if is_stated else "State the operating point at which the log begins, or give"
         return (
             f"An alarm in the first {lasting:.3g} s may be the initial-condition response: {name} begins "
             f"{shares[worst]:.3g} deviations of its noise from {where}, and when the warm-up ends "

@@ -425,7 +425,12 @@ _WITH_UNIT = re.compile(r"(.*\S)\s*[\[(]([^\[\]()]*)[\])]")
 _DATE_NAMES = ("date", "datum", "day", "tag", "fecha")
 _STATUS_NAMES = ("status", "quality")
 #: How a status begins that says that a value is bad.
-BAD_STATUS = ("bad", "invalid", "not good")
+_BAD_STATUS = ("bad", "invalid", "not good")
+
+
+def is_bad(status: str) -> bool:
+    """Whether the text of a status says that the value beside it is bad."""
+    return status.strip().lower().startswith(_BAD_STATUS)
 
 
 def column_of(header: Sequence[str], name: str) -> str | None:

@@ -25,13 +25,13 @@ from typing import TYPE_CHECKING, Any, TextIO, TypeAlias
 import numpy as np
 
 from obsynth.data.signals import (
-    BAD_STATUS,
     MISSING_TEXTS,
     TIME_HEADER,
     Signals,
     Stamps,
     column_of,
     date_place,
+    is_bad,
     status_places,
     with_date,
 )
@@ -187,7 +187,7 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
         time = stamps.read(stamp, row, header[places[0]], comma=dialect.comma)
         values = [dialect.number(cells[place], row, header[place], stamps) for place in places[1:]]
         for i, place in enumerate(states):
-            if place is not None and cells[place].strip().lower().startswith(BAD_STATUS):
+            if place is not None and is_bad(cells[place]):
                 stamps.take_bad(header[places[i]], row, cells[place].strip(), header[place])
                 values[i - 1] = float("nan")
         yield np.array([[time, *values]])
@@ -757,7 +757,7 @@ def _converted(frames: Iterator[pd.DataFrame], signals: Signals, stamps: Stamps)
 def _without_bad(values: FloatArray, name: str, states: pd.Series, done: int, stamps: Stamps) -> FloatArray:
     """Return samples ``(n,)`` without those of which their status says that they are bad."""
     said = [str(cell).strip() for cell in states]
-    bad = np.array([text.lower().startswith(BAD_STATUS) for text in said], dtype=bool)
+    bad = np.array([is_bad(text) for text in said], dtype=bool)
     if bad.any():
         first = int(np.argmax(bad))
         stamps.take_bad(name, done + first + 1, said[first], str(states.name), count=int(bad.sum()))
