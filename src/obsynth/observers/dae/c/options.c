@@ -50,6 +50,49 @@ static int watched(const struct observer *state, const double *u, const double *
     return 0;
 }
 
+#if OUTLIERS || BOUNDS
+/* Factor L of a symmetric matrix M = L L' of n rows; 0 where one depends on those before, but for such a share. */
+static int factored(const double *M, int n, double dependent, double *L)
+{
+    int i, j, k;
+    for (i = 0; i < n; i++) {
+        for (j = 0; j <= i; j++) {
+            double sum = M[i * n + j];
+            for (k = 0; k < j; k++) {
+                sum -= L[i * n + k] * L[j * n + k];
+            }
+            if (i == j) {
+                if (!(sum > dependent * M[i * n + i])) {
+                    return 0;
+                }
+                L[i * n + i] = sqrt(sum);
+            } else {
+                L[i * n + j] = sum / L[j * n + j];
+            }
+        }
+    }
+    return 1;
+}
+
+/* Put the solution of L L' s = x in the place of x. */
+static void substituted(const double *L, int n, double *x)
+{
+    int i, k;
+    for (i = 0; i < n; i++) {
+        for (k = 0; k < i; k++) {
+            x[i] -= L[i * n + k] * x[k];
+        }
+        x[i] /= L[i * n + i];
+    }
+    for (i = n - 1; i >= 0; i--) {
+        for (k = i + 1; k < n; k++) {
+            x[i] -= L[k * n + i] * x[k];
+        }
+        x[i] /= L[i * n + i];
+    }
+}
+#endif
+
 #if OUTLIERS
 /* Mean and covariance of outputs, from what is remembered alone. */
 static int forecasted(const struct observer *state, const double *u, const double *variances, double *mean,
@@ -78,12 +121,13 @@ static int forecasted(const struct observer *state, const double *u, const doubl
    prediction, NaN where it is missing. */
 static void beside_others(const double *off, const double *covariance, double *apart, double *deviation)
 {
+    double M[NY * NY] = {0};
     double L[NY * NY];
     double column[NY];
     double sizes[NY];
     int at[NY];
     int n = 0;
-    int i, j, k;
+    int i, j;
     for (i = 0; i < NY; i++) {
         apart[i] = deviation[i] = NAN;
         sizes[i] = sqrt(covariance[i * (NY + 1)]);
@@ -92,28 +136,20 @@ static void beside_others(const double *off, const double *covariance, double *a
         }
     }
     for (i = 0; i < n; i++) {
-        for (j = 0; j <= i; j++) {
-            double sum = covariance[at[i] * NY + at[j]] / (sizes[at[i]] * sizes[at[j]]);
-            for (k = 0; k < j; k++) {
-                sum -= L[i * NY + k] * L[j * NY + k];
-            }
-            L[i * NY + j] = i == j ? sqrt(sum) : sum / L[j * NY + j];
+        for (j = 0; j < n; j++) {
+            M[i * n + j] = covariance[at[i] * NY + at[j]] / (sizes[at[i]] * sizes[at[j]]);
         }
+    }
+    if (!factored(M, n, 0.0, L)) {
+        return;
     }
     for (i = 0; i < n; i++) {
         double total = 0.0;
         for (j = 0; j < n; j++) {
-            double sum = i == j ? 1.0 : 0.0;
-            for (k = 0; k < j; k++) {
-                sum -= L[j * NY + k] * column[k];
-            }
-            column[j] = sum / L[j * NY + j];
+            column[j] = i == j ? 1.0 : 0.0;
         }
+        substituted(L, n, column);
         for (j = n - 1; j >= 0; j--) {
-            for (k = j + 1; k < n; k++) {
-                column[j] -= L[k * NY + j] * column[k];
-            }
-            column[j] /= L[j * NY + j];
             total += column[j] * off[at[j]] / sizes[at[j]];
         }
         apart[at[i]] = sizes[at[i]] * total / column[i];
@@ -262,44 +298,29 @@ static int robust(const struct observer *state, const double *u, const double *v
 /* Solve M s = right on chosen rows by Cholesky; 0 where they are dependent. */
 static int chosen_solution(const double *M, const double *right, const int *chosen, double *s)
 {
-    double L[BOUNDS][BOUNDS];
+    double part[BOUNDS * BOUNDS] = {0};
+    double L[BOUNDS * BOUNDS];
+    double x[BOUNDS];
     int at[BOUNDS];
     int n = 0;
-    int i, j, k;
+    int i, j;
     for (i = 0; i < BOUNDS; i++) {
         if (chosen[i]) {
             at[n++] = i;
         }
     }
     for (i = 0; i < n; i++) {
-        for (j = 0; j <= i; j++) {
-            double sum = M[at[i] * BOUNDS + at[j]];
-            for (k = 0; k < j; k++) {
-                sum -= L[i][k] * L[j][k];
-            }
-            if (i == j) {
-                if (!(sum > DEPENDENT * M[at[i] * BOUNDS + at[i]])) {
-                    return 0;
-                }
-                L[i][i] = sqrt(sum);
-            } else {
-                L[i][j] = sum / L[j][j];
-            }
+        x[i] = right[at[i]];
+        for (j = 0; j < n; j++) {
+            part[i * n + j] = M[at[i] * BOUNDS + at[j]];
         }
     }
+    if (!factored(part, n, DEPENDENT, L)) {
+        return 0;
+    }
+    substituted(L, n, x);
     for (i = 0; i < n; i++) {
-        double sum = right[at[i]];
-        for (k = 0; k < i; k++) {
-            sum -= L[i][k] * s[at[k]];
-        }
-        s[at[i]] = sum / L[i][i];
-    }
-    for (i = n - 1; i >= 0; i--) {
-        double sum = s[at[i]];
-        for (k = i + 1; k < n; k++) {
-            sum -= L[k][i] * s[at[k]];
-        }
-        s[at[i]] = sum / L[i][i];
+        s[at[i]] = x[i];
     }
     return 1;
 }
