@@ -39,7 +39,7 @@ from obsynth.calibration.diagnostics import (
 )
 from obsynth.calibration.innovations_fit import InnovationsFit, Objective, chosen_timing, innovations_fit
 from obsynth.calibration.likelihood import IMPOSSIBLE, Likelihood
-from obsynth.calibration.logs import TOLD_ROWS, Log, LogData, read_log
+from obsynth.calibration.logs import Log, LogData, read_log, told_rows
 from obsynth.calibration.plants import (
     CalibrationPlant,
     LinearPlant,
@@ -48,7 +48,6 @@ from obsynth.calibration.plants import (
     PlantWithNoise,
     asked_states,
     correlation_name,
-    with_states,
 )
 from obsynth.calibration.problem import Problem, calibration_problem, require_variation
 from obsynth.calibration.reporting import Calibration, IntegrationError, integration_error, reported
@@ -302,21 +301,6 @@ def _end(problem: Problem, fit: InnovationsFit, usual: float, output: int, first
     return None
 
 
-def plant_as_written(given: Any) -> Any:
-    """Return the plant whose matrices hold the constants: that before elimination and sampling, if there were any."""
-    plant = getattr(given, "source", given)
-    uncertainty = getattr(plant, "uncertainty", None)
-    if uncertainty is None or not uncertainty.steps:
-        return plant
-    made = getattr(plant, "_made_from", None)
-    if made is None:
-        raise SpecError(
-            "Elimination or sampling has mixed the constants of this plant: give the plant as it was written.",
-            path="model",
-        )
-    return made[0]
-
-
 #: How often samples that stand out are left out: each time the others are known better.
 OUTLIER_ROUNDS = 3
 #: What is said of an offset without which the model follows nothing.
@@ -472,13 +456,16 @@ def calibrate(
     asked = asked_states(sensor_noise, offset, walks, model.output_names)
 
     def problem_with(states: NoiseStates, log: Log) -> Problem:
-        extended = with_states(plant, states, log)
+        extended = PlantWithNoise(plant, states, log) if states else plant
+        own = noisy
+        if isinstance(extended, PlantWithNoise):
+            own = (*(plant.equation_names if noisy is None else noisy), *extended.noisy)
         return calibration_problem(
             extended,
             log,
             unknown=unknown,
             priors=priors,
-            noisy=_noisy(extended, noisy),
+            noisy=own,
             Q=Q,
             R=R,
             initial_state=_by_name(initial_state, plant.state_names),
@@ -506,21 +493,11 @@ def calibrate(
 
 def _loads_as_parameters(model: Any, walks: Mapping[str, Any] | Sequence[str] | None) -> Any:
     """Return a nonlinear plant whose inputs that walk are parameters: no log holds them."""
-    if not isinstance(model, DAEModel) or walks is None:
-        return model
-    loads = [name for name in walks if name in model.inputs]
+    loads = [name for name in walks or () if isinstance(model, DAEModel) and name in model.inputs]
     if not loads:
         return model
     inputs = {name: value for name, value in model.inputs.items() if name not in loads}
     return model.replace(inputs=inputs, parameters={**model.parameters, **{name: model.inputs[name] for name in loads}})
-
-
-def _noisy(plant: CalibrationPlant, asked: Sequence[str] | None) -> Sequence[str] | None:
-    """Return the noisy equations: those asked for, and those of further states that noise drives."""
-    if not isinstance(plant, PlantWithNoise):
-        return asked
-    own = plant.inner.equation_names if asked is None else tuple(asked)
-    return (*own, *plant.noisy)
 
 
 def _by_name(value: Any, names: Sequence[str]) -> Any:
@@ -568,7 +545,12 @@ class _Fitting:
             problem, fits = seen, simulation_fits(seen, 1, self.seed, self.note, start=fits[0].t)
         error = None
         if self.choose_steps and isinstance(self.plant, NonlinearPlant):
-            error = _step_error(problem, self.plant, fits[0])
+            names, start = problem.names, fits[0]
+            states = SimulationError(problem).states(start)[:, : len(self.plant.state_names)]
+            theta = np.array(self.plant.theta(names, start.t), dtype=np.float64)
+            error = integration_error(
+                self.plant.promoted(names), states, problem.u, theta, start.deviations, problem.log.dt
+            )
             if error is not None and error.matters:
                 self.note("integrating by Radau")
                 problem = problem.integrated("radau", problem.substeps)
@@ -637,8 +619,8 @@ class _Fitting:
             self.note("without samples that stand out")
             names, log = problem.output_names, problem.log
             told = [
-                f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations ({_rows(log, wrong[:, i])}): they "
-                "count as not measured."
+                f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations (row "
+                f"{told_rows(log.rows[0] + np.flatnonzero(wrong[:, i]))}): they count as not measured."
                 for i, name in enumerate(names)
                 if wrong[:, i].any()
             ]
@@ -651,28 +633,10 @@ class _Fitting:
                     for i, before in enumerate(log.outliers or [np.zeros(0)] * len(names))
                 ),
             )
-            found = self.refitted(replace(found, problem=problem.with_log(kept)))
+            fits = simulation_fits(problem.with_log(kept), 1, self.seed, self.note, start=found.fit.t)
+            again = _innovations(problem.with_log(kept), fits, self.level, self.note, found.error)
+            found = _Found(again[0], fits, *again[1:], found.losses)
         return found
-
-    def refitted(self, found: _Found) -> _Found:
-        """Return the innovations fitted again, from the constants that were found."""
-        problem = found.problem
-        fits = simulation_fits(problem, 1, self.seed, self.note, start=None if found.fit is None else found.fit.t)
-        problem, fit, error = _innovations(problem, fits, self.level, self.note, found.error)
-        return _Found(problem, fits, fit, error, found.losses)
-
-
-def _rows(log: Log, wrong: BoolArray) -> str:
-    rows = log.rows[0] + np.flatnonzero(wrong)
-    return f"row {', '.join(map(str, rows[:TOLD_ROWS]))}{', ...' if len(rows) > TOLD_ROWS else ''}"
-
-
-def _step_error(problem: Problem, plant: NonlinearPlant, fit: Fit) -> IntegrationError | None:
-    """Return what backward Euler errs along the best simulation."""
-    names, own = problem.names, len(plant.state_names)
-    states = SimulationError(problem).states(fit)[:, :own]
-    theta = np.array(plant.theta(names, fit.t), dtype=np.float64)
-    return integration_error(plant.promoted(names), states, problem.u, theta, fit.deviations, problem.log.dt)
 
 
 def _innovations(
@@ -691,8 +655,17 @@ def _innovations(
 
 
 def require_plant(given: Any) -> DAEModel | DescriptorSystem | TimeVaryingDescriptorSystem:
-    """Return a plant as written; of a transformation its source."""
-    plant = plant_as_written(given)
+    """Return the plant whose matrices hold the constants: that before elimination and sampling, if there were any."""
+    plant = getattr(given, "source", given)
+    uncertainty = getattr(plant, "uncertainty", None)
+    if uncertainty is not None and uncertainty.steps:
+        made = getattr(plant, "_made_from", None)
+        if made is None:
+            raise SpecError(
+                "Elimination or sampling has mixed the constants of this plant: give the plant as it was written.",
+                path="model",
+            )
+        plant = made[0]
     if not isinstance(plant, (DAEModel, DescriptorSystem, TimeVaryingDescriptorSystem)):
         raise SpecError(
             f"model is {type(given).__name__}: give a DAEModel, a DescriptorSystem or a TimeVaryingDescriptorSystem.",

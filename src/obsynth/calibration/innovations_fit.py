@@ -221,16 +221,8 @@ def greatest_likelihood(objective: Objective, fits: Sequence[Fit], note: Callabl
         if not objective.widened(best):
             break
         value, best = objective.descent(best)
-    value, best = _at_other_correlations(objective, value, best, note)
-    value, best, curvature = polished(objective, best)
-    return Maximum(best, value, curvature, best)
-
-
-def _at_other_correlations(
-    objective: Objective, value: float, best: FloatArray, note: Callable[[str], object]
-) -> tuple[float, FloatArray]:
-    """Return the best of searches that begin where another one ended, but for one correlation of coloured noise: what
-    drives such noise moves a sensor from row to row by the same whatever the correlation."""
+    # What drives coloured noise moves a sensor from row to row by the same whatever its correlation: the search begins
+    # again from others, where this one ended.
     problem = objective.problem
     for i in range(len(problem.names), objective.nt):
         for samples in CORRELATIONS:
@@ -240,7 +232,8 @@ def _at_other_correlations(
             reached, z = objective.descent(start)
             if reached < value:
                 value, best = reached, z
-    return value, best
+    value, best, curvature = polished(objective, best)
+    return Maximum(best, value, curvature, best)
 
 
 def polished(
@@ -474,9 +467,8 @@ class Side:
 def profile_box(objective: Objective, maximum: Maximum, root: float, said: Information) -> list[tuple[Side, Side]]:
     """Return both ends of each constant's box, in its own units."""
     found, problem = [], objective.problem
-    names = problem.names
-    for i, width in enumerate(problem.widths[: len(names)]):
-        weak = objective.bent or any(names[i] in direction for direction in said.undetermined)
+    for i, (name, width) in enumerate(zip(problem.names, problem.widths, strict=False)):
+        weak = objective.bent or any(name in direction for direction in said.undetermined)
         side = _side_along_valley if weak else _side
         sides = [side(objective, maximum, i, sign, root) for sign in (-1.0, 1.0)]
         # An open side is the bound that was given, not what a division and a product leave of it.
@@ -739,6 +731,7 @@ def innovations_fit(
     coloured = [len(Q) + j in _beside(problem) for j in range(len(R))]
     R = np.where(coloured, np.maximum(R, DEFAULT_WHITE_SHARE**2 * np.nanmean(e**2, axis=0)), R)
     bounds = at_bounds(maximum.z, objective.low, objective.high)[: objective.nt]
+    has_offsets = isinstance(problem.plant, PlantWithNoise) and bool(problem.plant.states.offsets)
     return InnovationsFit(
         objective.constants(maximum.z),
         objective.plain(maximum.z),
@@ -752,7 +745,7 @@ def innovations_fit(
         whitened,
         e,
         spread,
-        _at_end(objective, maximum, found) if _has_offsets(problem) else None,
+        _at_end(objective, maximum, found) if has_offsets else None,
     ), moved
 
 
@@ -768,10 +761,6 @@ def _at_end(objective: Objective, maximum: Maximum, said: Information) -> tuple[
         # Where the plant has no solution a constant is not so far off.
         moved[:, i] = found / deviation if np.isfinite(found).all() else 0.0
     return x, np.sqrt(np.diag(P) + np.einsum("ij,jk,ik->i", moved, said.covariance, moved))
-
-
-def _has_offsets(problem: Problem) -> bool:
-    return isinstance(problem.plant, PlantWithNoise) and bool(problem.plant.states.offsets)
 
 
 def _beside(problem: Problem) -> list[int]:

@@ -116,13 +116,17 @@ class Log:
         notes = list(self.notes)
         for i, name in enumerate(self.output_names):
             rows = np.flatnonzero(wrong[:, i])
-            told = ", ".join(f"row {self.rows[0] + row}: {self.y[row, i]:.4g}" for row in rows[:TOLD_ROWS])
             if len(rows):
+                told = told_rows([f"row {self.rows[0] + row}: {self.y[row, i]:.4g}" for row in rows])
                 notes.append(
-                    f"{len(rows)} value(s) of {name} are far from all others and count as not measured "
-                    f"({told}{', ...' if len(rows) > TOLD_ROWS else ''})."
+                    f"{len(rows)} value(s) of {name} are far from all others and count as not measured ({told})."
                 )
         return replace(self, y=read_only(np.where(wrong, np.nan, self.y)), notes=tuple(notes))
+
+
+def told_rows(rows: Sequence[Any] | NDArray[np.int64]) -> str:
+    """Return the first few rows as a sentence names them."""
+    return ", ".join(map(str, rows[:TOLD_ROWS])) + (", ..." if len(rows) > TOLD_ROWS else "")
 
 
 def read_log(

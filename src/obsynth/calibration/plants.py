@@ -148,9 +148,8 @@ EXACT_STEP = "exact"
 LEAST_EFFECT = 1e-6
 #: What the matrices of varying and of invariant plants are called here; G and L are of constant effects.
 MATRIX_LETTERS = {"E": "E", "A": "A", "B": "B", "C": "C", "Phi": "G", "Psi": "L"}
-INVARIANT = {"E": "E", "A": "A", "B": "B", "C": "C", "D": "D"}
-#: Constant effects of an invariant plant: its faults, then its unknown inputs.
-EFFECTS = {"G": ("Bf", "Bd"), "L": ("Df", "Dd")}
+#: Constant effects of an invariant plant are its faults, then its unknown inputs.
+INVARIANT = {**{name: (name,) for name in "EABCD"}, "G": ("Bf", "Bd"), "L": ("Df", "Dd")}
 
 Known = Mapping[str, Any]
 
@@ -205,15 +204,13 @@ class LinearPlant(CalibrationPlant):
         else:
             entries = {} if uncertainty is None else uncertainty.entries
             self.matrices = {
-                key: _with_entries(getattr(plant, name), entries.get(name, ()), uncertainty)
-                for name, key in INVARIANT.items()
+                key: _with_entries([(getattr(plant, name), entries.get(name, ())) for name in beside], uncertainty)
+                for key, beside in INVARIANT.items()
             }
-            for key, both in EFFECTS.items():
-                self.matrices[key] = _beside(
-                    *(_with_entries(getattr(plant, name), entries.get(name, ()), uncertainty) for name in both)
-                )
             values = {name: item.nominal for name, item in constants.items()}
-            effects = (*plant.fault_names, *(_own_name(name, plant.fault_names) for name in plant.disturbance_names))
+            # A fault may have the name of an unknown input.
+            own = (f"unknown input {name}" if name in plant.fault_names else name for name in plant.disturbance_names)
+            effects = (*plant.fault_names, *own)
             self.continuous = not plant.is_discrete
         self.state_names = self.equation_names = plant.state_names
         self.nx, self.nu, self.ny = len(plant.state_names), plant.nu, plant.ny
@@ -313,14 +310,13 @@ class LinearPlant(CalibrationPlant):
         return matrix
 
     def _constant_effects(self, t: Any, unknown: Sequence[str]) -> Any:
-        entries = [t[list(unknown).index(name)] if name in unknown else ca.SX(0.0) for name in self.effects]
-        return ca.vertcat(*entries) if entries else ca.SX(0, 1)
+        return _column([t[list(unknown).index(name)] if name in unknown else 0.0 for name in self.effects])
 
     def step(self, unknown: Sequence[str], integration: str) -> tuple[int, Any]:
         """Return stages, and the function from stages, state before, signals, constants and dt to equations."""
         stages = len(BUTCHER[integration]) if self.continuous else 1
         X, x, dt = ca.SX.sym("X", self.nx * stages), ca.SX.sym("x", self.nx), ca.SX.sym("dt")
-        s, t = ca.SX.sym("s", self._width()), ca.SX.sym("t", len(unknown))
+        s, t = ca.SX.sym("s", len(self.nominal_signals)), ca.SX.sym("t", len(unknown))
         at, f = self._at(s, t, unknown), self._constant_effects(t, unknown)
         before, now = s[: self.nu], s[self.nu : 2 * self.nu]
         driven = self._product(at("B", False), before) + self._product(at("G", False), f)
@@ -350,12 +346,9 @@ class LinearPlant(CalibrationPlant):
         """Return a product that is zero where there are no signals."""
         return matrix @ column if column.numel() else ca.SX.zeros(matrix.shape[0])
 
-    def _width(self) -> int:
-        return 2 * self.nu + 1 + sum(self.matrices[name].width for name, _ in self._recorded())
-
     def outputs(self, unknown: Sequence[str]) -> Any:
         """Return the function from state, signals and constants to y, H and L."""
-        x, s, t = ca.SX.sym("x", self.nx), ca.SX.sym("s", self._width()), ca.SX.sym("t", len(unknown))
+        x, s, t = ca.SX.sym("x", self.nx), ca.SX.sym("s", len(self.nominal_signals)), ca.SX.sym("t", len(unknown))
         at, f = self._at(s, t, unknown), self._constant_effects(t, unknown)
         y = at("C", True) @ x + self._product(at("L", False), f) + ca.DM(self.output_point)
         if "D" in self.matrices:
@@ -394,25 +387,19 @@ class LinearPlant(CalibrationPlant):
         return np.asarray(1.0 / effects)
 
 
-def _with_entries(matrix: FloatArray, entries: Sequence[tuple[int, int, str]], uncertainty: Any) -> _Matrix:
+def _with_entries(beside: Sequence[tuple[FloatArray, Sequence[tuple[int, int, str]]]], uncertainty: Any) -> _Matrix:
+    """Return matrices side by side, of which some entries are expressions."""
+
     def symbolic(known: Known, _: Any) -> Any:
-        found = ca.SX(ca.DM(np.asarray(matrix, dtype=np.float64)))
-        for row, column, text in entries:
-            found[row, column] = known[text] if text in known else symbolic_value(uncertainty.parsed(text), known)
-        return found
+        parts = []
+        for matrix, entries in beside:
+            found = ca.SX(ca.DM(np.asarray(matrix, dtype=np.float64)))
+            for row, column, text in entries:
+                found[row, column] = known[text] if text in known else symbolic_value(uncertainty.parsed(text), known)
+            parts.append(found)
+        return ca.horzcat(*parts)
 
-    return _Matrix((matrix.shape[0], matrix.shape[1]), symbolic)
-
-
-def _beside(one: _Matrix, two: _Matrix) -> _Matrix:
-    """Return two matrices with as many rows side by side."""
-    shape = (one.shape[0], one.shape[1] + two.shape[1])
-    return _Matrix(shape, lambda known, _: ca.horzcat(one.symbolic(known, None), two.symbolic(known, None)))
-
-
-def _own_name(name: str, taken: Sequence[str]) -> str:
-    """Return the name of an unknown input, which a fault may have too."""
-    return f"unknown input {name}" if name in taken else name
+    return _Matrix((len(beside[0][0]), sum(matrix.shape[1] for matrix, _ in beside)), symbolic)
 
 
 #: Where the search for a correlation begins, and its bounds: in samples, the last as a share of the log.
@@ -595,11 +582,6 @@ class PlantWithNoise(CalibrationPlant):
         y = ca.densify(y) + ca.mtimes(ca.DM(shown), x[self.own : self.own + shown.shape[1]]) if shown.size else y
         parts = [y, ca.jacobian(y, x), ca.jacobian(y, t)]
         return ca.Function("outputs", [x, s, t], [ca.densify(part) for part in parts])
-
-
-def with_states(inner: CalibrationPlant, states: NoiseStates, log: Log) -> CalibrationPlant:
-    """Return a plant with states for what disturbs it; as it is where nothing does."""
-    return PlantWithNoise(inner, states, log) if states else inner
 
 
 #: Optimisation costs more than it gains on straight code of thousands of lines.

@@ -26,7 +26,7 @@ from obsynth.calibration.diagnostics import (
     whiteness,
 )
 from obsynth.calibration.innovations_fit import InnovationsFit, Side, covariance_of, quantile
-from obsynth.calibration.logs import EVEN, TOLD_ROWS, Log
+from obsynth.calibration.logs import EVEN, Log, told_rows
 from obsynth.calibration.plants import PlantWithNoise, correlation_name
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.simulation_error import Fit, SimulationError, unexplained
@@ -478,9 +478,10 @@ def _of_simulation(problem: Problem, start: Fit, level: float) -> InnovationsFit
     e = problem.y - y
     root = quantile(level, len(problem.names), problem.log.samples, len(problem.output_names))
     spread = root * np.sqrt(np.diag(information.covariance))
-    sides = []
-    for t, half, low, high in zip(start.t[kept], spread, problem.low[kept], problem.high[kept], strict=True):
-        sides.append((Side(max(t - half, low), t - half <= low), Side(min(t + half, high), t + half >= high)))
+    sides = [
+        (Side(max(t - half, low), t - half <= low), Side(min(t + half, high), t + half >= high))
+        for t, half, low, high in zip(start.t[kept], spread, problem.low[kept], problem.high[kept], strict=True)
+    ]
     ends = (start.t - problem.low < END_SHARE * problem.widths) | (problem.high - start.t < END_SHARE * problem.widths)
     variances = np.tile(start.deviations**2, (len(y), 1))
     nothing = np.zeros(len(problem.noisy))
@@ -580,10 +581,9 @@ def _misfits(problem: Problem, start: Fit, whitened: FloatArray, R: dict[str, fl
             )
         rows = problem.log.rows[0] + np.flatnonzero(np.abs(np.nan_to_num(column)) > STANDS_OUT)
         if len(rows):
-            told = ", ".join(map(str, rows[:TOLD_ROWS])) + (", ..." if len(rows) > TOLD_ROWS else "")
             found.append(
-                f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations (row {told}): if they "
-                "are outliers, mark them as missing."
+                f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations (row {told_rows(rows)}): "
+                "if they are outliers, mark them as missing."
             )
     return found
 

@@ -63,7 +63,9 @@ def calibrated_spec(path: Path, found: Calibration, *, calibration: Path | None 
     _set_constants(plant, found, calibration, with_ranges=linear and plant.get("kind") != "time-varying")
     if plant.get("kind") == "time-varying":
         if method["id"] in _RECURSIVE:
-            options |= {"Q": _diagonal(found.Q, plant), "R": np.diag(list(found.R.values())).tolist()}
+            names = plant.get("state_names") or [f"x{i + 1}" for i in range(len(plant["A"]))]
+            variances = [float(found.Q.get(name, 0.0)) for name in names]
+            options |= {"Q": np.diag(variances).tolist(), "R": np.diag(list(found.R.values())).tolist()}
     else:
         _set_noise(plant, found, linear=linear)
         if not linear:
@@ -169,8 +171,3 @@ def _nonlinear_options(found: Calibration) -> dict[str, Any]:
         "initial_covariance": {name: float(value) for name, value in found.initial_covariance.items()} | known,
         **({"outliers": "gate", "outlier_sizes": dict(found.outlier_sizes)} if found.outlier_sizes else {}),
     }
-
-
-def _diagonal(variances: Mapping[str, float], plant: Mapping[str, Any]) -> list[list[float]]:
-    names = plant.get("state_names") or [f"x{i + 1}" for i in range(len(plant["A"]))]
-    return np.diag([float(variances.get(name, 0.0)) for name in names]).tolist()

@@ -130,15 +130,11 @@ def recorded_innovations(design: ObserverDesign, log: Log) -> RecordedInnovation
         # Afterwards every value is known at its own time.
         log = replace(log, y=observer.timing.in_order(log.y))
     if isinstance(observer, DAEObserver):
-        return _nonlinear(changed(observer, sensors=None), log)
+        found = _over(changed(observer, sensors=None), log)
+        return _recorded(found, found.innovations, np.sqrt(np.einsum("kii->ki", found.innovation_covariances)))
     if isinstance(observer, RecursiveObserver):
         return _recursive(changed(observer, sensors=None), log, dict(getattr(design.plant, "operating_point", {})))
     raise TypeError(f"{type(observer).__name__} has no innovations with a covariance")
-
-
-def _nonlinear(observer: DAEObserver, log: Log) -> RecordedInnovations:
-    found = _over(observer, log)
-    return _recorded(found, found.innovations, np.sqrt(np.einsum("kii->ki", found.innovation_covariances)))
 
 
 def _integration_error(observer: object, log: Log, record: RecordedInnovations) -> IntegrationError | None:
