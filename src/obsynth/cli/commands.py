@@ -141,7 +141,7 @@ def run_check(options: argparse.Namespace) -> int:
     if spec.transformation is not None:
         structures = {"as written": obsynth.analyse_structure(spec.transformation.source), **structures}
     done = "" if spec.transformation is None else spec.transformation.description
-    methods = obsynth.check(spec.plant, {} if spec.method == AUTO else {spec.method: spec.options})
+    methods = obsynth.check(spec.plant, {spec.method: spec.options})
     own = methods.values() if spec.method == AUTO else [methods[spec.method]]
     passed = any(report.passed for report in own)
 

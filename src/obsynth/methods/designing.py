@@ -19,7 +19,7 @@ from obsynth.methods.method import Method, Synthesis, silent
 from obsynth.methods.refusals import require_above_rounding, with_advice
 from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_class
 from obsynth.methods.verifying import verify
-from obsynth.numerics.arguments import arguments_checked
+from obsynth.numerics.arguments import arguments_checked, field_types
 from obsynth.numerics.libraries import failed_computations, failure_of, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -162,7 +162,8 @@ def check(
     plant : DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel or Transformation
         The plant.
     options : mapping, optional
-        Options by method id, of which those that the conditions depend on are used, such as ``fault_model``.
+        Options by method id, of which those that the conditions depend on are used, such as ``fault_model``; those of
+        ``auto`` are for every method that has them all.
 
     Returns
     -------
@@ -201,16 +202,40 @@ def _checked(plant: Plant, options: Mapping[str, Mapping[str, Any]]) -> dict[str
     found = {}
     for method in REGISTRY:
         known = method_class(method)
-        asked = known.of(options.get(method, known.placeholders))
-        conditions = kind_conditions(plant, known) or _existence(plant, asked)
+        given = options.get(method, known.placeholders)
+        by_default = AUTO in options and set(options[AUTO]) <= set(field_types(known))
+        conditions: Sequence[Condition]
+        try:
+            asked = known.of(options[AUTO] if by_default else given)
+            conditions = kind_conditions(plant, known) or _existence(plant, asked)
+        except SpecError as error:
+            if not by_default:
+                raise
+            conditions = kind_conditions(plant, known) or (_not_stated(error, method),)
         found[method] = VerificationReport.of(condition_rows(conditions))
     return found
 
 
+def _not_stated(error: SpecError | PreconditionError, method: str) -> Condition:
+    """Return the condition that fails where a design needs what neither the plant nor the options state."""
+    signals = error.signals if isinstance(error, PreconditionError) else ()
+    claim = "what a design needs is stated"
+    return Condition("stated", claim, False, np.nan, np.nan, method, str(error), signals=signals)
+
+
 def _existence(plant: Plant, asked: Method) -> Sequence[Condition]:
-    """Return a method's existence conditions; where its numbers fail, one that says so: the other methods go on."""
+    """Return a method's existence conditions, and where they hold one for what a design needs and nobody states.
+
+    Where its numbers fail, one says so: the other methods go on.
+    """
     try:
-        return asked.existence(plant)
+        found = asked.existence(plant)
+        if all(condition.holds for condition in found):
+            try:
+                asked.require_stated(plant)
+            except (SpecError, PreconditionError) as error:
+                return (*found, _not_stated(error, asked.id))
+        return found
     except PreconditionError as error:
         name, told, signals, unclear = error.condition, str(error), error.signals, error.unclear
     except (SolverError, np.linalg.LinAlgError, ArithmeticError, ValueError, MemoryError) as error:

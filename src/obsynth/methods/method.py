@@ -133,6 +133,10 @@ class Method(ABC):
     def existence(self, plant: Any, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions of a plant, with these options, decided exactly or in floating point."""
 
+    def require_stated(self, plant: Any) -> None:
+        """Raise an error where a design needs what neither the plant nor the options state."""
+        return None
+
     def for_plant(self, plant: DescriptorSystem) -> Self:
         """Return the method without what a plant of fewer faults makes void."""
         return self

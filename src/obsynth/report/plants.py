@@ -146,7 +146,7 @@ _TIME_CONDITIONS = {
     "exists: discrete time": "discrete only: sample the plant first (transform: {sample_time: ...})",
 }
 #: Conditions on what a spec says, which the plant cannot fail.
-_ASKED = {"exists: bounds stated", "exists: fault named", "exists: region stated"}
+_ASKED = {"exists: bounds stated", "exists: fault named", "exists: region stated", "exists: stated"}
 _PLANT_KIND, _OF_THIS_KIND = "exists: kind of plant", "exists: plant of this kind"
 
 

@@ -118,7 +118,7 @@ class DaeAdaptiveObserver(Method):
         "steps": ClaimMeaning("samples", "steps of the nominal run", "claims"),
     }
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"parameters"})
-    placeholders: ClassVar[Mapping[str, Any]] = {"dt": 1.0}
+    placeholders: ClassVar[Mapping[str, Any]] = {"dt": 1.0, "Q": 1.0, "R": 1.0, "initial_parameter_covariance": 1.0}
 
     dt: Positive | None = None
     Q: Annotated[Any, WrittenAs("named covariance")] = None
@@ -158,3 +158,9 @@ class DaeAdaptiveObserver(Method):
         from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
 
         return tuple(dae_conditions(plant, 1.0 if self.dt is None else self.dt))
+
+    def require_stated(self, plant: DAEModel) -> None:
+        """Raise `SpecError` where noise or a parameter's deviation is not stated."""
+        from obsynth.observers.dae.building import dae_observer_from_options
+
+        dae_observer_from_options(plant, self.as_given())

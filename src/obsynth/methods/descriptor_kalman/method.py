@@ -118,6 +118,12 @@ class DescriptorKalman(Method):
 
         return kalman_conditions(plant, early=self.early_constraints)
 
+    def require_stated(self, plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> None:
+        """Raise `SpecError` where the noise that the plant states is none that the method covers."""
+        from obsynth.methods.recursive.synthesis import with_stated_noise
+
+        with_stated_noise(plant, self.as_given())
+
     def synthesise(
         self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, progress: Callable[[str], None]
     ) -> Synthesis:

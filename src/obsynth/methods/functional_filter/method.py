@@ -153,6 +153,12 @@ class FunctionalFilter(Method):
             exactly=None if exactly else False,
         )
 
+    def require_stated(self, plant: DescriptorSystem) -> None:
+        """Raise `PreconditionError` where a combination of the outputs that the gain reads has no noise."""
+        from obsynth.methods.functional_filter.synthesis import require_stated
+
+        require_stated(plant, self)
+
     def for_plant(self, plant: DescriptorSystem) -> Self:
         """Return the method without the faults that a plant no longer has."""
         if self.faults is None or isinstance(self.faults, str):

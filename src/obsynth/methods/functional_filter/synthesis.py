@@ -252,6 +252,15 @@ def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Ca
     )
 
 
+def require_stated(plant: DescriptorSystem, asked: FunctionalFilter) -> None:
+    """Raise `PreconditionError` where a Kalman gain would be infinite: a combination of the outputs has no noise."""
+    _require_samples(plant, asked)
+    noisy, _ = _with_noise(plant, asked)
+    if asked.poles is None:
+        for model in _models(noisy, exosystem(asked.fault_model, plant.fault_names, plant.dt), asked):
+            require_noise(model, noisy.output_names, noisy.Dw)
+
+
 def _require_samples(plant: DescriptorSystem, asked: FunctionalFilter) -> None:
     late = [name for name, default in (("delay", 0), ("mean", 1)) if getattr(asked, name) != default]
     if late and not plant.dt > 0.0:

@@ -1,0 +1,100 @@
+"""`check` says no where `design` refuses for want of what the user states: noise, a sample time, options of auto."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+import obsynth as ob
+from obsynth.cli.main import main
+
+LINEAR = ob.DescriptorSystem(
+    np.diag([1.0, 1.0, 0.0]),
+    [[0.9, 0.1, 0.0], [-0.2, 0.7, 0.1], [1.0, 0.5, -1.0]],
+    C=[[1, 0, 0], [0, 0, 1]],
+    Bf=[[0], [1], [0]],
+    dt=0.1,
+)
+TANK = ob.DAEModel(
+    {"balance": "2 * der(level) = inflow - outflow", "valve": "outflow = c * sqrt(level)"},
+    {"flow": "outflow"},
+    states={"level": 1.0, "outflow": 0.5},
+    inputs={"inflow": 0.5},
+    parameters={"c": 0.5},
+)
+BIASED = ob.DAEModel(
+    {"balance": "der(level) = -level"}, {"y": "level + bias"}, states={"level": 1.0}, parameters={"bias": 0.0}
+)
+NOISE = {"dt": 1.0, "Q": 1e-4, "R": 1e-4}
+
+
+@pytest.mark.parametrize(
+    ("plant", "method", "options", "words"),
+    [
+        (TANK, "dae-adaptive-observer", {"dt": 1.0, "R": 1e-4}, "Q is missing"),
+        (TANK, "dae-adaptive-observer", {"dt": 1.0, "Q": {"balance": 1e-4}}, "R is missing"),
+        (BIASED, "dae-adaptive-observer", NOISE, "initial_parameter_covariance is missing"),
+        (LINEAR.replace(Bw=np.ones((3, 2)), Dw=np.eye(2)), "descriptor-kalman", {}, "Bw Dw' is not zero"),
+        (LINEAR.replace(Bw=np.ones((3, 2)), Dw=np.eye(2)), "adaptive-observer", {}, "Bw Dw' is not zero"),
+        (LINEAR.replace(Bw=np.eye(3), Dw=np.zeros((2, 3))), "functional-filter", {}, "free of noise"),
+        (LINEAR.replace(dt=0.0, A=-LINEAR.A), "functional-filter", {"delay": 2}, "count samples"),
+    ],
+)
+def test_check_tells_what_is_not_stated(plant: Any, method: str, options: dict[str, Any], words: str) -> None:
+    report = ob.check(plant, {method: options})[method]
+    assert [words in row.detail for row in report.failures] == [True]
+    with pytest.raises(ob.ObsynthError, match=words):
+        ob.design(plant, method, **options)
+
+
+@pytest.mark.parametrize(
+    ("plant", "method", "options"),
+    [
+        (TANK, "dae-adaptive-observer", NOISE),
+        (LINEAR.replace(Bw=np.ones((3, 2)), Dw=np.eye(2)), "descriptor-kalman", {"Q": np.eye(3), "R": np.eye(2)}),
+        (LINEAR.replace(Bw=np.eye(3), Dw=np.zeros((2, 3))), "functional-filter", {"noise": {"y1": 0.1, "y2": 0.1}}),
+    ],
+)
+def test_what_is_stated_is_enough(plant: Any, method: str, options: dict[str, Any]) -> None:
+    assert ob.check(plant, {method: options})[method].passed
+    assert ob.design(plant, method, **options).report.passed
+
+
+def test_a_question_without_options_is_one_about_the_plant() -> None:
+    assert ob.check(TANK)["dae-adaptive-observer"].passed
+
+
+def test_options_of_auto_are_those_of_every_method_that_has_them() -> None:
+    # The fault enters with a zero at 1: as a step it does not show, as a sine it does.
+    plant = ob.DescriptorSystem(None, [[0.5, 0.0], [1.0, 0.2]], C=[[-1.0, 0.8]], Bf=[[1.0], [0.0]], dt=1.0)
+    step = ob.check(plant, {"auto": {}})
+    sine = ob.check(plant, {"auto": {"fault_model": {"sinusoid": 0.5}}})
+    named = ob.check(plant, {"functional-filter": {"fault_model": {"sinusoid": 0.5}}})
+    assert sine["functional-filter"].passed == named["functional-filter"].passed
+    assert sine["functional-filter"].passed != step["functional-filter"].passed
+
+
+def test_command_for_a_nonlinear_plant(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    plant = {
+        "schema_version": 1,
+        "kind": "dae",
+        "equations": {"balance": "2 * der(level) = inflow - outflow", "valve": "outflow = c * sqrt(level)"},
+        "outputs": {"flow": "outflow"},
+        "states": {"level": 1.0, "outflow": 0.5},
+        "inputs": {"inflow": 0.5},
+        "parameters": {"c": 0.5},
+    }
+    (tmp_path / "tank.yaml").write_text(yaml.safe_dump(plant))
+    named = {"method": {"id": "dae-adaptive-observer", "options": {"dt": 1.0}}}
+    for method, words in ((named, "Q is missing"), ({}, "dt is missing")):
+        path = tmp_path / "spec.yaml"
+        path.write_text(yaml.safe_dump({"schema_version": 1, "name": "tank", "plant": {"file": "tank.yaml"}, **method}))
+        assert main(["check", "--system", str(path)]) == ob.PreconditionError.exit_code
+        assert words in " ".join(capsys.readouterr().out.split())
