@@ -305,3 +305,19 @@ class TestManyStates:
         assert whole.contraction == pytest.approx(few.contraction, rel=1e-9)
         # Of many states the growth is a bound.
         assert whole.growth <= few.growth <= 20.0 * whole.growth
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e6])
+def test_a_state_that_is_zero_after_a_step_is_known_to_rounding(unit: float) -> None:
+    # x2 is zero from the first step on; factorisations leave 1e-16 of the others there, which was compared with itself.
+    states = np.diag([1.0, unit, 1.0])
+    plant = DescriptorSystem(
+        np.diag([1.0, 1.0, 0.0]) @ states,
+        np.array([[-0.5, -0.75, -0.25], [0, 0, 0], [0, 0, 1]]) @ states,
+        C=np.array([[-2.0, 1, -1]]) @ states,
+        Bf=[[1.0], [0], [0]],
+        Bw=[[0, 0.1], [0, 0], [0, 0]],
+        Dw=[[0.01, 0]],
+        dt=1.0,
+    )
+    assert obsynth.descriptor_kalman(plant).report.passed

@@ -24,6 +24,9 @@ CONSISTENCY_STEPS = 60
 CONSISTENCY_SEED = 20130703
 #: Bands are this many standard deviations of the statistic wide: a sound design fails one time in two million.
 BAND_DEVIATIONS = 5.0
+#: A state that tends to zero beside others ends at their rounding, in units in which equations and outputs are of one
+#: size: this share of them counts as its terms, of which bounds of 1e-9 are some hundred roundings.
+ROUNDED_BESIDE = 1e-4
 
 _SOURCE = "recomputed, Monte Carlo with a fixed seed"
 
@@ -107,7 +110,8 @@ def state_terms(step: StepMatrices, sizes: FloatArray) -> FloatArray:
     units = np.exp2(np.round(problem.solve()))
     left, own = units[:rows], units[rows:]
     inverse = own[:, None] * np.linalg.pinv(left[:, None] * step.H * own) * left
-    return np.asarray(np.abs(inverse) @ sizes)
+    terms = (np.abs(inverse) @ sizes).T / own
+    return np.asarray(((terms + ROUNDED_BESIDE * np.max(terms, axis=-1, keepdims=True)) * own).T)
 
 
 def normalised(errors: FloatArray, root: FloatArray, terms: FloatArray) -> tuple[FloatArray, FloatArray]:
