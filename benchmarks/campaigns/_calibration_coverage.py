@@ -15,11 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from obsynth.calibration.innovations_fit import Objective, Profile, guarded_maximum, quantile
+from obsynth.calibration.fits import Objective, Profile, guarded_maximum, quantile, simulation_fits
 from obsynth.calibration.logs import Log
 from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem, calibration_problem
-from obsynth.calibration.simulation_error import simulation_fits
 from obsynth.plants.dae.model import DAEModel
 from obsynth.simulation.dae import simulate_dae
 from obsynth.spec import load_spec

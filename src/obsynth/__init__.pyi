@@ -21,7 +21,7 @@ from obsynth.data.alarm_proof import verify_alarm as verify_alarm
 from obsynth.data.online_monitor import learn_thresholds as learn_thresholds
 from obsynth.data.online_monitor import online_monitor as online_monitor
 from obsynth.data.run import run_on_data as run_on_data
-from obsynth.data.smoothing import smooth as smooth
+from obsynth.data.run import smooth as smooth
 from obsynth.errors import InfeasibleError as InfeasibleError
 from obsynth.errors import ObsynthError as ObsynthError
 from obsynth.errors import PreconditionError as PreconditionError
@@ -64,8 +64,8 @@ from obsynth.observers.batches import run_batch as run_batch
 from obsynth.observers.dae.observer import DAEObserver as DAEObserver
 from obsynth.observers.decisions import ParameterMonitor as ParameterMonitor
 from obsynth.observers.decisions import decide as decide
-from obsynth.observers.linear.derived import sample_observer as sample_observer
 from obsynth.observers.linear.observer import LinearObserver as LinearObserver
+from obsynth.observers.linear.observer import sample_observer as sample_observer
 from obsynth.observers.recursive.observer import Adaptation as Adaptation
 from obsynth.observers.recursive.observer import RecursiveObserver as RecursiveObserver
 from obsynth.plants.dae.model import DAEModel as DAEModel

@@ -30,7 +30,7 @@ _TYPE_NAMES = {
     "plants.constants": "CalibratedBox Constant ConstantsBox",
     "plants.uncertainty": "Uncertainty",
     "results.checks": "Check",
-    "simulation.signals": "Trajectory",
+    "simulation.scenario": "Trajectory",
     "sweeps.sweep": "Fleet FleetRun Sweep SweepResult",
     "tolerances.robustness": "Robustness",
 }

@@ -33,7 +33,7 @@ from obsynth.plants.constants import Constant as Constant
 from obsynth.plants.constants import ConstantsBox as ConstantsBox
 from obsynth.plants.uncertainty import Uncertainty as Uncertainty
 from obsynth.results.checks import Check as Check
-from obsynth.simulation.signals import Trajectory as Trajectory
+from obsynth.simulation.scenario import Trajectory as Trajectory
 from obsynth.sweeps.sweep import Fleet as Fleet
 from obsynth.sweeps.sweep import FleetRun as FleetRun
 from obsynth.sweeps.sweep import Sweep as Sweep

@@ -147,7 +147,7 @@ class TestOtherFiles:
         assert not Path("o.c").exists()
 
     def test_the_folder_of_the_state_is_looked_for_before_work_begins(self, capsys, monkeypatch):
-        monkeypatch.setattr("obsynth.data.log_run.LogRun.take", lambda *_: pytest.fail("work has begun"))
+        monkeypatch.setattr("obsynth.data.run.LogRun.take", lambda *_: pytest.fail("work has begun"))
         assert main([*RUN, "o.csv", "--state", "missing/state.json"]) == 2
         assert "The folder missing does not exist" in capsys.readouterr().err
         assert not Path("o.csv").exists()

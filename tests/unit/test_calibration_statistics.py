@@ -20,7 +20,7 @@ from obsynth.calibration.diagnostics import (
     whiteness,
     wrong_samples,
 )
-from obsynth.calibration.innovations_fit import Maximum, covariance_of, information, profile_box, quantile
+from obsynth.calibration.fits import Maximum, covariance_of, information, profile_box, quantile
 from obsynth.calibration.plants import NoiseStates, PlantWithNoise
 from obsynth.results.certificate_files import box_row, calibration_text, read_calibration, verify_calibration
 

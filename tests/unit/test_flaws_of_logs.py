@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 import obsynth
-from obsynth.data.log_run import LogRun
+from obsynth.data.run import LogRun
 from obsynth.observers.dae.c_code import compiler
 
 METHODS = ("functional-filter", "ui-pi-observer", "fault-estimation-filter")

@@ -13,7 +13,7 @@ import pytest
 from test_flaws_of_logs import designed, log
 
 import obsynth
-from obsynth.data.log_run import LogRun
+from obsynth.data.run import LogRun
 from obsynth.observers.dae.c_code import FLAGS, compiler, shared_library
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")

@@ -356,7 +356,7 @@ def test_noise_of_the_worst_signs_keeps_the_bound_at_any_stamps(spacing, kind):
     response, back = np.zeros(len(times)), observer.Cz[observer.residual_rows]
     response[-1] = observer.Dy[observer.residual_rows][0, 0]
     for k in range(len(times) - 1, 0, -1):
-        transition, constant, ramp = obsynth.observers.linear.derived.first_order_hold(
+        transition, constant, ramp = obsynth.observers.linear.observer.first_order_hold(
             observer.Az, observer.By, float(times[k] - times[k - 1])
         )
         response[k] += (back @ ramp).item()

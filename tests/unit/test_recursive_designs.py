@@ -13,8 +13,7 @@ import obsynth
 from obsynth import DescriptorSystem, PreconditionError, SpecError, TimeVaryingDescriptorSystem
 from obsynth.cli.main import main
 from obsynth.methods.designing import check
-from obsynth.observers.recursive.gain_schedule import run_batch
-from obsynth.observers.recursive.gain_schedule_summary import gain_schedule_summary
+from obsynth.observers.recursive.gain_schedule import gain_schedule_summary, run_batch
 from obsynth.spec import load_spec
 
 NOISE = {"Q": 0.1, "R": 0.2}
@@ -297,8 +296,8 @@ class TestManyStates:
     @pytest.mark.long
     def test_as_the_recursion_has_it(self, design, monkeypatch):
         few = gain_schedule_summary(design.observer)
-        monkeypatch.setattr("obsynth.observers.recursive.gain_schedule_summary.MANY_STATES", 200)
-        monkeypatch.setattr("obsynth.observers.recursive.gain_schedule_summary.STEPS_WITHOUT_HORIZON", few.steps)
+        monkeypatch.setattr("obsynth.observers.recursive.gain_schedule.MANY_STATES", 200)
+        monkeypatch.setattr("obsynth.observers.recursive.gain_schedule.STEPS_WITHOUT_HORIZON", few.steps)
         whole = gain_schedule_summary(design.observer)
         assert whole.steps == few.steps
         np.testing.assert_allclose(whole.L, few.L, rtol=0.0, atol=1e-12)

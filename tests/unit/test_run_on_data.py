@@ -507,7 +507,7 @@ def test_equal_intervals_are_equal_in_spite_of_rounding():
 @pytest.mark.parametrize("continuous", [False, True])
 def test_rows_in_one_piece_are_those_of_single_steps_bit_for_bit(continuous, monkeypatch):
     """With bad cells, missing rows, irregular stamps in continuous time, an overflow, and pieces of any length."""
-    from obsynth.data import log_run
+    from obsynth.data import run as data_run
 
     rng = np.random.default_rng(8)
     a = 0.4 * rng.normal(size=(3, 3))
@@ -520,16 +520,16 @@ def test_rows_in_one_piece_are_those_of_single_steps_bit_for_bit(continuous, mon
         dt=0.0 if continuous else 0.1,
     )
     design = obsynth.ui_pi_observer(plant)
-    run = log_run.LogRun(design)
+    run = data_run.LogRun(design)
     count = 300
     intervals = rng.uniform(0.05, 0.3, count) if continuous else np.full(count, 0.1)
     intervals[[40, 200]] = 7.0
     times = np.cumsum(intervals)
     values = rng.normal(size=(count, 3))
     values[60, 1], values[61], values[150, 0], values[[250, 251]] = np.nan, np.nan, np.inf, 1e308
-    monkeypatch.setattr(log_run, "ROWS_AT_ONCE", 37)
+    monkeypatch.setattr(data_run, "ROWS_AT_ONCE", 37)
     whole = run.estimates(times.tolist(), values)
-    single = log_run.LogRun(design)
+    single = data_run.LogRun(design)
     monkeypatch.setattr(type(single.observer), "takes_pieces", False)
     rows = single.estimates(times.tolist(), values)
     assert {row.status for row in rows} >= {"ok", "gap", "recovering"}

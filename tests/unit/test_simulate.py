@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 import obsynth
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.simulation.linear import make_stepper, simulate_plant
-from obsynth.simulation.signals import resolve
+from obsynth.simulation.scenario import resolve
 from obsynth.spec import load_spec
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")

@@ -37,8 +37,17 @@ from obsynth.calibration.diagnostics import (
     whiteness,
     wrong_samples,
 )
-from obsynth.calibration.innovations_fit import InnovationsFit, Objective, chosen_timing, innovations_fit
-from obsynth.calibration.likelihood import IMPOSSIBLE, Likelihood
+from obsynth.calibration.fits import (
+    FIRST_ROWS,
+    Fit,
+    InnovationsFit,
+    Objective,
+    SimulationError,
+    chosen_timing,
+    innovations_fit,
+    simulation_fits,
+    with_seen_start,
+)
 from obsynth.calibration.logs import Log, LogData, read_log, told_rows
 from obsynth.calibration.plants import (
     CalibrationPlant,
@@ -49,9 +58,8 @@ from obsynth.calibration.plants import (
     asked_states,
     correlation_name,
 )
-from obsynth.calibration.problem import Problem, calibration_problem, require_variation
+from obsynth.calibration.problem import IMPOSSIBLE, Likelihood, Problem, calibration_problem, require_variation
 from obsynth.calibration.reporting import Calibration, IntegrationError, integration_error, reported
-from obsynth.calibration.simulation_error import FIRST_ROWS, Fit, SimulationError, simulation_fits, with_seen_start
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.dae_adaptive_observer.conditions import NOMINAL_SAMPLES
 from obsynth.numerics.arguments import Seed, arguments_checked, is_whole, whole_number

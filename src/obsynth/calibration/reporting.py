@@ -25,11 +25,10 @@ from obsynth.calibration.diagnostics import (
     mean_off,
     whiteness,
 )
-from obsynth.calibration.innovations_fit import InnovationsFit, Side, covariance_of, quantile
+from obsynth.calibration.fits import Fit, InnovationsFit, Side, SimulationError, covariance_of, quantile, unexplained
 from obsynth.calibration.logs import EVEN, Log, told_rows
 from obsynth.calibration.plants import PlantWithNoise, correlation_name
 from obsynth.calibration.problem import Problem
-from obsynth.calibration.simulation_error import Fit, SimulationError, unexplained
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import SMALLEST, FloatArray, read_only
 from obsynth.observers.running import BAND_WIDTH

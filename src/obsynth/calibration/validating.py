@@ -29,12 +29,11 @@ from obsynth.calibration.diagnostics import (
     whiteness,
     wrong_samples,
 )
-from obsynth.calibration.innovations_fit import Objective, greatest_likelihood
+from obsynth.calibration.fits import Fit, Objective, greatest_likelihood
 from obsynth.calibration.logs import Log, LogData, quantum, read_log
 from obsynth.calibration.plants import NonlinearPlant, sample_graphs
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.reporting import IntegrationError, integration_error
-from obsynth.calibration.simulation_error import Fit
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, read_only

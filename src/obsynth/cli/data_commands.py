@@ -500,8 +500,7 @@ def _run_robustness(options: argparse.Namespace) -> int:
 
 def _target(options: argparse.Namespace) -> Path | TextIO:
     """Return where estimates go; refuse a hopeless place before any work is done."""
-    from obsynth.data.log_run import STATE
-    from obsynth.data.run import ESTIMATES
+    from obsynth.data.run import ESTIMATES, STATE
     from obsynth.data.sources import check_suffix
 
     named = {"--gains": options.gains, "--system": options.system, "--state": options.state}

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
-from obsynth.data.log_run import faults_on_rows
+from obsynth.data.run import faults_on_rows
 from obsynth.data.signals import TIME_HEADER
 from obsynth.data.sources import log_table
 from obsynth.data.stuck_sensors import stuck_rows, stuck_texts
@@ -61,8 +61,7 @@ from obsynth.plotting.panels import (
 from obsynth.results.certificate_files import COMPARISON, SHOWN_DIGITS, result_text
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import design_as_dict
-from obsynth.simulation.scenario import Scenario, Sine, Step, scenario_from
-from obsynth.simulation.signals import resolve
+from obsynth.simulation.scenario import Scenario, Sine, Step, resolve, scenario_from
 from obsynth.tolerances.exact_plant import plant_at
 
 if TYPE_CHECKING:

@@ -35,8 +35,7 @@ from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane, sector
-from obsynth.observers.linear.derived import averaged
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, averaged
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import exosystem
 from obsynth.results.design import Certificate

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.data.log_run import LogRun
+from obsynth.data.run import LogRun
 from obsynth.data.sources import Data, samples
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.alarm_proof import (

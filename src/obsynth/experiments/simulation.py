@@ -24,8 +24,7 @@ from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.derived import sample_observer
-from obsynth.observers.linear.observer import LinearObserver, split_rows
+from obsynth.observers.linear.observer import LinearObserver, sample_observer, split_rows
 from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import BAND_WIDTH, Estimates
@@ -44,8 +43,7 @@ from obsynth.simulation.linear import (
     simulate_time_varying,
     varying_runs,
 )
-from obsynth.simulation.scenario import Scenario, observer_start
-from obsynth.simulation.signals import ScenarioSignals, Trajectory, resolve_parameters
+from obsynth.simulation.scenario import Scenario, ScenarioSignals, Trajectory, observer_start, resolve_parameters
 
 #: Warm-up ends when the effect of an error at the start has shrunk to this share of its largest, for good.
 WARM_UP_SHARE = 0.01

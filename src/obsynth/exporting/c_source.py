@@ -36,7 +36,7 @@ from obsynth.exporting.realisation import Alarms, Realisation, verification_word
 from obsynth.files.outputs import write_together
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.observers.dae.c_code import FLAGS, compiler, in_lines, observer_code, observer_struct, shared_library
-from obsynth.observers.linear.derived import checked_warm_up
+from obsynth.observers.linear.observer import checked_warm_up
 from obsynth.observers.running import Estimates, as_run
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign

@@ -14,15 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from obsynth.data.linear_log import GAP_LEFT_SHARE, LEAST_SHOWN, LinearLogObserver
+from obsynth.data.log_observers import GAP_LEFT_SHARE, LEAST_SHOWN, LinearLogObserver
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned import LearnedThresholds
 from obsynth.numerics.arguments import real_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.derived import checked_warm_up, sample_observer, transient
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, checked_warm_up, sample_observer, transient
 from obsynth.observers.recursive.gain_schedule import steady_observer
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.dae.model import DAEModel

@@ -26,7 +26,7 @@ from obsynth.observers.dae.estimates import DAERow, GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.dae.steps import DAEState, Steps
 from obsynth.observers.outliers import projected
-from obsynth.observers.records import measured_record, whole_record
+from obsynth.observers.records import measured_record, taken_inputs, whole_record
 from obsynth.observers.recursive.observer import (
     RawEstimate,
     Recursion,
@@ -37,7 +37,6 @@ from obsynth.observers.recursive.observer import (
 )
 from obsynth.observers.recursive.step_model import StepMatrices, right_side, stacked_noise
 from obsynth.observers.running import Estimates
-from obsynth.observers.unknown_inputs import taken_inputs
 from obsynth.plants.dae.model import checked_inputs
 
 

@@ -21,8 +21,7 @@ from obsynth.numerics.modal_response import resolved
 from obsynth.numerics.norms import response
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.spectra import boundary_points, eigenvalues
-from obsynth.observers.linear.derived import GRID_REACH, frequency_grid
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import GRID_REACH, LinearObserver, frequency_grid
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plotting.panels import WIDTH, one_panel, plain_decades, tidy
 from obsynth.results.design import ObserverDesign

@@ -1,6 +1,6 @@
 """Simulated plants: exact recursions of discrete descriptor systems."""
 
 from obsynth.simulation.linear import simulate_plant
-from obsynth.simulation.signals import Trajectory
+from obsynth.simulation.scenario import Trajectory
 
 __all__ = ["Trajectory", "simulate_plant"]

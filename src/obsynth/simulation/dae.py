@@ -15,7 +15,7 @@ from obsynth.numerics.ranks import covariance_factor
 from obsynth.plants.dae.functions import Compiled, DAEFunctions, take_samples
 from obsynth.plants.dae.model import DAEModel, checked_inputs, finite_vector, step_length
 from obsynth.plants.dae.step import ImplicitStep, onto_constraint
-from obsynth.simulation.signals import Trajectory
+from obsynth.simulation.scenario import Trajectory
 
 
 @arguments_checked

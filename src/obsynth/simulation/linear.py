@@ -26,8 +26,7 @@ from obsynth.numerics.matrix_equations import continuous_riccati, discrete_ricca
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.simulation.scenario import Scenario
-from obsynth.simulation.signals import ScenarioSignals, Trajectory, resolve, signal_of
+from obsynth.simulation.scenario import Scenario, ScenarioSignals, Trajectory, resolve, signal_of
 
 
 def simulate_plant(

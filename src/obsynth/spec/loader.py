@@ -40,8 +40,7 @@ from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
 from obsynth.plants.validation import index_of
 from obsynth.results.certificate_files import read_calibration
 from obsynth.results.design import ObserverDesign
-from obsynth.simulation.scenario import PROFILE_KINDS, Profile, Scenario
-from obsynth.simulation.signals import check_parameters
+from obsynth.simulation.scenario import PROFILE_KINDS, Profile, Scenario, check_parameters
 from obsynth.spec.documents import DocumentProblems, checked_plant, checked_spec, read_names, read_yaml
 
 if TYPE_CHECKING:

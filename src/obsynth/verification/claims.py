@@ -14,7 +14,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.numerics.arguments import is_number
-from obsynth.observers.linear.derived import unaveraged
+from obsynth.observers.linear.observer import unaveraged
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.covariances import certain_noise_covariance
 from obsynth.results.checks import Check, information, nothing_wrong, upper_bound_check

@@ -27,8 +27,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, Made, remembered
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
-from obsynth.observers.linear.derived import poles_of
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, poles_of
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.contraction import Contraction, absolute_gains, prove_contraction

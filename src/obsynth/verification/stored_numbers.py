@@ -17,8 +17,7 @@ from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, remember
 from obsynth.numerics.modal_response import MOST_ENTRIES_AT_ONCE, STATES_FOR_MODES, ModalSolves, pencils_at, resolved
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.numerics.spectra import boundary_points
-from obsynth.observers.linear.derived import modes_of, poles_of
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, modes_of, poles_of
 from obsynth.proofs.balls import rounded_up
 from obsynth.proofs.contraction import LEFT_OF_SUM, proved_contractions
 from obsynth.results.checks import Check, information, upper_bound_check

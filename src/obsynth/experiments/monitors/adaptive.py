@@ -33,8 +33,7 @@ from obsynth.methods.tracking import tracking_of
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
-from obsynth.observers.linear.derived import sample_observer
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, sample_observer
 from obsynth.plants.constants import ConstantsBox, shown
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import ELIMINATED, SAMPLED, Uncertainty
@@ -43,8 +42,7 @@ from obsynth.proofs.affine import AffineMatrix, affine_block, affine_zero_order_
 from obsynth.proofs.balls import rounded_up
 from obsynth.proofs.contraction import inverse_bound
 from obsynth.results.design import ObserverDesign
-from obsynth.simulation.scenario import Scenario
-from obsynth.simulation.signals import resolve
+from obsynth.simulation.scenario import Scenario, resolve
 from obsynth.tolerances.robustness import EXACT_MODEL, structure_of, with_tolerances
 from obsynth.tolerances.subdivision import index_one_on_box, values_at
 from obsynth.verification.adaptive_bound import (

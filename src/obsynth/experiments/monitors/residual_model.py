@@ -31,12 +31,10 @@ from obsynth.numerics.continuous import first_order_hold, peak_gain
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import hinf_norm, output_covariance, spectral_radius, state_units
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
-from obsynth.observers.linear.derived import sample_observer
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, sample_observer
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
-from obsynth.simulation.scenario import Additive, Random, Scenario, observer_start
-from obsynth.simulation.signals import ScenarioSignals, resolve
+from obsynth.simulation.scenario import Additive, Random, Scenario, ScenarioSignals, observer_start, resolve
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.responses import OUTWARD
 

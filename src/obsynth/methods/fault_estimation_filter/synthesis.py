@@ -71,8 +71,7 @@ from obsynth.methods.fault_estimation_filter.realisation import notes, realise_f
 from obsynth.methods.method import Synthesis
 from obsynth.numerics.arrays import FloatArray, as_matrix, largest_singular_value
 from obsynth.numerics.regions import disk
-from obsynth.observers.linear.derived import averaged
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, averaged
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
 

@@ -22,7 +22,7 @@ from obsynth.methods.recursive.steady_filter import reached_condition
 from obsynth.methods.recursive.unknown_inputs import without_unknown_inputs
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import covariance_factor
-from obsynth.observers.recursive.gain_schedule_summary import (
+from obsynth.observers.recursive.gain_schedule import (
     STEPS_TO_CONTRACT,
     GainScheduleSummary,
     gain_schedule_summary,

@@ -21,9 +21,8 @@ from obsynth.observers.dae.settings import DAESettings
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import DAEState, Steps
 from obsynth.observers.progress import shown_progress
-from obsynth.observers.records import measured_record
+from obsynth.observers.records import measured_record, require_inputs
 from obsynth.observers.running import Estimates
-from obsynth.observers.unknown_inputs import require_inputs
 from obsynth.plants.dae.functions import Compiled, take_samples
 from obsynth.plants.dae.model import checked_inputs
 

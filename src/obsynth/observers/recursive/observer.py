@@ -59,7 +59,16 @@ from obsynth.observers.outliers import (
     robust_advance,
     with_surprise,
 )
-from obsynth.observers.records import measured_record, require_horizon, whole_record
+from obsynth.observers.records import (
+    TakenInputs,
+    held_inputs,
+    measured_record,
+    no_inputs,
+    require_horizon,
+    require_inputs,
+    taken_inputs,
+    whole_record,
+)
 from obsynth.observers.recursive.step_model import (
     PreparedStep,
     StepMatrices,
@@ -70,7 +79,6 @@ from obsynth.observers.recursive.step_model import (
     with_missing_inputs,
 )
 from obsynth.observers.running import Estimates, StepObserver, named_estimates
-from obsynth.observers.unknown_inputs import TakenInputs, held_inputs, no_inputs, require_inputs, taken_inputs
 from obsynth.plants.time_varying import MatrixSequence, TimeVaryingDescriptorSystem
 
 Form: TypeAlias = Literal["innovation", "literal", "random-walk"]

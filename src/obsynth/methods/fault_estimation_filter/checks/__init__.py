@@ -29,8 +29,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import highest_gain_found, hinf_norm
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
-from obsynth.observers.linear.derived import modes_of
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, modes_of
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.covariances import certain_noise_covariance
 from obsynth.results.checks import Check, fitting_check, information, nothing_wrong, upper_bound_check

@@ -37,12 +37,13 @@ from obsynth.numerics.ranks import RANK_TOLERANCE, numerical_rank
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.square_root_estimation import LeastSquaresStep, least_squares_step, rank_revealing_step
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.recursive.gain_schedule import GainStep, gains_once
-from obsynth.observers.recursive.gain_schedule_summary import (
+from obsynth.observers.recursive.gain_schedule import (
     CLEARLY_STABLE,
     STEPS_TO_CONTRACT,
     GainScheduleSummary,
+    GainStep,
     gain_schedule_summary,
+    gains_once,
     looked_at,
 )
 from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options

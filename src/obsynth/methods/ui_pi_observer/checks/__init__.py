@@ -26,8 +26,7 @@ from obsynth.numerics.spectra import (
     farthest_pole,
     mean_miss,
 )
-from obsynth.observers.linear.derived import poles_of
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, poles_of
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
 from obsynth.proofs.covariances import certain_noise_covariance

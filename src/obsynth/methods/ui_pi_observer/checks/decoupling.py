@@ -21,8 +21,7 @@ from obsynth.numerics.modal_response import pencils_at
 from obsynth.numerics.ranks import RANK_TOLERANCE, numerical_rank
 from obsynth.numerics.scaling import balancing_factors
 from obsynth.numerics.spectra import boundary_points
-from obsynth.observers.linear.derived import frequency_grid
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, frequency_grid
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Equations whose reciprocal condition is above this are independent to the tolerance of every rank.

@@ -21,8 +21,7 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_v
 from obsynth.numerics.norms import balanced_realisation, response
 from obsynth.numerics.ranks import NEGLIGIBLE_INPUT
 from obsynth.numerics.spectra import boundary_points, decay_rates
-from obsynth.observers.linear.derived import frequency_grid, is_stable, poles_of
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, frequency_grid, is_stable, poles_of
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import balanced_transition
 from obsynth.results.checks import Check, information
