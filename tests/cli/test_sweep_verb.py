@@ -40,6 +40,25 @@ def test_folder_table_and_picture(spec, tmp_path, capsys):
     assert [case["gamma_min"] for case in told["cases"][:2]] == [float(row["gamma_min"]) for row in rows[:2]]
 
 
+@pytest.mark.parametrize("ending", [".gains.json", ".result.json"])
+@pytest.mark.parametrize("content", [None, "{", "{}"], ids=["missing", "cut", "empty"])
+def test_a_sweep_goes_on_where_a_file_was_lost(spec, tmp_path, capsys, ending, content):
+    """It refused to write the result anew, as it had read it."""
+    out = tmp_path / "many"
+    arguments = ["sweep", "--system", spec, "--set", "gamma_margin=[0.05]", "--out", str(out), "--quiet"]
+    assert main(arguments) == 0
+    (file,) = out.glob(f"*{ending}")
+    before = json.loads(file.read_text())
+    file.unlink()
+    if content is not None:
+        file.write_text(content)
+    assert main(arguments) == 0, capsys.readouterr().err
+    after = json.loads(file.read_text())
+    assert after["kind"] == before["kind"]
+    assert main(arguments) == 0
+    assert json.loads(file.read_text()) == after
+
+
 @pytest.mark.parametrize(
     ("extra", "path"),
     [

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import obsynth
+from obsynth.results.gain_set_writing import digest_of
 from obsynth.results.gain_sets import gain_set_bytes, loaded
 
 PLANT = """\
@@ -91,12 +92,46 @@ def test_a_folder_is_gone_on_with(spec, tmp_path):
     third = obsynth.sweep(spec, values, folder=folder)
     assert third.results[0].claims["gamma"] != first.results[0].claims["gamma"]
     assert obsynth.load(third.results[0].file).report.passed
-    # So is a result without all that it must have.
-    result = folder / third.results[0].file.name.replace(".gains.", ".result.")
-    body = json.loads(result.read_text())
-    result.write_text(json.dumps({name: value for name, value in body.items() if name != "status"}))
-    assert outcomes(obsynth.sweep(spec, values, folder=folder)) == outcomes(third)
-    assert json.loads(result.read_text())["status"] == "designed"
+
+
+def without_status(body):
+    del body["status"]
+
+
+@pytest.mark.parametrize("sealed", [False, True], ids=["as edited", "with the digest made anew"])
+@pytest.mark.parametrize(
+    ("change", "is_taken"),
+    [
+        (lambda body: body["claims"].update(gamma=0.01), True),
+        (lambda body: body.update(status="infeasible", message="proved"), True),
+        (without_status, False),
+        (lambda body: body.update(claims=[["gamma", 1.0]]), False),
+        (lambda body: body.update(signals=3), False),
+        (lambda body: body.update(facts={"shape": [2], "data": ["x", 1]}), False),
+        (lambda body: body.update(key="0" * 64), False),
+    ],
+    ids=["claim", "status", "no status", "claims of another type", "signals of another type", "array of texts", "key"],
+)
+def test_a_result_that_was_edited_is_found_anew(spec, tmp_path, change, is_taken, sealed):
+    """A table was made of whatever stood in the folder: claims and states of cases that nobody had found."""
+    folder, values = tmp_path / "many", {"gamma_margin": [0.05]}
+    first = obsynth.sweep(spec, values, folder=folder)
+    (result,) = folder.glob("*.result.json")
+    document = json.loads(result.read_text())
+    change(document["result"])
+    if sealed:
+        document["sha256"] = digest_of(document["result"])
+    result.write_text(json.dumps(document))
+    again = obsynth.sweep(spec, values, folder=folder)
+    assert (outcomes(again) == outcomes(first)) is not (sealed and is_taken)
+
+
+def test_an_option_and_a_claim_of_the_same_name_have_a_column_each(spec):
+    found = obsynth.sweep(spec, {"gamma": [3.0, 0.01]})
+    header, rows = found.rows()
+    assert len(set(header)) == len(header)
+    assert [row[header.index("gamma")] for row in rows] == [3.0, 0.01]
+    assert rows[0][header.index("certified gamma")] == found.results[0].claims["gamma"]
 
 
 def test_plants_in_memory():

@@ -37,10 +37,17 @@ def sealed(kind: str, version: int, body: Any, *, under: str = "certificate") ->
 
 
 def opened(
-    path: Path, kinds: tuple[str, ...], version: int, what: str, again: str, *, under: str = "certificate"
+    path: Path,
+    kinds: tuple[str, ...],
+    version: int,
+    what: str,
+    again: str,
+    *,
+    under: str = "certificate",
+    is_protected: bool = True,
 ) -> tuple[str, dict[str, Any], bool]:
     """Return kind and body of what `sealed` wrote, and whether its digest is right; ``again`` says how to make one."""
-    document = read_json(path)
+    document = read_json(path, is_protected=is_protected)
     if not isinstance(document, dict) or document.get("kind") not in kinds:
         raise SpecError(f"{path} is no {what}.", path=str(path))
     body = document.get(under)

@@ -25,7 +25,7 @@ import numpy as np
 from obsynth.data.run import DataRun, run_on_data
 from obsynth.errors import ObsynthError, SpecError, a_kind
 from obsynth.experiments.assumptions import file_digest
-from obsynth.files.inputs import input_file, read_json
+from obsynth.files.inputs import input_file
 from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import table_writer
 from obsynth.methods.designing import design
@@ -37,6 +37,7 @@ from obsynth.observers.progress import RunsProgress, as_they_come, progress_of_r
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
 from obsynth.plotting.panels import tidy
+from obsynth.results.certificate_files import RESULT_VERSION, opened, sealed
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain, restored
 from obsynth.spec.documents import read_yaml
@@ -295,28 +296,31 @@ class ResultFolder(Generic[_Result]):
     def kept(self, item: Work, result: _Result, content: bytes | str | None) -> _Result:
         """Write what was made, then the result; return the result with the file."""
         file = write_atomically(self._file(item, self.ending), content) if content else None
-        body = {name: getattr(result, name) for name in self.fields}
-        known = {"kind": self.kind, "key": item.key, "sha256": None if file is None else file_digest(file)}
-        write_atomically(self._file(item, ".result.json"), json.dumps(plain({**known, **body}), indent=1) + "\n")
+        known = {"key": item.key, "file": None if file is None else file_digest(file)}
+        body = plain({**known, **{name: getattr(result, name) for name in self.fields}})
+        text = sealed(self.kind, RESULT_VERSION, body, under="result")
+        write_atomically(self._file(item, ".result.json"), text)
         return replace(result, file=file)  # type: ignore[type-var]
 
     def known(self, item: Work, **own: Any) -> _Result | None:
         """Return a result that is there already, whole and of the same work; `None` where it is to be made again."""
+        from pydantic import TypeAdapter
+
         written, file = self._file(item, ".result.json"), self._file(item, self.ending)
         try:
-            body = restored(read_json(written, where=str(written))) if written.is_file() else None
-        except SpecError:
+            # What does not do is written anew.
+            _, kept, intact = opened(
+                written, (self.kind,), RESULT_VERSION, "result", "", under="result", is_protected=False
+            )
+            body, digest = restored(kept), kept.get("file")
+            found: _Result = TypeAdapter(self.record).validate_python({name: body[name] for name in self.fields})
+        except (SpecError, LookupError, TypeError, ValueError, RecursionError):
             return None
-        if not isinstance(body, dict) or not {"kind", "key", "sha256", *self.fields} <= set(body):
+        if not intact or kept.get("key") != item.key:
             return None
-        if (body["kind"], body["key"]) != (self.kind, item.key):
+        if digest is not None and (not file.is_file() or file_digest(file) != digest):
             return None
-        made = body["sha256"] is not None
-        if made and (not file.is_file() or file_digest(file) != body["sha256"]):
-            return None
-        values = {name: tuple(body[name]) if isinstance(body[name], list) else body[name] for name in self.fields}
-        found: _Result = self.record(**{**values, **own}, file=file if made else None)
-        return found
+        return replace(found, **own, file=None if digest is None else file)  # type: ignore[type-var]
 
 
 _SWEEP_KIND = "obsynth sweep result"
@@ -403,7 +407,9 @@ class Sweep(ResultTable):
         parameters = all_of(result.parameters for result in self.results)
         claims = all_of(result.claims for result in self.results)
         facts = all_of(result.facts for result in self.results)
-        header = ["case", *parameters, "status", *facts, *claims, "condition", "signals", "message", "seconds", "file"]
+        # An option may have the name of what is claimed of it, and every column has its own.
+        claimed = [f"certified {name}" if name in parameters else name for name in claims]
+        header = ["case", *parameters, "status", *facts, *claimed, "condition", "signals", "message", "seconds", "file"]
         rows = [
             [
                 result.name,
@@ -773,7 +779,7 @@ def _pairs(gains: Sequence[Path], logs: Sequence[Path], options: Mapping[str, An
     return [
         Work(
             f"{names[gain]} on {log.stem}",
-            hashlib.sha256(f"{digests[gain]} {digests[log]} {said}".encode()).hexdigest(),
+            hashlib.sha256(f"{__version__} {digests[gain]} {digests[log]} {said}".encode()).hexdigest(),
             partial(_estimates, gain, log, **options),
         )
         for gain in gains
