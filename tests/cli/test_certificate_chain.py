@@ -21,7 +21,7 @@ SPEC, LOG = DESIGNS / "threetank" / "spec.yaml", DESIGNS / "threetank" / "log.cs
 def stated() -> dict[str, object]:
     """A calibration of the stiffness of the drive, as the verb writes it."""
     constants = {"k": {"nominal": 20.0, "range": [19.0, 21.0], "open": [], "unit": "N m/rad"}}
-    return {"level": 0.95, "log": {"digest": "cd" * 32}, "constants": constants}
+    return {"level": 0.95, "stands": True, "log": {"digest": "cd" * 32}, "constants": constants}
 
 
 def drive_spec(folder: Path) -> Path:
@@ -86,6 +86,44 @@ def test_an_edited_calibration_is_refused(folder: Path, change: str) -> None:
     with pytest.raises(obsynth.SpecError, match="changed after it was written"):
         read_calibration(folder / "box.json")
     assert main(["verify", "box.json"]) == 6
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "told"),
+    [
+        (("constants",), [1], "is damaged: constants"),
+        (("constants", "k"), 3, "is damaged: k"),
+        (("constants", "k", "unit"), None, "is damaged: k"),
+        (("constants", "k", "open"), 0, "is damaged: k"),
+        (("constants", "k", "range"), [21.0, 19.0], "is damaged: k"),
+        (("log",), "log.csv", "is damaged: log"),
+        (("stands",), None, "is damaged: stands"),
+        (("schema_version",), 2, "schema version 2, and this obsynth reads 1"),
+        (("stands",), False, "does not stand: .* 95 % is not its level"),
+        (("constants", "k", "unit"), "N/m", "'k' is in N m/rad here, and in N/m in box.json"),
+    ],
+)
+def test_what_is_no_box_of_the_plant_is_refused(folder: Path, where: tuple[str, ...], value: object, told: str) -> None:
+    """The digest is right: the file is of another version or plant, or its box does not hold what it says."""
+    spec, found = drive_spec(folder), stated()
+    holder = found
+    for name in where[:-1]:
+        holder = holder[name]
+    holder[where[-1]] = value
+    (folder / "box.json").write_text(calibration_text(found))
+    plant = folder / "plant.yaml"
+    plant.write_text(plant.read_text().replace("k: {nominal: 20.0}", "k: {nominal: 20.0, unit: N m/rad}"))
+    with pytest.raises(obsynth.SpecError, match=told):
+        obsynth.load_spec(spec)
+
+
+def test_a_unit_of_the_plant_stays_where_the_calibration_has_none(folder: Path) -> None:
+    spec, found = drive_spec(folder), stated()
+    found["constants"]["k"]["unit"] = "1"
+    (folder / "box.json").write_text(calibration_text(found))
+    plant = folder / "plant.yaml"
+    plant.write_text(plant.read_text().replace("k: {nominal: 20.0}", "k: {nominal: 20.0, unit: N m/rad}"))
+    assert obsynth.load_spec(spec).plant.uncertainty.box.constants["k"].unit == "N m/rad"
 
 
 def test_a_calibration_without_a_digest_is_asked_for_again(folder: Path) -> None:

@@ -207,7 +207,7 @@ FILE = {
         "k": {"nominal": 2.0, "range": [1.5, 2.5], "open": [], "unit": "N/m"},
         "m": {"nominal": 1.0, "range": [0.9, 1.2], "open": [], "unit": "kg"},
     },
-    "level": 0.95, "log": {"digest": "ab" * 32},
+    "level": 0.95, "stands": True, "log": {"digest": "ab" * 32},
 }  # fmt: skip
 
 

@@ -463,7 +463,7 @@ def test_files_and_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtur
         heated(), normal, false_alarms="1 per 500 rows").levels)  # fmt: skip
 
 
-@pytest.mark.parametrize("damage", ["level", "digest", "shape", "kind", "version", "text", "design"])
+@pytest.mark.parametrize("damage", ["level", "digest", "shape", "kind", "version", "text", "design", "sizes"])
 def test_files_that_are_wrong_are_refused(tmp_path: Path, damage: str) -> None:
     from obsynth.results.gain_sets import digest_of
 
@@ -476,12 +476,22 @@ def test_files_that_are_wrong_are_refused(tmp_path: Path, damage: str) -> None:
         body["columns"] = body["columns"][:-1]
     if damage == "design":
         body["gains"] = "0" * 64
+    if damage == "sizes":  # a linear design takes no outliers
+        body["outlier_sizes"] = {"shape": [1], "data": [1.0]}
     if damage != "digest":
         document["sha256"] = digest_of(body)
     document |= {"kind": {"kind": "other"}, "version": {"schema_version": 99}}.get(damage, {})
     file.write_text("{" if damage == "text" else json.dumps(document))
     with pytest.raises(obsynth.SpecError):
         obsynth.online_monitor(heated(), "learned", normal=file)
+
+
+def test_a_file_that_is_nested_too_deeply_is_named(tmp_path: Path) -> None:
+    file = learned().save(tmp_path / "t.json")
+    text = file.read_text()
+    file.write_text(text.replace('"thresholds": {', '"thresholds": {"deep": ' + "[" * 900 + "]" * 900 + ","))
+    with pytest.raises(obsynth.SpecError, match=r"t\.json"):
+        obsynth.load_thresholds(file)
 
 
 def test_what_a_followed_fault_leaves_is_told_where_estimates_are_not_watched(tmp_path, capsys) -> None:

@@ -163,7 +163,7 @@ def test_a_spec_with_tolerances_of_a_nonlinear_plant_watches_logs_of_it(tmp_path
 
 
 def test_a_calibration_file_gives_the_box(tmp_path: Path) -> None:
-    found = {"kind": "obsynth calibration", "level": 0.95, "log": {"digest": "cd" * 32}, "constants": {
+    found = {"level": 0.95, "stands": True, "log": {"digest": "cd" * 32}, "constants": {
         "a2": {"nominal": 0.0201, "range": [0.0195, 0.0211], "open": [], "unit": "V^0.5/s"}}}  # fmt: skip
     (tmp_path / "cal.json").write_text(calibration_text(found), encoding="utf-8")
     (tmp_path / "spec.yaml").write_text(

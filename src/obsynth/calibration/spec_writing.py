@@ -95,6 +95,8 @@ def _set_constants(plant: dict[str, Any], found: Calibration, calibration: Path 
     """Put nominal values in, with ranges where a design can use them."""
     stated, parameters = dict(plant.get("constants") or {}), dict(plant.get("parameters") or {})
     opened = {name for name, _ in found.box.open_sides}
+    if not found.box.stands:
+        calibration = None  # its ranges are stated, without a level
     others = any(isinstance(item, Mapping) for name, item in stated.items() if name not in found.nominal)
     for name, value in found.nominal.items():
         if name in parameters:

@@ -353,6 +353,14 @@ def constants_box(
     return ConstantsBox(found, **{key: value for key, value in more.items() if value is not None})  # type: ignore[arg-type]
 
 
+def does_not_stand(level: float) -> str:
+    """Return why a calibrated box whose innovations are not white gives no tolerances, and what to do."""
+    return (
+        f"The box does not stand: the innovations of the calibration are not white, so {100.0 * level:g} % is not its "
+        "level. Mend the model or its noise, or state ranges of your own (constants: {name: {nominal, range}})."
+    )
+
+
 @dataclass(frozen=True)
 class CalibratedBox:
     """Ranges of constants that a log allows, all at once, with a stated probability.
@@ -401,8 +409,10 @@ class CalibratedBox:
         Raises
         ------
         SpecError
-            A side is open: a tolerance without an end bounds nothing.
+            A side is open: a tolerance without an end bounds nothing.  Or the box does not stand.
         """
+        if not self.stands:
+            raise SpecError(does_not_stand(self.level), path="constants")
         if self.open_sides:
             name, side = self.open_sides[0]
             raise SpecError(

@@ -16,6 +16,7 @@ from obsynth.numerics.arguments import is_finite_number
 from obsynth.results.checks import Check, information, nothing_wrong
 from obsynth.results.design import ObserverDesign, VerificationReport
 from obsynth.results.gain_set_writing import design_as_dict, digest_of, plain, restored
+from obsynth.results.gain_sets import is_texts
 
 #: Kinds of results that are certified with the gain sets that they rest on.
 ROBUSTNESS, STUDY, COMPARISON = "obsynth robustness", "obsynth tolerance study", "obsynth comparison"
@@ -57,7 +58,10 @@ def opened(
             f"{again}.",
             path=str(path),
         )
-    return document["kind"], body, document.get("sha256") == digest_of(body)
+    try:
+        return document["kind"], body, document.get("sha256") == digest_of(body)
+    except RecursionError as error:
+        raise SpecError(f"{path} is nested too deeply to be a {what}: {again}.", path=str(path)) from error
 
 
 def result_text(
@@ -133,17 +137,32 @@ def calibration_text(data: Mapping[str, Any]) -> str:
     return json.dumps({"kind": CALIBRATION_KIND, "sha256": digest_of(body), **body}, indent=1, allow_nan=False) + "\n"
 
 
-def read_calibration(path: Path, *, where: str = "") -> dict[str, Any]:
-    """Return the content of a calibration file whose digest is right; raise `SpecError` for any other."""
-    found = read_json(path, where=where) if where else read_json(path)
-    name = path.name
+def _calibration_in(path: Path, where: str = "") -> dict[str, Any]:
+    """Return the content of a calibration file of this version, whatever its digest; `SpecError` for any other."""
+    found, name = read_json(path, where=where or None), path.name
     if not isinstance(found, dict) or found.get("kind") != CALIBRATION_KIND:
         raise SpecError(f"{name} is no calibration: write one by obsynth calibrate --out {name}.", path=where or name)
+    version = found.get("schema_version")
+    if version != CALIBRATION_VERSION:
+        raise SpecError(
+            f"{name} has the schema version {version!r}, and this obsynth reads {CALIBRATION_VERSION}: calibrate again "
+            f"(obsynth calibrate --out {name}).",
+            path=where or name,
+        )
+    return found
+
+
+def read_calibration(path: Path, *, where: str = "") -> dict[str, Any]:
+    """Return the content of a calibration file whose digest is right; raise `SpecError` for any other."""
+    found, name = _calibration_in(path, where), path.name
     if "sha256" not in found:
         raise SpecError(f"{name} holds no digest of itself, as files of older versions: calibrate again (obsynth "
                         f"calibrate --out {name}).", path=where or name)  # fmt: skip
     if not _intact(found):
         raise SpecError(f"{name} was changed after it was written: its digest does not match.", path=where or name)
+    wrong = _misfits(found)
+    if wrong:
+        raise SpecError(f"{name} is damaged: {', '.join(wrong)}. Calibrate again.", path=where or name)
     return found
 
 
@@ -171,16 +190,14 @@ def verify_calibration(path: str | Path, again: Mapping[str, Any] | None = None)
     SpecError
         The file is no calibration.
     """
-    found = read_json(Path(path))
-    if not isinstance(found, dict) or found.get("kind") != CALIBRATION_KIND:
-        raise SpecError(f"{path} is no calibration.", path=str(path))
+    found = _calibration_in(Path(path))
     rows = [
         nothing_wrong("digest", "the file is as it was written", [] if _intact(found) else ["sha256"], source=_SOURCE)
     ]
     rows.append(
         nothing_wrong(
             "box",
-            "ranges are finite, hold their nominal values, and the level is a probability",
+            "ranges are finite, hold their nominal values, and the level is a probability, of a log that is named",
             _misfits(found),
             source=_SOURCE,
         )
@@ -237,7 +254,12 @@ def _same_range(one: Any, item: Mapping[str, Any]) -> bool:
 def _stated_range(item: Any) -> list[float]:
     """Return low end, nominal value and high end of a constant of a file; nothing of what is malformed."""
     ends = item.get("range") if isinstance(item, dict) else None
-    if not isinstance(ends, list) or len(ends) != 2:
+    if (
+        not isinstance(ends, list)
+        or len(ends) != 2
+        or not is_texts([item.get("unit")])
+        or not is_texts(item.get("open"))
+    ):
         return []
     stated = [ends[0], item.get("nominal"), ends[1]]
     return stated if all(map(is_finite_number, stated)) else []
@@ -246,6 +268,9 @@ def _stated_range(item: Any) -> list[float]:
 def _misfits(found: Mapping[str, Any]) -> list[str]:
     level = found.get("level")
     wrong = [] if is_finite_number(level) and 0.0 < float(level or 0.0) < 1.0 else ["level"]
+    log = found.get("log")
+    wrong += [] if isinstance(log, dict) and isinstance(log.get("digest"), str) else ["log"]
+    wrong += [] if isinstance(found.get("stands"), bool) else ["stands"]
     constants = found.get("constants")
     if not isinstance(constants, dict):
         return [*wrong, "constants"]

@@ -31,7 +31,7 @@ from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.libraries import one_thread_if_small
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
-from obsynth.plants.constants import constant_of
+from obsynth.plants.constants import constant_of, does_not_stand
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import ALL_MATRICES, SIGNAL_NAMES, DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -488,30 +488,37 @@ def boxed_constants(section: PlantSection | DAESection, folder: Path) -> tuple[d
     if box:
         raise SpecError("box has a file, which says where it comes from: remove source, level and digest.", path="box")
     found = read_calibration(folder / file, where="box.file")
-    try:
-        calibrated = {name: _calibrated(name, item) for name, item in found["constants"].items()}
-        options = {"source": "calibrated", "level": found["level"], "digest": found["log"]["digest"],
-                   "calibration": found["sha256"]}  # fmt: skip
-    except (KeyError, TypeError, AttributeError) as error:
-        raise SpecError(f"{file} is damaged: it has no {error}.", path="box.file") from error
-    for name in calibrated:
+    if not found["stands"]:
+        raise SpecError(f"{file}: {does_not_stand(found['level'])}", path="box.file")
+    options = {"source": "calibrated", "level": found["level"], "digest": found["log"]["digest"],
+               "calibration": found["sha256"]}  # fmt: skip
+    calibrated = {}
+    for name, item in found["constants"].items():
         stated = constants.get(name)
         if isinstance(stated, dict) and ("range" in stated or "tolerance" in stated):
             raise SpecError(
                 f"{name!r} has a tolerance here, and one in {file}: remove one of them.", path=f"constants.{name}"
             )
+        unit = stated.get("unit") if isinstance(stated, dict) else None
+        calibrated[name] = _calibrated(name, item, unit or (section.units or {}).get(name), file)
     return constants | calibrated, {**options, "calibrated": tuple(calibrated)}
 
 
-def _calibrated(name: str, item: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nominal value, range and unit of a calibrated constant."""
+def _calibrated(name: str, item: Mapping[str, Any], unit: str | None, file: str) -> dict[str, Any]:
+    """Return nominal value, range and unit of a calibrated constant, whose unit in the plant is ``unit``, if any."""
     if item["open"]:
         raise SpecError(
             f"The box of {name!r} has an open {item['open'][0]} side: the log does not bound it there. State its "
             "range, or take a log that excites it.",
             path=f"constants.{name}",
         )
-    return {"nominal": item["nominal"], "range": list(item["range"]), "unit": item["unit"]}
+    if unit is not None and item["unit"] not in (unit, "1"):
+        raise SpecError(
+            f"{name!r} is in {unit} here, and in {item['unit']} in {file}: it was calibrated in another unit, or for "
+            "another plant.",
+            path=f"constants.{name}",
+        )
+    return {"nominal": item["nominal"], "range": list(item["range"]), "unit": unit or item["unit"]}
 
 
 def _entry(plant: DescriptorSystem, matrix: str, item: EntrySection) -> Entry:

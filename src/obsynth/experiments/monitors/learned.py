@@ -874,6 +874,11 @@ def learned_monitor(design: ObserverDesign, learned: LearnedThresholds) -> Monit
             f"The thresholds are for {missing[0]!r}, which the design does not have: learn them again for this design.",
             path="normal",
         )
+    if learned.outlier_sizes is not None and not has_innovations_by_sensor(observer):
+        raise SpecError(
+            "The thresholds hold sizes of outliers, and this design judges none of one sensor: learn them again.",
+            path="normal",
+        )
     residuals = (
         len(observer.residual_names) if isinstance(observer, LinearObserver) else len(innovation_names(observer))
     )
