@@ -16,7 +16,6 @@ from obsynth.numerics.arguments import is_finite_number
 from obsynth.results.checks import Check, information, nothing_wrong
 from obsynth.results.design import ObserverDesign, VerificationReport
 from obsynth.results.gain_set_writing import design_as_dict, digest_of, plain, restored
-from obsynth.results.gain_sets import is_texts
 
 #: Kinds of results that are certified with the gain sets that they rest on.
 ROBUSTNESS, STUDY, COMPARISON = "obsynth robustness", "obsynth tolerance study", "obsynth comparison"
@@ -254,12 +253,9 @@ def _same_range(one: Any, item: Mapping[str, Any]) -> bool:
 def _stated_range(item: Any) -> list[float]:
     """Return low end, nominal value and high end of a constant of a file; nothing of what is malformed."""
     ends = item.get("range") if isinstance(item, dict) else None
-    if (
-        not isinstance(ends, list)
-        or len(ends) != 2
-        or not is_texts([item.get("unit")])
-        or not is_texts(item.get("open"))
-    ):
+    if not isinstance(ends, list) or len(ends) != 2 or not isinstance(item.get("open"), list):
+        return []
+    if not all(isinstance(text, str) for text in (item.get("unit"), *item["open"])):
         return []
     stated = [ends[0], item.get("nominal"), ends[1]]
     return stated if all(map(is_finite_number, stated)) else []

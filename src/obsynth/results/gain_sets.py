@@ -225,7 +225,7 @@ _TYPES: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
     ),
     "gains": ("a mapping to arrays of numbers", lambda value: _is_mapping_to(value, _is_array)),
     "certificate": ("matrices and claims that are numbers", lambda value: _is_certificate(value)),
-    "notes": ("a list of texts", lambda value: is_texts(value)),
+    "notes": ("a list of texts", lambda value: _is_texts(value)),
     "recovery": ("maps with the names of states, or nothing", lambda value: value is None or _is_recovery(value)),
 }
 
@@ -259,7 +259,7 @@ def _is_array(value: Any) -> bool:
     return isinstance(value, np.ndarray)
 
 
-def is_texts(value: Any) -> bool:
+def _is_texts(value: Any) -> bool:
     return isinstance(value, list) and all(isinstance(item, str) for item in value)
 
 
@@ -276,6 +276,6 @@ def _is_certificate(value: Any) -> bool:
 
 
 def _is_recovery(value: Any) -> bool:
-    if not isinstance(value, dict) or not is_texts(value.get("names")):
+    if not isinstance(value, dict) or not _is_texts(value.get("names")):
         return False
     return all(_is_array(item) and item.ndim == 2 for key, item in value.items() if key.startswith(("from_", "noise_")))
