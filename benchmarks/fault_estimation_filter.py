@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 import obsynth
-from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem
+from obsynth.methods.fault_estimation_filter.central_filter import GainProblem
 from obsynth.methods.fault_estimation_filter.prepared_plant import prepare
 from obsynth.methods.fault_estimation_filter.synthesis import gain_problem, with_weight_limit
 from obsynth.numerics.norms import hinf_norm

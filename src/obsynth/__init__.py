@@ -65,8 +65,8 @@ _PUBLIC_NAMES = {
         "fault_estimation_filter functional_filter pd_observer ui_pi_observer"
     ),
     "methods.pd_observer.public": "apply_adaptation_gain",
-    "methods.recursive.steady_filter": "steady_state_filter",
-    "methods.ui_pi_observer.checks.fault_response": "fault_response",
+    "methods.recursive.synthesis": "steady_state_filter",
+    "methods.ui_pi_observer.checks": "fault_response",
     "methods.verifying": "verify",
     "observers.batches": "run_batch",
     "observers.dae.observer": "DAEObserver",

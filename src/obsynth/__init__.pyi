@@ -57,8 +57,8 @@ from obsynth.methods.functions import ui_pi_observer as ui_pi_observer
 from obsynth.methods.guaranteed_test.result import GuaranteedTest as GuaranteedTest
 from obsynth.methods.guaranteed_test.result import guaranteed_test as guaranteed_test
 from obsynth.methods.pd_observer.public import apply_adaptation_gain as apply_adaptation_gain
-from obsynth.methods.recursive.steady_filter import steady_state_filter as steady_state_filter
-from obsynth.methods.ui_pi_observer.checks.fault_response import fault_response as fault_response
+from obsynth.methods.recursive.synthesis import steady_state_filter as steady_state_filter
+from obsynth.methods.ui_pi_observer.checks import fault_response as fault_response
 from obsynth.methods.verifying import verify as verify
 from obsynth.observers.batches import run_batch as run_batch
 from obsynth.observers.dae.observer import DAEObserver as DAEObserver

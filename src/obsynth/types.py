@@ -23,7 +23,7 @@ _TYPE_NAMES = {
     "experiments.simulation": "Simulation",
     "methods.fault_figures": "FaultFigures",
     "methods.detection_filter.public": "DetectionFilter",
-    "methods.recursive.steady_filter": "SteadyState",
+    "methods.recursive.synthesis": "SteadyState",
     "observers.decisions": "Alarm Decision",
     "observers.running": "Estimates RunningObserver",
     "observers.windows": "WindowObserver",

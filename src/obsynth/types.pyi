@@ -22,7 +22,7 @@ from obsynth.experiments.simulation import Simulation as Simulation
 from obsynth.experiments.tolerance_study import ToleranceStudy as ToleranceStudy
 from obsynth.methods.detection_filter.public import DetectionFilter as DetectionFilter
 from obsynth.methods.fault_figures import FaultFigures as FaultFigures
-from obsynth.methods.recursive.steady_filter import SteadyState as SteadyState
+from obsynth.methods.recursive.synthesis import SteadyState as SteadyState
 from obsynth.observers.decisions import Alarm as Alarm
 from obsynth.observers.decisions import Decision as Decision
 from obsynth.observers.running import Estimates as Estimates

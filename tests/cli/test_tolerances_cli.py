@@ -11,7 +11,7 @@ import pytest
 
 from obsynth.cli.main import main
 from obsynth.results.gain_sets import load
-from obsynth.tolerances.exact_plant import plant_at
+from obsynth.tolerances.robustness import plant_at
 
 DRIVE = Path(__file__).parents[2] / "designs" / "drive" / "spec.yaml"
 MONITOR = ["--disturbance", "load torque=0.2", "--noise-bound", "1.7320508",

@@ -18,7 +18,7 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.monitors.adaptive import AdaptiveState, adaptive_plan, adaptive_step
 from obsynth.experiments.simulation import make_bench
 from obsynth.observers.running import state_as_data, state_from_data
-from obsynth.tolerances.exact_plant import drawn_points, plant_at
+from obsynth.tolerances.robustness import drawn_points, plant_at
 from obsynth.verification.adaptive_bound import thresholds_of_records
 
 START = 0.2

@@ -16,7 +16,7 @@ import obsynth
 from obsynth.experiments.alarm_proof import proved_alarm
 from obsynth.experiments.assumptions import file_digest
 from obsynth.results.gain_sets import digest_of
-from obsynth.tolerances.exact_plant import drawn_points
+from obsynth.tolerances.robustness import drawn_points
 
 
 @pytest.fixture(scope="module")

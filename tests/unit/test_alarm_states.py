@@ -11,7 +11,7 @@ from uncertain_plants import DRIVE, drive, two_masses
 
 import obsynth
 from obsynth.experiments.alarm_proof import assumptions_of, window_data
-from obsynth.tolerances.exact_plant import plant_at
+from obsynth.tolerances.robustness import plant_at
 
 STEPS, WINDOW = 40, 12
 UNCERTAIN = ("J1", "k")

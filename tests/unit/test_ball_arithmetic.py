@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.methods.pd_observer.checks.certificate import prove_gains
+from obsynth.methods.pd_observer.checks import prove_gains
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs import definiteness
-from obsynth.proofs.balls import Ball
+from obsynth.proofs.balls import LARGEST_ORDER, Ball, Enclosed, ExtendedBall, block, prove_by_ball_arithmetic
 from obsynth.proofs.definiteness import prove_positive_definite
-from obsynth.proofs.extended_balls import LARGEST_ORDER, Enclosed, ExtendedBall, block, prove_by_ball_arithmetic
 from obsynth.verification.certificates import prove_bounded_real, prove_gain, prove_stable
 
 ULP = 2.0**-52

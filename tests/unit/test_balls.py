@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from obsynth.proofs import products
-from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_up
-from obsynth.proofs.extended_balls import block
+from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, block, gamma, rounded_up
 
 #: Every double is a whole multiple of 1 / UNITS.
 UNITS = 2**1074

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from obsynth.methods.fault_estimation_filter.certificate import ROOMS, _with_room
-from obsynth.methods.fault_estimation_filter.injection_problem import _natural_states
+from obsynth.methods.fault_estimation_filter.central_filter import _natural_states
+from obsynth.methods.fault_estimation_filter.realisation import ROOMS, _with_room
 from obsynth.numerics.doubling import FEWEST_STATES
 from obsynth.numerics.norms import hinf_norm
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.methods.functional_filter.rates import delay_curve
+from obsynth.methods.functional_filter.kalman_gain import delay_curve
 from obsynth.report.designs import design_warnings, followed_steps
 from obsynth.spec.loader import load_spec
 

@@ -237,7 +237,7 @@ def test_a_zero_on_the_axis_is_refused_by_name() -> None:
 
 def test_sensitivity_is_refuted_between_the_points_of_a_grid() -> None:
     # A notch far narrower than any grid: the proof must not pass over it.
-    from obsynth.methods.detection_filter.norm_proofs import Transfer, sensitivity_is_proved
+    from obsynth.methods.detection_filter.checks import Transfer, sensitivity_is_proved
     from obsynth.proofs.balls import Ball
 
     a = np.array([[-1e-4, 1.2345], [-1.2345, -1e-4]])

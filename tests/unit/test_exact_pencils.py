@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_mat, fmpz_poly
 
-from obsynth.proofs import exact_pencils
+from obsynth.proofs import exact_arithmetic
 from obsynth.proofs.exact_arithmetic import (
+    ExactPencil,
     blocks,
     is_computed,
     locate_roots,
@@ -22,7 +23,6 @@ from obsynth.proofs.exact_arithmetic import (
     written_fraction,
     written_matrix,
 )
-from obsynth.proofs.exact_pencils import ExactPencil
 
 
 def mixed(E, A, seed):
@@ -199,17 +199,17 @@ def test_determinants_of_pencils_that_are_known(pairs):
     expected = fmpz_poly([1])
     for a, e in pairs:
         expected *= fmpz_poly([a, -e])
-    found = exact_pencils._determinant(left * slope * right, left * constant * right, degree)
+    found = exact_arithmetic._determinant(left * slope * right, left * constant * right, degree)
     assert found == primitive(fmpq_poly(expected))
 
 
 def test_a_determinant_that_vanishes_everywhere_is_zero():
     e, a = fmpz_mat([[1, 2], [2, 4]]), fmpz_mat([[3, 5], [6, 10]])
-    assert exact_pencils._determinant(e, a, 1) == fmpz_poly([0])
+    assert exact_arithmetic._determinant(e, a, 1) == fmpz_poly([0])
 
 
 def test_a_rank_is_that_of_the_rationals_also_where_it_is_less_modulo_the_prime():
-    prime = exact_pencils._PRIMES[0]
+    prime = exact_arithmetic._PRIMES[0]
     assert rank_of(fmpq_mat(2, 2, [fmpq(1, 3), fmpq(2, 3), fmpq(2, 7), fmpq(4, 7)])) == 1
     assert rank_of(fmpq_mat(2, 3, [fmpq(1, 3), fmpq(2, 3), fmpq(1), fmpq(2, 7), fmpq(4, 7), fmpq(0)])) == 2
     assert rank_of(fmpq_mat(2, 2, [fmpq(1), fmpq(0), fmpq(0), fmpq(prime)])) == 2

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 import obsynth
-from obsynth.methods.functional_filter import kalman_gain, rates
+from obsynth.methods.functional_filter import kalman_gain
 from obsynth.spec.loader import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"
@@ -348,4 +348,4 @@ def test_the_gain_is_that_of_its_riccati_equation_whatever_the_solver_gives(
 def test_what_rounding_leaves_of_an_integrator_is_no_time_of_the_plant(scatter: float) -> None:
     a = [[1.0 + scatter, 1.0], [0.0, 1.0]]
     sampled = obsynth.DescriptorSystem(None, a, C=[[1, 0]], Bf=[[0], [1]], dt=0.5)
-    assert rates.settling_time(sampled) == 10.0
+    assert kalman_gain.settling_time(sampled) == 10.0

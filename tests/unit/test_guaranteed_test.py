@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.methods.guaranteed_test.condensed import Condensed
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
 from obsynth.methods.guaranteed_test.proofs import (
+    Condensed,
     proved_least,
     proved_threshold,
     repaired_multipliers,

@@ -15,7 +15,7 @@ import pytest
 import obsynth
 from obsynth.cli.main import main
 from obsynth.results.design import Certificate
-from obsynth.tolerances.exact_plant import plant_at
+from obsynth.tolerances.robustness import plant_at
 
 ROOT = Path(__file__).parents[2]
 #: What the drive's example assumes: |load torque| <= 0.2 N m, |noise| <= 0.002 rad/s.

@@ -16,7 +16,7 @@ mpl.use("Agg")
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.methods.ui_pi_observer.checks.fault_response import fault_response
+from obsynth.methods.ui_pi_observer.checks import fault_response
 from obsynth.methods.verifying import verify
 from obsynth.plotting import estimate_gains, plot_gains, plot_poles
 from obsynth.report.page import html_report

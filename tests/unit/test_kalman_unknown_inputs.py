@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.methods.recursive.unknown_inputs import without_unknown_inputs
+from obsynth.methods.recursive.synthesis import without_unknown_inputs
 
 
 def plant(rng, *, direct, nx=4, ny=3, nd=2, **changes):

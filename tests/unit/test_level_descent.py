@@ -9,9 +9,9 @@ from obsynth.methods.fault_estimation_filter.central_filter import (
     NOISE_WEIGHTS,
     USUAL_WEIGHT,
     GammaIteration,
+    Injection,
     last_found,
 )
-from obsynth.methods.fault_estimation_filter.injection_problem import Injection
 
 TOLERANCE = 1e-7
 

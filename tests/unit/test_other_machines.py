@@ -14,14 +14,13 @@ import pytest
 
 import obsynth
 from obsynth.analysis.transformations.elimination import dynamic_coordinates
-from obsynth.methods.ui_pi_observer.assembly import KNOWN_POLES
+from obsynth.methods.ui_pi_observer.placement_problem import KNOWN_POLES
 from obsynth.numerics import scaling
 from obsynth.numerics.scaling import LogBalance
 from obsynth.numerics.spectra import rounding_of_eigenvalues
 from obsynth.proofs import contraction
-from obsynth.proofs.balls import Ball
+from obsynth.proofs.balls import Ball, enclosed_eigenvalues, middle_of
 from obsynth.proofs.contraction import LEFT_OF_SUM, prove_contraction, proved_contractions
-from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
 from obsynth.verification import certificates, stored_numbers
 
 sys.path.insert(0, str(Path(__file__).parents[2]))

@@ -14,18 +14,18 @@ import pytest
 import obsynth
 from obsynth.methods.conic import lmi
 from obsynth.methods.pd_observer import synthesis as pd_design
-from obsynth.methods.pd_observer.certificate import (
-    coupled_certificate,
-    explicit_certificate,
-    gain_certificate,
-    symmetric_certificate,
-)
-from obsynth.methods.pd_observer.checks.certificate import (
+from obsynth.methods.pd_observer.checks import (
     error_inputs,
     prove_gains,
     prove_shipped_stability,
 )
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
+from obsynth.methods.pd_observer.given_gains import (
+    coupled_certificate,
+    explicit_certificate,
+    gain_certificate,
+    symmetric_certificate,
+)
 from obsynth.methods.pd_observer.limits import least_noise_gain
 from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
 from obsynth.numerics.continuous import ContinuousNorms

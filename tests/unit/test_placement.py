@@ -10,8 +10,7 @@ import pytest
 
 from obsynth import DescriptorSystem, PreconditionError, SolverError, SpecError, ui_pi_observer
 from obsynth.methods.placement.eigenstructure import jordan_form, place
-from obsynth.methods.placement.kalman import NOISE_PRICE, KalmanProblem, compromise
-from obsynth.methods.placement.region import Region, region_gain
+from obsynth.methods.placement.region import NOISE_PRICE, KalmanProblem, Region, compromise, region_gain
 from obsynth.methods.ui_pi_observer.placement_problem import observable_split
 from obsynth.numerics.spectra import decay_rates, spectrum_error
 

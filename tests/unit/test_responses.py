@@ -10,8 +10,15 @@ from obsynth.analysis.transformations.uncertain_plant import affine_plant
 from obsynth.errors import PreconditionError
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.affine import AffineMatrix
-from obsynth.verification.error_structure import ErrorStructure, Tracking, error_structure
-from obsynth.verification.responses import largest_factor, loop_radius, responses_of, ring_length
+from obsynth.verification.error_structure import (
+    ErrorStructure,
+    Tracking,
+    error_structure,
+    largest_factor,
+    loop_radius,
+    responses_of,
+    ring_length,
+)
 
 #: What contraction of the ring and rounding may add to a sum, relatively.
 SHARE = 1e-3

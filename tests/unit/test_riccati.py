@@ -10,12 +10,13 @@ from scipy.linalg import block_diag, solve_continuous_are, solve_discrete_are
 
 from obsynth.methods.fault_estimation_filter.central_filter import (
     CentralEquation,
+    GainProblem,
+    Injection,
     Whitened,
     central_filter_at,
     central_injection,
     search_central_filter,
 )
-from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection
 from obsynth.numerics.doubling import (
     FIRST_POWER,
     RankWatch,

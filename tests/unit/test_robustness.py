@@ -9,7 +9,7 @@ from uncertain_plants import drive, two_masses, wang
 import obsynth
 from obsynth.analysis.transformations.uncertain_plant import affine_plant
 from obsynth.errors import PreconditionError
-from obsynth.tolerances.subdivision import index_one_on_box
+from obsynth.tolerances.robustness import index_one_on_box
 
 
 def test_largest_tolerances_are_those_of_the_audit() -> None:

@@ -8,7 +8,7 @@ from time_varying_plants import observer_for, varying
 
 import obsynth
 from obsynth import DescriptorSystem, PreconditionError, SpecError, TimeVaryingDescriptorSystem
-from obsynth.methods.recursive.steady_filter import steady_state_filter
+from obsynth.methods.recursive.synthesis import steady_state_filter
 from obsynth.observers.recursive.gain_schedule import gain_steps
 
 

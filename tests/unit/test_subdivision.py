@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from obsynth.proofs.affine import AffineMatrix
-from obsynth.tolerances.subdivision import proved_regular, proved_stable, subdivided
+from obsynth.tolerances.robustness import proved_regular, proved_stable, subdivided
 
 
 def test_proved_parts_cover_the_whole_box() -> None:

@@ -7,7 +7,7 @@ from uncertain_plants import drive
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.tolerances.exact_plant import acting_like_faults
+from obsynth.tolerances.robustness import acting_like_faults
 
 
 @pytest.fixture(scope="module")

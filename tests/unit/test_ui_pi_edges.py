@@ -8,8 +8,8 @@ import pytest
 from obsynth import DescriptorSystem, design_from_gains, ui_pi_observer
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.designing import check
-from obsynth.methods.placement.kalman import KalmanProblem
-from obsynth.methods.ui_pi_observer.pencils import number
+from obsynth.methods.placement.region import KalmanProblem
+from obsynth.methods.ui_pi_observer.augmented_plant import number
 from obsynth.numerics.arrays import FloatArray
 
 TWO = [[-1.0, 1.0], [0.0, -2.0]]

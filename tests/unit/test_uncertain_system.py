@@ -14,8 +14,7 @@ from obsynth.numerics.expressions import parse_expression
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
 from obsynth.proofs.affine import AffineMatrix, affine_exponential, affine_inverse
 from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
-from obsynth.tolerances.exact_plant import drawn_points, plant_at
-from obsynth.tolerances.subdivision import index_one_on_box
+from obsynth.tolerances.robustness import drawn_points, index_one_on_box, plant_at
 
 ONE = {"E": None, "A": [["1 - 0.1 * k / m"]], "C": [[1]], "dt": 0.1}
 

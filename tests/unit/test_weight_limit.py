@@ -8,7 +8,7 @@ import pytest
 
 import obsynth
 from obsynth.errors import InfeasibleError
-from obsynth.methods.fault_estimation_filter.injection_problem import WeightLimit
+from obsynth.methods.fault_estimation_filter.central_filter import WeightLimit
 
 #: A rod of 24 cells, heated in two, with one sensor on each and one between.
 SIZE = 24

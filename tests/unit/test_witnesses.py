@@ -30,8 +30,8 @@ from obsynth.methods.fault_estimation_filter.conditions import fault_filter_cond
 from obsynth.methods.functional_filter.conditions import conditions as functional_conditions
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 from obsynth.methods.recursive.conditions import recursive_conditions
+from obsynth.methods.ui_pi_observer.augmented_plant import exact_drops
 from obsynth.methods.ui_pi_observer.conditions import existence
-from obsynth.methods.ui_pi_observer.pencils import exact_drops
 from obsynth.plants.fault_models import exosystem
 
 #: A last digit or two of numbers near one.

@@ -30,7 +30,7 @@ from obsynth.files.tables import html_table, standing_page, text_table
 from obsynth.methods.automatic import SETTLING_TIMES, Candidate, Maker, candidate, linear_methods
 from obsynth.methods.designing import agree, design
 from obsynth.methods.fault_figures import DECOUPLED, FaultFigures, held, on_the_clock, step_responses
-from obsynth.methods.functional_filter.rates import settling_time
+from obsynth.methods.functional_filter.kalman_gain import settling_time
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import MOST_STATES, problem_of
 from obsynth.methods.guaranteed_test.programs import largest_hidden_fault
@@ -62,7 +62,7 @@ from obsynth.results.certificate_files import COMPARISON, SHOWN_DIGITS, result_t
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import design_as_dict
 from obsynth.simulation.scenario import Scenario, Sine, Step, resolve, scenario_from
-from obsynth.tolerances.exact_plant import plant_at
+from obsynth.tolerances.robustness import plant_at
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

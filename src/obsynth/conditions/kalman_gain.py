@@ -26,9 +26,12 @@ from obsynth.conditions import atoms
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import ObsynthError, VerificationError
 from obsynth.methods.functions import descriptor_kalman
-from obsynth.methods.recursive.steady_filter import steady_state_filter
-from obsynth.methods.recursive.synthesis import with_stated_noise
-from obsynth.methods.recursive.unknown_inputs import kalman_conditions, without_unknown_inputs
+from obsynth.methods.recursive.synthesis import (
+    kalman_conditions,
+    steady_state_filter,
+    with_stated_noise,
+    without_unknown_inputs,
+)
 from obsynth.numerics.arguments import arguments_checked, require_shape
 from obsynth.numerics.arrays import SMALLEST, FloatArray, as_matrix
 from obsynth.numerics.norms import output_covariance

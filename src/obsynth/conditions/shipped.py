@@ -13,7 +13,7 @@ from obsynth.conditions.share_pasand import augmented_problem
 from obsynth.conditions.wang import wang2015
 from obsynth.errors import SpecError
 from obsynth.methods.recursive.conditions import recursive_conditions
-from obsynth.methods.recursive.steady_filter import steady_state_filter
+from obsynth.methods.recursive.synthesis import steady_state_filter
 from obsynth.methods.ui_pi_observer.augmented_plant import direct_part, shipped_model
 from obsynth.methods.ui_pi_observer.conditions import existence_conditions
 from obsynth.numerics.matrix_equations import discrete_lyapunov

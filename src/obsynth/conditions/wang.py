@@ -27,12 +27,12 @@ from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import SpecError
 from obsynth.methods.conic import lmi
 from obsynth.methods.designing import design_from_gains
-from obsynth.methods.fault_estimation_filter.central_filter import search_least_gain
+from obsynth.methods.fault_estimation_filter.central_filter import GainProblem, normalise, null_basis, search_least_gain
 from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
-from obsynth.methods.fault_estimation_filter.detectability_indexes import exact_indexes, fault_detectability
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import proved_lower_bound
-from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, normalise, null_basis
 from obsynth.methods.fault_estimation_filter.prepared_plant import (
+    exact_indexes,
+    fault_detectability,
     prepare,
     restricted_equivalent_from,
     with_sensor_faults_as_states,

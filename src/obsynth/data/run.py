@@ -51,7 +51,7 @@ from obsynth.files.outputs import (
 from obsynth.files.tables import table_writer
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
-from obsynth.methods.guaranteed_test.tolerant import rows_before
+from obsynth.methods.guaranteed_test.windows import rows_before
 from obsynth.numerics.arguments import (
     arguments_checked,
     is_finite_number,

@@ -42,8 +42,7 @@ from obsynth.methods.guaranteed_test.proofs import (
 )
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.windows import Window
-from obsynth.methods.tracking import tracking_of
-from obsynth.methods.verifying import verify
+from obsynth.methods.verifying import tracking_of, verify
 from obsynth.numerics.arguments import real_number, whole_number
 from obsynth.numerics.arrays import FloatArray, require_no_overflow
 from obsynth.plants.constants import MOST_LISTED, shown

@@ -24,7 +24,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import Estimates
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
-from obsynth.tolerances.exact_plant import drawn_points, plant_at
+from obsynth.tolerances.robustness import drawn_points, plant_at
 
 
 @dataclass(frozen=True)

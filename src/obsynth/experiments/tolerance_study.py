@@ -24,7 +24,7 @@ from obsynth.results.certificate_files import SHOWN_DIGITS, STUDY, result_text
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.results.gain_sets import design_as_dict
 from obsynth.simulation.scenario import Scenario, Step
-from obsynth.tolerances.exact_plant import drawn_points, plant_at
+from obsynth.tolerances.robustness import drawn_points, plant_at
 
 #: Tolerances that are tried, by default.
 TOLERANCES = (0.0, 0.01, 0.02, 0.05)

@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.methods.fault_figures import DECOUPLED, SETTLING_SAMPLES, FaultFigures, fault_figures, on_the_clock
-from obsynth.methods.functional_filter.rates import settling_time
+from obsynth.methods.functional_filter.kalman_gain import settling_time
 from obsynth.methods.method import Method, Purpose
 from obsynth.methods.registry import REGISTRY, kind_of, method_class, methods_for
 from obsynth.numerics.arguments import field_types

@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.analysis.zeros import fault_zeros, regularity_of
 from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY, method_class
-from obsynth.methods.ui_pi_observer.pencils import equilibrated
+from obsynth.methods.ui_pi_observer.augmented_plant import equilibrated
 from obsynth.numerics.arguments import arguments_checked, chosen
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.modal_response import resolved

@@ -30,10 +30,9 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_v
 from obsynth.numerics.doubling import symmetric_product
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.numerics.scaling import balanced_matrix
-from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_up
+from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, Enclosed, arb_matrix, block, gamma, rounded_up
 from obsynth.proofs.covariances import enclosed_sum
 from obsynth.proofs.definiteness import prove_positive_definite
-from obsynth.proofs.extended_balls import Enclosed, arb_matrix, block
 from obsynth.proofs.products import exponential
 
 #: Where between the spectral radius (0) and one (1) the rate is tried, in turn.

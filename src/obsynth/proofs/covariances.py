@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.norms import balanced_realisation
 from obsynth.numerics.spectra import abscissa, noise_covariance
-from obsynth.proofs.extended_balls import arb_matrix
+from obsynth.proofs.balls import arb_matrix
 
 #: Relative difference of two ways of computing a variance up to which double precision is believed.
 SURE_DIFFERENCE = 1e-6

@@ -33,8 +33,18 @@ from numpy.typing import NDArray
 
 from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray
-from obsynth.proofs.balls import PANEL_ROWS, UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_up
-from obsynth.proofs.extended_balls import LARGEST_ORDER, Enclosed, Formula, prove_by_ball_arithmetic
+from obsynth.proofs.balls import (
+    LARGEST_ORDER,
+    PANEL_ROWS,
+    UNDERFLOW,
+    UNIT_ROUNDOFF,
+    Ball,
+    Enclosed,
+    Formula,
+    gamma,
+    prove_by_ball_arithmetic,
+    rounded_up,
+)
 
 #: The first shift that is tried, relative to the error bound: as little as leaves a bound above zero.
 LEAST_SHIFT = 1.0 + 2.0**-5

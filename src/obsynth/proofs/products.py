@@ -21,8 +21,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balancing_factors
-from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_up
-from obsynth.proofs.extended_balls import arb_matrix
+from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, arb_matrix, gamma, rounded_up
 
 #: Digits in which exponentials are formed, in bits.
 EXPONENTIAL_BITS = 160

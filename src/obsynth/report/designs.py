@@ -25,7 +25,7 @@ from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.files.tables import html_table
 from obsynth.methods.fault_figures import SETTLING_SAMPLES, FaultFigures, fault_figures, on_the_clock
-from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, settling_time
+from obsynth.methods.functional_filter.kalman_gain import DelayCurve, delay_curve, settling_time
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.observer import SETTLED_TO, LinearObserver, sample_observer, transient
 from obsynth.observers.windows import WindowObserver

@@ -1,14 +1,24 @@
-"""What a design guarantees for every plant in the box of its constants, as lines for people and as plain data."""
+"""Single plants of a box: their matrices, what an observer follows of one, gains at vertices, effects like faults.
+
+Statements about every matrix in a box, by cutting the box until each part is proved, or one point refutes it.
+
+Whether a plant is stable, and of index 1 (or 0), at every point of its box.
+
+What a design guarantees for every plant in the box of its constants, as lines for people and as plain data.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.sampling import discretise
 from obsynth.analysis.transformations.uncertain_plant import (
     ROW_ROUNDING_SHARE,
     AffinePlant,
@@ -17,32 +27,406 @@ from obsynth.analysis.transformations.uncertain_plant import (
     moving_family,
     untouched_states,
 )
-from obsynth.errors import PreconditionError, SpecError
+from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.files.outputs import write_atomically
-from obsynth.methods.tracking import tracking_of
-from obsynth.methods.verifying import verify
+from obsynth.methods.verifying import tracking_of, verify
 from obsynth.numerics.arguments import arguments_checked
-from obsynth.numerics.arrays import FloatArray, freeze
+from obsynth.numerics.arrays import FloatArray, freeze, largest_singular_value
+from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
+from obsynth.numerics.ranks import DIRECTION_SHARE, ROUNDED_ZERO
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.constants import SAME_TOLERANCE, ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system
-from obsynth.plants.uncertainty import Uncertainty, as_written
-from obsynth.proofs.affine import AffineMatrix
+from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, as_written
+from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse
 from obsynth.results.certificate_files import ROBUSTNESS, SHOWN_DIGITS, result_text
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.results.gain_sets import design_as_dict
-from obsynth.tolerances.exact_plant import acting_like_faults, is_sampled, moving_at, vertex_gains
-from obsynth.tolerances.subdivision import MOST_BOXES, BoxVerdict, index_one_on_box, proved_stable, values_at
-from obsynth.verification.error_structure import ErrorStructure, Tracking, error_structure
-from obsynth.verification.responses import (
+from obsynth.verification.error_structure import (
+    ErrorStructure,
     Responses,
+    Tracking,
     blame,
     blamed_rows,
+    error_structure,
     largest_factor,
     loop_radius,
     responses_of,
     same_sample_inverse,
 )
+
+
+def plant_at(plant: DescriptorSystem, values: Mapping[str, float]) -> DescriptorSystem:
+    """Return the plant for values of its constants: no family of matrices, and with the noise of the plant itself."""
+    uncertain = plant.uncertainty
+    if uncertain is None:
+        return plant
+    if uncertain.written is None:
+        found = plant.replace(**uncertain.filled(as_written(plant, uncertain), values), uncertainty=None)
+    else:
+        bare = _written_at(plant, uncertain, values)
+        for kind, size in uncertain.steps:
+            bare = discretise(bare, size).plant if kind == SAMPLED else eliminate_algebraic_states(bare).plant
+        found = plant.replace(**{name: getattr(bare, name) for name in UNCERTAIN_MATRICES}, uncertainty=None)
+    # It is no family any more, but knows which of its inputs is one in every row, if one is.
+    shift = uncertain.shift
+    return found.replace(uncertainty=Uncertainty(ConstantsBox({}), {}, shift=shift)) if shift else found
+
+
+def moving_at(plant: DescriptorSystem, values: Mapping[str, float]) -> FloatArray:
+    """Return A of the plant for values of its constants, reduced, and before it was sampled."""
+    bare = plant if plant.uncertainty is None else _written_at(plant, plant.uncertainty, values)
+    # Of the signals nothing is asked: without them the elimination has a tenth of the columns.
+    moving = DescriptorSystem(E=bare.E, A=bare.A, C=np.zeros((1, bare.nx)), dt=bare.dt)
+    return eliminate_algebraic_states(moving).plant.A
+
+
+def _written_at(plant: DescriptorSystem, uncertain: Uncertainty, values: Mapping[str, float]) -> DescriptorSystem:
+    """Return the plant as it was written, for values of its constants."""
+    matrices: dict[str, Any] = uncertain.filled(as_written(plant, uncertain), values)
+    return DescriptorSystem(**matrices, dt=0.0 if is_sampled(uncertain.steps) else plant.dt)
+
+
+def is_sampled(steps: tuple[tuple[str, float], ...]) -> bool:
+    """Whether a plant was sampled since it was written."""
+    return any(kind == SAMPLED for kind, _ in steps)
+
+
+def drawn_points(count: int, runs: int, seed: int, *, vertices: float = 0.5) -> FloatArray:
+    """Return points ``(runs, count)`` of the box: a share of them vertices, the others uniform inside."""
+    generator = np.random.default_rng(seed)
+    points = generator.uniform(-1.0, 1.0, (runs, count))
+    chosen = generator.random(runs) < vertices
+    points[chosen] = generator.choice([-1.0, 1.0], (int(chosen.sum()), count))
+    return points
+
+
+#: Vertices beyond this number are drawn at random.
+MOST_VERTICES = 32
+#: Samples over which the gain at a vertex is summed up, at most.
+MOST_GAIN_SAMPLES = 5_000
+#: What is left of a response when its sum ends.
+_GAIN_LEFT = 1e-6
+#: Samples that are taken at once.
+_GAIN_BLOCK = 50
+
+
+def vertex_gains(
+    design: ObserverDesign, plant: DescriptorSystem, affine: AffinePlant, tracking: Tracking
+) -> dict[str, float]:
+    """Return the largest peak (l1) gain from disturbances at the vertices; some drawn where there are too many."""
+    observer, uncertain = design.linear[1], plant.uncertainty
+    labels = observer.row_names[len(observer.state_names) :]
+    if uncertain is None or not plant.nd or not labels:
+        return {}
+    count = len(uncertain.box.names)
+    corners = (
+        np.array(list(itertools.product((-1.0, 1.0), repeat=count)))
+        if 2**count <= MOST_VERTICES
+        else (np.random.default_rng(0).choice([-1.0, 1.0], (MOST_VERTICES, count)))
+    )
+    followed, basis = tracking.T, affine.coordinates
+    nominal = eliminate_algebraic_states(plant)
+    if plant.nx != nominal.plant.nx:
+        followed, basis = followed @ plant.E @ nominal.recovery.from_state, np.eye(nominal.plant.nx)
+    worst = np.zeros(len(labels))
+    for corner in corners:
+        at = plant_at(plant, uncertain.box.values(corner))
+        worst = np.maximum(worst, _peak_gain(observer, at, followed, basis))
+    return {label: float(gain) for label, gain in zip(labels, worst, strict=True)}
+
+
+def _peak_gain(
+    observer: LinearObserver, plant: DescriptorSystem, followed: FloatArray, basis: FloatArray
+) -> FloatArray:
+    """Return the peak gain of plant and error in series, without states that reach neither error nor outputs."""
+    shown = slice(observer.fault_rows.start, len(observer.Cz))
+    try:
+        smooth = eliminate_algebraic_states(plant).plant
+    except ObsynthError:
+        return np.full(len(observer.Cz) - observer.fault_rows.start, np.inf)
+    back = 2.0 * np.eye(len(basis)) - basis
+    into = observer.Az @ followed + observer.By @ smooth.C - followed @ smooth.A
+    through = observer.Cz[shown] @ followed + observer.Dy[shown] @ smooth.C
+    seen = np.vstack([back @ smooth.A, into, through])
+    terms = np.concatenate(
+        [
+            np.abs(back @ smooth.A).sum(axis=1),
+            (np.abs(observer.Az @ followed) + np.abs(observer.By) @ np.abs(smooth.C)).sum(axis=1),
+            (np.abs(observer.Cz[shown]) @ np.abs(followed) + np.abs(observer.Dy[shown]) @ np.abs(smooth.C)).sum(axis=1),
+        ]
+    )
+    apart = untouched_states(seen @ basis, terms)
+    kept = [i for i in range(smooth.nx) if i not in apart]
+    nx, nz = len(kept), observer.order
+    a = np.block(
+        [[(back @ smooth.A @ basis)[np.ix_(kept, kept)], np.zeros((nx, nz))], [(into @ basis)[:, kept], observer.Az]]
+    )
+    b = np.vstack([(back @ smooth.Bd)[kept], observer.By @ smooth.Dd - followed @ smooth.Bd])
+    c = np.hstack([(through @ basis)[:, kept], observer.Cz[shown]])
+    total = np.abs(observer.Dy[shown] @ smooth.Dd).sum(axis=1)
+    if np.max(np.abs(np.linalg.eigvals(a)), initial=0.0) >= 1.0:
+        return np.full(len(c), np.inf)
+    return np.asarray(total + _summed_response(a, b, c))
+
+
+def _summed_response(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    """Return the sums of ``abs(c a^k b)`` over k and the columns, until little of ``a^k b`` is left."""
+    powers = [np.eye(len(a))]
+    while len(powers) <= _GAIN_BLOCK:
+        powers.append(a @ powers[-1])
+    block, onwards = np.array(powers[:-1]), powers[-1]
+    column, left, total = b, _GAIN_LEFT * float(np.abs(b).max(initial=0.0)), np.zeros(len(c))
+    for _ in range(0, MOST_GAIN_SAMPLES, _GAIN_BLOCK):
+        moved = block @ column
+        sizes = np.abs(moved).max(axis=(1, 2), initial=0.0)
+        total = total + np.abs(c @ moved[: max(int(np.argmax(np.append(sizes <= left, True))), 1)]).sum(axis=(0, 2))
+        if np.any(sizes <= left):
+            break
+        column = onwards @ column
+    return total
+
+
+def acting_like_faults(plant: DescriptorSystem) -> tuple[str, ...]:
+    """Return the constants with tolerances that act where a fault does, from the plant as written."""
+    uncertain = plant.uncertainty
+    if uncertain is None or not plant.nf:
+        return ()
+    numbers = as_written(plant, uncertain)
+    affine = uncertain.affine(numbers, uncertain.box)
+    faults = np.vstack([numbers["Bf"], numbers["Df"]])
+    found = []
+    for i, name in enumerate(uncertain.box.names):
+        # What multiplies the same signal stands in one column: derivative of the state, state, u, f, d.
+        zero = np.zeros((plant.ny, len(numbers["A"])))
+        above = [affine[key].parts[i] for key in ("E", "A", "B", "Bf", "Bd")]
+        below = [zero, *(affine[key].parts[i] for key in ("C", "D", "Df", "Dd"))]
+        directions = _range(np.vstack([np.hstack(above), np.hstack(below)]))
+        both = np.hstack([faults / np.linalg.norm(faults, axis=0), directions])
+        if np.linalg.matrix_rank(both, tol=DIRECTION_SHARE) < both.shape[1]:
+            found.append(name)
+    return tuple(found)
+
+
+def _range(effects: FloatArray) -> FloatArray:
+    """Return unit columns that span what a constant does to equations and outputs."""
+    left, values, _ = np.linalg.svd(effects)
+    return np.asarray(left[:, : int(np.sum(values > DIRECTION_SHARE * max(values[0], np.finfo(np.float64).tiny)))])
+
+
+#: Boxes after which a statement is left open.
+MOST_BOXES = 150
+#: The matrix over ``lower <= q <= upper``.
+Build: TypeAlias = Callable[[FloatArray, FloatArray], AffineMatrix]
+#: Halvings of the way to a point that fails.
+BISECTIONS = 50
+#: With more constants than this, not all vertices are looked at first.
+MOST_VERTEX_CONSTANTS = 10
+#: Norms computed in double precision are multiplied by this before they are compared.
+_NORM_OUTWARD = 1.0 + 1e-9
+#: What rounding takes from a product of matrices, beside its terms.
+_PRODUCT_ROUNDING = 1e-14
+
+
+@dataclass(frozen=True, eq=False)
+class BoxVerdict:
+    """``proved``, ``refuted`` (at a point ``q``) or ``open``, and how many boxes it took."""
+
+    verdict: str
+    boxes: int
+    at: FloatArray | None = None
+
+
+def subdivided(
+    build: Build,
+    count: int,
+    holds_on: Callable[[AffineMatrix], bool],
+    fails_at: Callable[[FloatArray], bool],
+    exact_at: Callable[[FloatArray], FloatArray],
+    *,
+    most: int = MOST_BOXES,
+) -> BoxVerdict:
+    """Cut the box along the constant that matters most; ``build``: the matrix over a part, ``exact_at``: at a point."""
+    if count <= MOST_VERTEX_CONSTANTS:
+        for corner in itertools.product((-1.0, 1.0), repeat=count):
+            point = np.array(corner)
+            if fails_at(exact_at(point)):
+                return BoxVerdict("refuted", 0, point)
+    todo = [(-np.ones(count), np.ones(count))]
+    done = 0
+    while todo:
+        lower, upper = todo.pop()
+        done += 1
+        try:
+            part = build(lower, upper)
+        except PreconditionError:
+            part = None
+        if part is not None and holds_on(part):
+            continue
+        middle = (lower + upper) / 2.0
+        if fails_at(exact_at(middle)):
+            return BoxVerdict("refuted", done, middle)
+        sizes = upper - lower if part is None else np.abs(part.parts).sum(axis=(1, 2))
+        if done >= most or not sizes.any():
+            return BoxVerdict("open", done)
+        i = int(np.argmax(sizes))
+        cut_above, cut_below = lower.copy(), upper.copy()
+        cut_above[i], cut_below[i] = middle[i], middle[i]
+        todo += [(lower, cut_below), (cut_above, upper)]
+    return BoxVerdict("proved", done)
+
+
+def values_at(box: ConstantsBox, q: FloatArray) -> dict[str, float]:
+    """Return the values of the uncertain constants at a point, without the rounding of zero."""
+    values = box.values(q)
+    sizes = {item.name: max(abs(item.low), abs(item.high)) for item in box.uncertain}
+    return {name: 0.0 if abs(values[name]) < ROUNDED_ZERO * size else values[name] for name, size in sizes.items()}
+
+
+def proved_regular(build: Build, count: int, exact_at: Callable[[FloatArray], FloatArray]) -> BoxVerdict:
+    """Return whether a matrix is nonsingular on the whole box; a change of the determinant's sign refutes it."""
+    middle = exact_at(np.zeros(count))
+    if not middle.size:
+        return BoxVerdict("proved", 0)
+    sign = np.linalg.slogdet(middle)[0]
+
+    def invertible(part: AffineMatrix) -> bool:
+        try:
+            affine_inverse(part)
+        except (PreconditionError, np.linalg.LinAlgError):
+            return False
+        return True
+
+    def singular(point: FloatArray) -> bool:
+        return bool(np.linalg.slogdet(point)[0] * sign <= 0.0)
+
+    found = subdivided(build, count, invertible, singular, exact_at)
+    if found.at is None:
+        return found
+    # Where, between the middle of the box and the point that fails, it begins to fail.
+    low, high = 0.0, 1.0
+    for _ in range(BISECTIONS):
+        between = (low + high) / 2.0
+        low, high = (low, between) if singular(exact_at(between * found.at)) else (between, high)
+    return BoxVerdict(found.verdict, found.boxes, np.asarray(high * found.at))
+
+
+def proved_stable(
+    build: Build,
+    count: int,
+    exact_at: Callable[[FloatArray], FloatArray],
+    *,
+    discrete: bool,
+    most: int = MOST_BOXES,
+) -> BoxVerdict:
+    """Return whether a matrix is stable on the whole box, in the norm of a Lyapunov function of each part's centre."""
+
+    def stable(part: AffineMatrix) -> bool:
+        return _contracts(part, discrete=discrete)
+
+    def unstable(point: FloatArray) -> bool:
+        values = np.linalg.eigvals(point)
+        return bool(np.max(np.abs(values)) >= 1.0 if discrete else np.max(values.real) >= 0.0)
+
+    return subdivided(build, count, stable, unstable, exact_at, most=most)
+
+
+def _contracts(part: AffineMatrix, *, discrete: bool) -> bool:
+    """Return whether ``A'PA - P < 0`` (``A'P + PA < 0``) on a part, P that of its centre for ``-I``."""
+    a = part.center
+    root, inverse = _energy_coordinates(a, discrete=discrete)
+    if not np.isfinite(inverse).all():
+        return False
+    # Once more in the coordinates of the first: there all modes count alike.
+    a = root @ a @ inverse
+    lyapunov = _lyapunov(a, discrete=discrete)
+    if not np.linalg.eigvalsh(lyapunov)[0] > 0.0:
+        return False
+    parts = [root @ item @ inverse for item in part.parts]
+    rest = np.abs(root) @ part.radius @ np.abs(inverse)
+    rest = rest + _PRODUCT_ROUNDING * len(a) * (np.abs(root) @ part.magnitude @ np.abs(inverse))
+    size, remainder = np.abs(lyapunov), largest_singular_value(rest)
+    if discrete:
+        first = sum(largest_singular_value(a.T @ lyapunov @ item + item.T @ lyapunov @ a) for item in parts)
+        spread = np.abs(parts).sum(axis=0) + rest if parts else rest
+        second = largest_singular_value(spread.T @ size @ spread)
+        second += 2.0 * largest_singular_value(np.abs(a.T) @ size) * remainder
+        middle = a.T @ lyapunov @ a - lyapunov
+    else:
+        first = sum(largest_singular_value(lyapunov @ item + item.T @ lyapunov) for item in parts)
+        second = 2.0 * largest_singular_value(size) * remainder
+        middle = lyapunov @ a + a.T @ lyapunov
+    rounding = _PRODUCT_ROUNDING * len(a) * largest_singular_value(size) * (1.0 + largest_singular_value(a) ** 2)
+    return float(np.linalg.eigvalsh((middle + middle.T) / 2.0)[-1]) + (first + second + rounding) * _NORM_OUTWARD < 0.0
+
+
+def _lyapunov(a: FloatArray, *, discrete: bool) -> FloatArray:
+
+    weight = np.eye(len(a))
+    found = discrete_lyapunov(a.T, weight) if discrete else continuous_lyapunov(a.T, -weight)
+    return np.asarray((found + found.T) / 2.0)
+
+
+def _energy_coordinates(a: FloatArray, *, discrete: bool) -> tuple[FloatArray, FloatArray]:
+    """Return S and its inverse, in whose coordinates Lyapunov's function is a sum of squares; NaN if there is none."""
+    values, vectors = np.linalg.eigh(_lyapunov(a, discrete=discrete))
+    if not values[0] > 0.0:
+        return np.full_like(a, np.nan), np.full_like(a, np.nan)
+    return (vectors * np.sqrt(values)).T, vectors / np.sqrt(values)
+
+
+#: What rounding may leave where a compressed row of E vanishes, beside the terms it is made of.
+VANISHING_SHARE = 1e-13
+
+
+def index_one_on_box(plant: DescriptorSystem) -> BoxVerdict:
+    """Return whether ``[E_dyn; A_alg](q)`` is nonsingular on the box; `PreconditionError` where rows become dynamic."""
+    written = plant.uncertainty
+    if written is None:
+        from obsynth.analysis.zeros import structure_of
+
+        index = structure_of(plant).index
+        return BoxVerdict("proved" if index is not None and index <= 1 else "refuted", 0, np.zeros(0))
+    numbers = as_written(plant, written)
+    affine = written.affine(numbers, written.box)
+    dynamic, algebraic = compressed_rows(affine["E"].at(written.box.offsets))
+    require_algebraic(affine["E"], algebraic)
+
+    def build(lower: FloatArray, upper: FloatArray) -> AffineMatrix:
+        found = written.affine(numbers, written.box.part(lower, upper))
+        return affine_block([[found["E"].after(dynamic)], [found["A"].after(algebraic)]])
+
+    def exactly(q: FloatArray) -> FloatArray:
+        found = written.filled(numbers, written.box.values(q))
+        return np.vstack([dynamic @ found["E"], algebraic @ found["A"]])
+
+    return proved_regular(build, len(written.box.names), exactly)
+
+
+def compressed_rows(e: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return ``R1, R2``: rows of E that have full rank, and a rational basis of ``R2 E = 0``; numbers as written."""
+    from obsynth.proofs.exact_arithmetic import nearest_doubles, null_basis, pivot_columns, written_matrix
+
+    n = len(e)
+    exact = written_matrix(e.T)
+    chosen = pivot_columns(exact)
+    null = nearest_doubles(null_basis(exact)) if len(chosen) < n else np.zeros((n, 0))
+    return np.eye(n)[chosen], np.asarray(null.T)
+
+
+def require_algebraic(e: AffineMatrix, algebraic: FloatArray) -> None:
+    """Refuse a box that makes an algebraic row dynamic."""
+    found, size = e.after(algebraic), np.abs(algebraic) @ e.magnitude
+    moving = np.abs(found.parts).sum(axis=0) > VANISHING_SHARE * size
+    if moving.any():
+        rows = np.flatnonzero(np.abs(algebraic[moving.any(axis=1)]).sum(axis=0))
+        raise PreconditionError(
+            f"A tolerance puts a derivative into an algebraic equation (rows {', '.join(str(i + 1) for i in rows)}): "
+            "the plant's order changes inside the box. Give these rows of E no tolerance of their own.",
+            condition="algebraic rows",
+        )
+
 
 #: A design without tolerances says this.
 EXACT_MODEL = "assumes an exact model"

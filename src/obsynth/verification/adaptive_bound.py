@@ -17,9 +17,9 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.proofs.balls import gamma
 from obsynth.proofs.contraction import positive_vector
-from obsynth.verification.error_structure import ErrorStructure
-from obsynth.verification.responses import (
+from obsynth.verification.error_structure import (
     OUTWARD,
+    ErrorStructure,
     Responses,
     power_rounding,
     responses_of,

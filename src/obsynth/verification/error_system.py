@@ -29,9 +29,8 @@ from obsynth.numerics.arrays import FloatArray, Made, remembered
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver, poles_of
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import Ball, rounded_up
+from obsynth.proofs.balls import Ball, ExtendedBall, rounded_up
 from obsynth.proofs.contraction import Contraction, absolute_gains, prove_contraction
-from obsynth.proofs.extended_balls import ExtendedBall
 from obsynth.proofs.products import as_ball
 from obsynth.results.checks import Check, upper_bound_check
 

@@ -31,6 +31,7 @@ from obsynth.numerics.pencils import FiniteZeros, full_svd
 from obsynth.numerics.ranks import CLEAR_GAP, MARKOV_TOLERANCE, RANK_TOLERANCE, TRACE_TOLERANCE, rank_from
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import (
+    ExactPencil,
     Root,
     blocks,
     holds_computed,
@@ -47,7 +48,6 @@ from obsynth.proofs.exact_arithmetic import (
     written_matrix,
     zeros_matrix,
 )
-from obsynth.proofs.exact_pencils import ExactPencil
 
 #: Plants with more unknowns are decided in floating point.
 MOST_EXACT_UNKNOWNS = 70

@@ -13,22 +13,20 @@ from flint import arb_mat, fmpq_mat, fmpz_poly
 from obsynth.numerics.ranks import RankDecision
 from obsynth.plants.descriptor import DECISIVE, DescriptorSystem
 from obsynth.proofs.exact_arithmetic import (
+    EnclosedPencil,
+    ExactPencil,
+    bits_for,
     blocks,
+    exponential,
     holds_computed,
     picked_columns,
     picked_rows,
     rank_of,
+    rank_to_digits,
     rational_matrix,
+    system_pencil,
     written_matrix,
     zeros_matrix,
-)
-from obsynth.proofs.exact_pencils import (
-    EnclosedPencil,
-    ExactPencil,
-    bits_for,
-    exponential,
-    rank_to_digits,
-    system_pencil,
 )
 
 #: Degree of the minimal polynomial of an eigenvalue, times columns of the pencil, above which its rank there is left

@@ -22,7 +22,7 @@ from obsynth.numerics.sparse import dense
 from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem, note_source
 from obsynth.plants.uncertainty import SAMPLED
-from obsynth.proofs.extended_balls import arb_matrix
+from obsynth.proofs.balls import arb_matrix
 from obsynth.proofs.products import as_ball
 
 #: With so many states and signals, whose exponential takes 10 ms, each entry is rounded once: another machine finds it

@@ -29,7 +29,7 @@ from obsynth.experiments.monitors.monitor import Judged, LinearSample, Rule, Sam
 from obsynth.experiments.monitors.residual_model import noisy_plant, watches_estimates
 from obsynth.experiments.monitors.rules import FITTING_SHARE, NormRule, NormState, norm_of
 from obsynth.experiments.simulation import Runs
-from obsynth.methods.tracking import tracking_of
+from obsynth.methods.verifying import tracking_of
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
@@ -43,8 +43,7 @@ from obsynth.proofs.balls import rounded_up
 from obsynth.proofs.contraction import inverse_bound
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario, resolve
-from obsynth.tolerances.robustness import EXACT_MODEL, structure_of, with_tolerances
-from obsynth.tolerances.subdivision import index_one_on_box, values_at
+from obsynth.tolerances.robustness import EXACT_MODEL, index_one_on_box, structure_of, values_at, with_tolerances
 from obsynth.verification.adaptive_bound import (
     THRESHOLD_ROUNDING,
     AdaptiveBound,
@@ -55,8 +54,7 @@ from obsynth.verification.adaptive_bound import (
     filtered,
     thresholds_of_records,
 )
-from obsynth.verification.error_structure import ErrorStructure, Tracking, error_structure
-from obsynth.verification.responses import loop_radius
+from obsynth.verification.error_structure import ErrorStructure, Tracking, error_structure, loop_radius
 
 #: Share of a bound within which a value is not decided here: more than rounding can change.
 UNDECIDED_SHARE = 1e-9

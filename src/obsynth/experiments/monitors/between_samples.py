@@ -18,7 +18,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold, peak_gain
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import Ball, rounded_up
+from obsynth.proofs.balls import Ball, block, rounded_up
 from obsynth.proofs.contraction import (
     Contraction,
     column_norms,
@@ -27,7 +27,6 @@ from obsynth.proofs.contraction import (
     peak_sums,
     prove_contraction,
 )
-from obsynth.proofs.extended_balls import block
 from obsynth.proofs.products import exponential
 
 #: Modes of the plant that decay by less than this exponent in a sample are not followed until they have decayed.

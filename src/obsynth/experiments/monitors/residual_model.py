@@ -35,8 +35,8 @@ from obsynth.observers.linear.observer import LinearObserver, sample_observer
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Additive, Random, Scenario, ScenarioSignals, observer_start, resolve
+from obsynth.verification.error_structure import OUTWARD
 from obsynth.verification.error_system import ErrorModel
-from obsynth.verification.responses import OUTWARD
 
 
 def schur_form(matrix: FloatArray) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.methods.own_terms import ChosenSolver
+from obsynth.methods.method import ChosenSolver
 from obsynth.numerics.arrays import FloatArray
 
 if TYPE_CHECKING:

@@ -114,7 +114,7 @@ class DescriptorKalman(Method):
         self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, exactly: bool = True
     ) -> tuple[Condition, ...]:
         """Return the existence conditions; the list ends at the first failure."""
-        from obsynth.methods.recursive.unknown_inputs import kalman_conditions
+        from obsynth.methods.recursive.synthesis import kalman_conditions
 
         return kalman_conditions(plant, early=self.early_constraints)
 

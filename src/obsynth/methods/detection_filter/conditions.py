@@ -11,8 +11,7 @@ from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.exact_arithmetic import holds_computed
-from obsynth.proofs.exact_pencils import ExactPencil
+from obsynth.proofs.exact_arithmetic import ExactPencil, holds_computed
 
 #: The zeros of pencils with more columns are left to the Riccati equation.
 MOST_PENCIL_COLUMNS = 70

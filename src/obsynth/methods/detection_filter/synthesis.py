@@ -11,15 +11,15 @@ from obsynth.analysis.conditions import require_all
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.errors import SolverError
-from obsynth.methods.detection_filter.conditions import unknown_inputs
-from obsynth.methods.detection_filter.method import DetectionFilterMethod
-from obsynth.methods.detection_filter.norm_proofs import (
+from obsynth.methods.detection_filter.checks import (
     Transfer,
     added_gain,
     error_transfer,
     gain_is_proved,
     sensitivity_is_proved,
 )
+from obsynth.methods.detection_filter.conditions import unknown_inputs
+from obsynth.methods.detection_filter.method import DetectionFilterMethod
 from obsynth.methods.method import Synthesis
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.matrix_equations import continuous_solution

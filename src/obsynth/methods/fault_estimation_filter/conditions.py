@@ -23,14 +23,16 @@ from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, 
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import MOST_NAMES, Zero, hidden_faults, leading_names, regularity_of, zero_at
 from obsynth.errors import PreconditionError
-from obsynth.methods.fault_estimation_filter.detectability_indexes import (
+from obsynth.methods.fault_estimation_filter.prepared_plant import (
     REFUSE_CONDITION,
     FaultDetectability,
+    PreparedPlant,
     detectability_conditions,
     nonsingular_t,
     numbers_with_fault_states,
+    prepare,
+    with_sensor_faults_as_states,
 )
-from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare, with_sensor_faults_as_states
 from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem

@@ -15,7 +15,7 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.methods.conic import lmi
-from obsynth.methods.fault_estimation_filter.injection_problem import (
+from obsynth.methods.fault_estimation_filter.central_filter import (
     GainProblem,
     Injection,
     NormalisedProblem,

@@ -11,12 +11,16 @@ from annotated_types import Ge
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
 from obsynth.methods.fault_estimation_filter.least_gain_proof import LEAST_GAIN_WITNESSES
-from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
-from obsynth.methods.own_terms import (
+from obsynth.methods.method import (
+    ClaimMeaning,
+    Method,
     OwnConstraints,
     OwnRegion,
+    PlantKind,
+    Purpose,
     SolverName,
     SolverOptions,
+    Synthesis,
     own_term_conflicts,
     own_terms,
 )

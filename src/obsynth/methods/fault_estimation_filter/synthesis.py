@@ -40,26 +40,23 @@ from obsynth.methods.fault_estimation_filter.central_filter import (
     AT_THE_BOUND,
     FEW_STATES,
     MOST_STATES_FOR_LEVELS,
+    GainProblem,
+    Injection,
     LeastGain,
+    WeightLimit,
     least_level,
     least_noise_filter,
     noise_weighted_filters,
     noise_weighted_filters_within,
+    null_basis,
     search_by_bisection,
     search_least_gain,
 )
-from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
 from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import (
     BOUND_MARGIN,
     least_gain_certificate,
     proved_lower_bound,
-)
-from obsynth.methods.fault_estimation_filter.injection_problem import (
-    GainProblem,
-    Injection,
-    WeightLimit,
-    null_basis,
 )
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.fault_estimation_filter.prepared_plant import (
@@ -67,7 +64,7 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import (
     prepare,
     with_sensor_faults_as_states,
 )
-from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
+from obsynth.methods.fault_estimation_filter.realisation import bounded_real_certificate, notes, realise_filter
 from obsynth.methods.method import Synthesis
 from obsynth.numerics.arrays import FloatArray, as_matrix, largest_singular_value
 from obsynth.numerics.regions import disk

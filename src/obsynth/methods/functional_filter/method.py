@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -155,9 +156,7 @@ class FunctionalFilter(Method):
 
     def require_stated(self, plant: DescriptorSystem) -> None:
         """Raise `PreconditionError` where a combination of the outputs that the gain reads has no noise."""
-        from obsynth.methods.functional_filter.synthesis import require_stated
-
-        require_stated(plant, self)
+        import_module("obsynth.methods.functional_filter.synthesis").require_stated(plant, self)
 
     def for_plant(self, plant: DescriptorSystem) -> Self:
         """Return the method without the faults that a plant no longer has."""

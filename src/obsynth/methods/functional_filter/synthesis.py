@@ -21,19 +21,20 @@ import numpy as np
 from scipy.linalg import block_diag, schur
 
 from obsynth.errors import SpecError
+from obsynth.methods.functional_filter.checks import estimate_deviations, tracking_map
 from obsynth.methods.functional_filter.conditions import chosen_faults, residual_sets
 from obsynth.methods.functional_filter.kalman_gain import (
     FilterModel,
     KalmanGain,
+    default_rates,
     filter_model,
     kalman_gain,
     model_states,
     require_noise,
+    settling_time,
     whitening,
 )
 from obsynth.methods.functional_filter.method import FunctionalFilter
-from obsynth.methods.functional_filter.rates import default_rates, settling_time
-from obsynth.methods.functional_filter.tracking import estimate_deviations, tracking_map
 from obsynth.methods.method import Synthesis
 from obsynth.methods.placement.eigenstructure import checked_poles, place
 from obsynth.methods.refusals import require_all_told
@@ -43,7 +44,7 @@ from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
-from obsynth.proofs.extended_balls import arb_matrix
+from obsynth.proofs.balls import arb_matrix
 from obsynth.proofs.products import EXPONENTIAL_BITS, as_ball
 from obsynth.results.design import Certificate
 from obsynth.verification.certificates import slowest_decay, stability_factor

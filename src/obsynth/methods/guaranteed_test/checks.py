@@ -27,8 +27,7 @@ from obsynth.methods.guaranteed_test.proofs import (
     repaired_multipliers,
     repaired_point,
 )
-from obsynth.methods.guaranteed_test.tolerant import MEAN_ROOM, mean_over_record, part_beside
-from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.methods.guaranteed_test.windows import MEAN_ROOM, Window, mean_over_record, part_beside
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.windows import WindowObserver

@@ -185,7 +185,7 @@ class GuaranteedTestMethod(Asked, Method):
     ) -> tuple[Condition, ...]:
         """Return the existence conditions: bounds are stated, and something tells the fault."""
         if isinstance(plant, DAEModel):
-            from obsynth.methods.guaranteed_test.nonlinear import nonlinear_conditions
+            from obsynth.methods.guaranteed_test.synthesis import nonlinear_conditions
 
             return nonlinear_conditions(plant, self)
         from obsynth.methods.guaranteed_test.conditions import conditions
@@ -201,14 +201,14 @@ class GuaranteedTestMethod(Asked, Method):
     ) -> Any:
         """Return weights, observer and certificate, not yet verified; ``scenario``: see the synthesis."""
         if isinstance(plant, DAEModel):
-            from obsynth.methods.guaranteed_test.nonlinear import synthesise_nonlinear
+            from obsynth.methods.guaranteed_test.synthesis import synthesise_nonlinear
 
             return synthesise_nonlinear(plant, self, progress=progress)
         for option in ("region", "sample_time", "given", "model"):
             if getattr(self, option) is not None:
                 raise SpecError(f"{option} is for nonlinear plants: leave it out.", path=f"method.options.{option}")
         if self.isolate and isinstance(plant, DescriptorSystem):
-            from obsynth.methods.guaranteed_test.bank_synthesis import synthesise_bank
+            from obsynth.methods.guaranteed_test.synthesis import synthesise_bank
 
             found = synthesise_bank(plant, self, progress=progress)
             return found if scenario is None else replace(found, notes=(*found.notes, NOMINAL_BANK))
@@ -238,7 +238,7 @@ class GuaranteedTestMethod(Asked, Method):
         """Return what the registers follow: the multipliers of one equation each; without a fault the row is zero."""
         from obsynth.methods.guaranteed_test.bank import is_bank, tests_of
         from obsynth.methods.guaranteed_test.problem import window_as_designed
-        from obsynth.methods.guaranteed_test.tolerant import tracked
+        from obsynth.methods.guaranteed_test.windows import tracked
 
         if not cls.has_error_model(design):
             return None

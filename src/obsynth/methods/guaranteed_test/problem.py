@@ -13,13 +13,13 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.options import Asked
-from obsynth.methods.guaranteed_test.tolerant import side_by_side
 from obsynth.methods.guaranteed_test.windows import (
     Bounds,
     Question,
     Window,
     disturbance_names,
     fault_names,
+    side_by_side,
     window_of,
 )
 from obsynth.numerics.arguments import is_finite_number, real_number
@@ -29,7 +29,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.proofs.exact_pencils import ExactPencil
+from obsynth.proofs.exact_arithmetic import ExactPencil
 
 #: What each course covers, and what not.
 COURSES: Mapping[str, str] = {

@@ -12,8 +12,7 @@ from obsynth.extensions import extension
 from obsynth.methods.functions import design_function
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import Programmes, free_faults, problem_as_designed, window_as_designed
-from obsynth.methods.guaranteed_test.tolerant import rows_before
-from obsynth.methods.guaranteed_test.windows import courses_of
+from obsynth.methods.guaranteed_test.windows import courses_of, rows_before
 from obsynth.numerics.arguments import arguments_checked, real_array, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver

@@ -21,8 +21,7 @@ from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.ranks import equilibrate
 from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.exact_arithmetic import holds_computed
-from obsynth.proofs.exact_pencils import ExactPencil
+from obsynth.proofs.exact_arithmetic import ExactPencil, holds_computed
 
 _SOURCE = "Filasova et al., eqs. (1), (2)"
 

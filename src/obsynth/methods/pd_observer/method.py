@@ -10,8 +10,18 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
-from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
-from obsynth.methods.own_terms import OwnConstraints, OwnRegion, SolverName, SolverOptions, own_term_conflicts
+from obsynth.methods.method import (
+    ClaimMeaning,
+    Method,
+    OwnConstraints,
+    OwnRegion,
+    PlantKind,
+    Purpose,
+    SolverName,
+    SolverOptions,
+    Synthesis,
+    own_term_conflicts,
+)
 from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, real_array, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.plants.descriptor import DescriptorSystem

@@ -23,21 +23,20 @@ from obsynth.analysis.plant_units import FAR_UNITS, PlantUnits
 from obsynth.analysis.structure import analyse_structure
 from obsynth.errors import InfeasibleError, SolverError
 from obsynth.methods.conic.lmi import chosen_solver
-from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
-from obsynth.methods.own_terms import own_terms
-from obsynth.methods.pd_observer.certificate import (
-    coupled_certificate,
-    explicit_certificate,
-    gain_certificate,
-    symmetric_certificate,
-)
-from obsynth.methods.pd_observer.checks.certificate import (
+from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis, own_terms
+from obsynth.methods.pd_observer.checks import (
     GAIN_CLAIMS,
     error_inputs,
     prove_gains,
     prove_shipped_stability,
 )
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
+from obsynth.methods.pd_observer.given_gains import (
+    coupled_certificate,
+    explicit_certificate,
+    gain_certificate,
+    symmetric_certificate,
+)
 from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve
 from obsynth.methods.pd_observer.limits import default_delta, fastest_mode, require_possible
 from obsynth.methods.pd_observer.method import PdObserver

@@ -53,8 +53,8 @@ from obsynth.analysis.zeros import (
     zero_at,
 )
 from obsynth.errors import PreconditionError
-from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
-from obsynth.methods.ui_pi_observer.pencils import (
+from obsynth.methods.ui_pi_observer.augmented_plant import (
+    AugmentedPlant,
     equilibrated,
     exact_drops,
     exact_loss,

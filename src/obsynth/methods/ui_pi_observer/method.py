@@ -10,8 +10,18 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
-from obsynth.methods.method import OPTIONS_PATH, ClaimMeaning, Method, PlantKind, Purpose, Synthesis
-from obsynth.methods.own_terms import OwnConstraints, SolverName, SolverOptions, own_term_conflicts
+from obsynth.methods.method import (
+    OPTIONS_PATH,
+    ClaimMeaning,
+    Method,
+    OwnConstraints,
+    PlantKind,
+    Purpose,
+    SolverName,
+    SolverOptions,
+    Synthesis,
+    own_term_conflicts,
+)
 from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, problem_with, shown
 from obsynth.numerics.spectra import decay_rates
 from obsynth.plants.descriptor import DescriptorSystem
@@ -246,7 +256,7 @@ class UiPiObserver(Method):
         cls, plant: DescriptorSystem, *, U: Any, D: Any, K: Any, F: Any, fault_model: Any = "step"
     ) -> Synthesis:
         """Return realisation and certificate of the gains of eqs. (11), (12), (23); see `obsynth.design_from_gains`."""
-        from obsynth.methods.ui_pi_observer.assembly import synthesis_from_gains
+        from obsynth.methods.ui_pi_observer.placement_problem import synthesis_from_gains
 
         return synthesis_from_gains(plant, U=U, D=D, K=K, F=F, fault_model=fault_model)
 

@@ -6,6 +6,8 @@ free matrix G is itself an output injection, from the rows ``N_U A`` that the de
 The pair is split into its observable part and the modes that no gain moves (procedure 1, step 7): Lemma 6 (always
 observable) is false.  A staircase of rank decisions loses its way on large stiff pairs; the fixed modes are known from
 the zeros of the plant's pencil, so they are peeled off one eigenspace at a time.
+
+Realisation and certificate of the gains of an unknown-input PI observer, found or given.
 """
 
 from __future__ import annotations
@@ -19,22 +21,42 @@ import numpy as np
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import is_outside, structure_of
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.methods.placement.kalman import KalmanProblem
+from obsynth.methods.method import Synthesis, plain
+from obsynth.methods.placement.region import KalmanProblem
 from obsynth.methods.ui_pi_observer.augmented_plant import (
     AugmentedPlant,
     Decoupled,
     ObserverGains,
+    combinations_seen,
     decouple,
     direct_part,
     paper_decoupling,
+    realise,
 )
+from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, largest_singular_value
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE, product_but_rounding
 from obsynth.numerics.scaling import LogBalance
-from obsynth.numerics.spectra import DEAD_BEAT, eigenvalues, moving_speeds
+from obsynth.numerics.spectra import (
+    DEAD_BEAT,
+    PRINTED_DIGITS,
+    abscissa,
+    as_printed,
+    decay_rates,
+    digits_needed,
+    eigenvalues,
+    farthest_pole,
+    moving_speeds,
+    rounding_of_eigenvalues,
+)
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.fault_models import Exosystem
+from obsynth.plants.fault_models import Exosystem, exosystem
+from obsynth.proofs.balls import enclosed_eigenvalues, middle_of
+from obsynth.proofs.covariances import certain_noise_covariance
+from obsynth.results.design import Certificate
+from obsynth.verification.certificates import slowest_decay, stability_factor
 
 #: Where all modes are slower than this share of the pair's size, they are integrators that rounding has scattered.
 INTEGRATOR_SCATTER = 3e-5
@@ -328,3 +350,91 @@ def _balancing(f: FloatArray, c: FloatArray) -> FloatArray:
     for state in states:
         problem.wish(state, 0.0)
     return np.asarray(np.exp2(problem.solve()[:n]))
+
+
+#: Poles of what is shipped that are this close to those asked for, relative to their size, are claimed as asked.
+SAME_AS_ASKED = 5e-5
+#: Poles that a rounding of Ahat moves by more than this, relative to their size, are claimed as they are enclosed: what
+#: an algorithm finds of them another processor does not find again to the share that is allowed.
+KNOWN_POLES = 1e-6
+
+
+def synthesis_from_gains(plant: DescriptorSystem, *, U: Any, D: Any, K: Any, F: Any, fault_model: Any) -> Synthesis:
+    """Return the realisation of given gains; see `obsynth.design_from_gains`."""
+    model = exosystem(fault_model, plant.fault_names, plant.dt)
+    nx, ny, count = plant.nx, plant.ny, model.order
+    given = {name: as_matrix(value, name) for name, value in (("U", U), ("D", D), ("K", K), ("F", F))}
+    shapes = {"U": (nx, nx), "D": (nx, ny), "K": (nx, ny), "F": (count, ny)}
+    for name, shape in shapes.items():
+        require_shape(given[name].shape, shape, name)
+    u, d = with_faults(given["U"], given["D"], plant, model)
+    gains = ObserverGains(u, d, np.vstack([given["K"], given["F"]]))
+    options = {"from_gains": True, "fault_model": plain(fault_model)}
+    found = assembled(plant, model, gains, None, {}, structured=True)
+    return Synthesis(options, found.gains, found.observer, found.certificate)
+
+
+def assembled(
+    plant: DescriptorSystem,
+    model: Exosystem,
+    gains: ObserverGains,
+    poles: ComplexArray | None,
+    claims: dict[str, float],
+    *,
+    structured: bool,
+) -> Synthesis:
+    """Return realisation and certificate of gains in the plant's units; poles that were not asked for are computed."""
+    observer, letters = realise(plant, model, gains, combinations_seen(plant))
+    nx = plant.nx
+    if structured:
+        letters |= {"U": gains.U[:nx, :nx], "D": gains.D[:nx], "K": gains.K[:nx], "F": gains.K[nx:]}
+        letters["Hhat"] = letters["U"] @ plant.Bf
+    letters |= {"Phi": model.Phi, "Cw": model.Cw}
+    poles = _shipped_poles(observer, poles)
+    order = np.lexsort((poles.imag, poles.real))
+    matrices = {
+        "tracking": gains.U,
+        "Phi": model.Phi,
+        "Cw": model.Cw,
+        "poles": np.column_stack([poles.real, poles.imag])[order] if poles.size else np.zeros((0, 2)),
+        "stability": stability_factor(observer),
+    }
+    slowest = slowest_decay(observer.Az, plant.dt)
+    claims = {"decay": slowest, "noise_amplification": noise_amplification(observer), **claims}
+    if not abscissa(as_printed(observer.Az, PRINTED_DIGITS), plant.dt) < (1.0 if plant.dt > 0.0 else 0.0):
+        claims["digits"] = float(digits_needed(observer.Az, plant.dt))
+    finite = {name: value for name, value in claims.items() if np.isfinite(value)}
+    return Synthesis({}, letters, observer, Certificate(matrices, finite))
+
+
+def _shipped_poles(observer: LinearObserver, asked: ComplexArray | None) -> ComplexArray:
+    """Return the poles as asked for where the stored numbers have them, else those that they have: what is shipped."""
+    found = eigenvalues(observer.Az)
+    if asked is not None and farthest_pole(found, asked, observer.dt) <= SAME_AS_ASKED:
+        return asked
+    if (
+        asked is None
+        and len(found)
+        and rounding_of_eigenvalues(observer.Az) <= KNOWN_POLES
+        and slowest_decay(observer.Az, observer.dt) == np.min(decay_rates(found, observer.dt), initial=np.inf)
+    ):
+        return found
+    enclosed = enclosed_eigenvalues(observer.Az)
+    if enclosed is None:
+        return found
+    exact = np.array([middle_of(ball) for ball in enclosed])
+    return asked if asked is not None and farthest_pole(exact, asked, observer.dt) <= SAME_AS_ASKED else exact
+
+
+def noise_amplification(observer: LinearObserver) -> float:
+    """Return the largest H2 norm from unit white noise on every output to a fault estimate, the direct part left out.
+
+    NaN where rounding leaves no digit of it.  For dt = 0 times the root of the time for which noise is held.
+    """
+    rows = observer.Cz[observer.fault_rows]
+    direct = observer.Dy[observer.fault_rows] * (observer.dt > 0.0)
+    stable = abscissa(observer.Az, observer.dt) < (1.0 if observer.dt > 0.0 else 0.0)
+    if not len(rows) or not stable:
+        return 0.0 if not len(rows) else float("inf")
+    covariance = certain_noise_covariance(observer.Az, observer.By, rows, direct, observer.dt)
+    return float(np.sqrt(np.max(np.maximum(np.diag(covariance), 0.0))))

@@ -17,18 +17,16 @@ import numpy as np
 from obsynth.analysis.zeros import is_outside
 from obsynth.errors import PreconditionError, SolverError
 from obsynth.methods.conic.lmi import chosen_solver
-from obsynth.methods.method import Synthesis
-from obsynth.methods.own_terms import own_terms
+from obsynth.methods.method import Synthesis, own_terms
 from obsynth.methods.placement.eigenstructure import checked_poles, place
-from obsynth.methods.placement.kalman import NOISE_PRICE, KalmanProblem, compromise
-from obsynth.methods.placement.region import Region, region_gain
+from obsynth.methods.placement.region import NOISE_PRICE, KalmanProblem, Region, compromise, region_gain
 from obsynth.methods.refusals import require_all_told
-from obsynth.methods.ui_pi_observer.assembly import assembled
+from obsynth.methods.ui_pi_observer.augmented_plant import number, numbers
 from obsynth.methods.ui_pi_observer.conditions import Existence, existence
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
-from obsynth.methods.ui_pi_observer.pencils import number, numbers
 from obsynth.methods.ui_pi_observer.placement_problem import (
     PlacementProblem,
+    assembled,
     kalman_problem,
     placement_problem,
 )
