@@ -389,3 +389,45 @@ def test_many_rows_show_their_rate_themselves() -> None:
     rates = [rate(6_000, 100.0, seed, 0.5, conformal=True) for seed in range(4)]
     # Of 29 alarms that the second half may have: a deviation of .19 each, .1 of their mean.
     assert 0.7 <= np.mean(rates) <= 1.2
+
+
+@functools.cache
+def doubly_seen(sensors: str = "") -> obsynth.ObserverDesign:
+    """Return the tank with a second gauge, which the design knows to be slow, or not."""
+    model = obsynth.DAEModel(
+        {"tank": "der(h) = 10 * (1 - f) * u - h"}, {"y": "h", "slow": "h"}, states={"h": 0.0}, inputs={"u": 0.0},
+        parameters={"f": 0.0},
+    )  # fmt: skip
+    return obsynth.dae_adaptive_observer(
+        model, dt=DT, Q=[[1e-4]], R=np.diag([0.01, 1e-4]), form="augmented-kalman", random_walk=[[1e-4]],
+        initial_covariance=[[0.01]], initial_parameter_covariance=[[0.01]], sensors={"slow": {"every": 5}} if sensors
+        else None, outliers="gate",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("sensors", ["", "stated"])
+def test_sensors_slower_than_the_rows_leave_the_others_to_be_watched(sensors: str, tmp_path: Path) -> None:
+    """No row with such a sample follows another one, so that no autoregression could be fitted: it ended in an error
+    of LAPACK. What its samples say of the faults counts all the same."""
+    design = doubly_seen(sensors)
+
+    def seen(data: pd.DataFrame, seed: int) -> pd.DataFrame:
+        noise = 0.01 * np.random.default_rng(seed).standard_normal(len(data))
+        level = lfilter([1.0], [1.0, -1.0 / (1.0 + DT)], DT * 10.0 * data["u"] / (1.0 + DT))
+        return data.assign(slow=np.where(np.arange(len(data)) % 5 == 0, level + noise, np.nan))
+
+    learned = obsynth.learn_thresholds(design, seen(log(3_000, 1), 2), false_alarms="1 per 1000 rows")
+    assert (learned.columns, learned.seldom, learned.left_out) == (("r[y]",), ("r[slow]",), ("r[slow]",))
+    assert learned.statistics.estimates == ("fhat[f]",)
+    assert learned.rows == 3_000 - SETTLING
+    again = obsynth.load_thresholds(learned.save(tmp_path / "t.json"))
+    assert again.seldom == learned.seldom
+    monitor = obsynth.online_monitor(design, "learned", normal=again)
+    run = obsynth.run_on_data(design, seen(log(3_000, 3), 4), monitor=monitor)
+    assert len(run.events) <= 8
+    faulty = log(600, 5)
+    faulty.loc[300:, "u"] *= 0.7
+    run = obsynth.run_on_data(design, seen(faulty, 6).assign(u=log(600, 5)["u"]), monitor=monitor)
+    assert run.events
+    assert run.events[0].fault == "f"
+    assert 300 <= run.events[0].first_row <= 310

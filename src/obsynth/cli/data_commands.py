@@ -297,15 +297,18 @@ def run_thresholds(options: argparse.Namespace) -> int:
             f"Warning: the rate needs {found.needed} rows without faults, and {found.rows} are given.", file=sys.stderr
         )
     lines = [f"{found.statement[0].upper()}{found.statement[1:]}.", f"Monitored: {', '.join(found.columns)}."]
-    if found.left_out:
+    if found.seldom:
+        lines.append(f"Not monitored, as most rows lack them: {', '.join(found.seldom)}.")
+    if dependent := [name for name in found.left_out if name not in found.seldom]:
         lines.append(
-            f"Not monitored, as they depend on the others or are correlated for too long: {', '.join(found.left_out)}."
+            f"Not monitored, as they depend on the others or are correlated for too long: {', '.join(dependent)}."
         )
-        if expects_fault_courses(design) and not any(name.startswith("fhat[") for name in found.columns):
-            lines.append(
-                "Once the estimate follows a fault, these return to zero: an alarm comes at the onset of the fault or "
-                "not at all. Give run a level for the estimate as well (--threshold)."
-            )
+    estimates_are_left_out = not any(name.startswith("fhat[") for name in found.columns)
+    if found.left_out and expects_fault_courses(design) and estimates_are_left_out:
+        lines.append(
+            "Once the estimate follows a fault, these return to zero: an alarm comes at the onset of the fault or "
+            "not at all. Give run a level for the estimate as well (--threshold)."
+        )
     lines += found.notes
     answer(
         options,

@@ -601,7 +601,7 @@ class SteppingLogObserver(LogObserver):
     @property
     def gates(self) -> bool:
         """Whether a gate judges each sample in its own row."""
-        return self.observer.outliers == "gate" and self.observer.timing.is_plain
+        return self.observer.outliers == "gate" and not self.observer.timing.longest
 
     @property
     def outliers(self) -> dict[str, int]:

@@ -219,7 +219,7 @@ def monitor_struct(alarms: Alarms, prefix: str) -> list[str]:
         f"    REAL means[{len(FORGETTING) * m}];",
         f"    REAL before[{(1 + width) * width}];",
         f"    REAL scores[{max(AGES) * 2 * width}];",
-        "    int at, quiet, waiting;",
+        "    int at, quiet, to_wait;",
         "    long taken;",
         f"}} {prefix}_monitor;",
         "",
@@ -279,6 +279,7 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
         *(line for name, table in tables.items() for line in table_lines(name, filled_table(table))),
         *integer_table("monitor_ages", AGES),
         *integer_table("monitor_places", [alarms.columns.index(name) for name in found.columns]),
+        *integer_table("monitor_seldom", [int(name in found.seldom) for name in alarms.columns]),
         *integer_table("monitor_told", [faults.get(name, -1) for name in found.statistics.told]),
     ]
     return "\n".join(lines) + filled_template("learned.c", prefix, {})

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray, largest_singular_value, read_only
 
@@ -86,7 +87,7 @@ class Autoregression:
 def fitted_autoregression(x: FloatArray, order: int | None = None) -> Autoregression:
     """Return the autoregression of rows ``(n, m)``, of which some may be NaN, with the order of least criterion."""
     n, m = x.shape
-    most = max(0, min(MOST_ORDER, n // (ROWS_PER_COEFFICIENT * m))) if order is None else order
+    most = _most_order(np.asarray(np.isfinite(x).all(axis=1)), m) if order is None else order
     mean = np.nanmean(x, axis=0)
     z = x - mean
     lags = np.hstack([np.ones((n - most, 1)), *(z[most - i : n - i] for i in range(1, most + 1))])
@@ -112,6 +113,17 @@ def fitted_autoregression(x: FloatArray, order: int | None = None) -> Autoregres
     a = _stable(a)
     offset = mean + coefficients[0] - a.sum(axis=0) @ mean
     return Autoregression(read_only(offset), read_only(a), read_only(np.linalg.inv(np.linalg.cholesky(best[2]))))
+
+
+def _most_order(known: NDArray[np.bool_], channels: int) -> int:
+    """Return the longest memory that rows determine of which some are ``known (n,)``: none where none follow others."""
+    after, found = known, 0
+    for order in range(1, MOST_ORDER + 1):
+        after = after[1:] & known[:-order]
+        if len(known) < ROWS_PER_COEFFICIENT * channels * order or after.sum() < 1 + channels * order:
+            break
+        found = order
+    return found
 
 
 def _stable(a: FloatArray) -> FloatArray:

@@ -146,7 +146,7 @@ def _powers(statistics: Statistics) -> tuple[FloatArray, FloatArray]:
 
 
 LEARNED_KIND = "obsynth learned thresholds"
-LEARNED_VERSION = 9
+LEARNED_VERSION = 10
 LEARNED = FileKind(
     "learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"', suffix=".json"
 )
@@ -237,6 +237,8 @@ class LearnedThresholds:
         Whether the rate is rarer than what the bootstrap shows.
     left_out : tuple of str
         Columns that are not watched, as they add nothing to the others.
+    seldom : tuple of str
+        Those of them that most rows lack, as of sensors slower than the rows: a row is whole without them.
     settling : int
         Rows at the start of a run in which nothing is decided, as nothing was learned from such rows.
     pairs : WrongPairs
@@ -272,6 +274,7 @@ class LearnedThresholds:
     outlier_sizes: FloatArray | None = None
     lasting: float = 0.0
     notes: tuple[str, ...] = ()
+    seldom: tuple[str, ...] = ()
 
     @property
     def holds(self) -> bool:
@@ -333,6 +336,7 @@ class LearnedThresholds:
             "gains": self.gains,
             "columns": list(self.columns),
             "left_out": list(self.left_out),
+            "seldom": list(self.seldom),
             "offset": model.offset,
             "A": model.A,
             "whitener": model.whitener,
@@ -449,6 +453,7 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         None if data["outlier_sizes"] is None else read_only(np.asarray(data["outlier_sizes"], dtype=np.float64)),
         float(data["lasting"]),
         tuple(map(str, data["notes"])),
+        tuple(map(str, data["seldom"])),
     )
 
 
@@ -524,7 +529,10 @@ def thresholds_from_rows(
     that the estimates follow leaves nothing in these: where it is known what each sample says of the faults, changes of
     these are looked for beside them, and the estimates in units of their deviations, which follow from the same.
     """
-    names, known = watched_names(design), np.asarray(np.isfinite(rows).all(axis=1))
+    names, faults = watched_names(design), len(design.observer.fault_names)
+    seldom = seldom_known(rows, faults) if like is None else [names.index(name) for name in like.seldom]
+    usual = [i for i in range(len(names)) if i not in seldom]
+    known = np.asarray(np.isfinite(rows[:, usual]).all(axis=1))
     others = pairs.others(every)
     count = int(known.sum())
     if count < LEAST_NORMAL:
@@ -533,11 +541,10 @@ def thresholds_from_rows(
             f"{LEAST_NORMAL} and more.",
             path="normal",
         )
-    faults = len(design.observer.fault_names)
     conformal = is_conformal(count, others)
     scores = None if scores is None else _usual_scores(scores, known)
     if like is None:
-        both, residuals = independent(rows[known], 0), independent(rows[known], faults)
+        both, residuals = ([usual[i] for i in independent(rows[known][:, usual], first)] for first in (0, faults))
         choices = [part for part in ((both, residuals) if scores is None else (residuals or both,)) if part]
     else:
         choices = [[names.index(name) for name in like.columns]]
@@ -578,7 +585,19 @@ def thresholds_from_rows(
         innovation,
         outlier_sizes,
         lasting,
+        seldom=tuple(names[i] for i in seldom),
     )
+
+
+def seldom_known(rows: FloatArray, faults: int) -> list[int]:
+    """Return the residuals of rows ``(n, m)``, after so many estimates of ``faults``, without which at least half of
+    the rows are whole: those of sensors that are slower than the rows.  One residual is left."""
+    there = np.isfinite(rows)
+    there = there[there.any(axis=1)]
+    left = list(range(rows.shape[1]))
+    while len(left) > faults + 1 and 2 * there[:, left].all(axis=1).sum() < len(there):
+        left.remove(min(left[faults:], key=lambda i: int(there[:, i].sum())))
+    return [i for i in range(rows.shape[1]) if i not in left]
 
 
 def divided_at_starts(observer: Any, scores: Scores | None) -> dict[str, float]:
@@ -607,12 +626,12 @@ def raised_levels(
 ) -> Raised:
     """Return what in ``rows (n, m)`` raises the levels that were ``found`` with what was ``given`` to
     `thresholds_from_rows`: no events where none do by much."""
-    known = np.asarray(np.isfinite(rows).all(axis=1))
+    known = whole_rows(design, found, rows)
     said = _usual_scores(scores, known) if found.statistics.estimates and scores is not None else None
     x = watched_rows(design, found, rows)
     events = events_of(x, found.columns, found.statistics, found.levels, said, found.centres)
     left = without_events(rows, events)
-    count = int(np.isfinite(left).all(axis=1).sum())
+    count = int(whole_rows(design, found, left).sum())
     others = found.pairs.others(found.every)
     if not events or count < LEAST_NORMAL or is_conformal(count, others) != is_conformal(found.rows, others):
         return Raised()
@@ -627,7 +646,13 @@ def raised_levels(
 def watched_rows(design: ObserverDesign, found: LearnedThresholds, rows: FloatArray) -> FloatArray:
     """Return the columns that are watched of ``rows (n, m)``, NaN in rows of which a part is not known."""
     places = [watched_names(design).index(name) for name in found.columns]
-    return np.where(np.asarray(np.isfinite(rows).all(axis=1))[:, None], rows[:, places], np.nan)
+    return np.where(whole_rows(design, found, rows)[:, None], rows[:, places], np.nan)
+
+
+def whole_rows(design: ObserverDesign, found: LearnedThresholds, rows: FloatArray) -> NDArray[np.bool_]:
+    """Return in which of ``rows (n, m)`` nothing is missing but what most of them lack ``(n,)``."""
+    usual = [name not in found.seldom for name in watched_names(design)]
+    return np.asarray(np.isfinite(rows[:, usual]).all(axis=1))
 
 
 def _usual_scores(scores: Scores, known: NDArray[np.bool_]) -> Scores | None:
@@ -732,6 +757,7 @@ class LearnedRule(Rule):
         self._residual = np.array([not name.startswith("fhat[") for name in learned.columns])
         self._faults = {f"fault {name}": i for i, name in enumerate(faults)}
         self._places = np.array([names.index(name) for name in learned.columns])
+        self._usual = np.array([name not in learned.seldom for name in names])
         templates = learned.statistics.templates()
         self._templates = templates.reshape(len(templates) * len(AGES), -1)
         self._model = learned.statistics.model
@@ -753,7 +779,7 @@ class LearnedRule(Rule):
         state = state._replace(last=sample.time, taken=state.taken + 1)
         state = self._scored(state, sample.said, max(missing, 0))
         found = watched_values(sample.residuals, sample.said)
-        whole = found is not None and sample.deciding and bool(np.isfinite(found).all())
+        whole = found is not None and sample.deciding and bool(np.isfinite(found[self._usual]).all())
         shown = None if found is None or not sample.deciding else self._completed(state, found, whole=whole)
         counts = shown is not None and state.taken > self.learned.settling
         most, varying = math.inf if counts else 0.0, isinstance(sample.said, Evidence)

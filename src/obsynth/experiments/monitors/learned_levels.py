@@ -45,12 +45,12 @@ def parameter_walk(observer: Any) -> FloatArray | None:
     from such a walk, or samples arrive late."""
     if not observer.fault_names:
         return None
-    if isinstance(observer, DAEObserver) and observer.timing.is_plain:
+    if isinstance(observer, DAEObserver) and not observer.timing.longest:
         walks = observer.form == "augmented-kalman" or (
             observer.form == "random-walk" and observer.weight == "innovation"
         )
         return observer.random_walk if walks else None
-    if isinstance(observer, RecursiveObserver) and observer.timing.is_plain and observer.adaptation is not None:
+    if isinstance(observer, RecursiveObserver) and not observer.timing.longest and observer.adaptation is not None:
         return observer.adaptation.walk if observer.form == "random-walk" else None
     return None
 

@@ -24,7 +24,7 @@ static void monitor_reset(PREFIX_monitor *m)
     }
     m->at = 0;
     m->taken = 0;
-    m->waiting = 0;
+    m->to_wait = 0;
     m->statistic = NAN;
     m->alarm = m->event = m->quiet = 0;
     m->fault = -1;
@@ -315,7 +315,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
         is_partly = is_partly || seen[i];
     }
     for (i = 0; i < MONITOR_WATCHED; i++) {
-        is_whole = is_whole && isfinite(shown[i]);
+        is_whole = is_whole && (isfinite(shown[i]) || monitor_seldom[i]);
     }
     is_partly = is_partly && deciding && !is_whole && innovation >= 0;
     for (i = 0; i < CHANNELS; i++) {
@@ -331,13 +331,13 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
     /* Where the gain follows what is measured, a missing sample moves the estimates otherwise than was learned: rows
      * that are predicted from that one count by no more than the observer's own covariance, which has grown, says. In
      * that row itself the innovations that are there are what they always are. */
-    if (m->waiting > 0) {
+    if (m->to_wait > 0) {
         most = innovation / monitor_innovation[0][0];
     }
     if (!is_whole && innovation >= 0) {
-        m->waiting = ORDER + 1;
+        m->to_wait = ORDER + 1;
     }
-    m->waiting -= m->waiting > 0;
+    m->to_wait -= m->to_wait > 0;
     is_said = is_whole || (innovation >= 0 && (is_said || known));
     monitor_add(m, is_said ? x : NULL, kept, known ? most : 0);
     monitor_score(m, shown, covariance);
