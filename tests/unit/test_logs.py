@@ -193,7 +193,7 @@ def test_a_picture_of_one_s_own_data(design, frame):
     axes = list(figure.subplots(6, 1))
     panels = plot_data(run, design=design, axes=axes)
     labels = [panel.get_ylabel() for panel in panels]
-    assert labels == ["level (m)", "flow", "valve", "leak (kg/s)", "residuals", "statistic"]
+    assert labels == ["level (m)", "flow", "valve", "leak (kg/s)", "residuals (kg/s)", "statistic"]
     (estimate,) = [line for line in panels[3].get_lines() if line.get_label() == "estimate"]
     assert np.array_equal(estimate.get_ydata(), run.table["fhat[leak]"])
     assert np.array_equal(estimate.get_xdata(), run.table["time of fhat[leak]"])
@@ -225,6 +225,20 @@ def test_a_panel_is_shaded_red_at_its_own_alarms_alone():
         run = obsynth.run_on_data(design, log, thresholds=thresholds)
         panels = plot_data(run, show=["faults", "residuals"], axes=list(Figure().subplots(3, 1)))
         assert [sum(patch.get_alpha() == 0.15 for patch in panel.patches) for panel in panels] == shaded
+
+
+def test_residuals_of_unlike_units_have_panels_of_their_own():
+    """A residual of a few kelvins beside one of a thousand pascals would be a line at zero."""
+    plant = obsynth.DescriptorSystem(
+        None, np.diag([0.8, 0.7]), None, ["level", "flow"], Bf=[[1.0], [1.0]], dt=0.5, state_names=["level", "flow"],
+        units={"level": "m", "flow": "m3/s"},
+    )  # fmt: skip
+    design = obsynth.ui_pi_observer(plant)
+    log = pd.DataFrame(np.zeros((ROWS, 3)), columns=["time", "level", "flow"]).assign(time=0.5 * np.arange(ROWS))
+    run = obsynth.run_on_data(design, log)
+    panels = plot_data(run, design=design, show=["residuals"])
+    drawn = {panel.get_ylabel(): [line.get_label() for line in panel.get_lines()] for panel in panels}
+    assert drawn == {"residuals (m)": ["r[level]"], "residuals (m3/s)": ["r[flow]"]}
 
 
 @pytest.mark.parametrize(("zone", "label"), [(None, "time"), ("+02:00", "time (UTC+02:00)"), ("UTC", "time (UTC)")])

@@ -248,6 +248,24 @@ def test_gains_to_the_states_are_errors_and_peak_at_their_norm() -> None:
         plot_gains(design, to="moon")
 
 
+def test_a_short_axis_of_frequencies_has_plain_numbers_that_do_not_touch() -> None:
+    panel = plot_gains(obsynth.fault_estimation_filter(load_spec(DESIGNS / "wang2015" / "spec.yaml").plant))
+    panel.get_figure().draw_without_rendering()
+    low, high = panel.get_xlim()
+    for minor in (False, True):
+        ticks = zip(panel.get_xticks(minor=minor), panel.get_xticklabels(minor=minor), strict=True)
+        texts = [text.get_text() for place, text in ticks if low <= place <= high and text.get_text()]
+        assert texts == ([] if minor else ["0.2", "0.5", "1", "2"])
+
+
+def test_a_factor_of_an_axis_stands_beside_no_legend() -> None:
+    (panel,) = plot_states(made_estimates(), states=1e-6 * np.arange(STEPS), dt=1.0)
+    panel.get_figure().draw_without_rendering()
+    factor = panel.yaxis.get_offset_text()
+    assert "1e" in factor.get_text()
+    assert not factor.get_window_extent().overlaps(panel.get_legend().get_window_extent())
+
+
 def test_a_trade_off_is_sorted_and_says_what_is_missing(slow) -> None:
     spec = load_spec(DESIGNS / "sharepasand" / "spec.yaml")
     designs = [obsynth.ui_pi_observer(spec.plant, fault_model="step", region={"decay": d}) for d in (4.0, 0.5, 1.0)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib as mpl
@@ -61,6 +62,14 @@ def test_what_does_not_decide_yet_and_no_alarm(wang) -> None:
     assert np.isnan(shown[0])
     assert np.isfinite(shown[-1])
     assert not any(str(item.get_label()).startswith("alarm") for item in panel.get_lines())
+
+
+def test_a_threshold_that_begins_next_to_zero_does_not_stretch_the_picture(wang) -> None:
+    design, scenario, simulation = wang
+    found = obsynth.monitor(design, scenario).watch(simulation.estimates)
+    limit = np.where(np.arange(len(found.threshold)) < 2, 5e-324, found.threshold)
+    panel = plot_detection(replace(found, threshold=limit), dt=1.0)
+    assert panel.get_ylim()[0] == pytest.approx(np.median(limit) / 1000.0)
 
 
 def test_the_papers_threshold_says_what_it_is_not(wang) -> None:

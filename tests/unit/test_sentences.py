@@ -99,6 +99,11 @@ def test_a_box_is_told_in_per_cent_or_by_its_ends() -> None:
     assert around_zero.phrase == "constants (b in -0.5 .. 0.5; they may change from sample to sample)"
     off = constants_box({"a": {"nominal": 2.0, "range": [1.9, 2.2]}})
     assert off.phrase == "constants (a in 1.9 .. 2.2; the same at all times)"
+    # Six digits, rounded into the range: what holds for the box holds for what the text says.
+    calibrated = constants_box({"a": {"nominal": 2.1, "range": [2.087847870048583, 2.1118556243976663]}})
+    assert calibrated.phrase == "constants (a in 2.08785 .. 2.11185; the same at all times)"
+    narrow = constants_box({"a": {"nominal": 2.00000001, "range": [2.00000001, 2.00000003]}})
+    assert narrow.phrase == "constants (a in 2.00000001 .. 2.00000003; the same at all times)"
     many = constants_box({f"c{i}": {"nominal": 1.0, "range": [0.5, 1.0 + i]} for i in range(9)})
     assert many.phrase.startswith("constants (9 constants within their ranges;")
     assert constants_box({"a": 1.0}).phrase == "an exact model"

@@ -160,6 +160,8 @@ def relative_error(faults: Sequence[Mapping[str, Any]]) -> float:
 LONGEST_WINDOW = 32
 #: A picture of estimates reaches as far as this share of their samples.
 SHOWN_SAMPLES = 0.98
+#: Room below and above a fault in its panel, as a share of its range.
+ROOM_AROUND_FAULT = 0.75
 #: Opacity of an estimate that reaches beyond its panel.
 FAINT = 0.25
 #: What the page of a comparison begins with.
@@ -385,7 +387,7 @@ class Comparison:
             left, right = axes[row]
             right.plot(self.times, self.truth[:, row], label="fault", **TRUE_STYLE)
             left.axhline(1.0, color="0.8", linewidth=0.8)
-            reach = self._reach(shown, row)
+            low, high = self._range(shown, row)
             for rank, entry in enumerate(shown):
                 names = [fault.figures.fault for fault in entry.faults]
                 if name not in names:
@@ -395,7 +397,7 @@ class Comparison:
                 style: dict[str, Any] = {"color": colour, "zorder": 3.0 + len(shown) - rank}
                 response, estimate = np.clip(entry.responses[:, column], -1.0, 3.0), entry.estimates[:, column]
                 left.plot(np.arange(len(response)) * self.sample_time, response, label=entry.method, **style)
-                noisy = float(np.nanquantile(np.abs(estimate), SHOWN_SAMPLES)) > reach
+                noisy = float(np.nanquantile(np.abs(estimate), SHOWN_SAMPLES)) > max(-low, high)
                 faint = {"alpha": FAINT, "linewidth": 0.4, "zorder": 1.0} if noisy else {"linewidth": 0.8}
                 right.plot(self.times, estimate, **{**style, **faint})
             times = [f.figures.most for entry in shown for f in entry.faults if np.isfinite(f.figures.most)]
@@ -403,7 +405,7 @@ class Comparison:
             left.set_xlim(0.0, min(max([3.0 * max(times, default=length), 10.0 * self.sample_time]), length))
             left.set_ylabel(f"estimate of a unit step\nof {name}")
             right.set_ylabel(with_unit(name, self._units))
-            right.set_ylim(-reach, reach)
+            right.set_ylim(low, high)
             for panel in (left, right):
                 label_time(panel)
                 tidy(panel)
@@ -412,13 +414,15 @@ class Comparison:
             legend_above(axes[0, 1])
         return figure
 
-    def _reach(self, shown: Sequence[ComparedMethod], row: int) -> float:
-        """Return how far the panel of a fault reaches on both sides of zero: what the best estimate needs."""
+    def _range(self, shown: Sequence[ComparedMethod], row: int) -> tuple[float, float]:
+        """Return the ends of the panel of a fault: room about the fault, and for the best estimate of the first one."""
         known = self.truth[np.isfinite(self.truth[:, row]), row]
-        reach = 2.5 * (float(np.max(np.abs(known), initial=0.0)) or 1.0)
+        low, high = float(np.min(known, initial=0.0)), float(np.max(known, initial=0.0))
+        room = ROOM_AROUND_FAULT * (high - low or 1.0)
         if row or not shown:
-            return reach
-        return max(reach, 1.5 * float(np.nanquantile(np.abs(shown[0].estimates[:, 0]), SHOWN_SAMPLES)))
+            return low - room, high + room
+        best = np.nanquantile(shown[0].estimates[:, 0], (1.0 - SHOWN_SAMPLES, SHOWN_SAMPLES))
+        return min(low - room, 1.5 * float(best[0])), max(high + room, 1.5 * float(best[1]))
 
     def __str__(self) -> str:
         table = text_table(self.rows(), left=2)

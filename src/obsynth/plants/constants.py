@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -19,6 +20,8 @@ _KEYS = ("nominal", "tolerance", "range", "unit")
 MOST_LISTED = 6
 #: Whole numbers up to so many digits are shown without a point.
 WHOLE_DIGITS = 12
+#: Digits of the ends of a range in a text: a calibrated one has all of them.
+RANGE_DIGITS = 6
 #: Shares of tolerances that agree so well are one share: they were stated as per cent.
 SAME_TOLERANCE = 1e-9
 _PER_CENT = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s*%\s*")
@@ -29,6 +32,13 @@ def shown(value: float, unit: str = "") -> str:
     number = float(value)
     text = str(int(number)) if number.is_integer() and abs(number) < 10.0**WHOLE_DIGITS else repr(number)
     return f"{text} {'' if unit == '1' else unit}".rstrip()
+
+
+def _in_few_digits(item: Constant) -> tuple[float, float]:
+    """Return a range inside that of a constant, so that what holds for the latter holds for what a text says."""
+    low = float(Context(RANGE_DIGITS, ROUND_CEILING).create_decimal(repr(item.low)))
+    high = float(Context(RANGE_DIGITS, ROUND_FLOOR).create_decimal(repr(item.high)))
+    return (low, high) if low < high else (item.low, item.high)
 
 
 def deviations_told(count: float) -> str:
@@ -193,7 +203,9 @@ class ConstantsBox:
             text = f"{names} within {100.0 * float(np.mean(shares)):.6g} % of nominal"
         elif len(self.names) <= MOST_LISTED:
             text = ", ".join(
-                f"{item.name} in {shown(item.low)} .. {shown(item.high, item.unit)}" for item in self.uncertain
+                f"{item.name} in {shown(low)} .. {shown(high, item.unit)}"
+                for item in self.uncertain
+                for low, high in [_in_few_digits(item)]
             )
         else:
             text = f"{names} within their ranges"

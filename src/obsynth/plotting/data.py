@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
@@ -78,9 +78,9 @@ def plot_data(
     Returns
     -------
     list of Axes
-        One for each of the first six outputs and faults, one for all residuals, one for the statistic, one for the
-        shares.  Rows in which nothing is decided (warm-up, gaps) lie in grey, rows with an alarm in red; in the panel
-        of a fault those that name it.
+        One for each of the first six outputs and faults, one for the residuals of each unit, one for the statistic,
+        one for the shares.  Rows in which nothing is decided (warm-up, gaps) lie in grey, rows with an alarm in red; in
+        the panel of a fault those that name it.
 
     Raises
     ------
@@ -151,10 +151,18 @@ def _plans(
     outputs.sort(key=lambda name: name not in estimated)
     plans = [("outputs", name) for name in outputs[:MOST_DRAWN]]
     plans += [("faults", name) for name in [name for name in columns if name.startswith("fhat[")][:MOST_DRAWN]]
-    plans += [("residuals", "")] if any(name.startswith("r[") for name in columns) else []
+    # Residuals of unlike units would hide one another.
+    plans += [("residuals", unit) for unit in dict.fromkeys(_residual_units(columns, design).values())]
     plans += [("statistic", "")] if "statistic" in columns else []
     plans += [("shares", "")] if any(name.startswith("share ") for name in columns) else []
     return [plan for plan in plans if plan[0] in show]
+
+
+def _residual_units(columns: Iterable[Any], design: ObserverDesign | None) -> dict[str, str]:
+    """Return the residuals that are drawn, with their units."""
+    units: Mapping[str, str] = {} if design is None else design.plant.units
+    names = [str(name) for name in columns if str(name).startswith("r[")][:MOST_DRAWN]
+    return {name: unit if (unit := units.get(name[2:-1], "")) != "1" else "" for name in names}
 
 
 @dataclass(frozen=True)
@@ -205,16 +213,17 @@ class _Drawing:
             mark(panel, times.iloc[row], values[row], f"alarm at {run.stamps.shown(run.alarms[column])}")
         panel.set_ylabel(with_unit(name, self.units))
 
-    def residuals(self, panel: Axes, _: str) -> None:
-        """Draw all residuals with the thresholds of the run."""
-        names = [name for name in self.table.columns if name.startswith("r[")][:MOST_DRAWN]
+    def residuals(self, panel: Axes, unit: str) -> None:
+        """Draw the residuals of a unit with the thresholds of the run."""
+        units = _residual_units(self.table.columns, self.design)
+        names = [name for name, own in units.items() if own == unit]
         for name, colour in zip(names, LINE_COLOURS, strict=False):
             style = {**RESIDUAL_STYLE, "linewidth": 0.9, "color": colour}
             panel.plot(self.table["time"], self.table[name], label=name, **style)
         for i, name in enumerate(name for name in names if name in self.run.thresholds):
             style = THRESHOLD_STYLES[i % len(THRESHOLD_STYLES)]
             _limits(panel, 0.0, self.run.thresholds[name], f"threshold of {name}", style)
-        panel.set_ylabel("residuals")
+        panel.set_ylabel(with_unit("residuals", {"residuals": unit}))
 
     def statistic(self, panel: Axes, _: str) -> None:
         """Draw the statistic of the monitor with its threshold and its first alarm."""

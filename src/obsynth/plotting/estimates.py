@@ -488,7 +488,8 @@ def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None)
     if np.any(~np.isnan(shown)):
         panel.set_yscale("log")
         if deciding.any():
-            panel.set_ylim(bottom=float(np.min(detection.threshold[deciding])) * 10.0**-DECADES_BELOW)
+            # An adaptive threshold may begin next to zero: its least value says nothing about the picture.
+            panel.set_ylim(bottom=float(np.median(detection.threshold[deciding])) * 10.0**-DECADES_BELOW)
     if detection.k is not None:
         blamed = f": {detection.fault}" if detection.fault else ""
         mark(panel, time[detection.k], detection.values[detection.k], f"alarm at {detection.time:g} s{blamed}")

@@ -10,7 +10,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.observers.running import Estimates
-from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH, finish, one_panel, with_unit
+from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH, finish, one_panel, plain_decades, with_unit
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
         panel.set_ylim(bottom=0.0)
     if seconds.size > 1 and seconds[0] > 0.0:
         # What a few more samples bring is of interest where they are few.
-        panel.set_xscale("log")
+        plain_decades(panel, across=True)
     after = "from the step to the last sample" if before else "from the first to the last sample"
     return finish(panel, with_unit(found.fault, found.plant.units), below=f"{after} (s)")
 

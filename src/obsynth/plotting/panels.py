@@ -121,6 +121,8 @@ def tidy(panel: Axes) -> None:
     for side in ("top", "right"):
         panel.spines[side].set_visible(False)
     panel.margins(x=0.01)
+    # A factor such as 1e-5 stands at the right: at the left is the legend.
+    panel.yaxis.set_offset_position("right")
     names_as_they_are(panel)
 
 
@@ -219,22 +221,25 @@ def with_unit(name: str, units: Mapping[str, str] | None) -> str:
     return f"{name} ({unit})" if unit and unit != "1" else name
 
 
-def plain_decades(panel: Axes) -> None:
-    """Give the vertical axis a logarithmic scale whose numbers stand plain at 1, 2 and 5 where it is short."""
+def plain_decades(panel: Axes, *, across: bool = False) -> None:
+    """Give an axis, vertical or ``across``, a logarithmic scale, with plain numbers at 1, 2 and 5 where it is short."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-    panel.set_yscale("log")
+    (panel.set_xscale if across else panel.set_yscale)("log")
     lines = [np.asarray(line.get_ydata(), dtype=np.float64) for line in panel.get_lines()]
-    shown = np.concatenate([np.zeros(0), *lines])
+    # Across, a level that is drawn from one side to the other has no place.
+    shown = np.array(panel.dataLim.intervalx) if across else np.concatenate([np.zeros(0), *lines])
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
     if not shown.size or shown.max() > SHORT_SPREAD * shown.min():
         return
-    steps = np.ravel(np.outer(10.0 ** np.arange(-15, 16), (1.0, 2.0, 5.0)))
-    below, above = steps[steps < shown.min()], steps[steps > shown.max()]
-    panel.set_ylim(below[-1] if below.size else None, above[0] if above.size else None)
-    panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    panel.yaxis.set_minor_locator(NullLocator())
+    axis = panel.xaxis if across else panel.yaxis
+    if not across:
+        steps = np.ravel(np.outer(10.0 ** np.arange(-15, 16), (1.0, 2.0, 5.0)))
+        below, above = steps[steps < shown.min()], steps[steps > shown.max()]
+        panel.set_ylim(below[-1] if below.size else None, above[0] if above.size else None)
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
 
 
 #: Up to this ratio of largest to smallest, a logarithmic axis has plain numbers.

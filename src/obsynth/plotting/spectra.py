@@ -372,7 +372,6 @@ def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None 
     """
     found, target = estimate_gains(design, to=to), TARGETS.get(to, "")
     panel = one_panel(axes, size=(WIDTH, 4.0))
-    panel.set_xscale("log")
     if to == "faults":
         panel.axhline(1.0, color="0.7", linewidth=0.8, zorder=0)
     for name, gain in found.gains.items():
@@ -388,6 +387,7 @@ def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None 
     if to == "faults" and gamma is not None and "disturbances" in found.gains:
         panel.plot(found.frequencies[[0, -1]], [gamma, gamma], label=f"proved for disturbances: {gamma:.4g}", **_BOUND)
     plain_decades(panel)
+    plain_decades(panel, across=True)
     panel.set_xlabel("frequency (rad/s)")
     panel.set_ylabel("singular value")
     if found.gains:

@@ -60,9 +60,9 @@ def plot_trade_off(
     for panel, name in zip(panels, names, strict=True):
         y = np.array([_number(design, name) for design in designs])
         panel.plot(x[order], y[order], color="black", linewidth=1.2, marker="o", markersize=5)
-        for values, scale in ((x, panel.set_xscale), (y, panel.set_yscale)):
+        for values in (x, y):
             if values.min() > 0.0 and values.max() > WIDE_AXIS * values.min():
-                scale("log")
+                plain_decades(panel, across=values is x)
         panel.set_ylabel(name)
         tidy(panel)
         panel.margins(x=0.03)

@@ -202,7 +202,8 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
 
     def deviation(name: str, missing: str) -> str:
         value = deviations.get(f"noise in fhat[{name}]")
-        return missing if value is None else f"{number(value)} {units.get(name, '')}".strip()
+        unit = units.get(name, "")
+        return missing if value is None else f"{number(value)} {'' if unit == '1' else unit}".strip()
 
     if isinstance(observer, WindowObserver):
         delayed = zip(observer.fault_names, observer.fault_delays, strict=True)

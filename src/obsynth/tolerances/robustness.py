@@ -430,6 +430,8 @@ def require_algebraic(e: AffineMatrix, algebraic: FloatArray) -> None:
 
 #: A design without tolerances says this.
 EXACT_MODEL = "assumes an exact model"
+#: What a verdict over the box is called in texts.
+VERDICTS = {"proved": "proved", "refuted": "refuted", "open": "not decided"}
 #: Constants that are blamed at most.
 MOST_BLAMED = 4
 #: What is to blame for less is left out.
@@ -563,11 +565,11 @@ class Robustness:
         yield "constants", f"{len(self.box.names)} with a tolerance ({names}), {self.box.variation}, {self.box.origin}"
         if self.not_covered:
             yield "linear model", self.not_covered
-        yield "regular, index 1", self.regular + (self._where() if self.regular == "refuted" else "")
+        yield "regular, index 1", VERDICTS[self.regular] + (self._where() if self.regular == "refuted" else "")
         where = self._where() if self.stable == "refuted" and self.regular != "refuted" else ""
         lasting = ", ".join(f"{value.real:.4g}" if not value.imag else f"{value:.4g}" for value in self.untouched)
         but = f", but for the mode at {lasting}, which no constant touches" if lasting else ""
-        yield "plant stable", self.stable + where + (f" ({self.boxes} boxes)" if self.boxes else "") + but
+        yield "plant stable", VERDICTS[self.stable] + where + (f" ({self.boxes} boxes)" if self.boxes else "") + but
         if self.sharing:
             yield "never distinguished from a fault", f"{', '.join(self.sharing)}: they act where a fault acts"
         if self.reason:
@@ -628,7 +630,7 @@ def robustness_statement(claims: Mapping[str, Any], design: ObserverDesign, dige
     uncertain = plant.uncertainty
     box = "an exact model" if uncertain is None else uncertain.box.phrase
     where = ", ".join(f"{name} = {value:.6g}" for name, value in claims["breaking"].items())
-    verdicts = {"proved": "proved", "refuted": f"refuted at {where}" if where else "refuted", "open": "not decided"}
+    verdicts = {**VERDICTS, "refuted": f"refuted at {where}"} if where else VERDICTS
     lasting = f" but for {len(claims['untouched'])} mode(s) that no constant touches" if claims["untouched"] else ""
     words = [
         f"regular of index 1 ({verdicts.get(claims['regular'])})",

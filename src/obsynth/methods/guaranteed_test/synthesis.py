@@ -346,7 +346,7 @@ def padded(rows: Sequence[FloatArray], width: int = 1) -> FloatArray:
 
 def _notes(problem: Problem, asked: Asked, window: Window, claims: Mapping[str, float], table: FloatArray) -> list[str]:
     question, threshold, least = window.question, claims["threshold"], claims.get("least")
-    words = []
+    words, mean = [], claims.get("mean_threshold")
     if threshold == 0.0:
         words.append(
             "No disturbance and no noise has an effect on the residual: compare it with the effect of rounding."
@@ -354,8 +354,12 @@ def _notes(problem: Problem, asked: Asked, window: Window, claims: Mapping[str, 
     elif least is not None:
         words.append(
             f"The threshold is {threshold:.9g}, and no function of {question.samples} samples has one below "
-            f"{least:.9g}: they differ by {threshold - least:.1e}. A fault of twice "
-            "that is certain to raise an alarm."
+            f"{least:.9g}: they differ by {threshold - least:.1e}. "
+            + (
+                "A fault of twice that is certain to raise an alarm."
+                if mean is None
+                else f"This is for the nominal plant: over the tolerances it is {mean:.4g} in the mean of the scenario."
+            )
         )
         if not window.twice_is_hidden:
             words.append(
@@ -369,14 +373,13 @@ def _notes(problem: Problem, asked: Asked, window: Window, claims: Mapping[str, 
     words.append(f"The course {question.course} is {COURSES[question.course]}.")
     if question.course == "any" and asked.lag is None:
         words.append(f"The least lag with which {problem.fault} can be estimated is {question.lag}.")
-    mean = claims.get("mean_threshold")
     if mean is not None:
         words.append(
-            f"Over the tolerances of the constants the threshold follows the signals ({mean:.4g} in the mean over the "
-            "scenario, for which the weights are made); that of the nominal plant is never above it, and no function "
-            "of these samples has one below least over the tolerances either. The size that is certain to be detected "
-            "is that of the nominal plant: over the tolerances a fault of twice the threshold of its row may be "
-            "needed, and more where they move what the fault does."
+            "Over the tolerances of the constants the threshold follows the signals, and the weights are those with "
+            "the smallest mean over the scenario; no function of these samples has a threshold below least over the "
+            "tolerances either. No size is certain to be detected there: a fault of twice the threshold of its row may "
+            "be needed, and more where the constants change the effect of the fault. For the nominal plant a fault of "
+            f"{2.0 * threshold:.4g} is certain to pass its threshold."
         )
     elif isinstance(problem.plant, DescriptorSystem) and problem.plant.uncertainty is not None:
         words.append(
