@@ -14,7 +14,7 @@ import argparse
 import numpy as np
 
 from obsynth.calibration.calibrating import calibrate
-from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system
 

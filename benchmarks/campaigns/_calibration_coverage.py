@@ -19,7 +19,7 @@ from obsynth.calibration.fits import Objective, Profile, guarded_maximum, quanti
 from obsynth.calibration.logs import Log
 from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem, calibration_problem
-from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae import DAEModel
 from obsynth.simulation.dae import simulate_dae
 from obsynth.spec import load_spec
 

@@ -27,7 +27,7 @@ import obsynth
 from obsynth.data.alarm_proof import verify_alarm
 from obsynth.experiments.alarm_proof import proved_alarm
 from obsynth.results.certificate_files import calibration_text, verify_calibration
-from obsynth.results.gain_sets import design_as_dict, digest_of, loaded, restored
+from obsynth.results.design import design_as_dict, digest_of, loaded, restored
 
 CASES = 3000
 LIMIT = 120.0

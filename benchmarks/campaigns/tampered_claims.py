@@ -24,7 +24,7 @@ from benchmarks.campaigns._true_claims import raised
 from benchmarks.campaigns.frame import Outcome
 
 import obsynth as ob
-from obsynth.results.gain_sets import design_as_dict
+from obsynth.results.design import design_as_dict
 from obsynth.spec import load_spec
 
 CASES = 3_000

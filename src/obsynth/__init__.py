@@ -30,14 +30,13 @@ from obsynth.version import __version__ as __version__
 #: What is public, by the module that holds it.  Imported when it is first used, so that ``import obsynth`` stays fast;
 #: ``__init__.pyi`` tells the types.
 _PUBLIC_NAMES = {
-    "analysis.diagnosis.decoupled": "decouple",
+    "analysis.diagnosis.fault_columns": "decouple",
     "analysis.diagnosis.diagnosing": "diagnose",
     "analysis.dae_structure": "identifiability",
     "analysis.structure": "analyse_structure",
-    "analysis.transformations.elimination": "eliminate_algebraic_states",
+    "analysis.transformations.elimination": "eliminate_algebraic_states discretise",
     "analysis.transformations.linearisation": "linearise",
     "analysis.transformations.noise": "with_noise",
-    "analysis.transformations.sampling": "discretise",
     "calibration.calibrating": "calibrate",
     "calibration.validating": "validate",
     "calibration.validity": "validity",
@@ -55,8 +54,9 @@ _PUBLIC_NAMES = {
     "experiments.simulation": "simulate",
     "exporting.files": "export",
     "importing.fmu": "from_fmu",
-    "importing.model_files": "from_matlab from_modelica",
-    "importing.python_objects": "from_andes from_casadi from_control from_pandas from_scipy from_sympy",
+    "importing.linear_models": (
+        "from_andes from_casadi from_control from_matlab from_modelica from_pandas from_scipy from_sympy"
+    ),
     "methods.designing": "check design design_from_gains",
     "methods.detection_filter.public": "detection_filter",
     "methods.guaranteed_test.result": "GuaranteedTest guaranteed_test",
@@ -73,14 +73,12 @@ _PUBLIC_NAMES = {
     "observers.decisions": "decide ParameterMonitor",
     "observers.linear.observer": "LinearObserver sample_observer",
     "observers.recursive.observer": "Adaptation RecursiveObserver",
-    "plants.dae.model": "DAEModel",
-    "plants.descriptor": "DescriptorSystem",
+    "plants.dae": "DAEModel",
+    "plants.descriptor": "DescriptorSystem TimeVaryingDescriptorSystem",
     "plants.fault_models": "fault_model FaultModel",
-    "plants.time_varying": "TimeVaryingDescriptorSystem",
     "plants.uncertain_system": "uncertain_system",
     "report.page": "html_report",
-    "results.design": "Certificate ObserverDesign VerificationReport",
-    "results.gain_sets": "load",
+    "results.design": "Certificate ObserverDesign VerificationReport load",
     "simulation.dae": "simulate_dae",
     "simulation.linear": "simulate_time_varying",
     "simulation.scenario": "Drift Gaussian Intermittent LostEffectiveness Ramp Scenario Sine Step Stuck Uniform",
@@ -97,8 +95,8 @@ __all__ = sorted(_PUBLIC_HOMES)
 provide(
     {
         "conditions of a design": "obsynth.conditions.shipped:conditions_of",
-        "design summary": "obsynth.report.designs:summary",
-        "picture of a guaranteed test": "obsynth.plotting.guaranteed:plot_least_thresholds",
+        "design summary": "obsynth.report.tables:summary",
+        "picture of a guaranteed test": "obsynth.plotting.estimates:plot_least_thresholds",
     }
 )
 

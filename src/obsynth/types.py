@@ -5,7 +5,7 @@ from typing import Any
 
 #: By the module that holds it, imported when a name is first used.
 _TYPE_NAMES = {
-    "analysis.diagnosis.decoupled": "DecoupledPlant",
+    "analysis.diagnosis.fault_columns": "DecoupledPlant",
     "analysis.diagnosis.diagnosing": "Diagnosis FaultDiagnosis StructuredResidual",
     "analysis.dae_structure": "Identifiability",
     "calibration.diagnostics": "Validation",
@@ -27,8 +27,7 @@ _TYPE_NAMES = {
     "observers.decisions": "Alarm Decision",
     "observers.running": "Estimates RunningObserver",
     "observers.windows": "WindowObserver",
-    "plants.constants": "CalibratedBox Constant ConstantsBox",
-    "plants.uncertainty": "Uncertainty",
+    "plants.constants": "CalibratedBox Constant ConstantsBox Uncertainty",
     "results.checks": "Check",
     "simulation.scenario": "Trajectory",
     "sweeps.sweep": "Fleet FleetRun Sweep SweepResult",

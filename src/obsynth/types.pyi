@@ -1,8 +1,8 @@
 from obsynth.analysis.dae_structure import Identifiability as Identifiability
-from obsynth.analysis.diagnosis.decoupled import DecoupledPlant as DecoupledPlant
 from obsynth.analysis.diagnosis.diagnosing import Diagnosis as Diagnosis
 from obsynth.analysis.diagnosis.diagnosing import FaultDiagnosis as FaultDiagnosis
 from obsynth.analysis.diagnosis.diagnosing import StructuredResidual as StructuredResidual
+from obsynth.analysis.diagnosis.fault_columns import DecoupledPlant as DecoupledPlant
 from obsynth.calibration.diagnostics import Validation as Validation
 from obsynth.calibration.reporting import Calibration as Calibration
 from obsynth.calibration.validity import Validity as Validity
@@ -31,7 +31,7 @@ from obsynth.observers.windows import WindowObserver as WindowObserver
 from obsynth.plants.constants import CalibratedBox as CalibratedBox
 from obsynth.plants.constants import Constant as Constant
 from obsynth.plants.constants import ConstantsBox as ConstantsBox
-from obsynth.plants.uncertainty import Uncertainty as Uncertainty
+from obsynth.plants.constants import Uncertainty as Uncertainty
 from obsynth.results.checks import Check as Check
 from obsynth.simulation.scenario import Trajectory as Trajectory
 from obsynth.sweeps.sweep import Fleet as Fleet

@@ -11,8 +11,8 @@ import pytest
 
 from obsynth import ObserverDesign
 from obsynth.cli import data_commands, output
-from obsynth.report import designs, page
-from obsynth.results.gain_sets import gain_set_digest
+from obsynth.report import page, tables
+from obsynth.results.design import gain_set_digest
 
 
 @pytest.fixture(scope="session")
@@ -41,7 +41,7 @@ def _verified_once(verified_again: Callable[[Path], Any], monkeypatch: pytest.Mo
 @pytest.fixture(scope="session")
 def facts_once() -> Callable[[ObserverDesign], list[tuple[str, str]]]:
     """Return what a design promises within its tolerances, and remember it for exactly the contents of a gain set."""
-    really, known = designs.tolerance_facts, {}
+    really, known = tables.tolerance_facts, {}
 
     def remembered(design: ObserverDesign) -> list[tuple[str, str]]:
         digest = gain_set_digest(design)
@@ -56,5 +56,5 @@ def facts_once() -> Callable[[ObserverDesign], list[tuple[str, str]]]:
 def _tolerances_once(
     facts_once: Callable[[ObserverDesign], list[tuple[str, str]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (designs, page):
+    for module in (tables, page):
         monkeypatch.setattr(module, "tolerance_facts", facts_once)

@@ -14,7 +14,7 @@ import pytest
 
 import obsynth
 from obsynth.cli.main import design_command, main
-from obsynth.results.gain_sets import digest_of, load
+from obsynth.results.design import digest_of, load
 
 ROOT = Path(__file__).parents[2]
 WANG = ROOT / "designs" / "wang2015" / "spec.yaml"

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from obsynth.cli.main import main
-from obsynth.results.gain_sets import load
+from obsynth.results.design import load
 from obsynth.tolerances.robustness import plant_at
 
 DRIVE = Path(__file__).parents[2] / "designs" / "drive" / "spec.yaml"

@@ -13,8 +13,7 @@ from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencils import reduced, structure_of_reduced
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
-from obsynth.spec.documents import read_yaml
-from obsynth.spec.loader import read_matrix_market
+from obsynth.spec.loader import read_matrix_market, read_yaml
 
 FOLDER = Path(__file__).parents[2] / "designs" / "ieee14"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")

@@ -15,7 +15,7 @@ from obsynth.methods.ui_pi_observer.conditions import decoupling_rank, existence
 from obsynth.plants.fault_models import exosystem
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
-from obsynth.spec.documents import read_yaml
+from obsynth.spec.loader import read_yaml
 
 FOLDER = Path(__file__).parents[2] / "designs" / "kundur"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")

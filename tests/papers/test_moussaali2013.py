@@ -13,7 +13,7 @@ from obsynth.cli.main import main
 from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.simulation.linear import simulate_time_varying
 from obsynth.spec import Spec, load_spec
-from obsynth.spec.documents import read_yaml
+from obsynth.spec.loader import read_yaml
 
 FOLDER = Path(__file__).parents[2] / "designs" / "moussaali2013_ltv"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")

@@ -15,7 +15,7 @@ from obsynth.methods.ui_pi_observer.augmented_plant import paper_decoupling
 from obsynth.numerics.spectra import spectrum_error
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
-from obsynth.spec.documents import read_yaml
+from obsynth.spec.loader import read_yaml
 
 FOLDER = Path(__file__).parents[2] / "designs" / "sharepasand"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")

@@ -12,7 +12,7 @@ from obsynth.analysis.zeros import fault_zeros
 from obsynth.numerics.norms import spectral_radius
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
-from obsynth.spec.documents import read_yaml
+from obsynth.spec.loader import read_yaml
 
 FOLDER = Path(__file__).parents[2] / "designs" / "smib"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")

@@ -14,7 +14,7 @@ import obsynth
 from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.simulation.linear import varying_runs
 from obsynth.spec import load_spec
-from obsynth.spec.documents import read_yaml
+from obsynth.spec.loader import read_yaml
 
 FOLDER = Path(__file__).parents[2] / "designs" / "smib"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")["inertia"]

@@ -10,7 +10,7 @@ import pytest
 import obsynth
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
-from obsynth.spec.documents import read_yaml
+from obsynth.spec.loader import read_yaml
 
 FOLDER = Path(__file__).parents[2] / "designs" / "smib"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")["pd_observer"]

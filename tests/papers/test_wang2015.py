@@ -21,7 +21,7 @@ from obsynth.methods.fault_estimation_filter.synthesis import PrintedInequality,
 from obsynth.numerics.norms import hinf_norm, spectral_radius
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
-from obsynth.spec.documents import read_yaml
+from obsynth.spec.loader import read_yaml
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 EXPECTED = read_yaml(DESIGNS / "wang2015" / "expected.yaml")

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 
 
 class PaperGains(NamedTuple):

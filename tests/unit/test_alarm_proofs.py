@@ -15,7 +15,7 @@ from uncertain_plants import drive, wang
 import obsynth
 from obsynth.experiments.alarm_proof import proved_alarm
 from obsynth.experiments.assumptions import file_digest
-from obsynth.results.gain_sets import digest_of
+from obsynth.results.design import digest_of
 from obsynth.tolerances.robustness import drawn_points
 
 

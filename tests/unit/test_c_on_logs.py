@@ -20,8 +20,7 @@ from obsynth.experiments.monitors.learned_levels import AGES, Statistics, parame
 from obsynth.exporting.c_source import c_identifier
 from obsynth.numerics.autoregression import Autoregression
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.results.design import VerificationReport
-from obsynth.results.gain_sets import gain_set_digest
+from obsynth.results.design import VerificationReport, gain_set_digest
 from obsynth.spec import load_spec
 
 ROOT = Path(__file__).parents[2]

@@ -28,7 +28,7 @@ from obsynth.methods.designing import check
 from obsynth.observers.batches import run_dae_batch
 from obsynth.observers.dae import step_graph as dae_algebra
 from obsynth.observers.dae.estimates import DAERow
-from obsynth.plants.dae.step import StepGraph
+from obsynth.plants.dae import StepGraph
 
 FITS, CLAIMS, RUNS, NEES, NIS = "fits the plant", "claims", "runs", "NEES", "NIS"
 CONTRACTION, DERIVATIVES, RESIDUAL, CONDITION = "contraction", "derivatives", "Newton residual", "condition of (7)"

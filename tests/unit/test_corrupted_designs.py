@@ -36,7 +36,7 @@ from obsynth import (
 )
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.methods.fault_estimation_filter.least_gain_proof import LEAST_GAIN_WITNESSES
-from obsynth.plants.uncertainty import matrices_of
+from obsynth.plants.constants import matrices_of
 from obsynth.spec.loader import load_spec
 from obsynth.verification.claims import WITNESS_CLAIMS
 

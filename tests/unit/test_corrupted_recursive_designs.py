@@ -12,7 +12,7 @@ from time_varying_plants import varying
 
 import obsynth
 from obsynth import Certificate, ObserverDesign, verify
-from obsynth.plants.time_varying import MatrixSequence
+from obsynth.plants.descriptor import MatrixSequence
 
 FITS, STATE, COVARIANCE, REGRESSOR = "fits the plant", "batch: state", "batch: covariance", "batch: regressor"
 CONTRACTION, CLAIMS, NEES, NIS, WHITE, RUNS = "contraction", "claims", "NEES", "NIS", "whiteness", "runs"

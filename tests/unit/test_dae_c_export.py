@@ -18,7 +18,7 @@ from obsynth import SpecError, simulate_dae
 from obsynth.cli.main import main
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.running import changed
-from obsynth.plants.dae.functions import Compiled
+from obsynth.plants.dae import Compiled
 from obsynth.spec import load_spec
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")

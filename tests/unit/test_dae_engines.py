@@ -16,8 +16,7 @@ from obsynth.observers import batches as dae_batch
 from obsynth.observers import progress
 from obsynth.observers.dae import c_code as dae_library
 from obsynth.observers.dae import observer as dae_records
-from obsynth.plants.dae.functions import Compiled, DAEFunctions
-from obsynth.plants.dae.step import ImplicitStep
+from obsynth.plants.dae import Compiled, DAEFunctions, ImplicitStep
 
 SIZES = np.array([2e3, 2e3, 5.0, 5.0, 0.1, 1e3])
 
@@ -286,7 +285,7 @@ def test_a_long_run_shows_a_bar_and_a_short_one_does_not(capsys, monkeypatch) ->
 
 
 def test_truths_are_the_same_in_stretches_and_step_by_step(monkeypatch) -> None:
-    from obsynth.plants.dae import functions as dae_stretches
+    from obsynth.plants import dae as dae_stretches
 
     model = exchanger()
     u = np.tile(model.nominal_input, (300, 1))

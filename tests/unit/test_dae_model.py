@@ -11,8 +11,7 @@ from dae_plants import ROD, diode, exchanger, pendulum
 from obsynth import DAEModel, SpecError, dae_adaptive_observer, identifiability
 from obsynth.analysis.dae_structure import index_report
 from obsynth.methods.designing import check
-from obsynth.plants.dae.functions import DAEFunctions
-from obsynth.plants.dae.step import ImplicitStep
+from obsynth.plants.dae import DAEFunctions, ImplicitStep
 
 UNITS = dict.fromkeys(["a", "b", "go", "c", "seen"], "1")
 

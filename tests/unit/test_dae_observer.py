@@ -11,9 +11,8 @@ import pytest
 from dae_plants import exchanger, linear
 
 from obsynth import DAEModel, DAEObserver, SolverError, SpecError, dae_adaptive_observer, run_batch, simulate_dae
-from obsynth.numerics.arrays import read_only
-from obsynth.plants.dae.functions import DAEFunctions
-from obsynth.plants.dae.step import ImplicitStep
+from obsynth.numerics.arguments import read_only
+from obsynth.plants.dae import DAEFunctions, ImplicitStep
 from obsynth.types import Estimates
 
 BALANCES = [(2e-4) ** 2, 75.0**2, 38.0**2, 0.0]  # 0.1 % of the flow, 0.5 % of the heat

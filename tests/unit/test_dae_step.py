@@ -7,8 +7,7 @@ import pytest
 from dae_plants import ROD, diode, exchanger, pendulum
 
 from obsynth import DAEModel, SolverError, SpecError
-from obsynth.plants.dae.functions import DAEFunctions
-from obsynth.plants.dae.step import ImplicitStep
+from obsynth.plants.dae import DAEFunctions, ImplicitStep
 
 METHODS = ("backward-euler", "radau")
 

@@ -19,7 +19,7 @@ import obsynth
 from obsynth.cli.main import main
 from obsynth.data.sources import Dialect
 from obsynth.errors import SpecError
-from obsynth.spec.documents import read_yaml
+from obsynth.spec.loader import read_yaml
 
 FMU = """<?xml version="1.0"?><fmiModelDescription fmiVersion="2.0" modelName="m" guid="{x}"><ModelExchange
 modelIdentifier="m" providesDirectionalDerivative="true"/><ModelVariables><ScalarVariable name="x" valueReference="1"

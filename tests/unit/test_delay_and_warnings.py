@@ -10,7 +10,7 @@ import pytest
 
 import obsynth
 from obsynth.methods.functional_filter.kalman_gain import delay_curve
-from obsynth.report.designs import design_warnings, followed_steps
+from obsynth.report.tables import design_warnings, followed_steps
 from obsynth.spec.loader import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

@@ -9,9 +9,15 @@ import pytest
 from networks import random_network
 
 import obsynth
-from obsynth.analysis.diagnosis.decoupled import PencilUnits, decoupled, unknowns_pencil
-from obsynth.analysis.diagnosis.explanations import hidden_motion, hiding_amplitudes
-from obsynth.analysis.diagnosis.fault_columns import Questions, question
+from obsynth.analysis.diagnosis.fault_columns import (
+    PencilUnits,
+    Questions,
+    decoupled,
+    hidden_motion,
+    hiding_amplitudes,
+    question,
+    unknowns_pencil,
+)
 from obsynth.numerics.ranks import TRACE_TOLERANCE
 
 CASES = Path(__file__).parents[1] / "data" / "cases"

@@ -16,12 +16,11 @@ from obsynth import (
     fault_estimation_filter,
     ui_pi_observer,
 )
-from obsynth.analysis.existence.numbers import numbers_of
-from obsynth.analysis.existence.statements import ROUNDING_LEVEL, settled_rank
+from obsynth.analysis.existence.statements import ROUNDING_LEVEL, numbers_of, settled_rank
 from obsynth.methods.designing import check
 from obsynth.methods.registry import method_class
 from obsynth.numerics.ranks import decide_rank
-from obsynth.results.gain_set_writing import plain, restored
+from obsynth.results.design import plain, restored
 
 E = np.array([[1, 0, 0], [1, 1, 1], [0, 0, 0]])
 A = np.array([[-1, 2, 2], [-1, 0, -1], [0, 0, 3]])

@@ -7,13 +7,17 @@ import signal
 import pytest
 
 from obsynth import SpecError
-from obsynth.files.inputs import input_file, protect_stream, protected_inputs, read_json, read_text
 from obsynth.files.outputs import (
     FileKind,
     HeldSignals,
     check_output,
     check_replaceable,
     ending_signals,
+    input_file,
+    protect_stream,
+    protected_inputs,
+    read_json,
+    read_text,
     replacement_of,
     require_distinct,
     write_atomically,

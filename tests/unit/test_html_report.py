@@ -86,7 +86,8 @@ def recursive() -> obsynth.ObserverDesign:
 @pytest.fixture(scope="module", autouse=True)
 def _drawn_once():
     """Pictures and tolerances of a design are made once: most tests are about what stands around them."""
-    from obsynth.report import designs, page
+    from obsynth.report import page
+    from obsynth.report import tables as report_tables
 
     patch, drawn, told, pictures_of = pytest.MonkeyPatch(), {}, {}, page.pictures_of
 
@@ -103,7 +104,7 @@ def _drawn_once():
         # The report is asked for nothing but whether it fails.
         key = design.plant, design.observer, bool(design.report.checks) and not design.report.passed
         if key not in told:
-            told[key] = designs.tolerance_facts(design)
+            told[key] = report_tables.tolerance_facts(design)
         return told[key]
 
     patch.setattr(page, "pictures_of", pictures_once)

@@ -119,8 +119,8 @@ def test_nothing_that_the_package_exports_is_of_the_command_line() -> None:
 
 
 def test_an_arrow_in_a_text_is_found() -> None:
-    nodes = arrows('WAY = "obsynth.report.designs:summary"')
-    assert runs_up(nodes, "obsynth.results", FILES) == ["obsynth.report.designs"]
+    nodes = arrows('WAY = "obsynth.report.tables:summary"')
+    assert runs_up(nodes, "obsynth.results", FILES) == ["obsynth.report.tables"]
 
 
 def test_types_are_told_of_every_public_name() -> None:

@@ -64,7 +64,7 @@ def test_nothing_heavy_is_loaded(program: str) -> None:
 def test_a_short_record_is_run_without_numba() -> None:
     run = (
         "import numpy as np, obsynth; from obsynth.observers.recursive.observer import RecursiveObserver; "
-        "from obsynth.plants.time_varying import MatrixSequence as M; one = np.eye(1); "
+        "from obsynth.plants.descriptor import MatrixSequence as M; one = np.eye(1); "
         "plant = obsynth.TimeVaryingDescriptorSystem(None, one, one, one, dt=1.0); "
         "RecursiveObserver(plant, M.of(one, 'Q'), M.of(one, 'R'), [0.0], one, None).run(np.ones(9), np.ones(9))"
     )

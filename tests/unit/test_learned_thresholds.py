@@ -465,7 +465,7 @@ def test_files_and_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 @pytest.mark.parametrize("damage", ["level", "digest", "shape", "kind", "version", "text", "design", "sizes"])
 def test_files_that_are_wrong_are_refused(tmp_path: Path, damage: str) -> None:
-    from obsynth.results.gain_sets import digest_of
+    from obsynth.results.design import digest_of
 
     file = learned().save(tmp_path / "t.json")
     document = json.loads(file.read_text())

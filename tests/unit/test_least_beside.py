@@ -12,7 +12,7 @@ from rich.console import Console
 import obsynth
 from obsynth.cli.main import main
 from obsynth.comparison.comparing import design_beside_least, in_words
-from obsynth.report.scenarios import comparison_report
+from obsynth.report.tables import comparison_report
 
 DRIVE = Path(__file__).parents[2] / "designs/drive/spec.yaml"
 

@@ -10,7 +10,7 @@ import pytest
 import obsynth
 from obsynth.cli.main import main
 from obsynth.errors import SpecError
-from obsynth.plants.validation import index_of
+from obsynth.plants.descriptor import index_of
 from obsynth.report.page import value_text
 
 PLANT = {

@@ -26,7 +26,7 @@ from obsynth.plotting import (
     plot_states,
     plot_trade_off,
 )
-from obsynth.plotting.spectra import region_asked_for
+from obsynth.plotting.trade_off import region_asked_for
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

@@ -8,7 +8,7 @@ from time_varying_plants import maximum_likelihood, observer_for, printed, recor
 
 from obsynth import PreconditionError, SpecError, TimeVaryingDescriptorSystem
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.plants.time_varying import MatrixSequence
+from obsynth.plants.descriptor import MatrixSequence
 
 SAMPLES = 9
 

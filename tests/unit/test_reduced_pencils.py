@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.analysis.diagnosis.decoupled import finite_values, left_part
+from obsynth.analysis.diagnosis.fault_columns import finite_values, left_part
 from obsynth.analysis.existence.named_pencils import named_pencil
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.ui_pi_observer.checks import decoupling_norm, decoupling_norms

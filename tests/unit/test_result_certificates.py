@@ -15,7 +15,7 @@ import pytest
 import obsynth
 from obsynth.cli.main import main
 from obsynth.results.certificate_files import differences
-from obsynth.results.gain_sets import digest_of
+from obsynth.results.design import digest_of
 from obsynth.tolerances.robustness import robustness_statement
 
 

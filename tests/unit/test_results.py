@@ -15,9 +15,9 @@ import pytest
 import obsynth
 from obsynth import Certificate, DescriptorSystem, ObserverDesign, SpecError, VerificationReport, load, verify
 from obsynth.files.outputs import write_atomically
-from obsynth.results import gain_sets
+from obsynth.results import design as design_module
 from obsynth.results.checks import Check
-from obsynth.results.gain_sets import design_as_dict, digest_of, plain, restored
+from obsynth.results.design import design_as_dict, digest_of, plain, restored
 
 AWKWARD = [-0.0, 5e-324, -2.2250738585072014e-308, 1.7976931348623157e308, 0.1, 1.0 / 3.0, np.nextafter(1.0, 2.0), 2e22]
 
@@ -383,7 +383,7 @@ class TestAtomicWriting:
         before = json.dumps(design_as_dict(design))
         design.save(tmp_path / "a.json")
         assert json.dumps(design_as_dict(design)) == before
-        assert gain_sets.GAIN_SET_VERSION == 2
+        assert design_module.GAIN_SET_VERSION == 2
 
 
 PROGRAM = """

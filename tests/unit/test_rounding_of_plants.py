@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.report.plants import is_unclear
+from obsynth.report.tables import is_unclear
 
 
 def test_a_fault_of_which_elimination_leaves_only_rounding_is_unclear() -> None:

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.analysis.diagnosis.explanations import state_sensors, with_sensors
-from obsynth.analysis.diagnosis.fault_columns import Question, Removal
-from obsynth.analysis.diagnosis.sensor_search import SensorResponses
+from obsynth.analysis.diagnosis.diagnosing import SensorResponses
+from obsynth.analysis.diagnosis.fault_columns import Question, Removal, state_sensors, with_sensors
 from obsynth.spec.loader import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

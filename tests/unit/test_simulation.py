@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
-from obsynth.analysis.transformations.sampling import discretise
+from obsynth.analysis.transformations.elimination import discretise, eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.simulation import Trajectory, simulate_plant
 from obsynth.simulation.linear import simulate_time_varying
 from obsynth.spec import load_spec

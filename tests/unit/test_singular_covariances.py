@@ -12,7 +12,7 @@ import pytest
 import obsynth
 from obsynth import DescriptorSystem, ObserverDesign
 from obsynth.methods.recursive.checks import BATCH_TOLERANCE
-from obsynth.plants.time_varying import MatrixSequence
+from obsynth.plants.descriptor import MatrixSequence
 
 TURN = [[0.9, 0.1], [-0.2, 0.7]]
 SHIFT = [[0.5, 0.0], [0.0, 0.0]]

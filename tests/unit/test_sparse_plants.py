@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import structural_rank
 
 import obsynth
-from obsynth.analysis.diagnosis.decoupled import decouple
+from obsynth.analysis.diagnosis.fault_columns import decouple
 from obsynth.analysis.transformations.elimination import eliminated_by_sparsity
 from obsynth.analysis.transformations.recovery import without_rounding
 from obsynth.methods.designing import check

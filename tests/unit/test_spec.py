@@ -17,7 +17,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY
 from obsynth.spec import load_spec
 from obsynth.spec.loader import read_matrix
-from obsynth.spec.schema_values import options_schema
+from obsynth.spec.schema import options_schema
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 

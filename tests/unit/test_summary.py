@@ -13,8 +13,8 @@ from scipy.optimize import brentq
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.plotting.spectra import _state_response, fault_gains
-from obsynth.report.designs import design_warnings, followed_steps, summary
+from obsynth.plotting.trade_off import _state_response, fault_gains
+from obsynth.report.tables import design_warnings, followed_steps, summary
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 

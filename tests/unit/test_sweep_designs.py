@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.results.gain_set_writing import digest_of
-from obsynth.results.gain_sets import gain_set_bytes, loaded
+from obsynth.results.design import digest_of, gain_set_bytes, loaded
 
 PLANT = """\
 schema_version: 1

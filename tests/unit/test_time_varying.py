@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from obsynth import DescriptorSystem, SpecError
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import TimeVaryingDescriptorSystem
 
 EXPRESSIONS = {
     "E": [[0, 0], [-1, "(k - 1) / k"]],

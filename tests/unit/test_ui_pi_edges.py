@@ -10,7 +10,7 @@ from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.designing import check
 from obsynth.methods.placement.region import KalmanProblem
 from obsynth.methods.ui_pi_observer.augmented_plant import number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 
 TWO = [[-1.0, 1.0], [0.0, -2.0]]
 PLANTS = {

@@ -14,8 +14,8 @@ from test_linearise import tanks
 
 import obsynth
 from obsynth import DAEModel, PreconditionError, SpecError, linearise
-from obsynth.plants.dae.functions import local_equations
-from obsynth.plants.uncertainty import matrices_of
+from obsynth.plants.constants import matrices_of
+from obsynth.plants.dae import local_equations
 from obsynth.results.certificate_files import calibration_text
 from obsynth.spec import load_spec
 

@@ -11,7 +11,7 @@ from obsynth.analysis.transformations.recovery import augment_faults
 from obsynth.analysis.transformations.uncertain_plant import affine_plant
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.expressions import parse_expression
-from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
+from obsynth.plants.constants import UNCERTAIN_MATRICES
 from obsynth.proofs.affine import AffineMatrix, affine_exponential, affine_inverse
 from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
 from obsynth.tolerances.robustness import drawn_points, index_one_on_box, plant_at

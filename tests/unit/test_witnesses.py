@@ -24,8 +24,8 @@ from obsynth import (
 )
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence import named_pencils
+from obsynth.analysis.existence.named_pencils import EntryChange, Unclear, Witness, rational_matrices
 from obsynth.analysis.existence.statements import Evaluator, _first_of_the_largest
-from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.functional_filter.conditions import conditions as functional_conditions
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions

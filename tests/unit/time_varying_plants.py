@@ -6,7 +6,7 @@ import numpy as np
 
 from obsynth import TimeVaryingDescriptorSystem
 from obsynth.observers.recursive.observer import Adaptation, RecursiveObserver
-from obsynth.plants.time_varying import MatrixSequence
+from obsynth.plants.descriptor import MatrixSequence
 
 
 def varying(**changes) -> TimeVaryingDescriptorSystem:

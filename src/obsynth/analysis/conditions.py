@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from obsynth.analysis.existence.witnesses import Unclear
+from obsynth.analysis.existence.named_pencils import Unclear
 from obsynth.errors import PreconditionError
 from obsynth.numerics.ranks import RankDecision
 from obsynth.plants.descriptor import DescriptorSystem

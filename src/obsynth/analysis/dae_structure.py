@@ -8,13 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import arguments_checked, require_shape
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.arguments import FloatArray, arguments_checked, as_matrix, read_only, require_shape
 from obsynth.numerics.newton import ScaledMatrix
 from obsynth.numerics.ranks import IDENTIFIABLE_SHARE, NAMED_SHARE, SINGULAR_CONDITION, covariance_factor, is_definite
-from obsynth.plants.dae.functions import DAEFunctions
-from obsynth.plants.dae.model import DAEModel, checked_inputs, finite_vector, step_length
-from obsynth.plants.dae.step import ImplicitStep
+from obsynth.plants.dae import DAEFunctions, DAEModel, ImplicitStep, checked_inputs, finite_vector, step_length
 
 #: A start and one step.
 FEWEST_SAMPLES = 2

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only, remembered
+from obsynth.numerics.arguments import ComplexArray, FloatArray, read_only, remembered
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import LogBalance
 from obsynth.plants.descriptor import DescriptorSystem

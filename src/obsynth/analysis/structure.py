@@ -12,13 +12,11 @@ import numpy as np
 from obsynth.analysis.existence.statements import Evaluator
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.analysis.zeros import structure_of, unstable_poles
-from obsynth.numerics.arguments import arguments_checked
-from obsynth.numerics.arrays import ComplexArray
+from obsynth.numerics.arguments import ComplexArray, arguments_checked
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.validation import listed
+from obsynth.plants.descriptor import DescriptorSystem, listed
 
 
 @dataclass(frozen=True, eq=False)

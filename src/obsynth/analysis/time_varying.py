@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.transformations.recovery import Transformation
-from obsynth.numerics.arguments import require_kind
-from obsynth.numerics.arrays import FloatArray, remembered
+from obsynth.numerics.arguments import FloatArray, remembered, require_kind
 from obsynth.numerics.ranks import RankDecision, decide_rank
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 
 #: Steps that are looked at where the plant has no horizon.
 STEPS_WITHOUT_HORIZON = 1000

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only, remembered
+from obsynth.numerics.arguments import ComplexArray, FloatArray, read_only, remembered
 from obsynth.numerics.pencils import (
     FEW_COLUMNS,
     GENERIC_POINTS,

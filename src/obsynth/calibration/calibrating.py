@@ -62,12 +62,10 @@ from obsynth.calibration.problem import IMPOSSIBLE, Likelihood, Problem, calibra
 from obsynth.calibration.reporting import Calibration, IntegrationError, integration_error, reported
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.dae_adaptive_observer.conditions import NOMINAL_SAMPLES
-from obsynth.numerics.arguments import Seed, arguments_checked, is_whole, whole_number
-from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.numerics.arguments import FloatArray, Seed, arguments_checked, is_whole, read_only, whole_number
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.plants.noise_model import noise_state, process_variance
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 #: Autocorrelations between which a search for coloured noise begins, and the share of R that it begins with.
 FIRST_KEPT, COLOURED_SHARE = (0.3, 0.98), 0.7

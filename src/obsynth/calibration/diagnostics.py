@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.arguments import SMALLEST, FloatArray
 from obsynth.observers.running import BAND_WIDTH
 from obsynth.plotting.panels import (
     BAND_STYLE,

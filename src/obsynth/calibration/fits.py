@@ -21,9 +21,9 @@ from obsynth.calibration.logs import refused, roughness
 from obsynth.calibration.plants import PlantWithNoise
 from obsynth.calibration.problem import IMPOSSIBLE, LARGEST_STEP_RESIDUAL, Likelihood, Problem
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.arguments import SMALLEST, FloatArray
 from obsynth.numerics.ranks import LEAST_INFORMATION
-from obsynth.plants.dae.functions import Compiled
+from obsynth.plants.dae import Compiled
 from obsynth.plants.noise_model import DEFAULT_WHITE_SHARE, offset_state
 
 BoolArray = NDArray[np.bool_]

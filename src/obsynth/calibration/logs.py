@@ -18,7 +18,7 @@ from obsynth.data.log_estimator import MOST_STALE
 from obsynth.data.sources import log_table, parsed_rows
 from obsynth.data.stuck_sensors import stuck_rows, stuck_texts
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, read_only
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -28,16 +28,19 @@ from obsynth.analysis.transformations.linearisation import promoted
 from obsynth.calibration.logs import Log, refused, roughness
 from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.arguments import SMALLEST, FloatArray
 from obsynth.numerics.newton import largest_entries
 from obsynth.numerics.ranks import rounding_rank
 from obsynth.observers.dae.c_code import compiler, shared_library
-from obsynth.plants.dae.functions import BUTCHER, DAEFunctions
-from obsynth.plants.dae.model import DAEModel, symbolic_value, symbols_of
-from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.dae import BUTCHER, DAEFunctions, DAEModel, symbolic_value, symbols_of
+from obsynth.plants.descriptor import (
+    INDEX_NAME,
+    DescriptorSystem,
+    MatrixSequence,
+    TimeVaryingDescriptorSystem,
+    index_of,
+)
 from obsynth.plants.noise_model import UNKNOWN_NUMBER, noise_state, offset_state, seconds
-from obsynth.plants.time_varying import INDEX_NAME, MatrixSequence, TimeVaryingDescriptorSystem
-from obsynth.plants.validation import index_of
 
 #: Deviation of an initial state that is not stated, as a share of its nominal size.
 CALIBRATED_STATE_SHARE = 0.1

@@ -19,12 +19,11 @@ from obsynth.calibration.logs import EVEN, Log, bad_log, quantum, refused, repea
 from obsynth.calibration.plants import CalibrationPlant, SampleGraphs, compiled, sample_graphs
 from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arguments import is_number, real_number, require_mapping, require_shape, whole_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, is_number, real_number, require_mapping, require_shape, whole_number
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.records import named_covariance, named_vector
-from obsynth.plants.dae.functions import Compiled
-from obsynth.plants.validation import index_of
+from obsynth.plants.dae import Compiled
+from obsynth.plants.descriptor import index_of
 
 #: Measured values for each unknown constant and variance that are needed at least.
 VALUES_PER_UNKNOWN = 5

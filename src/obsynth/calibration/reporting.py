@@ -30,12 +30,10 @@ from obsynth.calibration.logs import EVEN, Log, told_rows
 from obsynth.calibration.plants import PlantWithNoise, correlation_name
 from obsynth.calibration.problem import Problem
 from obsynth.errors import SolverError
-from obsynth.numerics.arrays import SMALLEST, FloatArray, read_only
+from obsynth.numerics.arguments import SMALLEST, FloatArray, read_only
 from obsynth.observers.running import BAND_WIDTH
 from obsynth.plants.constants import CalibratedBox
-from obsynth.plants.dae.functions import BUTCHER, DAEFunctions
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.dae.step import ImplicitStep
+from obsynth.plants.dae import BUTCHER, DAEFunctions, DAEModel, ImplicitStep
 from obsynth.plants.noise_model import noise_state, noise_variance, offset_state
 from obsynth.plotting.panels import BAND_STYLE, WIDTH, new_figure, tidy
 

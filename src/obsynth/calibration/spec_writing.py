@@ -11,7 +11,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.files.outputs import FileKind, yaml_text
 from obsynth.plants.noise_model import offset_state
-from obsynth.spec.documents import read_yaml
+from obsynth.spec.loader import read_yaml
 
 if TYPE_CHECKING:
     from obsynth.calibration.reporting import Calibration

@@ -35,8 +35,7 @@ from obsynth.calibration.plants import NonlinearPlant, sample_graphs
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.reporting import IntegrationError, integration_error
 from obsynth.errors import PreconditionError, SolverError, SpecError
-from obsynth.numerics.arguments import arguments_checked
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, arguments_checked, read_only
 from obsynth.observers.dae.estimates import GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver

@@ -13,11 +13,9 @@ from numpy.typing import ArrayLike
 from obsynth.analysis.transformations.linearisation import DRIFT
 from obsynth.calibration.logs import EVEN, Log, LogData, quantum, read_log
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import arguments_checked
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, arguments_checked, read_only
 from obsynth.observers.records import named_vector
-from obsynth.plants.dae.functions import BUTCHER
-from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae import BUTCHER, DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plotting.panels import (
     BAND_STYLE,

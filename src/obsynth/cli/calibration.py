@@ -8,12 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import obsynth
-from obsynth.cli.arguments import columns_of, numbers_of, pair, refuse_given
 from obsynth.cli.data_commands import with_input_delay
-from obsynth.cli.output import answer, gains_to_hand_on, output_file, progress
+from obsynth.cli.output import (
+    answer,
+    columns_of,
+    gains_to_hand_on,
+    numbers_of,
+    output_file,
+    pair,
+    progress,
+    refuse_given,
+)
 from obsynth.errors import SpecError, VerificationError
-from obsynth.files.inputs import protect
-from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.outputs import FileKind, protect, write_atomically
 
 #: Written by ``linearise`` and ``calibrate``.
 PLANT = FileKind("a plant that obsynth has linearised", rb"\A# Linearised by obsynth", suffix=".yaml")
@@ -35,7 +42,7 @@ def _log_arguments(options: argparse.Namespace) -> dict[str, Any]:
 
 def run_linearise(options: argparse.Namespace) -> int:
     """Run ``linearise``: spec or plant in, matrices and operating point out."""
-    from obsynth.report.plants import linear_plant_text, plant_document
+    from obsynth.report.tables import linear_plant_text, plant_document
     from obsynth.spec.loader import load_model
 
     model, spec = load_model(options.system)
@@ -91,7 +98,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
     """Run ``calibrate``: spec and log in, constants with their box and a verdict out."""
     from obsynth.calibration.spec_writing import calibrated_spec
     from obsynth.results.certificate_files import CALIBRATION_KIND, calibration_text
-    from obsynth.results.gain_sets import plain
+    from obsynth.results.design import plain
     from obsynth.spec.loader import load_plant
 
     with progress(quiet=options.quiet) as report_stage:

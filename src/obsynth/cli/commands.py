@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import obsynth
-from obsynth.cli.arguments import refuse_given
-from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json, progress, stdout_console
+from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json, progress, refuse_given, stdout_console
 from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.results.certificate_files import CALIBRATION_KIND, box_row, verify_calibration
-from obsynth.results.gain_sets import GAIN_SET, design_as_dict, gain_set_bytes, place_of, restored, written_for
+from obsynth.results.design import GAIN_SET, design_as_dict, gain_set_bytes, place_of, restored, written_for
 
 if TYPE_CHECKING:
     from obsynth.analysis.structure import Structure
@@ -34,7 +33,7 @@ def run_design(options: argparse.Namespace) -> int:
         _ask(spec)
         design = design_of_spec(spec, progress=report_stage)
         file = write_atomically(target, gain_set_bytes(design, spec=spec.path))
-    from obsynth.report.designs import summary
+    from obsynth.report.tables import summary
 
     if options.json:
         print_json(
@@ -55,7 +54,7 @@ def run_design(options: argparse.Namespace) -> int:
 
 def _print_design(design: obsynth.ObserverDesign, file: Path, *, verbose: bool) -> None:
     """Print the answer first; every claim and check if asked for, and what fails in any case."""
-    from obsynth.report.designs import design_report, print_summary, summary
+    from obsynth.report.tables import design_report, print_summary, summary
     from obsynth.results.layout import checks_table
 
     console = stdout_console()
@@ -125,7 +124,7 @@ def run_check(options: argparse.Namespace) -> int:
     _ask(spec)
     from obsynth.methods.registry import AUTO
     from obsynth.numerics.libraries import failure_of
-    from obsynth.report.plants import is_unclear
+    from obsynth.report.tables import is_unclear
 
     if not isinstance(spec.plant, obsynth.DescriptorSystem):
         refuse_given(options, ("whole_bank",), "linear plants with constant matrices")
@@ -146,7 +145,7 @@ def run_check(options: argparse.Namespace) -> int:
     passed = any(report.passed for report in own)
 
     def told() -> None:
-        from obsynth.report.plants import check_report, diagnosis_report, print_methods
+        from obsynth.report.tables import check_report, diagnosis_report, print_methods
 
         console = stdout_console()
         if diagnosis is not None:
@@ -274,7 +273,7 @@ def _require_fitting(options: argparse.Namespace, kind: str) -> None:
 
 def _calibrated_again(options: argparse.Namespace) -> dict[str, Any]:
     """Return what the same calibration of the given plant and log comes to."""
-    from obsynth.files.inputs import read_json
+    from obsynth.files.outputs import read_json
     from obsynth.spec.loader import load_plant
 
     plant, _ = load_plant(options.system)

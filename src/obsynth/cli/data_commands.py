@@ -1,32 +1,61 @@
-"""The verbs that take a gain set further: run on data, thresholds, proved alarms, exports, pictures and pages."""
+"""The verbs that take a gain set further: run on data, thresholds, proved alarms, exports, pictures and pages.
+
+The verbs that run a scenario: ``simulate``, ``evaluate``, and ``compare``, which does so for every method.
+
+``sweep``, and ``run`` for many gain sets: many cases in, one table and one picture out.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
 import obsynth
-from obsynth.cli.arguments import (
+from obsynth.cli.commands import designed_or_loaded, spec_output
+from obsynth.cli.output import (
     MONITOR_NAMES,
     STREAM,
+    answer,
     columns_of,
     flag_of,
+    gains_to_hand_on,
     numbers_of,
+    output_file,
+    print_json,
+    progress,
     ranges_of,
     refuse_given,
     stated_settings,
+    stdout_console,
+    verified_again,
 )
-from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json, verified_again
-from obsynth.errors import SpecError, VerificationError
-from obsynth.experiments.monitors.options import LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW, refuse_idle
-from obsynth.files.inputs import protect, protect_stream
-from obsynth.files.outputs import FileKind, require_distinct, write_atomically
+from obsynth.errors import PreconditionError, SpecError, VerificationError
+from obsynth.experiments.monitors.options import (
+    CHANGE,
+    FALSE_ALARMS,
+    LINEAR_OPTIONS,
+    PARAMETER_OPTIONS,
+    WINDOW,
+    refuse_idle,
+)
+from obsynth.files.outputs import (
+    FileKind,
+    input_file,
+    made_folder,
+    protect,
+    protect_stream,
+    require_distinct,
+    write_atomically,
+    write_together,
+)
 from obsynth.files.tables import text_table
+from obsynth.results.certificate_files import RESULT_FILE
 
 
 def protect_inputs(options: argparse.Namespace) -> None:
@@ -333,8 +362,6 @@ def run_thresholds(options: argparse.Namespace) -> int:
 def run_run(options: argparse.Namespace) -> int:
     """Run ``run``: gain set and data in, estimates out."""
     if options.gains.is_dir():
-        from obsynth.cli.sweep import run_many
-
         if options.input_delay is not None:
             raise SpecError(
                 "--input-delay is for one gain set: state inputs.hold in the specs of a folder.", path="--input-delay"
@@ -543,7 +570,7 @@ def run_plot(options: argparse.Namespace) -> int:
 
 
 def _draw(found: obsynth.types.DataRun, design: obsynth.ObserverDesign, parts: list[str], target: Path | None) -> None:
-    from obsynth.plotting.data import panel_count, plot_data
+    from obsynth.plotting.estimates import panel_count, plot_data
 
     if target is not None:
         count = panel_count(found, parts, design=design)
@@ -571,3 +598,463 @@ def written_picture(target: Path, count: int, draw: Callable[[list[Any]], Any]) 
     from obsynth.plotting.panels import image_of
 
     write_atomically(target, image_of(count, draw, kind=target.suffix[1:].lower()))
+
+
+def _prepared(
+    options: argparse.Namespace, report_stage: Callable[[str], None], kind: FileKind | None = None
+) -> tuple[obsynth.Spec, obsynth.Scenario, Path | None, obsynth.ObserverDesign]:
+    """Return spec, scenario, where to write a file of some kind, and the design, made or loaded."""
+    report_stage(f"reading {options.system}")
+    spec = obsynth.load_spec(options.system)
+    scenario = required_scenario(spec)
+    if options.gains is not None:
+        protect(options.gains)
+    else:
+        refuse_given(options, ("unverified",), "a gain set: give --gains, as what is designed here is verified")
+    target = None if options.out is None else spec_output(options.out, kind, spec, options, option="--out")
+    return spec, scenario, target, designed_or_loaded(spec, options.gains, report_stage, unverified=options.unverified)
+
+
+def run_simulate(options: argparse.Namespace) -> int:
+    """Run ``simulate``: spec in, table of errors out, and every signal in a file if asked."""
+    with progress(quiet=options.quiet) as report_stage:
+        from obsynth.experiments.simulation import SIMULATED_SIGNALS, simulate
+
+        spec, scenario, target, design = _prepared(options, report_stage, SIMULATED_SIGNALS)
+        report_stage("simulating")
+        found = simulate(design, scenario)
+        # A log as run reads it; a bias of a sensor is a deviation of its own.
+        point = {**getattr(design.plant, "operating_point", {})}
+        point = {name: value for name, value in point.items() if name not in getattr(design.plant, "sensor_faults", ())}
+        written = None if target is None else str(found.write_csv(target, operating_point=point))
+    from obsynth.report.tables import simulation_report
+
+    answer(
+        options,
+        {"spec": spec.path, "file": written, **found.summary()},
+        lambda: simulation_report(design.name, found, console=stdout_console(), units=design.plant.units, file=written),
+    )
+    return 0
+
+
+def _run_tolerances(options: argparse.Namespace) -> int:
+    """Run ``evaluate --tolerances``: spec in, a table and a picture out."""
+    if options.monitor not in (None, "pointwise"):
+        raise SpecError("--tolerances compares two pointwise monitors: leave out --monitor.", path="--tolerances")
+    unused = ("plants", "confidence", "jobs", "initial_error", "initial", "false_alarms", "window", "change")
+    refuse_given(options, unused, "one monitor on many runs, and --tolerances compares two on plants that it draws")
+    with progress(quiet=options.quiet) as report_stage:
+        kind = None if options.out is None else RESULT_FILE if _is_json(options.out) else picture_kind(options.out)
+        spec, scenario, target, design = _prepared(options, report_stage, kind)
+
+        found = obsynth.tolerance_study(
+            design,
+            scenario,
+            tolerances=[_tolerance(item) for item in options.tolerances.split(",")],
+            runs=options.runs,
+            disturbance_bounds=numbers_of(options.disturbance) or None,
+            noise_bound=options.noise_bound,
+            progress=report_stage,
+        )
+    if target is not None and _is_json(target):
+        found.save(target)
+    elif target is not None:
+        from obsynth.plotting.trade_off import plot_tolerances
+
+        written_picture(target, 2, lambda axes: plot_tolerances(found, axes=axes))
+    answer(
+        options,
+        {"spec": spec.path, "file": target, "statement": found.statement, **found.as_dict()},
+        f"{found}\n{found.statement}",
+    )
+    return 0
+
+
+def _is_json(path: Path) -> bool:
+    return path.suffix.lower() == ".json"
+
+
+def _tolerance(text: str) -> float | str:
+    """Return a tolerance as a share, or as a text with its per cent."""
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip()
+
+
+def run_evaluate(options: argparse.Namespace) -> int:
+    """Run ``evaluate``: spec in, table of rates and errors out."""
+    if options.tolerances is not None:
+        return _run_tolerances(options)
+    refuse_given(options, ("out", "force"), "the picture or certificate of --tolerances")
+    if options.monitor is None:
+        refuse_given(options, MONITOR_NAMES, "a monitor: name it with --monitor")
+    with progress(quiet=options.quiet) as report_stage:
+        spec, scenario, _, design = _prepared(options, report_stage)
+        report_stage("running")
+
+        watched: obsynth.types.Monitor | obsynth.ParameterMonitor | None = None
+        if options.monitor is not None and isinstance(design.observer, obsynth.LinearObserver):
+            watched = obsynth.monitor(design, scenario, options.monitor, **monitor_settings(design, options))
+        elif options.monitor is not None:
+            watched = _parameter_monitor(options)
+        with chosen_executor(options.jobs, None) as executor:
+            found = obsynth.evaluate(
+                design,
+                scenario,
+                runs=options.runs,
+                monitor=watched,
+                executor=executor,
+                progress=lambda done, total: report_stage(f"{done} of {total} runs"),
+                plants=options.plants,
+                **({} if options.confidence is None else {"confidence": options.confidence}),
+            )
+    from obsynth.comparison.comparing import design_beside_least, in_words
+    from obsynth.report.tables import described, evaluation_report, final_threshold
+
+    least = design_beside_least(design, scenario)
+    sentences = [in_words(name, *pair, design.plant.units.get(name, "")) for name, pair in least.items()]
+    told: dict[str, Any] | None = None
+    if watched is not None:
+        kind, statement = described(watched)
+        told = {"kind": kind, "statement": statement, "final_threshold": final_threshold(watched)}
+    answer(
+        options,
+        {
+            "spec": spec.path,
+            "monitor": told,
+            "least_thresholds": {name: {"bound": pair[0], "least": pair[1]} for name, pair in least.items()},
+            **found.as_dict(),
+        },
+        lambda: evaluation_report(
+            design.name, found, monitor=watched, console=stdout_console(), units=design.plant.units, beside=sentences
+        ),
+    )
+    return 0
+
+
+def _parameter_monitor(options: argparse.Namespace) -> obsynth.ParameterMonitor:
+    """Return the decision on parameters that is asked for."""
+    table = {**PARAMETER_OPTIONS, "glr": ("false_alarms",)}
+    refuse_idle(table, options.monitor, stated_settings(options), called=flag_of)
+    change = (options.change or CHANGE) if options.monitor == "cusum" else None
+    return obsynth.ParameterMonitor(options.monitor, false_alarms=options.false_alarms or FALSE_ALARMS, change=change)
+
+
+def _compared_delay(spec: obsynth.Spec, options: argparse.Namespace) -> int:
+    """Return rows by which the inputs of the log act later than linear designs on samples take them."""
+    if options.input_delay == "auto":
+        raise SpecError("--input-delay auto is for calibrate: give a number of rows.", path="--input-delay")
+    told = options.input_delay if options.input_delay is not None else spec.input_delay(spec.plant)
+    return told or 0
+
+
+def run_compare(options: argparse.Namespace) -> int:
+    """Run ``compare``: spec in, table and recommendation out; 3 where no method exists."""
+    from obsynth.comparison.comparing import COMPARISON_PAGE
+
+    with progress(quiet=options.quiet) as report_stage:
+        report_stage(f"reading {options.system}")
+        spec = obsynth.load_spec(options.system)
+        if options.data is None:
+            refuse_given(options, ("map", "scale", "time_column", "input_delay"), "a log: give --data")
+        if options.out is not None:
+            output_file(options.out, RESULT_FILE if _is_json(options.out) else COMPARISON_PAGE, options)
+        plant, clock = _plant_and_clock(spec, options.sample_time)
+        given = {} if spec.method == "auto" else {spec.method: spec.options}
+        found = obsynth.compare(
+            plant,
+            scenario=spec.scenario,
+            options=given,
+            sample_time=clock,
+            within=options.within,
+            tolerance=options.tolerance,
+            runs=options.runs,
+            data=options.data,
+            columns=columns_of(options),
+            scales=numbers_of(options.scale),
+            input_delay=_compared_delay(spec, options),
+            progress=report_stage,
+        )
+        if options.out is not None:
+            report_stage(f"writing {options.out}")
+            if _is_json(options.out):
+                found.save(options.out)
+            else:
+                write_atomically(options.out, found.page())
+    from obsynth.report.tables import comparison_report
+
+    answer(
+        options,
+        {"spec": spec.path, "statement": found.statement, **found.to_dict()},
+        lambda: comparison_report(found, console=stdout_console(), file=options.out),
+    )
+    return 0 if found.recommended else PreconditionError.exit_code
+
+
+def _plant_and_clock(spec: obsynth.Spec, sample_time: float | None) -> tuple[obsynth.DescriptorSystem, float | None]:
+    """Return the plant before it was sampled, and the clock: some methods are continuous, and so are tolerances."""
+    plant = spec.plant
+    if not isinstance(plant, obsynth.DescriptorSystem):
+        raise SpecError(
+            "compare is for linear plants with constant matrices; of a plant of equations give the linear one that its "
+            "spec makes with transform: {linearise: {at: equilibrium, faults: [...]}, sample_time: ...}.",
+            path="plant",
+        )
+    if spec.transformation is None:
+        return plant, sample_time
+    source = spec.transformation.source
+    # Faults and unknown inputs are those of the plant as written.
+    return source, sample_time if sample_time is not None else (plant.dt or None)
+
+
+PICTURE = FileKind("a picture", rb"\A\x89PNG")
+
+
+def run_sweep(options: argparse.Namespace) -> int:
+    """Run ``sweep``; the exit code is 0 when every case was decided, whatever it came to."""
+    if options.out.exists() and not options.out.is_dir():
+        raise SpecError(f"{options.out} is no folder: give --out the name of one.", path="--out")
+    listed = [_value_list(text) for text in options.set]
+    parameters = dict(listed)
+    if len(parameters) < len(listed):
+        raise SpecError("Two lists of values (--set) are of the same entry: put them into one.", path="--set")
+    for spec in options.system:
+        input_file(Path(spec))  # what is designed for hours is not refused in the end
+    _require_claim(options, parameters)
+
+    def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:
+        return obsynth.sweep(options.system, parameters, executor=executor, folder=options.out, progress=done)
+
+    def draw(found: Any) -> Any:
+        claims = {name for result in found.results for name in result.claims}
+        if options.claim is not None and options.claim not in claims:
+            known = ", ".join(sorted(claims)) or "none"
+            print(
+                f"Warning: no picture is written, as no design claims {options.claim!r}; there are: {known}.",
+                file=sys.stderr,
+            )
+            return None
+        return found.plot(options.claim) if claims else None
+
+    table = FileKind("the table of a sweep", rb"\Acase,")
+    found, files = _carried_out(options, options.out, ("designs", table, "sweep.png"), work, draw)
+    _tell(options, found, files, "cases")
+    return 0
+
+
+def _require_claim(options: argparse.Namespace, parameters: dict[str, list[Any]]) -> None:
+    """Refuse a claim that no method of a sweep can make before anything is designed."""
+    if options.claim is None:
+        return
+    from obsynth.methods.registry import REGISTRY, method_class
+    from obsynth.spec.loader import read_yaml
+
+    methods = list(parameters.get("method.id", ()))
+    for section in parameters.get("method", [read_yaml(Path(spec)).get("method") for spec in options.system]):
+        methods.append(section.get("id") if isinstance(section, dict) else None)
+    # What chooses its method may come to any.
+    known = REGISTRY if any(method not in REGISTRY for method in methods) else methods
+    claims = sorted({claim for method in known for claim in method_class(method).claims})
+    if options.claim not in claims:
+        raise SpecError(
+            f"No method of this sweep claims {options.claim!r}: give --claim one of {', '.join(claims)}.",
+            path="--claim",
+        )
+
+
+def run_many(options: argparse.Namespace) -> int:
+    """Run ``run`` for a folder of gain sets: a table, a picture, and the estimates of each design on each log."""
+    alone = ("system", "state", "prove", "monitor", "smooth", "lag")
+    given = [name for name in alone if getattr(options, name)]
+    if given:
+        names = ", ".join(f"--{name}" for name in given)
+        raise SpecError(f"{names}: for one gain set; --gains is a folder of many.", path=f"--{given[0]}")
+    refuse_given(options, ("state_every", "sample_time", *MONITOR_NAMES), "one gain set: --gains is a folder of many")
+    folder = Path(options.out)
+    if options.out == STREAM or (folder.exists() and not folder.is_dir()):
+        raise SpecError("Many designs need a folder for their estimates: give one to --out.", path="--out")
+
+    for path in (Path(options.gains), Path(options.data)):
+        if path.is_file():
+            input_file(path)  # what is read is never written, by force or not
+    asked = {
+        "columns": dict(options.map) or None,
+        "time_column": options.time_column,
+        "outliers": options.outliers,
+        "scales": numbers_of(options.scale) or None,
+        "thresholds": numbers_of(options.threshold) or None,
+        "gap": options.gap,
+        "warm_up": options.warm_up,
+        "recovered": options.recovered,
+        "unverified": options.unverified or None,
+    }
+
+    def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:
+        stated = {name: value for name, value in asked.items() if value is not None}
+        return obsynth.run_fleet(options.gains, options.data, folder, executor=executor, progress=done, **stated)
+
+    table = FileKind("the table of many runs", rb"\Arun,status,")
+    found, files = _carried_out(
+        options,
+        folder,
+        ("runs", table, "fleet.png"),
+        work,
+        lambda found: found.plot() if "run" in found.counts else None,
+    )
+    if options.json or not options.quiet:
+        _tell(options, found, files, "runs")
+    return 0
+
+
+def _carried_out(
+    options: argparse.Namespace,
+    folder: Path,
+    named: tuple[str, FileKind, str],
+    work: Callable[[Executor | None, Callable[[int, int], None]], Any],
+    draw: Callable[[Any], Any],
+) -> tuple[Any, tuple[Path, ...]]:
+    """Return what ``work`` comes to, and the files of its table and picture; nothing is left of a folder in vain."""
+    what, kind, picture_name = named
+    with made_folder(folder):
+        table = output_file(folder / "table.csv", kind, options)
+        picture = output_file(folder / picture_name, PICTURE, options)
+        with progress(quiet=options.quiet) as report_stage, chosen_executor(options.jobs, options.cluster) as executor:
+            found = work(executor, lambda done, total: report_stage(f"{done} of {total} {what}"))
+            contents: dict[Path, str | bytes] = {table: found.csv()}
+            image = _png_of(lambda: draw(found))
+            if image is not None:
+                contents[picture] = image
+            return found, write_together(contents)
+
+
+def _tell(options: argparse.Namespace, found: Any, files: tuple[Path, ...], what: str) -> None:
+    """Print the table of a sweep or of many runs, and the files."""
+    header, rows = found.rows()
+    if options.json:
+        cases = [dict(zip(header, row, strict=True)) for row in rows]
+        print_json({"command": options.verb, "counts": found.counts, what: cases, "files": [str(f) for f in files]})
+        return
+    console = stdout_console()
+    shown = _shown_cases if what == "cases" else _shown_runs
+    console.print(shown(found, console.width))
+    console.print(f"Written: {', '.join(map(str, files))}", soft_wrap=True)
+
+
+@contextmanager
+def chosen_executor(jobs: int | None, cluster: str | None) -> Iterator[Executor | None]:
+    """Yield where work goes: nowhere else, processes, or a Dask cluster."""
+    if jobs is not None and cluster is not None:
+        raise SpecError("--jobs and --cluster are two places for the work: give one of them.", path="--jobs")
+    if cluster is not None:
+        from dask import distributed
+
+        connect: Any = distributed.Client
+        try:
+            client = connect(cluster, timeout="10s")
+        except OSError as error:
+            raise SpecError(f"There is no Dask scheduler at {cluster}: {error}.", path="--cluster") from error
+        with client:
+            yield client.get_executor()
+        return
+    if jobs in (None, 1):
+        yield None
+        return
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as executor:
+        try:
+            yield executor
+        except BaseException:
+            executor.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _value_list(text: str) -> tuple[str, list[Any]]:
+    """Return the path and the values of ``PATH=LIST``."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    name, sign, listed = text.partition("=")
+    try:
+        values = YAML(typ="safe", pure=True).load(listed) if sign else None
+    except (YAMLError, ValueError) as error:
+        raise SpecError(f"--set {text}: {listed!r} is no YAML list.", path="--set") from error
+    if not name or not isinstance(values, list):
+        raise SpecError(f"--set {text!r}: give PATH=[value, value, ...].", path="--set")
+    return name.strip(), values
+
+
+def _png_of(plot: Callable[[], Any]) -> bytes | None:
+    import matplotlib
+
+    from obsynth.plotting.panels import written
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure = plot()
+    if figure is None:
+        return None
+    picture = written(figure)
+    plt.close(figure)
+    return picture
+
+
+#: Blanks between columns.
+_BLANKS_BETWEEN = 2
+
+
+def _shown(found: Any, header: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> Any:
+    """Return a table for people, below what became of the cases, what is the same in all, and what has no room."""
+    from rich.console import Group
+    from rich.text import Text
+
+    from obsynth.results.layout import headed_table
+
+    listed = [tuple("" if cell == "nan" else cell for cell in row) for row in rows]
+    columns = dict(zip(header, zip(*listed, strict=True), strict=True)) if listed else {}
+    filled = {name: column for name, column in columns.items() if any(column)}
+    same = {name: column[0] for name, column in filled.items() if len(listed) > 1 and len(set(column)) == 1}
+    shown, widths, missing, room = dict[str, tuple[str, ...]](), dict[str, int](), list[str](), width + _BLANKS_BETWEEN
+    for name, column in filled.items():
+        if name not in same:
+            # Texts fold at blanks; a number that is cut is another number.
+            words = [word for text in (name.replace(".", ". "), *column) for word in text.split()]
+            wide = max(map(len, words)) + _BLANKS_BETWEEN
+            if wide <= room:
+                shown[name], widths[name], room = column, wide - _BLANKS_BETWEEN, room - wide
+            else:
+                missing.append(name)
+    lines = [", ".join(f"{count} {status}" for status, count in found.counts.items())]
+    if same:
+        lines.append(f"In all of them: {', '.join(f'{name} {value}' for name, value in same.items())}.")
+    if missing:
+        lines.append(f"In table.csv alone: {', '.join(missing)}.")
+    table = headed_table(*(name.replace(".", ". ") for name in shown))
+    for place, (name, cells) in zip(table.columns, shown.items(), strict=True):
+        # What room is left goes to the first texts that could use it.
+        more = min(max(map(len, cells)) - widths[name], room)
+        place.width, room = widths[name] + max(more, 0), room - max(more, 0)
+    for row in zip(*shown.values(), strict=True):
+        table.add_row(*(Text(cell or "-") for cell in row))
+    return Group(*map(Text, lines), Text(), table)
+
+
+def _shown_cases(found: Any, width: int) -> Any:
+    """Return the table of a sweep for people: without message and file."""
+    header, rows = found.rows()
+    kept = [i for i, name in enumerate(header) if name not in ("message", "file")]
+    told = ([f"{row[i]:.4g}" if isinstance(row[i], float) else str(row[i]) for i in kept] for row in rows)
+    return _shown(found, [header[i] for i in kept], told, width)
+
+
+def _shown_runs(found: Any, width: int) -> Any:
+    """Return the table of runs for people: the first alarm of each, and why one was not made."""
+    rows = []
+    for run in found.runs:
+        first = min(run.alarms, key=lambda name: run.alarms[name], default="")
+        alarm = f"{first} at {run.alarms[first]:g} s" if first else "-"
+        rows.append((run.name, run.status, str(run.rows), str(run.statuses.get("ok", 0)), alarm, run.message))
+    return _shown(found, ("run", "status", "rows", "ok", "first alarm", "why not"), rows, width)

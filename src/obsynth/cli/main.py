@@ -19,7 +19,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any, NamedTuple, NoReturn
 
-from obsynth.cli.arguments import (
+from obsynth.cli.output import (
     CLUSTER,
     DATA_OPTIONS,
     FORCE,
@@ -46,13 +46,14 @@ from obsynth.cli.arguments import (
     digits,
     flag,
     option,
+    print_error,
+    print_json,
     read_settings,
     settings_of,
     verbose,
 )
-from obsynth.cli.output import print_error, print_json
 from obsynth.errors import ObsynthError, SolverError, SpecError
-from obsynth.files.inputs import protected_inputs
+from obsynth.files.outputs import protected_inputs
 from obsynth.version import __version__
 
 
@@ -221,7 +222,7 @@ VERBS = {
         ),
     ),
     "simulate": Verb(
-        "scenarios:run_simulate",
+        "data_commands:run_simulate",
         "Design an observer from a spec, and simulate it on the spec's scenario.",
         (
             SYSTEM,
@@ -234,7 +235,7 @@ VERBS = {
         ),
     ),
     "compare": Verb(
-        "scenarios:run_compare",
+        "data_commands:run_compare",
         "Design by every method that exists for a spec's plant, and compare them on its scenario.",
         (
             SYSTEM,
@@ -266,7 +267,7 @@ VERBS = {
         ),
     ),
     "evaluate": Verb(
-        "scenarios:run_evaluate",
+        "data_commands:run_evaluate",
         "Design an observer from a spec, run the spec's scenario many times, and count alarms, delays and errors.",
         (
             SYSTEM,
@@ -305,7 +306,7 @@ VERBS = {
         ),
     ),
     "sweep": Verb(
-        "sweep:run_sweep",
+        "data_commands:run_sweep",
         "Design and verify for every combination of specs and values; a design that fails is a row of the table.",
         (
             option("--system", "FILE", "a spec (YAML), or several", type=Path, required=True, nargs="+"),

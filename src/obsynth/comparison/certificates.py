@@ -14,7 +14,7 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.alarm_proof import ALARM_KIND
 from obsynth.experiments.assumptions import Log, file_digest
 from obsynth.experiments.tolerance_study import study_statement, tolerance_study
-from obsynth.files.inputs import path_of, read_json
+from obsynth.files.outputs import path_of, read_json
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.results.certificate_files import (
     CALIBRATION_KIND,
@@ -29,8 +29,7 @@ from obsynth.results.certificate_files import (
     verify_calibration,
 )
 from obsynth.results.checks import Check, information, nothing_wrong
-from obsynth.results.design import ObserverDesign, VerificationReport
-from obsynth.results.gain_sets import loaded
+from obsynth.results.design import ObserverDesign, VerificationReport, loaded
 from obsynth.simulation.scenario import scenario_from
 from obsynth.tolerances.robustness import robustness, robustness_statement
 

@@ -36,14 +36,15 @@ from obsynth.methods.guaranteed_test.problem import MOST_STATES, problem_of
 from obsynth.methods.guaranteed_test.programs import largest_hidden_fault
 from obsynth.numerics.arguments import (
     Count,
+    FloatArray,
     NonNegative,
     Positive,
     Probability,
     arguments_checked,
     is_finite_number,
+    read_only,
     require_kind,
 )
-from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.continuous import driven
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
@@ -59,8 +60,7 @@ from obsynth.plotting.panels import (
     written,
 )
 from obsynth.results.certificate_files import COMPARISON, SHOWN_DIGITS, result_text
-from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_sets import design_as_dict
+from obsynth.results.design import ObserverDesign, design_as_dict
 from obsynth.simulation.scenario import Scenario, Sine, Step, resolve, scenario_from
 from obsynth.tolerances.robustness import plant_at
 

@@ -16,12 +16,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from annotated_types import Ge
 
-from obsynth.analysis.diagnosis.decoupled import fault_numbers
-from obsynth.analysis.diagnosis.explanations import Sensor, state_sensors, with_sensors
-from obsynth.analysis.diagnosis.fault_columns import Questions
-from obsynth.analysis.diagnosis.sensor_search import SensorSearch, Task, reached
+from obsynth.analysis.diagnosis.diagnosing import SensorSearch, Task, reached
+from obsynth.analysis.diagnosis.fault_columns import Questions, Sensor, fault_numbers, state_sensors, with_sensors
+from obsynth.analysis.transformations.elimination import discretise
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
-from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.files.tables import html_table, text_table
 from obsynth.methods.functions import functional_filter

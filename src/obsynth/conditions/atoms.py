@@ -15,8 +15,7 @@ import numpy as np
 
 from obsynth.errors import SpecError, a_kind
 from obsynth.methods.conic import lmi
-from obsynth.numerics.arguments import arguments_checked, real_array, real_number, require_shape
-from obsynth.numerics.arrays import require_no_overflow
+from obsynth.numerics.arguments import arguments_checked, real_array, real_number, require_no_overflow, require_shape
 from obsynth.numerics.regions import LMIRegion, checked_region
 
 if TYPE_CHECKING:

@@ -34,8 +34,7 @@ from obsynth.methods.conic import lmi
 from obsynth.methods.designing import design_from_gains
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
 from obsynth.methods.pd_observer.inequalities import PD_MARGIN
-from obsynth.numerics.arguments import arguments_checked, chosen, is_finite_number, shown
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, arguments_checked, chosen, is_finite_number, shown
 from obsynth.numerics.regions import LMIRegion, checked_region
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign

@@ -32,12 +32,10 @@ from obsynth.methods.recursive.synthesis import (
     with_stated_noise,
     without_unknown_inputs,
 )
-from obsynth.numerics.arguments import arguments_checked, require_shape
-from obsynth.numerics.arrays import SMALLEST, FloatArray, as_matrix
+from obsynth.numerics.arguments import SMALLEST, FloatArray, arguments_checked, as_matrix, require_shape
 from obsynth.numerics.norms import output_covariance
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, covariance_factor
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 
 #: A gain of the inequality is that of the recursion when they differ by at most this share of their size: the minimum

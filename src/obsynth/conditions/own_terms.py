@@ -33,7 +33,7 @@ from obsynth.methods.refusals import require_all_told
 from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
 from obsynth.methods.ui_pi_observer.placement_problem import synthesis_from_gains as ui_pi_from_gains
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane, sector
 from obsynth.observers.linear.observer import LinearObserver, averaged
 from obsynth.plants.descriptor import DescriptorSystem

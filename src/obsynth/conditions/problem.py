@@ -13,8 +13,7 @@ import numpy as np
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SolverError, SpecError, VerificationError, a_kind
 from obsynth.methods.designing import failed_rows
-from obsynth.numerics.arguments import require_kind, shown
-from obsynth.numerics.arrays import FloatArray, freeze, read_only
+from obsynth.numerics.arguments import FloatArray, freeze, read_only, require_kind, shown
 from obsynth.results.design import ObserverDesign, VerificationReport
 from obsynth.verification.plant import condition_rows
 

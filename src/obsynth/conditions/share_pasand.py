@@ -43,8 +43,7 @@ from obsynth.methods.ui_pi_observer.augmented_plant import (
 )
 from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.methods.ui_pi_observer.placement_problem import with_faults
-from obsynth.numerics.arguments import arguments_checked
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arguments import FloatArray, arguments_checked, as_matrix
 from obsynth.numerics.doubling import is_positive
 from obsynth.numerics.matrix_equations import continuous_solution, discrete_solution
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane

@@ -37,8 +37,15 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import (
     restricted_equivalent_from,
     with_sensor_faults_as_states,
 )
-from obsynth.numerics.arguments import arguments_checked, chosen, real_number, require_shape
-from obsynth.numerics.arrays import FloatArray, as_matrix, require_no_overflow
+from obsynth.numerics.arguments import (
+    FloatArray,
+    arguments_checked,
+    as_matrix,
+    chosen,
+    real_number,
+    require_no_overflow,
+    require_shape,
+)
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem

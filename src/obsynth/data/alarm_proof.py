@@ -31,16 +31,14 @@ from obsynth.experiments.alarm_proof import (
 from obsynth.experiments.assumptions import Log, file_digest
 from obsynth.experiments.monitors.guaranteed import is_guaranteed
 from obsynth.experiments.monitors.options import WINDOW
-from obsynth.files.inputs import path_of
+from obsynth.files.outputs import path_of
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.verifying import verify
-from obsynth.numerics.arguments import arguments_checked, is_whole, whole_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, arguments_checked, is_whole, whole_number
 from obsynth.observers.windows import WindowObserver
 from obsynth.results.certificate_files import SHOWN_DIGITS, opened
 from obsynth.results.checks import Check, information
-from obsynth.results.design import ObserverDesign, VerificationReport
-from obsynth.results.gain_sets import loaded, restored
+from obsynth.results.design import ObserverDesign, VerificationReport, loaded, restored
 
 
 @arguments_checked

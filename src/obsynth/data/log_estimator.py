@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.monitor import Evidence, LinearSample
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.observers.linear.observer import checked_warm_up
 from obsynth.observers.running import state_as_data, state_from_data
 from obsynth.plants.descriptor import DescriptorSystem

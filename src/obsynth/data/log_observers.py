@@ -18,8 +18,7 @@ from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVER
 from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError
 from obsynth.experiments.monitors.learned import innovation_names
 from obsynth.experiments.monitors.monitor import Evidence, LinearSample
-from obsynth.numerics.arguments import real_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, real_number
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver, noise_variances, transient

@@ -82,8 +82,7 @@ from obsynth.experiments.monitors.rules import (
     gap_growth,
     parameter_monitor,
 )
-from obsynth.numerics.arguments import Seed, arguments_checked, is_finite_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, Seed, arguments_checked, is_finite_number
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.outliers import checked_limit

@@ -37,12 +37,12 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.learned import LearnedRule, as_learned
 from obsynth.experiments.monitors.learned_levels import HOLD
 from obsynth.experiments.monitors.monitor import LinearSample, Monitor, Sample
-from obsynth.files.inputs import read_json
 from obsynth.files.outputs import (
     FileKind,
     HeldSignals,
     check_output,
     ending_signals,
+    read_json,
     remove_left_parts,
     replacement_of,
     require_distinct,
@@ -53,14 +53,15 @@ from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.windows import rows_before
 from obsynth.numerics.arguments import (
+    FloatArray,
     arguments_checked,
     is_finite_number,
     is_number,
+    read_only,
     real_number,
     require_kind,
     whole_number,
 )
-from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.linear.observer import SETTLED_TO, LinearObserver, transient
 from obsynth.observers.recursive.observer import deviations_in
 from obsynth.observers.running import BY_COLUMNS, Estimates, changed
@@ -73,11 +74,9 @@ from obsynth.observers.smoothing import (
     smoothed_estimates,
     smoothed_record,
 )
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.validation import index_of
+from obsynth.plants.descriptor import DescriptorSystem, index_of
 from obsynth.results.certificate_files import sealed
-from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
+from obsynth.results.design import ObserverDesign, digest_of, gain_set_digest, plain, restored
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -14,8 +14,7 @@ import numpy as np
 
 from obsynth.data.log_estimator import LogObserver
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, number_in_text, require_kind
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, is_finite_number, number_in_text, read_only, require_kind
 
 #: What a missing sample may look like in a log.
 MISSING_TEXTS = frozenset({"", "nan", "na", "n/a", "null", "none"})

@@ -36,10 +36,9 @@ from obsynth.data.signals import (
     with_date,
 )
 from obsynth.errors import SpecError
-from obsynth.files.inputs import input_file, reason
+from obsynth.files.outputs import input_file, reason
 from obsynth.files.tables import unquoted
-from obsynth.numerics.arguments import number_in_text, require_kind
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, number_in_text, require_kind
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 
 #: A run of repeats counts from so many samples on, and where it is so many times as long as any that is usual.
 LEAST_RUN, TIMES_USUAL = 6, 3.0

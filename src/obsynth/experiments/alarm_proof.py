@@ -43,14 +43,12 @@ from obsynth.methods.guaranteed_test.proofs import (
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.methods.verifying import tracking_of, verify
-from obsynth.numerics.arguments import real_number, whole_number
-from obsynth.numerics.arrays import FloatArray, require_no_overflow
+from obsynth.numerics.arguments import FloatArray, real_number, require_no_overflow, whole_number
 from obsynth.plants.constants import MOST_LISTED, shown
-from obsynth.plants.validation import index_of
+from obsynth.plants.descriptor import index_of
 from obsynth.proofs.balls import gamma
 from obsynth.results.certificate_files import SHOWN_DIGITS, sealed
-from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_sets import design_as_dict, plain
+from obsynth.results.design import ObserverDesign, design_as_dict, plain
 from obsynth.tolerances.robustness import structure_of
 from obsynth.verification.adaptive_bound import adaptive_bound, thresholds_of_records
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.plants.constants import MOST_LISTED, ConstantsBox, deviations_told, shown
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.gain_sets import digest_of, plain
+from obsynth.results.design import digest_of, plain
 
 
 @dataclass(frozen=True, eq=False)

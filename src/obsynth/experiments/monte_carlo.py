@@ -14,8 +14,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.simulation import Bench, Runs, aligned_errors, bench_of, make_bench
-from obsynth.numerics.arguments import OpenUnitInterval, arguments_checked, whole_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, OpenUnitInterval, arguments_checked, whole_number
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import ParameterMonitor
 from obsynth.observers.linear.observer import LinearObserver

@@ -19,8 +19,7 @@ from obsynth.analysis.transformations.recovery import Transformation, plant_and_
 from obsynth.errors import SpecError
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.files.tables import table_writer
-from obsynth.numerics.arguments import arguments_checked, require_kind
-from obsynth.numerics.arrays import FloatArray, freeze, read_only
+from obsynth.numerics.arguments import FloatArray, arguments_checked, freeze, read_only, require_kind
 from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.dae.observer import DAEObserver
@@ -29,10 +28,8 @@ from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import BAND_WIDTH, Estimates
 from obsynth.observers.windows import WindowObserver
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import MatrixSequence, TimeVaryingDescriptorSystem
-from obsynth.plants.validation import index_of
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem, MatrixSequence, TimeVaryingDescriptorSystem, index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae
 from obsynth.simulation.linear import (

@@ -16,13 +16,11 @@ from obsynth.experiments.simulation import Runs, make_bench
 from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import text_table
 from obsynth.methods.verifying import verify
-from obsynth.numerics.arguments import arguments_checked, whole_number
-from obsynth.numerics.arrays import FloatArray, freeze
+from obsynth.numerics.arguments import FloatArray, arguments_checked, freeze, whole_number
 from obsynth.plants.constants import deviations_told, shown, tolerance_share
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.certificate_files import SHOWN_DIGITS, STUDY, result_text
-from obsynth.results.design import ObserverDesign, require_verified
-from obsynth.results.gain_sets import design_as_dict
+from obsynth.results.design import ObserverDesign, design_as_dict, require_verified
 from obsynth.simulation.scenario import Scenario, Step
 from obsynth.tolerances.robustness import drawn_points, plant_at
 

@@ -1,4 +1,8 @@
-"""A sampled observer as C99: one header, one source, no allocation, no library; thresholds over tolerances beside it.
+"""What every export holds: one discrete- or continuous-time realisation, its names, and the digest of the gain set.
+
+Alarms of an exported observer: levels of its outputs, and a monitor that was learned from rows without faults.
+
+A sampled observer as C99: one header, one source, no allocation, no library; thresholds over tolerances beside it.
 
 Observers of nonlinear DAEs are templates filled with sizes and tables: CasADi writes the equations, and the loop of
 Newton around them, its damping and its homotopy are those of `obsynth.observers.dae.c_code`. What the header of one in
@@ -10,17 +14,21 @@ from __future__ import annotations
 
 import ctypes
 import json
+import math
 import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from obsynth.data.log_estimator import SETTLING_SLACK
+from obsynth.data.log_observers import GAP_LEFT_SHARE, LEAST_SHOWN, LinearLogObserver
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.learned import LearnedThresholds, as_learned, watched_names
 from obsynth.experiments.monitors.learned_levels import (
@@ -32,17 +40,272 @@ from obsynth.experiments.monitors.learned_levels import (
     MODEL_SHARE,
     parameter_walk,
 )
-from obsynth.exporting.realisation import Alarms, Realisation, verification_words
 from obsynth.files.outputs import write_together
-from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.arguments import SMALLEST, FloatArray, real_number, require_mapping
+from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.c_code import FLAGS, compiler, in_lines, observer_code, observer_struct, shared_library
-from obsynth.observers.linear.observer import checked_warm_up
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.linear.observer import LinearObserver, checked_warm_up, sample_observer, transient
+from obsynth.observers.recursive.gain_schedule import steady_observer
+from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import Estimates, as_run
-from obsynth.plants.dae.model import DAEModel
-from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_sets import gain_set_digest
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
+from obsynth.results.design import ObserverDesign, gain_set_digest, unverified_mark
 from obsynth.simulation.dae import simulate_dae
 from obsynth.verification.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
+
+#: What a file says about the steady state of a recursion.
+STEADY = (
+    "The steady state of a recursive design: its estimates are those of the recursion once the covariances have "
+    "settled, and where a sample is missing the model alone is used."
+)
+
+
+class GapTables(NamedTuple):
+    """What stands in for the sensors where a sample is missing: the model of the plant, as runs have it."""
+
+    faults: int  # of the plant
+    told: tuple[int, ...]  # which of them the observer estimates
+    kept_inputs: int = 1
+    states: int = 0
+    seen: int = 0
+    exists: bool = False
+    solved: bool = False
+    tables: Mapping[str, FloatArray] = MappingProxyType({})
+    left_share: float = 0.0
+    least_shown: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Realisation:
+    """The observer of a design, sampled if that was asked for, or the steady state of its recursion; from ``z(0)``."""
+
+    design: ObserverDesign
+    observer: LinearObserver
+    digest: str
+    start: FloatArray
+    note: str = ""
+    precision: str = "double"
+
+    @classmethod
+    def of(cls, design: ObserverDesign, sample_time: float | None, precision: str = "double") -> Realisation:
+        """Return the realisation of a design."""
+        digest = gain_set_digest(design)
+        if isinstance(design.observer, RecursiveObserver):
+            if design.observer.outliers != "none":
+                raise SpecError(
+                    f"Design {design.name!r} uses the option 'outliers', which exported code does not know: design it "
+                    "without, or run it with obsynth run.",
+                    path="outliers",
+                )
+            found = steady_observer(design.observer)
+            if sample_time is not None:
+                raise SpecError("A recursive design is sampled already: leave the sample time out.", path="sample_time")
+            return cls(design, found.observer, digest, found.start, STEADY, precision)
+        if isinstance(design.observer, DAEObserver):
+            raise SpecError(
+                f"Design {design.name!r} is for a nonlinear plant: it has no constant gains to write. Run it with "
+                "obsynth run, or with observer.step.",
+                path="observer",
+            )
+        _, observer = design.linear
+        if sample_time is not None:
+            if observer.dt > 0.0:
+                raise SpecError(
+                    f"The design is sampled already (dt = {observer.dt:g} s): leave the sample time out.",
+                    path="sample_time",
+                )
+            observer = sample_observer(observer, sample_time)
+        return cls(design, observer, digest, np.zeros(observer.order), precision=precision)
+
+    @property
+    def straight(self) -> bool:
+        """Whether signals are taken as straight lines between samples, as the design is continuous in time."""
+        return isinstance(self.design.observer, LinearObserver) and self.design.observer.dt == 0.0 < self.observer.dt
+
+    @property
+    def running(self) -> LinearObserver:
+        """The observer whose rows are said: a continuous one as it is, whose state a run starts at zero."""
+        return self.design.linear[1] if self.straight else self.observer
+
+    @cached_property
+    def transition(self) -> dict[str, FloatArray]:
+        """What makes z of a sample from that of the one before: of inputs and outputs there, or of these before and
+        their rise, where lines between them are straight."""
+        if not self.straight:
+            return {"z": self.observer.Az, "u": self.observer.Bu, "y": self.observer.By}
+        driven = np.hstack([self.running.Bu, self.running.By])
+        return dict(
+            zip(("z", "before", "rise"), first_order_hold(self.running.Az, driven, self.observer.dt), strict=True)
+        )
+
+    @cached_property
+    def gap(self) -> GapTables:
+        """The model that goes on where a sample is missing; without one the observer starts again."""
+        observer, plant = self.observer, _constant_plant(self.design.plant)
+        nothing = GapTables(len(observer.fault_names), tuple(range(len(observer.fault_names))))
+        signals = observer.input_names, observer.output_names
+        if plant is None or (plant.input_names, plant.output_names) != signals:
+            return nothing
+        if not set(observer.fault_names) <= set(plant.fault_names):
+            return nothing
+        running = LinearLogObserver(self.design.replace(plant=plant, observer=self.running))
+        model = running.gap_model
+        told = tuple(running.told_faults)
+        if model is None:
+            return GapTables(plant.nf, told)
+        moving = model.plant
+        if self.straight:
+            held = first_order_hold(moving.A, np.hstack([moving.B, moving.Bf]), observer.dt)
+            moves: tuple[FloatArray, ...] = (
+                held[0],
+                held[1][:, : moving.nu],
+                held[1][:, moving.nu :],
+                held[2][:, : moving.nu],
+            )
+        else:
+            moves = (moving.A, moving.B, moving.Bf)
+        tables = dict(zip(("model_A", "model_B", "model_F", "model_R"), moves, strict=False))
+        tables |= {"model_C": moving.C, "model_D": moving.D, "model_Df": moving.Df, "model_into": model.into}
+        tables |= {"noise_variances": running.noise[None]}
+        if running.solver is not None:
+            tables |= {"source_D": plant.D, "source_Df": plant.Df, "model_solver": running.solver}
+        kept = running.kept_inputs
+        return GapTables(
+            plant.nf, told, kept, moving.nx, len(running.seen), True, running.solver is not None, tables,
+            GAP_LEFT_SHARE, LEAST_SHOWN,
+        )  # fmt: skip
+
+    @property
+    def mark(self) -> str:
+        """What every file says of a design that fails its verification; empty where it holds."""
+        return unverified_mark(self.design.report)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs: known inputs, then outputs of the plant."""
+        return self.observer.input_names + self.observer.output_names
+
+    @property
+    def operating_point(self) -> tuple[FloatArray, FloatArray]:
+        """The operating point of inputs and of outputs: inputs are deviations from it, outputs as well."""
+        plant = self.design.plant
+        point = {} if isinstance(plant, DAEModel) else plant.operating_point
+        biases = getattr(plant, "sensor_faults", ())
+        after = [point.get(name, 0.0) for name in self.observer.state_names]
+        after += [0.0 if name in biases else point.get(name, 0.0) for name in self.observer.fault_names]
+        after += [0.0] * len(self.observer.residual_names)
+        return np.array([point.get(name, 0.0) for name in self.inputs]), np.array(after)
+
+    def as_arrays(self) -> dict[str, Any]:
+        """Return ``A, B, C, D, x0, Ts`` and everything else by name."""
+        observer = self.observer
+        before, after = self.operating_point
+        return {
+            "A": observer.Az,
+            "B": np.hstack([observer.Bu, observer.By]),
+            "C": observer.Cz,
+            "D": np.hstack([observer.Du, observer.Dy]),
+            "x0": self.start.reshape(-1, 1),
+            "Ts": observer.dt,
+            "input_point": before,
+            "output_point": after,
+            "delays": np.array([*observer.state_delays, *observer.fault_delays], dtype=np.float64),
+            "input_names": list(self.inputs),
+            "output_names": list(observer.row_names),
+            "name": self.design.name,
+            "method": self.design.method,
+            "sha256": self.digest,
+            **({"unverified": self.mark} if self.mark else {}),
+        }
+
+
+def verification_words(design: ObserverDesign) -> str:
+    """Return the status of a design's verification, in a sentence."""
+    mark = unverified_mark(design.report)
+    return mark or f"Verified: all {len(design.report.checks)} checks of obsynth hold."
+
+
+def _constant_plant(plant: Any) -> DescriptorSystem | None:
+    """Return the plant of a linear observer; that of a recursion, if it is one that changes with nothing."""
+    if isinstance(plant, DescriptorSystem):
+        return plant
+    if not isinstance(plant, TimeVaryingDescriptorSystem) or not plant.is_time_invariant:
+        return None
+    parts = {name: sequence.at(1) for name, sequence in plant.matrices.items()}
+    names = ("state_names", "input_names", "output_names", "operating_point", "units")
+    try:
+        return DescriptorSystem(
+            parts["E"], parts["A"], B=parts["B"], C=parts["C"], Bf=parts["Phi"], Df=parts["Psi"], dt=plant.dt,
+            fault_names=plant.parameter_names, **{name: getattr(plant, name) for name in names},
+        )  # fmt: skip
+    except SpecError:
+        # More or fewer equations than states.
+        return None
+
+
+#: What the largest statistic of a learned monitor is called, in units of its level.
+STATISTIC = "statistic"
+#: Seconds, about thirty years.
+_NEVER = 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class Alarms:
+    """What raises an alarm: ``levels`` by watched output, 0 for none; ``columns``: all outputs that a learned monitor
+    may take, fault estimates first; ``warm_up`` in seconds; ``walk (nf, nf)``: by which faults walk between samples."""
+
+    levels: Mapping[str, float]
+    columns: tuple[str, ...]
+    fault_names: tuple[str, ...]
+    warm_up: float
+    learned: LearnedThresholds | None = None
+    walk: FloatArray | None = None
+
+    @classmethod
+    def of(
+        cls,
+        columns: Sequence[str],
+        fault_names: Sequence[str],
+        thresholds: Mapping[str, float] | None,
+        warm_up: float,
+        learned: LearnedThresholds | None,
+        more: Sequence[str] = (),
+    ) -> Alarms:
+        """Return alarms; ``more``: what may be watched besides the columns.  Raise `SpecError` for another name."""
+        require_mapping(thresholds, "thresholds")
+        watched = [*columns, *more]
+        for name, level in (thresholds or {}).items():
+            if name not in watched:
+                raise SpecError(
+                    f"There is no output {name!r} to monitor: there are {', '.join(watched)}.", path="thresholds"
+                )
+            real_number(level, f"The threshold of {name!r}", "a positive number", above=0.0, path="thresholds")
+        levels = {name: float((thresholds or {}).get(name, 0.0)) for name in watched}
+        if learned is not None:
+            levels[STATISTIC] = 1.0
+        return cls(levels, tuple(columns), tuple(fault_names), warm_up, learned)
+
+
+def finite_warm_up(seconds: float) -> float:
+    """Return a number that a file may hold: an observer that never settles raises no alarm."""
+    return seconds if math.isfinite(seconds) else _NEVER
+
+
+def linear_alarms(
+    found: Realisation,
+    thresholds: Mapping[str, float] | None,
+    warm_up: float | None,
+    learned: LearnedThresholds | None,
+) -> Alarms:
+    """Return the alarms of a linear observer."""
+    observer = found.observer
+    columns = (*observer.row_names[observer.fault_rows], *observer.row_names[observer.residual_rows])
+    # That of the design itself, as runs have it: sampling changes no mode.
+    seconds = finite_warm_up(checked_warm_up(warm_up, transient(found.running)))
+    return Alarms.of(columns, observer.fault_names, thresholds, seconds, learned)
+
 
 _KEYWORDS = frozenset(
     {

@@ -18,6 +18,8 @@ from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned import LearnedRule, LearnedThresholds
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.exporting.c_source import (
+    Alarms,
+    Realisation,
     c_identifier,
     comment,
     dae_alarms,
@@ -25,6 +27,7 @@ from obsynth.exporting.c_source import (
     header_text,
     in_precision,
     included,
+    linear_alarms,
     quoted,
     source_text,
     table_lines,
@@ -33,20 +36,17 @@ from obsynth.exporting.c_source import (
     with_c_linkage,
     write_dae_c,
 )
-from obsynth.exporting.realisation import Alarms, Realisation, linear_alarms
 from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.methods.guaranteed_test.bank import groups_of, is_bank
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
-from obsynth.numerics.arguments import arguments_checked
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, arguments_checked
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.outliers import Outliers
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.sensor_timing import require_plain
 from obsynth.observers.windows import WindowObserver
-from obsynth.results.design import ObserverDesign, require_verified
-from obsynth.results.gain_sets import gain_set_digest
+from obsynth.results.design import ObserverDesign, gain_set_digest, require_verified
 from obsynth.verification.adaptive_bound import AdaptiveBound
 
 #: Relative rounding of a float, and of a double.

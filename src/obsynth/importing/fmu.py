@@ -20,13 +20,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.files.inputs import path_of
-from obsynth.importing.python_objects import plant_of
-from obsynth.numerics.arguments import arguments_checked, real_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.files.outputs import path_of
+from obsynth.importing.linear_models import plant_of
+from obsynth.numerics.arguments import FloatArray, arguments_checked, real_number
 from obsynth.numerics.libraries import imported
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.validation import suggestion
+from obsynth.plants.descriptor import DescriptorSystem, suggestion
 
 _REAL = ("Real", "Float64")
 #: By version of FMI: fmpy's class, and how it gets and sets real variables and updates the discrete states.

@@ -22,8 +22,8 @@ from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import arguments_checked, field_types
 from obsynth.numerics.libraries import failed_computations, failure_of, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.constants import UNCERTAIN_MATRICES
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
 from obsynth.results.design import Certificate, ObserverDesign, VerificationReport, source_of
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.claims import before_the_mean

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
-from obsynth.analysis.transformations.sampling import discretise
+from obsynth.analysis.transformations.elimination import discretise, eliminate_algebraic_states
 from obsynth.errors import PreconditionError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.linear import stabilising_feedback

@@ -18,13 +18,11 @@ import numpy as np
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import WrittenAs, field_types, problem_with, shown
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, WrittenAs, field_types, problem_with, shown
 from obsynth.numerics.regions import LMIRegion
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.plants.fault_models import FaultModel
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.verification.error_system import ErrorModel

@@ -13,10 +13,10 @@ from fractions import Fraction
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness
+from obsynth.analysis.existence.named_pencils import EntryChange, Unclear, Witness
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.method import Method
-from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.arguments import ComplexArray, FloatArray
 from obsynth.numerics.spectra import pole_text
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -51,7 +51,7 @@ def require_all_told(conditions: Iterable[Condition]) -> None:
 
 def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method) -> PreconditionError:
     """Return the refusal with what would help at its end; as it is where the existence conditions hold."""
-    from obsynth.analysis.diagnosis.explanations import least_additions, listed_sets, state_sensors
+    from obsynth.analysis.diagnosis.fault_columns import least_additions, listed_sets, state_sensors
 
     holds = _asker(asked)
     if holds(plant):

@@ -10,9 +10,8 @@ from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError, a_kind
 from obsynth.methods.installed import OWN, REGISTRY, not_loadable
 from obsynth.methods.method import Method, PlantKind
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 

@@ -10,8 +10,7 @@ import numpy as np
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.registry import REGISTRY, error_model, method_class
-from obsynth.numerics.arguments import arguments_checked, is_whole, shown
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, arguments_checked, is_whole, shown
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.design import ObserverDesign, VerificationReport

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.numerics.arrays import FloatArray, largest_singular_value, read_only
+from obsynth.numerics.arguments import FloatArray, largest_singular_value, read_only
 
 #: Longest memory that is tried, and rows that each coefficient of an equation needs.
 MOST_ORDER, ROWS_PER_COEFFICIENT = 12, 20

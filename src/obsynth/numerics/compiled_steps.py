@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 import numba
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.square_root_estimation import OUTGROWN
 
 #: A factorisation that changes by no more than this, relative to each column, and so many times in a row, has settled:

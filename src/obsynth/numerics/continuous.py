@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, largest_singular_value, reachable
+from obsynth.numerics.arguments import FloatArray, largest_singular_value, reachable
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import HinfNorm, hinf_norm

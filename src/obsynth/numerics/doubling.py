@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.numerics import lapack
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, largest_singular_value
 from obsynth.numerics.scaling import power_of_two_below
 
 #: Below so many states a whole step costs less than to look.

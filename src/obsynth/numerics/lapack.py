@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.arguments import ComplexArray, FloatArray
 
 #: Columns that LAPACK turns at once: its room is so many times the columns.
 LAPACK_BLOCK = 64

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, largest_singular_value
 from obsynth.numerics.doubling import REFUTED, doubled_riccati_solution, is_clearly_negative, is_positive
 from obsynth.numerics.norms import spectral_radius
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics import lapack
-from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
+from obsynth.numerics.arguments import SMALLEST, ComplexArray, FloatArray
 
 #: Poles of at least this modulus may make a peak of their own.
 NEAR = 0.5

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 
 #: Iterations before we give up: a damped iteration that needs more is not converging.
 MOST_ITERATIONS = 25

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value, read_only
+from obsynth.numerics.arguments import ComplexArray, FloatArray, largest_singular_value, read_only
 from obsynth.numerics.lapack import eigenvalues
 from obsynth.numerics.ranks import CLUSTER_TOLERANCE, RANK_TOLERANCE, RankDecision, rank_from
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, read_only
 
 #: Singular values below this fraction of the largest count as zero (data are balanced first).
 RANK_TOLERANCE = 1e-10

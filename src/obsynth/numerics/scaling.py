@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics import lapack
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, read_only
 
 #: Sweeps of the balancing; each one must improve on the last, so few are ever used.
 MOST_SWEEPS = 10

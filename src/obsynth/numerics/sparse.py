@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, kind_of_entries, read_only
+from obsynth.numerics.arguments import FloatArray, kind_of_entries, read_only
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import power_of_two_below
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
+from obsynth.numerics.arguments import ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import balanced_realisation, output_covariance
 from obsynth.numerics.scaling import balanced_matrix

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics import lapack
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.ranks import PERFECT_PARITY, RANK_TOLERANCE
 from obsynth.numerics.scaling import power_of_two_below
 

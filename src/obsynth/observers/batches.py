@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arguments import arguments_worded
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, arguments_worded, read_only
 from obsynth.observers.dae.c_code import BATCH_PARTS, compiler
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.observer import DAEObserver, advanced

@@ -15,8 +15,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import arguments_worded, check_fields, real_array, real_number, real_vector
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import (
+    FloatArray,
+    arguments_worded,
+    check_fields,
+    read_only,
+    real_array,
+    real_number,
+    real_vector,
+)
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.gain_schedule import gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arguments import real_number
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, read_only, real_number
 from obsynth.observers.records import named_bounds, named_vector
 
 BoolArray = NDArray[np.bool_]

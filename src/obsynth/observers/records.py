@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_number, real_array, real_number, require_kind
-from obsynth.numerics.arrays import FloatArray, as_given, as_matrix
-from obsynth.plants.dae.model import finite_vector
-from obsynth.plants.validation import index_of, suggestion
+from obsynth.numerics.arguments import FloatArray, as_given, as_matrix, is_number, real_array, real_number, require_kind
+from obsynth.plants.dae import finite_vector
+from obsynth.plants.descriptor import index_of, suggestion
 
 #: The fields of an observer that hold names.
 NAME_FIELDS = ("input_names", "output_names", "state_names", "fault_names", "residual_names")

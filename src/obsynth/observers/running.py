@@ -14,8 +14,7 @@ from typing import Any, Generic, Self, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.numerics.arguments import check_fields, require_kind
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, check_fields, read_only, require_kind
 from obsynth.observers.outliers import Outliers, checked_limit, checked_sizes, checked_state_bounds
 from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
 

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_whole
-from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.validation import index_of
+from obsynth.numerics.arguments import FloatArray, is_whole
+from obsynth.plants.descriptor import index_of
 
 #: Rows that may be waited for: a delay in another unit is larger.
 LONGEST_DELAY = 10_000

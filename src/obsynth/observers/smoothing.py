@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import PreconditionError
-from obsynth.numerics.arguments import whole_number
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, read_only, whole_number
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.numerics.square_root_estimation import Gaussian, SmootherGain, joint_step, nothing_later, stepped_back
 from obsynth.observers.dae.estimates import DAERow, GatheredRows
@@ -37,7 +36,7 @@ from obsynth.observers.recursive.observer import (
 )
 from obsynth.observers.recursive.step_model import StepMatrices, right_side, stacked_noise
 from obsynth.observers.running import Estimates
-from obsynth.plants.dae.model import checked_inputs
+from obsynth.plants.dae import checked_inputs
 
 
 class Lesson(NamedTuple):

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import real_array, real_vector, whole_number
-from obsynth.numerics.arrays import FloatArray, as_matrix, freeze, read_only
+from obsynth.numerics.arguments import FloatArray, as_matrix, freeze, read_only, real_array, real_vector, whole_number
 from obsynth.observers.records import (
     NAME_FIELDS,
     measured_record,

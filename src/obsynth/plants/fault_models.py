@@ -13,11 +13,18 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, is_whole
-from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, largest_singular_value, read_only
+from obsynth.numerics.arguments import (
+    ComplexArray,
+    FloatArray,
+    as_matrix,
+    is_finite_number,
+    is_whole,
+    largest_singular_value,
+    read_only,
+)
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.scaling import LogBalance
-from obsynth.plants.validation import index_of
+from obsynth.plants.descriptor import index_of
 
 #: Distance, relative to the norm of a given matrix, below which computed eigenvalues count as one multiple eigenvalue:
 #: a triple one scatters by the cube root of the unit roundoff.

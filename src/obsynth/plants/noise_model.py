@@ -11,8 +11,8 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_number, require_mapping
-from obsynth.plants.dae.functions import BUTCHER
-from obsynth.plants.validation import index_of
+from obsynth.plants.dae import BUTCHER
+from obsynth.plants.descriptor import index_of
 
 #: Stands for a number that `obsynth.calibrate` is to find.
 UNKNOWN_NUMBER = "unknown"

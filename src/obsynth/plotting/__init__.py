@@ -7,19 +7,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from obsynth.plotting.data import plot_data
     from obsynth.plotting.estimates import (
+        plot_data,
         plot_decision,
         plot_detection,
         plot_faults,
+        plot_hidden_course,
+        plot_intervals,
+        plot_least_thresholds,
         plot_parameters,
         plot_residuals,
         plot_simulation,
         plot_states,
     )
-    from obsynth.plotting.guaranteed import plot_hidden_course, plot_intervals, plot_least_thresholds
-    from obsynth.plotting.spectra import estimate_gains, plot_gains, plot_poles
-    from obsynth.plotting.trade_off import plot_tolerances, plot_trade_off
+    from obsynth.plotting.trade_off import estimate_gains, plot_gains, plot_poles, plot_tolerances, plot_trade_off
 
 __all__ = [
     "estimate_gains",
@@ -43,13 +44,11 @@ __all__ = [
 _PICTURE_HOMES = {
     name: module
     for module, names in {
-        "data": "plot_data",
         "estimates": (
-            "plot_decision plot_detection plot_faults plot_parameters plot_residuals plot_simulation plot_states"
+            "plot_data plot_decision plot_detection plot_faults plot_hidden_course plot_intervals "
+            "plot_least_thresholds plot_parameters plot_residuals plot_simulation plot_states"
         ),
-        "guaranteed": "plot_hidden_course plot_intervals plot_least_thresholds",
-        "spectra": "estimate_gains plot_gains plot_poles",
-        "trade_off": "plot_tolerances plot_trade_off",
+        "trade_off": "estimate_gains plot_gains plot_poles plot_tolerances plot_trade_off",
     }.items()
     for name in names.split()
 }

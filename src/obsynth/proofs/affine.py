@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.errors import PreconditionError
-from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.arguments import SMALLEST, FloatArray
 from obsynth.proofs.balls import gamma, rounded_up
 from obsynth.proofs.contraction import inverse_bound, spectral_radius_bound
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import PreconditionError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.expressions import step_function
 from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF
 

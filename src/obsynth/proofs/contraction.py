@@ -26,7 +26,7 @@ import flint
 import numpy as np
 
 from obsynth.numerics import lapack
-from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
+from obsynth.numerics.arguments import ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.doubling import symmetric_product
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.numerics.scaling import balanced_matrix

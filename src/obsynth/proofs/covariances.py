@@ -11,7 +11,7 @@ from typing import Any
 import flint
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, largest_singular_value
 from obsynth.numerics.norms import balanced_realisation
 from obsynth.numerics.spectra import abscissa, noise_covariance
 from obsynth.proofs.balls import arb_matrix

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics import lapack
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.proofs.balls import (
     LARGEST_ORDER,
     PANEL_ROWS,

@@ -34,7 +34,7 @@ import flint
 import numpy as np
 from flint import arb, arb_mat, fmpq, fmpq_mat, fmpq_poly, fmpz, fmpz_mat, fmpz_poly, nmod_mat, nmod_poly
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 
 
 def blocks(parts: list[list[fmpq_mat]]) -> fmpq_mat:

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import flint
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.scaling import balancing_factors
 from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, arb_matrix, gamma, rounded_up
 

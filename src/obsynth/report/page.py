@@ -40,8 +40,7 @@ from obsynth.methods.fault_figures import HELD_GROWTH
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.registry import REGISTRY, method_class
-from obsynth.numerics.arguments import arguments_checked
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, arguments_checked
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import Decision, decide
@@ -49,12 +48,10 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plotting.data import panel_count, plot_data
-from obsynth.plotting.estimates import plot_simulation, plot_states
-from obsynth.plotting.guaranteed import plot_hidden_course
+from obsynth.plotting.estimates import panel_count, plot_data, plot_hidden_course, plot_simulation, plot_states
 from obsynth.plotting.panels import data_url, image_of
-from obsynth.plotting.spectra import plot_gains, plot_poles
-from obsynth.report.designs import (
+from obsynth.plotting.trade_off import plot_gains, plot_poles
+from obsynth.report.tables import (
     delay_curves,
     delay_table,
     fault_estimates,
@@ -66,8 +63,7 @@ from obsynth.report.designs import (
     tolerance_facts,
 )
 from obsynth.results.checks import FITS, Check, CheckKind, Status
-from obsynth.results.design import ObserverDesign, VerificationReport
-from obsynth.results.gain_sets import gain_set_digest
+from obsynth.results.design import ObserverDesign, VerificationReport, gain_set_digest
 from obsynth.results.layout import headed_table, number, verdict, verdict_line, worth
 from obsynth.simulation.scenario import Scenario, Step
 from obsynth.version import __version__

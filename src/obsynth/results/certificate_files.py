@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.files.inputs import read_json
-from obsynth.files.outputs import FileKind
+from obsynth.files.outputs import FileKind, read_json
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.results.checks import Check, information, nothing_wrong
-from obsynth.results.design import ObserverDesign, VerificationReport
-from obsynth.results.gain_set_writing import design_as_dict, digest_of, plain, restored
+from obsynth.results.design import ObserverDesign, VerificationReport, design_as_dict, digest_of, plain, restored
 
 #: Kinds of results that are certified with the gain sets that they rest on.
 ROBUSTNESS, STUDY, COMPARISON = "obsynth robustness", "obsynth tolerance study", "obsynth comparison"

@@ -1,28 +1,38 @@
-"""The result of every method: what was asked, what is shipped, and the proof; the plant as written behind it."""
+"""The result of every method: what was asked, what is shipped, and the proof; the plant as written behind it; its file.
+
+A gain set is one JSON document with a schema version and a digest, floats bit for bit.  Large ones are a zip of the
+document and its arrays as ``.npz``, uncompressed and with a fixed date: the same design gives the same bytes.
+"""
 
 from __future__ import annotations
 
+import errno
+import hashlib
+import io
+import json
+import math
+import os
+import re
 import warnings
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+import zipfile
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from obsynth.analysis.transformations.recovery import StateRecovery, Transformation
+from obsynth.analysis.transformations.recovery import RecoveryOperator, StateRecovery, Transformation
 from obsynth.errors import SpecError, VerificationError
 from obsynth.extensions import extension
-from obsynth.numerics.arguments import require_kind
-from obsynth.numerics.arrays import FloatArray, freeze, read_only
+from obsynth.files.outputs import FileKind, input_file, json_data, path_of, read_json, write_atomically
+from obsynth.numerics.arguments import FloatArray, arguments_checked, freeze, is_number, read_only, require_kind
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.sensor_timing import LONGEST_DELAY
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.validation import listed
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem, listed
 from obsynth.results.checks import Check, all_hold
-from obsynth.results.gain_set_writing import save
 
 if TYPE_CHECKING:
     import control
@@ -30,7 +40,203 @@ if TYPE_CHECKING:
     from obsynth.observers.dae.observer import DAEObserver
     from obsynth.observers.recursive.observer import RecursiveObserver
     from obsynth.observers.windows import WindowObserver
-    from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+    from obsynth.plants.descriptor import TimeVaryingDescriptorSystem
+
+
+GAIN_SET_VERSION = 2
+GAIN_SET_KIND = "obsynth gain set"
+_PLACE_DIGITS = 16
+GAIN_SET = FileKind(
+    "a gain set",
+    rb'\A(PK\x03\x04[\s\S]{26}gain_set\.json)?\s*\{\s*"kind":\s*"obsynth gain set"',
+    ending=".gains.json",
+    suffix=".json",
+)
+#: Tags of kinds of designs; linear time-invariant ones have none.
+DESIGN_KINDS = (None, "recursive", "dae", "window")
+#: From so many numbers on, which are more than a megabyte as text, the arrays of a gain set are a binary member.
+MANY_NUMBERS = 50_000
+DOCUMENT, ARRAYS = "gain_set.json", "arrays.npz"
+#: Arrays with fewer numbers stay in the document of a packed gain set, where they can be read.
+SMALL_ARRAY = 64
+#: Larger members are refused before they fill the memory.
+MAXIMUM_BYTES = 4_000_000_000
+_DATE = (1980, 1, 1, 0, 0, 0)
+# What JSON does not have is marked by these sets of keys; a mapping that happens to have one of them is wrapped.
+_ARRAY, _FLOAT, _MAPPING, _MEMBER = {"shape", "data"}, {"float"}, {"mapping"}, {"member"}
+_MARKS = (_ARRAY, _FLOAT, _MAPPING, _MEMBER)
+
+
+def design_as_dict(design: Any) -> dict[str, Any]:
+    """Return the whole gain set as JSON data, digest included."""
+    body = plain(_body_of(design))
+    return {"kind": GAIN_SET_KIND, "schema_version": GAIN_SET_VERSION, "sha256": digest_of(body), "design": body}
+
+
+def gain_set_bytes(design: Any, *, spec: Path | None = None) -> bytes:
+    """Return what a file with a gain set holds; with ``spec`` it remembers the place of that spec."""
+    body, arrays, digest = _written(design)
+    place = {} if spec is None else {"written_for": place_of(spec)}
+    document = {"kind": GAIN_SET_KIND, **place, "schema_version": GAIN_SET_VERSION, "sha256": digest, "design": body}
+    text = json.dumps(document, indent=1, allow_nan=False) + "\n"
+    return text.encode() if arrays is None else _zipped({DOCUMENT: text, ARRAYS: arrays})
+
+
+def gain_set_digest(design: Any) -> str:
+    """Return the digest that the file of a design holds."""
+    return _written(design)[2]
+
+
+def _written(design: Any) -> tuple[Any, bytes | None, str]:
+    """Return what a gain set says, its arrays where they are apart, and the digest of both."""
+    body = _body_of(design)
+    apart: dict[str, FloatArray] | None = {} if count_of_numbers(body) >= MANY_NUMBERS else None
+    document, arrays = plain(body, apart), None
+    if apart is not None:
+        members: dict[str, bytes] = {}
+        for name, array in apart.items():
+            part = io.BytesIO()
+            np.lib.format.write_array(part, np.ascontiguousarray(array), allow_pickle=False)
+            members[f"{name}.npy"] = part.getvalue()
+        arrays = _zipped(members)
+    return document, arrays, digest_of(document, arrays)
+
+
+def _zipped(members: Mapping[str, str | bytes]) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(zipfile.ZipInfo(name, _DATE), content)
+    return stream.getvalue()
+
+
+def _body_of(design: Any) -> dict[str, Any]:
+    """Return everything that a gain set holds, with arrays."""
+    return {
+        "name": design.name,
+        "method": design.method,
+        "plant": design.plant.as_dict(),
+        "options": design.options,
+        "gains": design.gains,
+        "observer": design.observer.as_dict(),
+        "certificate": {"matrices": design.certificate.matrices, "claims": design.certificate.claims},
+        "solver": design.solver,
+        "notes": design.notes,
+        "recovery": None if design.recovery is None else _fields_of(design.recovery),
+        "report": design.report.as_dict(),
+        "source": None if design.source is None else design.source.as_dict(),
+        **({"input_delay": design.input_delay} if design.input_delay else {}),
+        **_tag(design),
+    }
+
+
+def types_of(kind: str | None) -> tuple[Any, Any]:
+    """Return the types of plant and observer of a kind; only those asked for are loaded."""
+    if kind == "recursive":
+        from obsynth.observers.recursive.observer import RecursiveObserver
+        from obsynth.plants.descriptor import TimeVaryingDescriptorSystem
+
+        return TimeVaryingDescriptorSystem, RecursiveObserver
+    if kind == "window":
+        from obsynth.observers.windows import WindowObserver
+        from obsynth.plants.descriptor import TimeVaryingDescriptorSystem
+
+        return TimeVaryingDescriptorSystem, WindowObserver
+    if kind == "dae":
+        from obsynth.observers.dae.observer import DAEObserver
+
+        return DAEModel, DAEObserver
+    return DescriptorSystem, LinearObserver
+
+
+def _tag(design: Any) -> dict[str, str]:
+    """Return the entry that tells of which kind plant and observer are."""
+    found = next((kind for kind in DESIGN_KINDS if isinstance(design.observer, types_of(kind)[1])), None)
+    return {} if found is None else {"kind": found}
+
+
+def _fields_of(record: StateRecovery) -> dict[str, Any]:
+    if (operator := record.by_operator) is not None:
+        # Sparse equations take less room than the map that they stand for.
+        return {
+            "names": record.names,
+            "noise_kept": record.noise_kept,
+            "operating_point": record.operating_point,
+            "operator": operator.as_dict(),
+        }
+    return {field.name: getattr(record, field.name) for field in fields(record)}
+
+
+def save(design: Any, path: str | Path) -> Path:
+    """Write ``design`` to ``path`` atomically and return the path."""
+    return write_atomically(path, gain_set_bytes(design))
+
+
+def place_of(spec: Path) -> str:
+    """Return a short digest of where a spec is, which tells two specs of one name apart."""
+    return hashlib.sha256(os.fsencode(spec.resolve())).hexdigest()[:_PLACE_DIGITS]
+
+
+def count_of_numbers(value: Any) -> int:
+    """Return how many numbers the arrays in nested data hold."""
+    if isinstance(value, np.ndarray):
+        return int(value.size)
+    if isinstance(value, Mapping):
+        return sum(map(count_of_numbers, value.values()))
+    return sum(map(count_of_numbers, value)) if isinstance(value, (list, tuple)) else 0
+
+
+def plain(value: Any, arrays: dict[str, FloatArray] | None = None) -> Any:
+    """Return ``value`` as JSON data, arrays (large ones in ``arrays``), NaN, infinities marked for `restored`."""
+    kind = type(value)
+    if kind is str or (kind is float and math.isfinite(value)):
+        # Most values by far, and asking whether one is a mapping takes longest.
+        return value
+    if isinstance(value, np.ndarray):
+        if arrays is not None and value.size >= SMALL_ARRAY and value.dtype == np.float64:
+            name = f"array{len(arrays):05d}"
+            arrays[name] = value
+            return {"member": name}
+        data = value.ravel().tolist()
+        finite = value.dtype == np.float64 and bool(np.isfinite(value).all())
+        return {"shape": list(value.shape), "data": data if finite else [plain(x) for x in data]}
+    if isinstance(value, (np.floating, np.integer, np.bool_)):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return {"float": str(value)}
+    if isinstance(value, Mapping):
+        entries = {str(key): plain(item, arrays) for key, item in value.items()}
+        return {"mapping": entries} if entries.keys() in _MARKS else entries
+    if isinstance(value, (list, tuple)):
+        return [plain(item, arrays) for item in value]
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise SpecError(f"A value of type {type(value).__name__} cannot be saved: only data can.")
+
+
+def restored(value: Any, arrays: Mapping[str, FloatArray] | None = None) -> Any:
+    """Return what `plain` wrote, with arrays and special floats restored."""
+    if isinstance(value, dict):
+        if value.keys() == _ARRAY:
+            data = [restored(item) for item in value["data"]]
+            if not {type(item) for item in data} <= {float, int}:
+                raise TypeError("an array holds something that is no number")
+            return np.array(data, dtype=np.float64).reshape(value["shape"])
+        if value.keys() == _MEMBER and arrays is not None:
+            return arrays[value["member"]]
+        if value.keys() == _FLOAT:
+            return float(value["float"])
+        if value.keys() == _MAPPING:
+            value = value["mapping"]
+        return {key: restored(item, arrays) for key, item in value.items()}
+    return [restored(item, arrays) for item in value] if isinstance(value, list) else value
+
+
+def digest_of(body: Any, arrays: bytes | None = None) -> str:
+    """Return the sha256 digest of the canonical JSON of ``body``, and of its arrays where they are apart."""
+    text = json.dumps(body, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    return hashlib.sha256(text if arrays is None else hashlib.sha256(arrays).digest() + text).hexdigest()
+
 
 OfPlant = TypeVar("OfPlant")
 OfObserver = TypeVar("OfObserver")
@@ -121,8 +327,7 @@ class PlantSource:
     @cached_property
     def derived(self) -> Transformation:
         """The elimination, and the sampling where there was one, done again; once for all checks."""
-        from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
-        from obsynth.analysis.transformations.sampling import discretise
+        from obsynth.analysis.transformations.elimination import discretise, eliminate_algebraic_states
 
         if self.sample_time is None:
             return eliminate_algebraic_states(self.plant)
@@ -273,7 +478,7 @@ class ObserverDesign:
             The design is a linear time-invariant one.
         """
         from obsynth.observers.recursive.observer import RecursiveObserver
-        from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+        from obsynth.plants.descriptor import TimeVaryingDescriptorSystem
 
         return self._parts(TimeVaryingDescriptorSystem, RecursiveObserver, "recursive observer")
 
@@ -442,3 +647,245 @@ def require_verified(design: ObserverDesign, *, unverified: bool = False) -> Non
         "Design it again, or allow it (--unverified, unverified=True): every file that is written then says so.",
         report=report,
     )
+
+
+__all__ = [
+    "GAIN_SET",
+    "GAIN_SET_VERSION",
+    "design_as_dict",
+    "digest_of",
+    "gain_set_bytes",
+    "gain_set_digest",
+    "load",
+    "loaded",
+    "place_of",
+    "plain",
+    "restored",
+    "save",
+    "written_for",
+]
+
+#: Larger gain sets are refused before they fill the memory.
+MOST_GAIN_SET_CHARACTERS = 2_000_000_000
+_HEAD_BYTES = 256
+
+
+def written_for(gains: Path) -> str | None:
+    """Return the digest of the place of the spec for which a gain set was written, `None` where it is not known."""
+    if not gains.is_file():  # a pipe would keep us waiting
+        return None
+    with gains.open("rb") as stream:
+        found = re.search(rb'"written_for":\s*"([0-9a-f]+)"', stream.read(_HEAD_BYTES))
+    return None if found is None else found.group(1).decode()
+
+
+@arguments_checked
+def load(path: str | Path) -> ObserverDesign:
+    """Read a gain set and check its digest.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file written by `ObserverDesign.save`.
+
+    Returns
+    -------
+    ObserverDesign
+        Equal to the saved one, bit for bit; its report is the saved one, run `verify` for a new one.
+
+    Raises
+    ------
+    SpecError
+        The file is missing, is no gain set, has an unknown schema version, or was changed.
+    """
+    source = path_of(path)
+    if source.is_dir() or not source.exists():
+        why = os.strerror(errno.EISDIR if source.is_dir() else errno.ENOENT)
+        raise SpecError(f"{source} cannot be read: {why}.", path=str(source))
+    document, arrays = _read_members(source)
+    return _design_of(document, arrays, str(source))
+
+
+def is_packed(start: bytes) -> bool:
+    """Whether a file that begins so is a zip."""
+    return start.startswith(b"PK\x03\x04")
+
+
+def unpacked(content: bytes) -> tuple[str, bytes]:
+    """Return the text of the document and the arrays; raise `ValueError` for any other zip."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            if sorted(archive.namelist()) != sorted([DOCUMENT, ARRAYS]):
+                raise ValueError("it does not hold the two members of a gain set")
+            if sum(item.file_size for item in archive.infolist()) > MAXIMUM_BYTES:
+                raise ValueError("it is too large")
+            return archive.read(DOCUMENT).decode("utf-8"), archive.read(ARRAYS)
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError) as error:
+        raise ValueError(f"it is damaged ({error})") from error
+
+
+def loaded(content: bytes, name: str = "the gain set") -> ObserverDesign:
+    """Return the design in what `gain_set_bytes` returned."""
+    try:
+        text, arrays = unpacked(content) if is_packed(content) else (content.decode("utf-8"), None)
+        document = json_data(text)
+    except ValueError as error:
+        raise SpecError(f"{name} is no gain set of obsynth ({error}).", path=name) from error
+    return _design_of(document, arrays, name)
+
+
+def _read_members(source: Path) -> tuple[Any, bytes | None]:
+    """Return the document of a gain set and, where they are apart, its arrays."""
+    file = input_file(source)
+    with file.open("rb") as stream:
+        start = stream.read(_HEAD_BYTES)
+    if not is_packed(start):
+        return read_json(source, most=MOST_GAIN_SET_CHARACTERS), None
+    try:
+        text, arrays = unpacked(file.read_bytes())
+        return json_data(text), arrays
+    except (ValueError, RecursionError) as error:
+        raise SpecError(f"{source} is no gain set of obsynth: {error}.", path=str(source)) from error
+
+
+def _design_of(document: Any, arrays: bytes | None, source: str) -> ObserverDesign:
+    """Return the design in a document whose digest is right."""
+    if not isinstance(document, dict) or document.get("kind") != GAIN_SET_KIND:
+        raise SpecError(f"{source} is no gain set of obsynth.", path=source)
+    if document.get("schema_version") != GAIN_SET_VERSION:
+        version = document.get("schema_version")
+        raise SpecError(
+            f"{source} has schema version {version!r}; this obsynth reads {GAIN_SET_VERSION}.",
+            path=source,
+        )
+    body = document.get("design")
+    try:
+        intact = isinstance(body, dict) and document.get("sha256") == digest_of(body, arrays)
+    except (ValueError, RecursionError):  # a number too large for a float
+        intact = False
+    if not intact:
+        raise SpecError(f"{source} was changed after it was written: its digest does not match.", path=source)
+    try:
+        parts = _checked_parts(restored(body, None if arrays is None else _arrays_in(arrays)))
+        return _design_from(parts)
+    except (SpecError, AttributeError, LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
+        raise SpecError(f"{source} is incomplete: {str(error).rstrip('.')}.", path=source) from error
+
+
+def _arrays_in(content: bytes) -> dict[str, FloatArray]:
+    """Return arrays by name; raise `ValueError` where they are damaged."""
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            return {name: np.asarray(archive[name], dtype=np.float64) for name in archive.files}
+    except (zipfile.BadZipFile, EOFError, OSError) as error:
+        raise ValueError(f"its arrays are damaged ({error})") from error
+
+
+def _recovery_from(plant: Any, data: dict[str, Any]) -> StateRecovery:
+    """Return the recovery of the states that ``plant`` was made from; its maps fit the signals of that plant."""
+    names = tuple(data["names"])
+    if "operator" in data:
+        operator = RecoveryOperator.from_dict(data["operator"])
+        if operator.dynamic.shape[0] != len(names):
+            raise SpecError(f"it has {len(names)} names for {operator.dynamic.shape[0]} states")
+        return StateRecovery.from_operator(names, operator, data["noise_kept"], data["operating_point"])
+    found = StateRecovery(**{**data, "names": names})
+    columns = {"state": plant.nx, "input": plant.nu}
+    # A plant that changes with k has parameters and Q instead.
+    if isinstance(plant, DescriptorSystem):
+        columns |= {"fault": plant.nf, "disturbance": plant.nd, "noise": plant.nw}
+    for signal, count in columns.items():
+        rows, own = getattr(found, f"from_{signal}").shape
+        if (rows, own) != (len(names), count):
+            raise SpecError(f"from_{signal} is {rows} by {own}, but {len(names)} by {count} is needed")
+    if "noise" in columns and found.noise_kept.shape[1] != plant.nw:
+        raise SpecError(f"noise_kept has {found.noise_kept.shape[1]} columns, but {plant.nw} are needed")
+    return found
+
+
+def _design_from(data: dict[str, Any]) -> ObserverDesign:
+    if not isinstance(data.get("kind"), (str, type(None))) or data.get("kind") not in DESIGN_KINDS:
+        raise SpecError(f"A design of the kind {data['kind']!r} is unknown to this obsynth.", path="kind")
+    kind, observer = types_of(data.get("kind"))
+    plant, recovery = _made("plant", kind, **data["plant"]), data["recovery"]
+    return ObserverDesign(
+        name=data["name"],
+        method=data["method"],
+        plant=plant,
+        options=data["options"],
+        gains=data["gains"],
+        observer=_made("observer", observer.from_dict, data["observer"]),
+        certificate=_made("certificate", Certificate, **data["certificate"]),
+        solver=data["solver"],
+        notes=tuple(data["notes"]),
+        recovery=None if recovery is None else _made("recovery", _recovery_from, plant, recovery),
+        report=_made("report", VerificationReport.from_dict, data["report"]),
+        source=None if data.get("source") is None else _made("source", PlantSource.from_dict, data["source"]),
+        input_delay=data.get("input_delay", 0),
+    )
+
+
+_Made = TypeVar("_Made")
+
+#: The type of every part that a gain set has, in words and as a test.
+_TYPES: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
+    **dict.fromkeys(("name", "method"), ("a text", lambda value: isinstance(value, str))),
+    **dict.fromkeys(
+        ("plant", "options", "observer", "solver", "report"), ("a mapping", lambda value: isinstance(value, dict))
+    ),
+    "gains": ("a mapping to arrays of numbers", lambda value: _is_mapping_to(value, _is_array)),
+    "certificate": ("matrices and claims that are numbers", lambda value: _is_certificate(value)),
+    "notes": ("a list of texts", lambda value: _is_texts(value)),
+    "recovery": ("maps with the names of states, or nothing", lambda value: value is None or _is_recovery(value)),
+}
+
+
+def _checked_parts(body: Any) -> dict[str, Any]:
+    """Return the content of a gain set if it has every part, each of its type; raise `SpecError` for the first."""
+    if not isinstance(body, dict):
+        raise SpecError("it holds no design")
+    for name, (wanted, fits) in _TYPES.items():
+        if name not in body:
+            raise SpecError(f"{name!r} is missing")
+        if not fits(body[name]):
+            shown = f"{name} is {body[name]!r}, not" if name in ("name", "method") else f"its {name} must be"
+            raise SpecError(f"{shown} {wanted}")
+    return body
+
+
+def _made(part: str, make: Callable[..., _Made], *values: Any, **named: Any) -> _Made:
+    """Return what a part describes; what cannot be made of it is a `SpecError`."""
+    try:
+        return make(*values, **named)
+    except SpecError as error:
+        raise SpecError(f"its {part} is refused: {str(error).rstrip('.')}") from error
+    except KeyError as error:
+        raise SpecError(f"its {part} has no {error}") from error
+    except (AttributeError, IndexError, TypeError, ValueError, ArithmeticError) as error:
+        raise SpecError(f"its {part} is damaged") from error
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, np.ndarray)
+
+
+def _is_texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, str) for item in value)
+
+
+def _is_mapping_to(value: Any, fits: Callable[[Any], bool]) -> bool:
+    return isinstance(value, dict) and all(fits(item) for item in value.values())
+
+
+def _is_certificate(value: Any) -> bool:
+    return (
+        isinstance(value, dict)
+        and _is_mapping_to(value.get("matrices"), _is_array)
+        and _is_mapping_to(value.get("claims"), is_number)
+    )
+
+
+def _is_recovery(value: Any) -> bool:
+    if not isinstance(value, dict) or not _is_texts(value.get("names")):
+        return False
+    return all(_is_array(item) and item.ndim == 2 for key, item in value.items() if key.startswith(("from_", "noise_")))

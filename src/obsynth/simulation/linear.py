@@ -14,18 +14,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.time_varying import algebraic_rows
-from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.elimination import discretise, eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import StateRecovery
-from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arguments import arguments_checked, real_array, real_vector, whole_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, arguments_checked, real_array, real_vector, whole_number
 from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.libraries import failed_computations
 from obsynth.numerics.matrix_equations import continuous_riccati, discrete_riccati
 from obsynth.numerics.ranks import decide_rank
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.simulation.scenario import Scenario, ScenarioSignals, Trajectory, resolve, signal_of
 
 

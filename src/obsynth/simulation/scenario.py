@@ -21,22 +21,24 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import (
+    FloatArray,
     OpenUnitInterval,
     Positive,
+    as_given,
+    as_matrix,
     check_fields,
+    freeze,
     is_finite_number,
     is_number,
     real_array,
     real_number,
     require_kind,
+    require_no_overflow,
     shown,
     whole_number,
 )
-from obsynth.numerics.arrays import FloatArray, as_given, as_matrix, freeze, require_no_overflow
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.plants.validation import index_of
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem, index_of
 
 #: Share of a sample by which rounding may move a start or an end.
 SAMPLE_SLACK = 1e-6

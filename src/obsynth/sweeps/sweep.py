@@ -25,23 +25,18 @@ import numpy as np
 from obsynth.data.run import DataRun, run_on_data
 from obsynth.errors import ObsynthError, SpecError, a_kind
 from obsynth.experiments.assumptions import file_digest
-from obsynth.files.inputs import input_file
-from obsynth.files.outputs import write_atomically
+from obsynth.files.outputs import input_file, write_atomically
 from obsynth.files.tables import table_writer
 from obsynth.methods.designing import design
 from obsynth.methods.registry import Plant
 from obsynth.methods.verifying import verify
-from obsynth.numerics.arguments import arguments_checked, require_kind
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, arguments_checked, require_kind
 from obsynth.observers.progress import RunsProgress, as_they_come, progress_of_runs
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.validation import index_of
+from obsynth.plants.descriptor import DescriptorSystem, index_of
 from obsynth.plotting.panels import tidy
 from obsynth.results.certificate_files import RESULT_VERSION, opened, sealed
-from obsynth.results.design import ObserverDesign, require_verified
-from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain, restored
-from obsynth.spec.documents import read_yaml
-from obsynth.spec.loader import changed_document, design_of_spec, spec_of
+from obsynth.results.design import ObserverDesign, gain_set_bytes, load, loaded, plain, require_verified, restored
+from obsynth.spec.loader import changed_document, design_of_spec, read_yaml, spec_of
 from obsynth.version import __version__
 
 if TYPE_CHECKING:

@@ -17,8 +17,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
-from obsynth.analysis.transformations.sampling import discretise
+from obsynth.analysis.transformations.elimination import discretise, eliminate_algebraic_states
 from obsynth.analysis.transformations.uncertain_plant import (
     ROW_ROUNDING_SHARE,
     AffinePlant,
@@ -30,19 +29,16 @@ from obsynth.analysis.transformations.uncertain_plant import (
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.files.outputs import write_atomically
 from obsynth.methods.verifying import tracking_of, verify
-from obsynth.numerics.arguments import arguments_checked
-from obsynth.numerics.arrays import FloatArray, freeze, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, arguments_checked, freeze, largest_singular_value
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.numerics.ranks import DIRECTION_SHARE, ROUNDED_ZERO
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.plants.constants import SAME_TOLERANCE, ConstantsBox
+from obsynth.plants.constants import SAME_TOLERANCE, SAMPLED, UNCERTAIN_MATRICES, ConstantsBox, Uncertainty, as_written
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system
-from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, as_written
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse
 from obsynth.results.certificate_files import ROBUSTNESS, SHOWN_DIGITS, result_text
-from obsynth.results.design import ObserverDesign, require_verified
-from obsynth.results.gain_sets import design_as_dict
+from obsynth.results.design import ObserverDesign, design_as_dict, require_verified
 from obsynth.verification.error_structure import (
     ErrorStructure,
     Responses,

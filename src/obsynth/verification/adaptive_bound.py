@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.proofs.balls import gamma

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray, remembered
+from obsynth.numerics.arguments import FloatArray, remembered
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.observers.linear.observer import LinearObserver, poles_of
 from obsynth.plants.descriptor import DescriptorSystem

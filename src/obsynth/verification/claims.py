@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations.recovery import StateRecovery
-from obsynth.numerics.arguments import is_number
-from obsynth.numerics.arrays import FloatArray, remembered
+from obsynth.numerics.arguments import FloatArray, is_number, remembered
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear.observer import unaveraged
 from obsynth.plants.descriptor import DescriptorSystem

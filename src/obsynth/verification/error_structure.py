@@ -18,7 +18,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant
 from obsynth.errors import PreconditionError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.ranks import EFFECT_RANK_SHARE
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.affine import AffineMatrix, affine_block

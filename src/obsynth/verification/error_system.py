@@ -25,7 +25,7 @@ from typing import Any, Generic, TypeAlias
 import flint
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray, Made, remembered
+from obsynth.numerics.arguments import FloatArray, Made, remembered
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver, poles_of
 from obsynth.plants.descriptor import DescriptorSystem

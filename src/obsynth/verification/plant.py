@@ -15,13 +15,12 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations.uncertain_plant import affine_plant
 from obsynth.analysis.zeros import structure_of, unstable_poles
 from obsynth.errors import ObsynthError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.sparse import dense, same_matrix
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.plants.descriptor import DECISIVE, SIGNAL_NAMES, DescriptorSystem, ExactNumbers
-from obsynth.plants.uncertainty import ELIMINATED, SAMPLED, UNCERTAIN_MATRICES, Uncertainty, as_written
-from obsynth.plants.validation import listed
+from obsynth.plants.constants import ELIMINATED, SAMPLED, UNCERTAIN_MATRICES, Uncertainty, as_written
+from obsynth.plants.descriptor import DECISIVE, SIGNAL_NAMES, DescriptorSystem, ExactNumbers, listed
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import column_norms, gathered, interval_pieces, peak_sums
 from obsynth.proofs.products import energy

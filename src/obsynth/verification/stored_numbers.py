@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from obsynth.analysis.zeros import structure_of
-from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, remembered
+from obsynth.numerics.arguments import SMALLEST, ComplexArray, FloatArray, remembered
 from obsynth.numerics.modal_response import MOST_ENTRIES_AT_ONCE, STATES_FOR_MODES, ModalSolves, pencils_at, resolved
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.numerics.spectra import boundary_points

@@ -1,4 +1,10 @@
-"""One fault on a decoupled plant: whether it shows, where it does not, how fast it does, and by which equations.
+"""A plant without its unknown inputs: what all questions of diagnosis are asked of, and what filters are built on.
+
+What is left of a pencil without finite zeros, infinite and right singular part, by orthogonal transformations with the
+rows it is made of, is ``[A_o - s E_o; C_o]``: observable, with the left null space of the whole. The pencil must come
+balanced; balancing again on the way would blow rounding up.
+
+One fault on a decoupled plant: whether it shows, where it does not, how fast it does, and by which equations.
 
 In floating point; exactly for small plants whose numbers are as somebody wrote them.
 
@@ -9,26 +15,40 @@ Least order of a residual that shows a fault, the least degree in y and u of an 
 F f + K w``, ``0 = C z + G f + L w`` with w = [u; y], the equations of degree m in w are spanned by ``s^k e``, k <= m,
 with e those of degree 0: the rows, and derivatives of equations that hold no w, which cost nothing. That is the least
 degree of a minimal polynomial basis (Forney 1975) among its rows that show the fault.
+
+What hides a fault, as a motion in one sentence, and which sensors would let it be detected or estimated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
-from itertools import dropwhile
+from itertools import combinations, dropwhile
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 from numpy.typing import NDArray
 
-from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled, finite_values, left_part, unknowns_pencil
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.analysis.zeros import are_outside
-from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import ComplexArray, FloatArray, arguments_checked, largest_singular_value, read_only
+from obsynth.numerics.lapack import LAPACK_BLOCK, pencil_eigenvalues
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.pencils import FiniteZeros, full_svd
-from obsynth.numerics.ranks import CLEAR_GAP, MARKOV_TOLERANCE, RANK_TOLERANCE, TRACE_TOLERANCE, rank_from
+from obsynth.numerics.ranks import (
+    CLEAR_GAP,
+    MARKOV_TOLERANCE,
+    RANK_TOLERANCE,
+    TRACE_TOLERANCE,
+    RankDecision,
+    product_but_rounding,
+    rank_from,
+)
+from obsynth.numerics.scaling import LogBalance, equilibrate_pencil, power_of_two_below
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import (
     ExactPencil,
@@ -48,6 +68,420 @@ from obsynth.proofs.exact_arithmetic import (
     written_matrix,
     zeros_matrix,
 )
+
+#: Pencils of more columns are of plants of many parts, whose couplings outnumber what each part is made of.
+BY_LEAST_SQUARES = 40
+
+
+@dataclass(frozen=True, eq=False)
+class PencilUnits:
+    """Powers of two by which rows ``(m,)``, columns ``(n,)`` and s are multiplied so that entries are near one."""
+
+    rows: FloatArray
+    columns: FloatArray
+    time: float
+
+    @classmethod
+    def of(cls, E: FloatArray, A: FloatArray) -> PencilUnits:
+        """Return the units of ``A - sE (m, n)``; those of the data play no role, that of time included."""
+        m, n = A.shape
+        balance = LogBalance(m + n + 1)
+        rows, columns = range(m), range(m, m + n)
+        balance.add(A, rows, columns)
+        balance.add(E, rows, columns, common=m + n)
+        factors = np.exp2(balance.solve(whole=True))
+        found = cls(factors[:m], factors[m : m + n], float(factors[-1]))
+        return found if n <= BY_LEAST_SQUARES else found._held_together(E, A)
+
+    def _held_together(self, E: FloatArray, A: FloatArray) -> PencilUnits:
+        """Return units with the largest entry of each row and column near one, and both matrices of one size.
+
+        Many parts that hardly touch each other pull units by least squares apart, until E looks singular."""
+        e, a = (self.rows[:, None] * part * self.columns for part in (E, A))
+        largest, moving = float(np.linalg.norm(a)), float(np.linalg.norm(e))
+        time = float(power_of_two_below(np.array(largest / moving))) if largest and moving else self.time
+        pencil = equilibrate_pencil(time * e, a)
+        return PencilUnits(self.rows * pencil.rows, self.columns * pencil.columns, time)
+
+
+@dataclass(frozen=True, eq=False)
+class LeftPart:
+    """What is left of a pencil: ``left @ (A - sE) = [A_o - s E_o; C_o] @ right``."""
+
+    E: FloatArray  # ``(k, k)``, as A
+    A: FloatArray
+    C: FloatArray  # ``(p, k)``
+    left: FloatArray  # ``(k + p, m)``
+    right: FloatArray  # ``(k, n)``
+    Ez: FloatArray  # of the finite zeros, as Az
+    Az: FloatArray
+    decisions: tuple[RankDecision, ...]
+
+    @property
+    def order(self) -> int:
+        """Number of states left."""
+        return int(self.E.shape[0])
+
+
+def left_part(E: FloatArray, A: FloatArray) -> LeftPart:
+    """Return the left singular part of a balanced pencil ``(m, n)``."""
+    decisions: list[RankDecision] = []
+    size_e, size_a = largest_singular_value(E), largest_singular_value(A)
+    left = np.eye(E.shape[0])
+    right = np.eye(E.shape[1])
+    while E.shape[1]:
+        _, values, basis = full_svd(E)
+        decision = rank_from(values, expected=E.shape[1], scale=size_e)
+        decisions.append(decision)
+        if decision.rank == E.shape[1]:
+            break
+        # The columns that E does not see go, with the rows that A reaches from them.
+        kernel, complement = basis[decision.rank :].T, basis[: decision.rank].T
+        reached, values, _ = full_svd(A @ kernel)
+        decision = rank_from(values, expected=kernel.shape[1], scale=size_a)
+        decisions.append(decision)
+        rest = reached[:, decision.rank :].T
+        E, A, left = rest @ E @ complement, rest @ A @ complement, rest @ left
+        right = complement.T @ right
+    k = E.shape[1]
+    rows = np.linalg.svd(E)[0] if k else np.eye(E.shape[0])
+    state, output = rows[:, :k].T, rows[:, k:].T
+    e, a, c = state @ E, state @ A, output @ A
+    left = np.vstack([state @ left, output @ left])
+    return _without_zeros(e, a, c, left, right, size_a, decisions)
+
+
+def _without_zeros(
+    e: FloatArray,
+    a: FloatArray,
+    c: FloatArray,
+    left: FloatArray,
+    right: FloatArray,
+    size: float,
+    decisions: list[RankDecision],
+) -> LeftPart:
+    """Take out the unobservable part: what stays are the states that the outputs see."""
+    k, p = e.shape[0], c.shape[0]
+    hidden = np.eye(k)
+    if c.size:
+        _, values, basis = full_svd(c)
+        decision = rank_from(values, expected=min(c.shape), scale=size)
+        decisions.append(decision)
+        hidden = basis[decision.rank :].T
+    hidden = _invariant(e, a, hidden, size, decisions)
+    count = hidden.shape[1]
+    if count == 0:
+        nothing = np.zeros((0, 0))
+        return LeftPart(e, a, c, left, right, nothing, nothing, tuple(decisions))
+    rows = np.linalg.qr(e @ hidden, mode="complete")[0]
+    zero, kept = rows[:, :count].T, rows[:, count:].T
+    seen = np.linalg.qr(hidden, mode="complete")[0][:, count:]
+    left = np.vstack([kept @ left[:k], left[k : k + p]])
+    return LeftPart(
+        kept @ e @ seen,
+        kept @ a @ seen,
+        c @ seen,
+        left,
+        seen.T @ right,
+        zero @ e @ hidden,
+        zero @ a @ hidden,
+        tuple(decisions),
+    )
+
+
+def _invariant(
+    e: FloatArray, a: FloatArray, hidden: FloatArray, size: float, decisions: list[RankDecision]
+) -> FloatArray:
+    """Return the largest part V of a space ``(k, h)``, orthonormal, with ``a V`` within ``e V``.
+
+    In coordinates of the space and of ``e V`` only what leaves is factored; each step turns both by reflections."""
+    from obsynth.numerics.lapack import dgeqrf, dormqr
+
+    count = hidden.shape[1]
+    rows, square = np.linalg.qr(e @ hidden, mode="complete")
+    turned = rows.T @ (a @ hidden)
+    moving, staying, leaving = square[:count], turned[:count], turned[count:]
+    while count:
+        left, values, right = np.linalg.svd(leaving, full_matrices=False)
+        # What has no row of its own is zero but for the rounding of what it is the rest of.
+        shown = values if len(leaving) >= count else np.append(values, np.finfo(np.float64).eps * size)
+        decision = rank_from(shown, expected=count, scale=size)
+        decisions.append(decision)
+        rank, count = decision.rank, count - decision.rank
+        if rank == 0:
+            break
+        turn = _reflection(right[:rank].T)
+        hidden, moving, staying = (turn(part)[:, rank:] for part in (hidden, moving, staying))
+        kept = turn(left[:, rank:].T @ leaving)[:, rank:]
+        if count:
+            packed, factors, _, _ = dgeqrf(moving)
+            moving, staying = (
+                np.triu(packed[:count]),
+                dormqr("L", "T", packed, factors, staying, LAPACK_BLOCK * count)[0],
+            )
+        leaving, staying = np.vstack([kept, staying[count:]]), staying[:count]
+    return hidden
+
+
+def _reflection(basis: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return what turns rows so that the span of an orthonormal basis ``(n, r)`` comes first (block reflector)."""
+    count = basis.shape[1]
+    left, values, right = np.linalg.svd(basis[:count])
+    # [Schreiber, Parlett 1988]: the polar factor's sign that nothing cancels with.
+    across = basis.copy()
+    across[:count] += left @ right
+    inner = right.T @ ((right @ across.T) / (1.0 + values)[:, None])
+    return lambda matrix: matrix - (matrix @ across) @ inner
+
+
+def finite_values(left: LeftPart) -> ComplexArray:
+    """Return the finite zeros that were taken out, complex, conjugate pairs exact."""
+    if left.Ez.shape[0] == 0:
+        return np.zeros(0, dtype=np.complex128)
+    alpha, beta = pencil_eigenvalues(left.Az, left.Ez)
+    return np.asarray(alpha / beta, dtype=np.complex128)
+
+
+#: Entries of unit rows below this are rounding of the orthogonal transformations that made them.
+ROTATION_ROUNDING = 1e-14
+
+
+@dataclass(frozen=True, eq=False)
+class DecoupledPlant:
+    r"""What a plant tells without its unknown inputs.
+
+    .. math::
+        E z^+ = A z + B_u u + B_y y + F f + N w, \qquad H y = C z + D_u u + G f + M w
+
+    with E regular and (E, A, C) observable: an ordinary plant whose known inputs are u **and y**, on which no unknown
+    input acts.  Its order is the sum of the left Kronecker indices of ``[A - sE, Bd; C, Dd]``.
+
+    Parameters
+    ----------
+    E, A : FloatArray
+        ``(k, k)``.
+    C : FloatArray
+        ``(p, k)``.
+    Bu, By, F, N : FloatArray
+        ``(k, nu)``, ``(k, ny)``, ``(k, faults kept)``, ``(k, nw)``.
+    Du, H, G, M : FloatArray
+        ``(p, nu)``, ``(p, ny)``, ``(p, faults kept)``, ``(p, nw)``.
+    rows : FloatArray
+        ``(k + p, nx + ny)``: the combinations of the plant's equations, and of its outputs, that these rows are.
+    states : FloatArray
+        ``(k, nx)``: ``z = states @ x``.
+    removed : ComplexArray
+        Finite zeros of the pencil of the unknown inputs, 1/s (or dimensionless).  They need not be stable: no filter
+        has a pole there.
+    source : DescriptorSystem
+        The plant.
+    faults : tuple of str
+        The faults kept, in the order of the columns of F.
+    without : tuple of str
+        What was removed: the unknown inputs, and faults that are not to show.
+    fault_sizes : FloatArray
+        Sizes of the faults' columns in balanced units, before the reduction.
+    signal_sizes : FloatArray
+        The same of the columns of ``[u; y]``; one for those that are zero.
+    time : float
+        Unit of s in which the plant is balanced, 1/s.
+    decisions : tuple of RankDecision
+        Every rank decided on the way.
+    """
+
+    E: FloatArray
+    A: FloatArray
+    C: FloatArray
+    Bu: FloatArray
+    By: FloatArray
+    F: FloatArray
+    N: FloatArray
+    Du: FloatArray
+    H: FloatArray
+    G: FloatArray
+    M: FloatArray
+    rows: FloatArray
+    states: FloatArray
+    removed: ComplexArray
+    source: DescriptorSystem
+    faults: tuple[str, ...]
+    without: tuple[str, ...]
+    fault_sizes: FloatArray
+    signal_sizes: FloatArray
+    time: float
+    decisions: tuple[RankDecision, ...]
+
+    @property
+    def order(self) -> int:
+        """Number of states left."""
+        return int(self.E.shape[0])
+
+    @property
+    def signals(self) -> FloatArray:
+        """Columns ``(k + p, nu + ny)`` of ``[u; y]`` in both equations, each in units of its size."""
+        return np.asarray(np.block([[self.Bu, self.By], [self.Du, -self.H]]) / self.signal_sizes)
+
+    @property
+    def thinnest(self) -> RankDecision | None:
+        """The least clear rank decision; ``None`` where nothing had to be decided."""
+        return min(self.decisions, key=lambda decision: decision.gap, default=None)
+
+    @property
+    def plant(self) -> DescriptorSystem:
+        """The decoupled plant by itself: inputs ``[u; y]``, outputs ``H y``."""
+        p, ny = len(self.C), self.By.shape[1]
+        source = self.source
+        return DescriptorSystem(
+            self.E,
+            self.A,
+            np.hstack([self.Bu, self.By]),
+            self.C if p else np.zeros((0, self.order)),
+            D=np.hstack([self.Du, np.zeros((p, ny))]),
+            Bf=self.F,
+            Df=self.G,
+            Bw=self.N,
+            Dw=self.M,
+            dt=source.dt,
+            input_names=(*source.input_names, *(f"measured {name}" for name in source.output_names)),
+            output_names=[f"r{i + 1}" for i in range(p)],
+            state_names=[f"z{i + 1}" for i in range(self.order)],
+            fault_names=self.faults,
+            noise_names=source.noise_names,
+        )
+
+
+@arguments_checked
+@on_one_thread_if_small
+def decouple(
+    plant: DescriptorSystem | Transformation, *, without: Sequence[str] = (), faults: Sequence[str] | None = None
+) -> DecoupledPlant:
+    """Remove the unknown inputs, and faults that are to have no effect, from a plant.
+
+    Exact for descriptor plants of any index, and whatever the unknown inputs, the faults removed and the initial state
+    are.  What is decided on the way does not depend on the units of the data, that of time included.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem or Transformation
+        Either time; ``sE - A`` need not be regular.
+    without : sequence of str, optional
+        Names of faults to remove together with every unknown input.
+    faults : sequence of str, optional
+        Names of the faults to keep; all that are not removed by default.  The others are taken to be absent.
+
+    Returns
+    -------
+    DecoupledPlant
+        ``F (k, len(faults))`` and its like; the order k is the sum of the left Kronecker indices.
+
+    Raises
+    ------
+    SpecError
+        A name is unknown, or stands in both lists.
+
+    References
+    ----------
+    .. [Frisk] E. Frisk, M. Nyberg, "A minimal polynomial basis solution to residual generation for fault diagnosis in
+       linear systems", Automatica 37, 2001: the null space; here it is never formed, but reduced to a state space.
+    """
+    plant = linear_plant(plant)
+    removed = fault_numbers(plant, without, "without")
+    kept = (
+        [i for i in range(plant.nf) if i not in removed] if faults is None else fault_numbers(plant, faults, "faults")
+    )
+    both = [plant.fault_names[i] for i in kept if i in removed]
+    if both:
+        raise SpecError(f"{', '.join(both)}: a fault cannot be kept and removed.", path="without")
+    return decoupled(plant, removed, kept)
+
+
+def fault_numbers(plant: DescriptorSystem, names: Sequence[str], where: str) -> list[int]:
+    """Return the columns of faults by name."""
+    listed = [names] if isinstance(names, str) else list(names)
+    unknown = [name for name in listed if name not in plant.fault_names]
+    if unknown:
+        raise SpecError(
+            f"{', '.join(map(repr, unknown))}: no such fault; there are: {', '.join(plant.fault_names) or 'none'}.",
+            path=where,
+        )
+    return [plant.fault_names.index(name) for name in dict.fromkeys(listed)]
+
+
+def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[int]) -> DecoupledPlant:
+    """Remove the unknown inputs and the faults ``removed`` from a plant; keep the columns ``kept``."""
+    nx, ny = plant.nx, plant.ny
+    pencil_e, pencil_a = unknowns_pencil(plant, removed)
+    units = PencilUnits.of(pencil_e, pencil_a)
+    found = left_part(
+        units.rows[:, None] * pencil_e * units.columns * units.time, units.rows[:, None] * pencil_a * units.columns
+    )
+    # Rows of the orthogonal reduction have unit length: what is below rounding is nothing.
+    rows = np.array(found.left)
+    moving = units.rows[:nx, None] * plant.E * units.columns[:nx]
+    rows[found.order :, :nx] = _without_dynamics(rows[found.order :, :nx], moving)
+    rows = np.where(np.abs(rows) > ROTATION_ROUNDING, rows, 0.0) * units.rows
+    faults = np.vstack([plant.Bf, plant.Df])[:, list(kept)]
+    signals = np.block([[plant.B, np.zeros((nx, ny))], [plant.D, -np.eye(ny)]])
+    sizes = np.linalg.norm(units.rows[:, None] * signals, axis=0)
+    k = found.order
+    parts = {
+        "u": product_but_rounding(rows, signals[:, : plant.nu]),
+        "y": product_but_rounding(rows, signals[:, plant.nu :]),
+        "f": product_but_rounding(rows, faults),
+        "w": product_but_rounding(rows, np.vstack([plant.Bw, plant.Dw])),
+    }
+    return DecoupledPlant(
+        E=read_only(_told(found.E) / units.time),
+        A=read_only(_told(found.A)),
+        C=read_only(_told(found.C)),
+        Bu=read_only(parts["u"][:k]),
+        By=read_only(parts["y"][:k]),
+        F=read_only(parts["f"][:k]),
+        N=read_only(parts["w"][:k]),
+        Du=read_only(parts["u"][k:]),
+        H=read_only(-parts["y"][k:]),
+        G=read_only(parts["f"][k:]),
+        M=read_only(parts["w"][k:]),
+        rows=read_only(rows),
+        states=read_only((found.right / units.columns)[:, :nx]),
+        removed=finite_values(found) * units.time,
+        source=plant,
+        faults=tuple(plant.fault_names[i] for i in kept),
+        without=(*plant.disturbance_names, *(plant.fault_names[i] for i in removed)),
+        fault_sizes=read_only(np.linalg.norm(units.rows[:, None] * faults, axis=0)),
+        signal_sizes=read_only(np.where(sizes > 0.0, sizes, 1.0)),
+        time=units.time,
+        decisions=found.decisions,
+    )
+
+
+def _without_dynamics(rows: FloatArray, e: FloatArray) -> FloatArray:
+    """Return combinations of equations that hold no derivative, ``rows E = 0``, without what rounding put into them.
+
+    Nothing at all is left of them where E is regular: a reduction of many steps leaves more than the rounding of one.
+    """
+    left, values, _ = full_svd(e)
+    rank = rank_from(values, expected=len(e)).rank
+    if rank == len(e):
+        return np.zeros_like(rows)
+    span = left[:, :rank]
+    return np.asarray(rows - (rows @ span) @ span.T)
+
+
+def _told(matrix: FloatArray) -> FloatArray:
+    """Return a matrix of the balanced plant, in which entries are near one, without what is only rounding."""
+    size = ROTATION_ROUNDING * max(1.0, float(np.max(np.abs(matrix), initial=0.0)))
+    return np.where(np.abs(matrix) > size, matrix, 0.0)
+
+
+def unknowns_pencil(plant: DescriptorSystem, removed: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+    """Return E and A of ``[A - sE, Bd, Bf; C, Dd, Df]`` with the faults ``removed`` beside the unknown inputs."""
+    columns = list(removed)
+    a = np.block([[plant.A, plant.Bd, plant.Bf[:, columns]], [plant.C, plant.Dd, plant.Df[:, columns]]])
+    e = np.zeros_like(a)
+    e[: plant.nx, : plant.nx] = plant.E
+    return e, a
+
 
 #: Plants with more unknowns are decided in floating point.
 MOST_EXACT_UNKNOWNS = 70
@@ -606,3 +1040,173 @@ def _beside(basis: _Rows, rows: _Rows, scale: float) -> tuple[_Rows, FloatArray,
     rank = int(np.count_nonzero(values > RANK_TOLERANCE * scale))
     new = _Rows(right[:rank], np.tensordot(left[:, :rank].T / values[:rank, None], f, axes=1))
     return new, np.tensordot(left[:, rank:].T, f, axes=1), np.asarray(terms)
+
+
+#: Plants with more states are not searched for pairs.
+MOST_STATES_FOR_SENSOR_PAIRS = 24
+#: Plants with more states are not searched for suggestions at all.
+MOST_STATES_FOR_SENSORS = 120
+#: Sets of sensors that are listed; the others are counted.
+MOST_LISTED_CHOICES = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """A signal that could be measured: rows of C, D, Dd and Df."""
+
+    name: str
+    C: FloatArray
+    D: FloatArray
+    Dd: FloatArray
+    Df: FloatArray
+    deviation: float | None = None
+
+
+def state_sensors(plant: DescriptorSystem, names: Sequence[str] | None = None) -> tuple[Sensor, ...]:
+    """Return a sensor for each state that is not an output already."""
+    measured = set(plant.output_names)
+    chosen = [name for name in plant.state_names if name not in measured] if names is None else list(names)
+    zero = (np.zeros(plant.nu), np.zeros(plant.nd), np.zeros(plant.nf))
+    eye = np.eye(plant.nx)
+    return tuple(Sensor(name, eye[plant.state_names.index(name)], *zero) for name in chosen)
+
+
+def with_sensors(plant: DescriptorSystem, sensors: Sequence[Sensor]) -> DescriptorSystem:
+    """Return the plant with more outputs; a stated deviation adds a noise of its own."""
+    if not sensors:
+        return plant
+
+    def stacked(matrix: FloatArray, part: str) -> FloatArray:
+        return np.vstack([matrix, *(getattr(sensor, part)[None, :] for sensor in sensors)])
+
+    stated = [i for i, sensor in enumerate(sensors) if sensor.deviation is not None]
+    noise = np.zeros((plant.ny + len(sensors), plant.nw + len(stated)))
+    noise[: plant.ny, : plant.nw] = plant.Dw
+    for column, i in enumerate(stated):
+        noise[plant.ny + i, plant.nw + column] = float(sensors[i].deviation or 0.0)
+    names = [*plant.noise_names, *(f"noise of {sensors[i].name}" for i in stated)]
+    return plant.replace(
+        C=stacked(plant.C, "C"),
+        D=stacked(plant.D, "D"),
+        Dd=stacked(plant.Dd, "Dd"),
+        Df=stacked(plant.Df, "Df"),
+        Bw=np.hstack([plant.Bw, np.zeros((plant.nx, len(stated)))]),
+        Dw=noise,
+        noise_names=names,
+        output_names=[*plant.output_names, *(sensor.name for sensor in sensors)],
+    )
+
+
+def least_additions(
+    plant: DescriptorSystem,
+    sensors: Sequence[Sensor],
+    reached: Callable[[DescriptorSystem], bool],
+    *,
+    most: tuple[int, int] = (MOST_STATES_FOR_SENSORS, MOST_STATES_FOR_SENSOR_PAIRS),
+    promising: Callable[[NDArray[np.int64]], NDArray[np.bool_]] | None = None,
+) -> tuple[tuple[str, ...], ...]:
+    """Return all single sensors that do it, or else all pairs; none for plants of more states than ``most``.
+
+    ``promising`` says of sets ``(N, size)`` of places which ones are to be asked about at all.
+    """
+    if plant.nx > most[0]:
+        return ()
+    for size in (1, 2) if plant.nx <= most[1] else (1,):
+        sets = np.array(list(combinations(range(len(sensors)), size)), dtype=np.int64).reshape(-1, size)
+        asked = sets if promising is None else sets[promising(sets)]
+        sensor_sets = [[sensors[i] for i in chosen] for chosen in asked.tolist()]
+        helping = [chosen for chosen in sensor_sets if reached(with_sensors(plant, chosen))]
+        if helping:
+            return tuple(tuple(sensor.name for sensor in chosen) for chosen in helping)
+    return ()
+
+
+def listed_sets(sets: Sequence[Sequence[str]]) -> str:
+    """Return sensor sets as a text: ``theta l, or omega l with i``."""
+    texts = [" with ".join(names) for names in sets[:MOST_LISTED_CHOICES]]
+    more = len(sets) - MOST_LISTED_CHOICES
+    return ", ".join(texts) + (f", or {more} others" if more > 0 else "")
+
+
+#: A motion is stated where it cancels the fault to this, relative to the fault's own column.
+EXACTNESS = 1e-8
+#: Signals of a motion that are named; the others are counted.
+MOST_NAMED_SIGNALS = 6
+
+
+def hidden_motion(plant: DescriptorSystem, fault: int, point: complex, removed: Sequence[int]) -> str | None:
+    """Return in words the amplitudes of states, unknown inputs and other faults with which a fault of 1 leaves every
+    output at zero, least in balanced units; all go like ``exp(point t)``, or ``point^k``.  ``None`` where none do."""
+    values = hiding_amplitudes(plant, fault, point, removed)
+    if values is None:
+        return None
+    own = plant.fault_names[fault]
+    names = (*plant.disturbance_names, *(plant.fault_names[j] for j in removed))
+    inputs = [_signal(plant.dt, point, name, value) for name, value in values.items() if name in names]
+    states = [f"{name} = {_amplitude(value)}" for name, value in values.items() if name not in names]
+    more = len(states) - MOST_NAMED_SIGNALS
+    rest = [*states[:MOST_NAMED_SIGNALS], *([f"{more} more states"] if more > 0 else [])]
+    others = [*inputs, *([f"states {', '.join(rest)}"] if rest else [])]
+    together = f"together with {' and '.join(others)}" if others else "from some initial state"
+    return f"{_signal(plant.dt, point, own, 1.0)} is output-nulling {together}"
+
+
+def hiding_amplitudes(
+    plant: DescriptorSystem, fault: int, point: complex, removed: Sequence[int]
+) -> dict[str, complex] | None:
+    """Return these amplitudes by name, those of inputs first."""
+    e, a = unknowns_pencil(plant, removed)
+    found = _solved(a - point * e, -np.concatenate([plant.Bf[:, fault], plant.Df[:, fault]]))
+    if found is None:
+        return None
+    names = (*plant.disturbance_names, *(plant.fault_names[j] for j in removed))
+    return {**_named(names, found[plant.nx :]), **_named(plant.state_names, found[: plant.nx])}
+
+
+def _signal(dt: float, point: complex, name: str, value: complex) -> str:
+    size = _amplitude(value)
+    if point == dc_point(dt):
+        return f"a step of {size} in {name}"
+    if dt > 0.0:
+        return f"{name} = {size} * ({_amplitude(point)})^k"
+    if point.real == 0.0:
+        return f"a sinusoid of {size} at {abs(point.imag):.4g} rad/s in {name}"
+    return f"{name} = {size} * exp({_amplitude(point)} t)"
+
+
+def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray | None:
+    """Return the solution with few entries: least squares, then those that are not needed left out one by one."""
+    units = PencilUnits.of(np.zeros(matrix.shape), np.abs(matrix))
+    work, goal = units.rows[:, None] * matrix * units.columns, units.rows * right
+    reach = float(np.linalg.norm(goal))
+    if reach == 0.0:
+        return None
+
+    def solve(kept: list[int]) -> tuple[ComplexArray, float]:
+        part, *_ = np.linalg.lstsq(work[:, kept], goal, rcond=RANK_TOLERANCE)
+        return np.asarray(part, dtype=np.complex128), float(np.linalg.norm(work[:, kept] @ part - goal)) / reach
+
+    kept = list(range(matrix.shape[1]))
+    part, miss = solve(kept)
+    if miss > EXACTNESS:
+        return None
+    for index in sorted(kept, key=lambda j: abs(part[kept.index(j)]))[: len(kept) if len(kept) <= 40 else 0]:
+        fewer = [j for j in kept if j != index]
+        if solve(fewer)[1] <= EXACTNESS:
+            kept = fewer
+    part, _ = solve(kept)
+    whole = np.zeros(matrix.shape[1], dtype=np.complex128)
+    whole[kept] = part
+    # What is only rounding in balanced units is nothing in those of the data.
+    whole[np.abs(whole) <= RANK_TOLERANCE * float(np.max(np.abs(whole), initial=0.0))] = 0.0
+    return np.asarray(units.columns * whole)
+
+
+def _named(names: Sequence[str], values: ComplexArray) -> dict[str, complex]:
+    return {name: complex(value) for name, value in zip(names, values, strict=True) if value != 0.0}
+
+
+def _amplitude(value: complex) -> str:
+    if abs(value.imag) <= EXACTNESS * abs(value):
+        return f"{value.real:.3g}"
+    return f"{value.real:.3g}{value.imag:+.3g}j"

@@ -1,20 +1,29 @@
-"""Solving the algebraic equations of an index-1 plant; those of a large one by its sparsity, without idle variables.
+"""Elimination of algebraic states in rational arithmetic: every entry of the result is rounded once.
+
+With bases N of ker E, L of its left null space, completed by unit vectors D and P, ``x = D z + N v``,
+``L A N v = -L (A D z + B u)`` and ``P E D z+ = P (A D z + A N v + B u)``: index 1 is ``L A N`` nonsingular.
+
+Solving the algebraic equations of an index-1 plant; those of a large one by its sparsity, without idle variables.
 
 Variables that act on nothing (as in filters whose time constants are zero) are found by the pattern of a plant: no
 output depends on them nor on what depends on them. They are left out exactly, with as many equations; with them the
 plant would have index 2, or would not be regular.
+
+Zero-order-hold sampling of continuous plants.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NoReturn
 
+import flint
 import numpy as np
+from flint import fmpq, fmpq_mat
 
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.transformations.exact_elimination import MOST_STATES_EXACTLY, exact_elimination, rounded_once
 from obsynth.analysis.transformations.recovery import (
     RecoveryOperator,
     StateRecovery,
@@ -24,13 +33,14 @@ from obsynth.analysis.transformations.recovery import (
     with_states,
     without_rounding,
 )
-from obsynth.analysis.zeros import in_own_units, structure_of
-from obsynth.errors import PreconditionError
-from obsynth.numerics.arguments import arguments_checked
-from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.libraries import one_thread_if_small
+from obsynth.analysis.zeros import fault_zeros, in_own_units, structure_of
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics.arguments import LARGEST, FloatArray, arguments_checked, real_number, require_no_overflow
+from obsynth.numerics.continuous import zero_order_hold
+from obsynth.numerics.libraries import on_one_thread_if_small, one_thread_if_small
 from obsynth.numerics.pencils import GENERIC_POINTS
 from obsynth.numerics.ranks import (
+    CANCELLATION_TOLERANCE,
     NAMED_SHARE,
     RANK_TOLERANCE,
     but_rounding,
@@ -38,7 +48,7 @@ from obsynth.numerics.ranks import (
     product_but_rounding,
     rounding_rank,
 )
-from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
+from obsynth.numerics.scaling import balanced_matrix, equilibrate_pencil, power_of_two_below
 from obsynth.numerics.sparse import (
     CoarseStructure,
     Indices,
@@ -55,10 +65,235 @@ from obsynth.numerics.sparse import (
     sparse_factor,
     unmatched_instead,
 )
-from obsynth.plants.descriptor import DescriptorSystem, note_source
-from obsynth.plants.uncertainty import ELIMINATED
-from obsynth.plants.validation import listed
-from obsynth.proofs.exact_arithmetic import holds_computed
+from obsynth.numerics.spectra import pole_text
+from obsynth.plants.constants import ELIMINATED, SAMPLED
+from obsynth.plants.descriptor import DECISIVE, DescriptorSystem, ExactNumbers, listed, note_source
+from obsynth.proofs.balls import arb_matrix
+from obsynth.proofs.exact_arithmetic import (
+    blocks,
+    fractions_of,
+    holds_computed,
+    identity,
+    nearest_doubles,
+    null_basis,
+    picked_columns,
+    picked_rows,
+    pivot_columns,
+    written_fraction,
+    written_matrix,
+    written_rows,
+    zeros_matrix,
+)
+from obsynth.proofs.products import as_ball
+
+#: Plants of more states are eliminated in floating point.
+MOST_STATES_EXACTLY = 64
+#: Digits (binary) in which coordinates that are not rational are changed.
+COORDINATE_BITS = 600
+
+_EXACT_INPUTS = ("B", "Bf", "Bd", "Bw")
+_EXACT_DIRECT = ("D", "Df", "Dd", "Dw")
+
+
+@dataclass(frozen=True, eq=False)
+class ExactElimination:
+    """The reduced plant and the recovery of its states, in rational coordinates."""
+
+    matrices: Mapping[str, fmpq_mat]  # ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw`` of the reduced plant
+    recovery: Mapping[str, fmpq_mat]  # ``x`` from the new states (``A``) and the signals (``B, Bf, Bd, Bw``)
+    pivots: tuple[int, ...]  # states that stand for the dynamic ones
+    computed: bool  # whether some of the data were computed in floating point
+    sizes: Mapping[str, FloatArray]  # of ``matrices``, the sums of the sizes of all terms
+    uncleaned: Mapping[str, fmpq_mat] | None = None  # ``matrices`` before what may be rounding was set to zero
+
+    def numbers(self, sizes: Mapping[str, FloatArray], *, own: bool) -> ExactNumbers:
+        """Return those of the reduced plant, with the sizes of the terms in its coordinates; ``own``: these ones."""
+        found: dict[str, fmpq_mat] = {"E": identity(len(self.pivots)), **self.matrices}
+        kept = {name: sizes[name] for name in DECISIVE if name in sizes}
+        known = all(np.all(np.isfinite(part)) for part in kept.values())
+        exact = {name: fractions_of(found[name]) for name in DECISIVE}
+        before = None if self.uncleaned is None else {"E": found["E"], **self.uncleaned}
+        return ExactNumbers(
+            exact,
+            own=own,
+            computed=self.computed,
+            sizes=kept if known else None,
+            states=int(self.recovery["A"].nrows()),
+            uncleaned=None if before is None else {name: fractions_of(before[name]) for name in DECISIVE},
+        )
+
+
+def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
+    """Return the elimination; ``None`` for too many states, or where no state can be eliminated so."""
+    if plant.nx > MOST_STATES_EXACTLY or plant.exact is not None:
+        return None
+    computed = any(holds_computed(getattr(plant, name)) for name in ("E", "A", "C", *_EXACT_INPUTS, *_EXACT_DIRECT))
+    found = _eliminated(plant, clean=computed)
+    if found is None or not computed:
+        return found
+    before = _eliminated(plant, clean=False, sized=False)
+    if before is None or all(found.matrices[name] == before.matrices[name] for name in found.matrices):
+        return replace(found, computed=True)
+    return replace(found, computed=True, uncleaned=before.matrices)
+
+
+def _eliminated(plant: DescriptorSystem, *, clean: bool, sized: bool = True) -> ExactElimination | None:
+    """Return the elimination; with ``clean`` what rounding of computed data may have left is zero.
+    Without ``sized`` the sizes of terms are left out."""
+    e, a, c = (written_matrix(matrix) for matrix in (plant.E, plant.A, plant.C))
+    pivots, rows = pivot_columns(e), pivot_columns(e.transpose())
+    if not pivots:
+        return None
+    null, left = null_basis(e), null_basis(e.transpose()).transpose()
+    signals = [written_matrix(getattr(plant, name)) for name in _EXACT_INPUTS]
+    whole = identity(plant.nx)
+    keep, take = picked_columns(whole, pivots), picked_rows(whole, rows)
+    right = blocks([[a * keep, *signals]])
+    coupling = left * a * null
+    if plant.nx > len(pivots) and coupling.det() == 0:
+        return None
+    direct = blocks([[c * keep, *(written_matrix(getattr(plant, name)) for name in _EXACT_DIRECT)]])
+    states = blocks([[keep, *(zeros_matrix(plant.nx, int(signal.ncols())) for signal in signals)]])
+    moving, leading = take * right, take * e * keep
+    # The inverses are asked for their sizes alone.
+    inverses = [_sizes(part.inv()) for part in (coupling, leading)] if clean or sized else []
+    sizes = [np.zeros((int(part.nrows()), int(part.ncols()))) for part in (moving, direct)]
+    if sized:
+        with np.errstate(all="ignore"):
+            sizes = _term_sizes((left, right), coupling, (take, a * null), (direct, c * null), leading, inverses)
+    if plant.nx > len(pivots):
+        algebraic = _solved_exactly(-coupling, left * right, inverses[0] if clean else None)
+        moving = _sum(moving, take * (a * null), algebraic, clean=clean)
+        direct = _sum(direct, c * null, algebraic, clean=clean)
+        states = _sum(states, null, algebraic, clean=clean)
+    moving = _solved_exactly(leading, moving, inverses[1] if clean else None)
+    widths = [len(pivots), *(int(signal.ncols()) for signal in signals)]
+    return ExactElimination(
+        dict(zip(("A", *_EXACT_INPUTS), _split_exactly(moving, widths), strict=True))
+        | dict(zip(("C", *_EXACT_DIRECT), _split_exactly(direct, widths), strict=True)),
+        dict(zip(("A", *_EXACT_INPUTS), _split_exactly(states, widths), strict=True)),
+        tuple(pivots),
+        clean,
+        dict(zip(("A", *_EXACT_INPUTS), np.split(sizes[0], np.cumsum(widths)[:-1], axis=1), strict=True))
+        | dict(zip(("C", *_EXACT_DIRECT), np.split(sizes[1], np.cumsum(widths)[:-1], axis=1), strict=True)),
+    )
+
+
+def _term_sizes(
+    constraints: tuple[fmpq_mat, fmpq_mat],
+    coupling: fmpq_mat,
+    equations: tuple[fmpq_mat, fmpq_mat],
+    outputs: tuple[fmpq_mat, fmpq_mat],
+    moving: fmpq_mat,
+    inverses: Sequence[FloatArray],
+) -> list[FloatArray]:
+    """Return the sums of the sizes of all terms, of the dynamic equations and of the outputs.
+    ``inverses``: sizes of the inverses of ``coupling`` and ``moving``."""
+    (left, right), (take, across), (direct, shown) = constraints, equations, outputs
+    solver, inverse = inverses
+    dynamic = _sizes(take) @ _sizes(right)
+    if not coupling.nrows():
+        return [inverse @ (_sizes(moving) @ (inverse @ dynamic)), _sizes(direct)]
+    algebraic = solver @ (_sizes(coupling) @ (solver @ (_sizes(left) @ _sizes(right))))
+    dynamic = dynamic + _sizes(take * across) @ algebraic
+    return [inverse @ (_sizes(moving) @ (inverse @ dynamic)), _sizes(direct) + _sizes(shown) @ algebraic]
+
+
+def rounded_once(
+    found: ExactElimination, plant: DescriptorSystem, dynamic: FloatArray | None
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray], dict[str, FloatArray]]:
+    """Return matrices, recovery and sizes of terms as doubles; states ``dynamic (nx, count)`` instead of the pivots."""
+    if dynamic is None:
+        return (
+            {name: nearest_doubles(matrix) for name, matrix in found.matrices.items()},
+            {name: nearest_doubles(matrix) for name, matrix in found.recovery.items()},
+            dict(found.sizes),
+        )
+    e = written_matrix(plant.E)
+    rows = pivot_columns((picked_columns(e, found.pivots)).transpose())
+    with flint.ctx.workprec(COORDINATE_BITS):
+        # E dynamic z = E (unit vectors) z_rational
+        change = flint.arb_mat(picked_rows(e * written_matrix(dynamic), rows)).solve(
+            flint.arb_mat(picked_rows(picked_columns(e, found.pivots), rows))
+        )
+        back = change.inv()
+
+        def moved(name: str, matrix: fmpq_mat, *, recovery: bool) -> FloatArray:
+            work = flint.arb_mat(matrix) if matrix.nrows() and matrix.ncols() else None
+            if work is None:
+                return np.zeros((int(matrix.nrows()), int(matrix.ncols())))
+            if name in ("A", "C"):
+                work = work * back
+            if not recovery and name in ("A", *_EXACT_INPUTS):
+                work = change * work
+            return _doubles(work)
+
+        return (
+            {name: moved(name, matrix, recovery=False) for name, matrix in found.matrices.items()},
+            {name: moved(name, matrix, recovery=True) for name, matrix in found.recovery.items()},
+            _moved_sizes(found.sizes, np.abs(_doubles(change)), np.abs(_doubles(back))),
+        )
+
+
+def _moved_sizes(sizes: Mapping[str, FloatArray], change: FloatArray, back: FloatArray) -> dict[str, FloatArray]:
+    """Return sizes of terms in other coordinates of the states."""
+    found = {name: size @ back if name in ("A", "C") else size for name, size in sizes.items()}
+    return {name: change @ size if name in ("A", *_EXACT_INPUTS) else size for name, size in found.items()}
+
+
+def _solved_exactly(matrix: fmpq_mat, right: fmpq_mat, inverse: FloatArray | None) -> fmpq_mat:
+    """Return ``matrix^-1 right``; with the sizes of ``matrix^-1``, what rounding of the data may have left is zero."""
+    solution = matrix.solve(right)
+    return solution if inverse is None else _cleaned(solution, inverse @ (_sizes(matrix) @ _sizes(solution)))
+
+
+def _sum(direct: fmpq_mat, factor: fmpq_mat, solution: fmpq_mat, *, clean: bool) -> fmpq_mat:
+    result = direct + factor * solution
+    return _cleaned(result, _sizes(direct) + _sizes(factor) @ _sizes(solution)) if clean else result
+
+
+def _cleaned(result: fmpq_mat, size_of_terms: FloatArray) -> fmpq_mat:
+    rows, columns = size_of_terms.shape
+    kept = _sizes(result) > CANCELLATION_TOLERANCE * size_of_terms
+    entries = [result[i, j] if kept[i, j] else fmpq(0) for i in range(rows) for j in range(columns)]
+    return fmpq_mat(rows, columns, entries)
+
+
+def _sizes(matrix: fmpq_mat) -> FloatArray:
+    return np.abs(nearest_doubles(matrix))
+
+
+def _doubles(matrix: Any) -> FloatArray:
+    rows = [[0.0 if value.contains(0) else float(value) for value in row] for row in matrix.tolist()]
+    return np.array(rows, dtype=np.float64)
+
+
+def _split_exactly(matrix: fmpq_mat, widths: list[int]) -> list[fmpq_mat]:
+    ends = np.cumsum(widths).tolist()
+    return [picked_columns(matrix, range(end - width, end)) for end, width in zip(ends, widths, strict=True)]
+
+
+def sampled_exact_numbers(smooth: DescriptorSystem, sample_time: float) -> ExactNumbers:
+    """Return the exact numbers behind a plant that is sampled from one with ``E = I``."""
+    step, known = written_fraction(sample_time), smooth.exact
+    if known is None:
+        computed = any(holds_computed(getattr(smooth, name)) for name in DECISIVE)
+        return ExactNumbers({name: written_rows(getattr(smooth, name)) for name in DECISIVE}, step, computed=computed)
+    sizes = None if known.sizes is None else _sampled_sizes(smooth, known.sizes, sample_time)
+    return replace(known, sample_time=step, sizes=sizes, states=0)
+
+
+def _sampled_sizes(
+    smooth: DescriptorSystem, sizes: Mapping[str, FloatArray], sample_time: float
+) -> dict[str, FloatArray] | None:
+    """Return the sizes of terms once sampled: what cancelled before goes through the integral of ``exp(A t)``."""
+    transition, held = zero_order_hold(smooth.A, np.hstack([smooth.Bf, smooth.Bd, np.eye(smooth.nx)]), sample_time)
+    faults, disturbances, integral = np.split(np.abs(held), [smooth.nf, smooth.nf + smooth.nd], axis=1)
+    found = dict(sizes)
+    for name, own in (("A", np.abs(transition)), ("Bf", faults), ("Bd", disturbances)):
+        found[name] = own + integral @ (sizes[name] - np.abs(getattr(smooth, name)))
+    return found if all(np.all(np.isfinite(part)) for part in found.values()) else None
+
 
 #: Rank that a matrix may lack beyond what its shape says, to begin with.
 BORDER = 8
@@ -778,3 +1013,150 @@ def _side_by_side(*blocks: Any) -> Any:
     from scipy.sparse import hstack
 
     return csr(hstack([csr(block) for block in blocks]))
+
+
+#: With so many states and signals, whose exponential takes 10 ms, each entry is rounded once: another machine finds it
+#: again, and entries that are small beside those they come from have all their digits.
+MOST_ROUNDED_ONCE = 24
+#: Digits, in bits: a chain of integrators in large units, whose exponential is squared thirty times, takes over 300.
+SQUARING_BITS = 640
+#: Fault zeros of a sampled plant between this radius and 1 make the fault estimate ring for long.
+SLOW_ZERO_RADIUS = 0.98
+
+
+@arguments_checked
+@on_one_thread_if_small
+def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> Transformation:
+    """Sample a continuous plant with a zero-order hold.
+
+    Exact for inputs, faults and disturbances that are constant between samples.  Algebraic states are
+    eliminated first.  A fault that changes within an interval acts there like its mean over it, weighted by how much
+    of the effect of each moment is left at the next sample: for short intervals the plain mean.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        Continuous, regular, index 0 or 1.
+    sample_time : float, seconds
+        Time between samples.
+
+    Returns
+    -------
+    Transformation
+        Process noise (``Bw``, per square root of a second) is integrated over a sample and becomes
+        ``process noise 1, 2, ...``, a factor of its covariance; ``Dw`` is per sample and stays.
+
+    Raises
+    ------
+    SpecError
+        ``plant.dt > 0``, or ``sample_time`` is not a positive number, or an unstable mode outgrows double precision
+        within it.
+    PreconditionError
+        As for `eliminate_algebraic_states`; or continuous white noise reaches an output directly.
+
+    References
+    ----------
+    .. [VanLoan1978] C. Van Loan, "Computing integrals involving the matrix exponential", IEEE TAC 23, 1978.
+    """
+    if isinstance(plant, Transformation):
+        return plant.then(discretise(plant.plant, sample_time))
+    if plant.dt > 0.0:
+        raise SpecError(f"The plant is already sampled (dt = {plant.dt:g} s): give a continuous plant.", path="dt")
+    real_number(sample_time, "sample_time", "a positive number of seconds", above=0.0)
+    require_no_overflow(sample_time, "sample_time", "sample_time")
+    first = eliminate_algebraic_states(plant)
+    smooth = first.plant
+    direct = np.flatnonzero(np.any(smooth.Dw, axis=0))
+    process = np.flatnonzero(np.any(dense(plant.Bw), axis=0) | np.any(smooth.Bw, axis=0))
+    signals = tuple(smooth.noise_names[i] for i in np.intersect1d(direct, process))
+    if signals:
+        raise PreconditionError(
+            f"Process noise {', '.join(signals)} reaches an output directly, where continuous white noise has "
+            "infinite variance: give measurement noise in Dw only, or filter the process noise by a state.",
+            condition="noise without a direct path",
+            signals=signals,
+        )
+    _require_bounded_growth(smooth.A, float(sample_time))
+    signals_in = np.hstack([smooth.B, smooth.Bf, smooth.Bd])
+    few = sum(signals_in.shape) <= MOST_ROUNDED_ONCE
+    transition, held = zero_order_hold(smooth.A, signals_in, sample_time, exponential=_rounded_once if few else None)
+    B, Bf, Bd = columns_of(held, (smooth.nu, smooth.nf, smooth.nd))
+    factor = _noise_factor(smooth.A, smooth.Bw, sample_time)
+    kept = [smooth.noise_names[i] for i in direct]
+    noise_names = [*(f"process noise {i + 1}" for i in range(factor.shape[1])), *kept]
+    Bw = np.hstack([factor, np.zeros((smooth.nx, len(kept)))])
+    Dw = np.hstack([np.zeros((smooth.ny, factor.shape[1])), smooth.Dw[:, direct]])
+    changes = {"A": transition, "B": B, "Bf": Bf, "Bd": Bd, "Bw": Bw, "Dw": Dw}
+    exact = sampled_exact_numbers(smooth, sample_time) if smooth.nx <= MOST_STATES_EXACTLY else None
+    sampled = smooth.replace(**changes, dt=float(sample_time), noise_names=noise_names, exact=exact)
+    noise_kept = np.hstack([np.zeros((smooth.nw, factor.shape[1])), np.eye(smooth.nw)[:, direct]])
+    recovery = unchanged_states(smooth, sampled, from_state=np.eye(smooth.nx), noise_kept=noise_kept)
+    description = f"sampled every {sample_time:g} s (zero-order hold)"
+    note_source(smooth, sampled, sample_time=float(sample_time))
+    step = Transformation(smooth, sampled, description, recovery)
+    return first.then(step.with_tolerances(SAMPLED, sample_time))
+
+
+def _rounded_once(block: FloatArray, step: float) -> FloatArray | None:
+    """Return ``exp(A h)`` in which every entry is rounded once; ``None`` where its balls are too wide."""
+    with flint.ctx.workprec(SQUARING_BITS):
+        found = as_ball((arb_matrix(block) * flint.arb(float(step))).exp())
+    size = np.abs(found.midpoint)
+    if not np.max(found.radius, initial=0.0) <= CANCELLATION_TOLERANCE * np.max(size, initial=0.0):
+        return None
+    return np.where(size > found.radius, found.midpoint, 0.0)
+
+
+def _require_bounded_growth(A: FloatArray, sample_time: float) -> None:
+    """Raise `SpecError` where the fastest unstable mode of ``A`` leaves the range of numbers within a sample."""
+    rate = float(np.linalg.eigvals(balanced_matrix(A)[0]).real.max(initial=0.0))
+    if rate * sample_time > math.log(LARGEST):
+        raise SpecError(
+            f"In one sample of {sample_time:g} s an unstable mode (eigenvalue {rate:.3g} 1/s) grows beyond "
+            f"{LARGEST:g}: sample more often than every {math.log(LARGEST) / rate:.2g} s, or look at the signs and "
+            "units of A.",
+            path="sample_time",
+        )
+    require_no_overflow(float(np.abs(A).max(initial=0.0)) * sample_time, "A times sample_time", "sample_time")
+
+
+def sampling_zero_warnings(plant: DescriptorSystem) -> tuple[str, ...]:
+    """Return a text for every fault zero inside, but near, the unit circle: estimates ring ``dt / -ln abs(z)`` s."""
+    if not plant.is_discrete:
+        return ()
+    zeros, outside = fault_zeros(plant)
+    inside = [zero.value for zero in zeros if not any(zero is other for other in outside)]
+    texts = [
+        f"Fault zero at {pole_text(value, 6, pair=True)} (modulus {abs(value):.6g}): errors of a fault estimate decay "
+        f"there with a time constant of {-plant.dt / math.log(abs(value)):.3g} s. Sample more slowly, or measure a "
+        "signal nearer to the fault."
+        for value in inside
+        if value.imag >= 0.0 and SLOW_ZERO_RADIUS < abs(value) < 1.0
+    ]
+    return tuple(dict.fromkeys(texts))
+
+
+def _noise_factor(A: FloatArray, noise: FloatArray, step: float) -> FloatArray:
+    """Return a factor of the covariance that unit white noise through ``noise`` gathers in ``step``."""
+    from scipy.linalg import expm
+
+    nx = A.shape[0]
+    if not noise.any():
+        return np.zeros((nx, 0))
+    balanced, scale = balanced_matrix(A)
+    scaled = noise / scale[:, None]
+    # Van Loan's block grows like exp(-A h): integrate a short step, then double it.
+    doublings = math.ceil(math.log2(max(float(np.linalg.norm(balanced, 1)) * step, 1.0)))
+    block = np.block([[-balanced, scaled @ scaled.T], [np.zeros((nx, nx)), balanced.T]])
+    result = expm(block * (step / 2.0**doublings))
+    transition = result[nx:, nx:].T
+    covariance = transition @ result[:nx, nx:]
+    for _ in range(doublings):
+        covariance = covariance + transition @ covariance @ transition.T
+        transition = transition @ transition
+    # An integrated state gathers far less noise than its derivative: compare like with like.
+    spread = power_of_two_below(np.sqrt(np.abs(np.diag(covariance))))
+    correlation = covariance / spread / spread[:, None]
+    sizes, directions = np.linalg.eigh((correlation + correlation.T) / 2.0)
+    kept = sizes > CANCELLATION_TOLERANCE * sizes[-1]
+    return np.asarray((scale * spread)[:, None] * directions[:, kept] * np.sqrt(sizes[kept]))

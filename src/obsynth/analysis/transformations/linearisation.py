@@ -17,17 +17,13 @@ from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arguments import arguments_checked, real_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, arguments_checked, real_number
 from obsynth.numerics.expressions import parse_expression
 from obsynth.numerics.ranks import JACOBIAN_RANK_TOLERANCE
-from obsynth.plants.constants import Constant, ConstantsBox, constants_box
-from obsynth.plants.dae.functions import LocalEquations, local_equations, symbolic_equations
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.constants import Constant, ConstantsBox, Entry, Uncertainty, constants_box
+from obsynth.plants.dae import DAEModel, LocalEquations, local_equations, symbolic_equations
+from obsynth.plants.descriptor import DescriptorSystem, index_of
 from obsynth.plants.uncertain_system import filled_plant, stated_box
-from obsynth.plants.uncertainty import Entry, Uncertainty
-from obsynth.plants.validation import index_of
 
 #: Largest scaled residual of what counts as a root.
 ROOT_RESIDUAL = 1e-9

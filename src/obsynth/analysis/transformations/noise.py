@@ -10,10 +10,10 @@ import numpy as np
 
 from obsynth.analysis.transformations.recovery import Transformation, unchanged_states
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import arguments_checked, real_number
-from obsynth.numerics.arrays import SMALLEST, FloatArray, require_no_overflow
-from obsynth.plants.dae.model import DAEModel, step_length
-from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.numerics.arguments import SMALLEST, FloatArray, arguments_checked, real_number, require_no_overflow
+from obsynth.plants.constants import Uncertainty
+from obsynth.plants.dae import DAEModel, step_length
+from obsynth.plants.descriptor import DescriptorSystem, index_of
 from obsynth.plants.noise_model import (
     OFFSET_SIZE,
     OFFSET_WALK,
@@ -24,8 +24,6 @@ from obsynth.plants.noise_model import (
     sensor_noises,
     stated_number,
 )
-from obsynth.plants.uncertainty import Uncertainty
-from obsynth.plants.validation import index_of
 
 
 @arguments_checked

@@ -14,15 +14,13 @@ import numpy as np
 
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arguments import require_kind
-from obsynth.numerics.arrays import FloatArray, freeze, read_only
+from obsynth.numerics.arguments import FloatArray, freeze, read_only, require_kind
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, NEGLIGIBLE_INPUT, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.numerics.sparse import MEAN_FACTOR, SIZE_SAMPLES, SolutionBounds, SparseFactor, csr, sparse_factor
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertainty import Uncertainty, matrices_of
-from obsynth.plants.validation import index_of
+from obsynth.plants.constants import Uncertainty, matrices_of
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem, index_of
 
 #: Signals in the order in which they stand in the algebraic equations.
 SIGNAL_ORDER = ("state", "input", "fault", "disturbance", "noise")

@@ -15,16 +15,15 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.analysis.transformations.elimination import discretise
 from obsynth.analysis.transformations.linearisation import linearise
-from obsynth.analysis.transformations.sampling import discretise
 from obsynth.analysis.transformations.uncertain_plant import reduced_matrices
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arguments import is_finite_number
-from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.dae.model import DAEModel, equation_of, symbols_of
+from obsynth.numerics.arguments import FloatArray, is_finite_number
+from obsynth.plants.constants import matrices_of
+from obsynth.plants.dae import DAEModel, equation_of, symbols_of
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertainty import matrices_of
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_exponential, affine_zero_order_hold
 from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
 from obsynth.proofs.balls import UNIT_ROUNDOFF, gamma, rounded_up

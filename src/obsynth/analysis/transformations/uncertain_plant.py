@@ -9,17 +9,17 @@ import numpy as np
 
 from obsynth.analysis.transformations.elimination import algebraic_coordinates
 from obsynth.errors import PreconditionError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.ranks import UNTOUCHED_SHARE
-from obsynth.plants.constants import ConstantsBox
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertainty import (
+from obsynth.plants.constants import (
     SAMPLED,
     UNCERTAIN_MATRICES,
+    ConstantsBox,
     Uncertainty,
     as_written,
     matrices_of,
 )
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse, affine_zero_order_hold
 
 #: Their coordinates are rounded to this many digits: any invertible change of coordinates is exact.

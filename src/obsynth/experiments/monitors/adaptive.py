@@ -20,8 +20,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.transformations.elimination import algebraic_coordinates, eliminate_algebraic_states
-from obsynth.analysis.transformations.sampling import discretise
+from obsynth.analysis.transformations.elimination import algebraic_coordinates, discretise, eliminate_algebraic_states
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant, reduced_family
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.assumptions import Assumptions
@@ -30,14 +29,11 @@ from obsynth.experiments.monitors.residual_model import noisy_plant, watches_est
 from obsynth.experiments.monitors.rules import FITTING_SHARE, NormRule, NormState, norm_of
 from obsynth.experiments.simulation import Runs
 from obsynth.methods.verifying import tracking_of
-from obsynth.numerics.arguments import is_finite_number, require_mapping
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, is_finite_number, require_mapping
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.linear.observer import LinearObserver, sample_observer
-from obsynth.plants.constants import ConstantsBox, shown
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertainty import ELIMINATED, SAMPLED, Uncertainty
-from obsynth.plants.validation import require_known
+from obsynth.plants.constants import ELIMINATED, SAMPLED, ConstantsBox, Uncertainty, shown
+from obsynth.plants.descriptor import DescriptorSystem, require_known
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_zero_order_hold
 from obsynth.proofs.balls import rounded_up
 from obsynth.proofs.contraction import inverse_bound

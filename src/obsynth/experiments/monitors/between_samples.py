@@ -14,7 +14,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.continuous import first_order_hold, peak_gain
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem

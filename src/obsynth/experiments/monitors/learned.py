@@ -37,11 +37,9 @@ from obsynth.experiments.monitors.learned_levels import (
     sample_score,
 )
 from obsynth.experiments.monitors.monitor import Evidence, Judged, LinearSample, Monitor, Rule, Sample
-from obsynth.files.inputs import path_of
-from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.outputs import FileKind, path_of, write_atomically
 from obsynth.methods.registry import error_model
-from obsynth.numerics.arguments import arguments_checked, is_finite_number
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, arguments_checked, is_finite_number, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
@@ -50,8 +48,7 @@ from obsynth.observers.running import changed
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.noise_model import offset_state
 from obsynth.results.certificate_files import opened, sealed
-from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
+from obsynth.results.design import ObserverDesign, digest_of, gain_set_digest, plain, restored
 
 #: Parts of a log whose largest statistics are compared, the share of them that is taken as usual, and how many times
 #: that an event stands out at least: a fifth of the parts of a log may hold events.

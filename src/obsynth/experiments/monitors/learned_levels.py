@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.experiments.monitors.monitor import NOT_DISTINGUISHED, Evidence
-from obsynth.numerics.arrays import SMALLEST, FloatArray, read_only
+from obsynth.numerics.arguments import SMALLEST, FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 from obsynth.numerics.ranks import DIRECTION_SHARE, rounding_rank
 from obsynth.observers.dae.observer import DAEObserver

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import arguments_checked
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, arguments_checked, read_only
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.recursive.observer import RawEstimate
 from obsynth.observers.running import Estimates, state_as_data, state_from_data

@@ -6,8 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import real_number, whole_number
-from obsynth.numerics.arrays import require_no_overflow
+from obsynth.numerics.arguments import real_number, require_no_overflow, whole_number
 
 _BOUNDED = ("disturbance_bounds", "noise_bound", "initial_error", "scenario", "sample_time")
 _STATISTICAL = ("window", "false_alarms", "scenario", "sample_time")

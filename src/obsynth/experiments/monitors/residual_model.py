@@ -22,11 +22,11 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from obsynth.analysis.transformations.sampling import discretise
+from obsynth.analysis.transformations.elimination import discretise
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.between_samples import BetweenSamples
 from obsynth.methods.registry import error_model
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, largest_singular_value
 from obsynth.numerics.continuous import first_order_hold, peak_gain
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import hinf_norm, output_covariance, spectral_radius, state_units

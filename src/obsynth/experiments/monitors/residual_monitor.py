@@ -32,11 +32,9 @@ from obsynth.experiments.monitors.residual_model import (
 )
 from obsynth.experiments.monitors.rules import NormRule, WhitenedRule
 from obsynth.experiments.simulation import Bench, make_bench
-from obsynth.numerics.arguments import arguments_checked, chosen, real_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, arguments_checked, chosen, real_number
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.validation import index_of
+from obsynth.plants.descriptor import DescriptorSystem, index_of
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.simulation.scenario import Scenario, observer_start
 

@@ -20,12 +20,11 @@ from obsynth.errors import SpecError
 from obsynth.experiments.monitors.between_samples import InputResponse
 from obsynth.experiments.monitors.monitor import Judged, LinearSample, Monitor, Rule, Sample
 from obsynth.experiments.monitors.residual_model import ResidualModel, UnlimitedHorizonBound
-from obsynth.numerics.arguments import real_number
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, largest_singular_value, real_number
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import NIS_WINDOW, WALKING_FORMS, alone, two_sided_sums
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.plants.validation import index_of
+from obsynth.plants.descriptor import index_of
 from obsynth.verification.error_system import ErrorModel
 
 #: States that are solved from the observer's own and the outputs are these, up to rounding.

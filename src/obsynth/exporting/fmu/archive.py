@@ -23,16 +23,20 @@ from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned import LearnedThresholds
 from obsynth.experiments.monitors.learned_levels import HOLD
 from obsynth.exporting.c_source import (
+    STATISTIC,
+    Alarms,
+    Realisation,
     c_identifier,
     comment,
     dae_alarms,
     dae_c_texts,
     header_text,
     in_precision,
+    linear_alarms,
     require_no_sample_time,
     source_text,
+    verification_words,
 )
-from obsynth.exporting.realisation import STATISTIC, Alarms, Realisation, linear_alarms, verification_words
 from obsynth.files.outputs import write_atomically
 from obsynth.observers.dae.c_code import FLAGS, compiler, shared_library
 from obsynth.observers.dae.observer import DAEObserver

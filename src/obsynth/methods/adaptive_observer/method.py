@@ -12,8 +12,7 @@ from obsynth.methods.method import ClaimMeaning, PlantKind, Purpose
 from obsynth.methods.recursive import RECURSIVE_CLAIMS
 from obsynth.numerics.arguments import Count, ForgettingFactor, Probability, WrittenAs
 from obsynth.observers.recursive.observer import Form, Guard
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 
 
 @dataclass(frozen=True)

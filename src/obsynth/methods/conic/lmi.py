@@ -15,7 +15,7 @@ import numpy as np
 
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.method import ChosenSolver
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 
 if TYPE_CHECKING:
     import cvxpy

@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.errors import ObsynthError
 from obsynth.methods.dae_adaptive_observer.conditions import SOURCE, dae_conditions
 from obsynth.methods.recursive.checks import claims_row, failed_run, listed_gains, refinement_rows
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.newton import LARGEST_RESIDUAL
 from obsynth.numerics.ranks import SINGULAR_CONDITION, covariance_factor
 from obsynth.observers.batches import run_dae_batch

@@ -9,8 +9,7 @@ import numpy as np
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.dae_structure import identifiability, index_report
 from obsynth.errors import SolverError, a_kind
-from obsynth.plants.dae.functions import DAEFunctions
-from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae import DAEFunctions, DAEModel
 
 #: Samples of the nominal trajectory along which directions are looked for.
 NOMINAL_SAMPLES = 51

@@ -11,7 +11,7 @@ from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
 from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, WrittenAs
 from obsynth.observers.dae.settings import Guard, Weight
 from obsynth.observers.outliers import Outliers
-from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae import DAEModel
 
 FormChoice: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman", "auto"]
 IntegrationChoice: TypeAlias = Literal["backward-euler", "radau", "auto"]

@@ -20,8 +20,7 @@ from obsynth.observers.dae.building import (
 )
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.running import plain_recursion
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.dae.step import PROJECTION_NOTICE
+from obsynth.plants.dae import PROJECTION_NOTICE, DAEModel
 from obsynth.plants.noise_model import offset_state
 from obsynth.results.design import Certificate
 

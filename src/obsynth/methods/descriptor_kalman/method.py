@@ -11,8 +11,7 @@ from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Syn
 from obsynth.methods.recursive import RECURSIVE_CLAIMS
 from obsynth.numerics.arguments import Positive, WrittenAs
 from obsynth.observers.outliers import Outliers
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 

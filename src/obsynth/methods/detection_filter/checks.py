@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.methods.detection_filter.conditions import conditions, unknown_inputs
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.numerics.spectra import abscissa

@@ -8,7 +8,7 @@ from obsynth.analysis.conditions import Condition, rank_condition
 from obsynth.analysis.existence.statements import Evaluator
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.errors import PreconditionError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import ExactPencil, holds_computed

@@ -21,7 +21,7 @@ from obsynth.methods.detection_filter.checks import (
 from obsynth.methods.detection_filter.conditions import unknown_inputs
 from obsynth.methods.detection_filter.method import DetectionFilterMethod
 from obsynth.methods.method import Synthesis
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, largest_singular_value
 from obsynth.numerics.matrix_equations import continuous_solution
 from obsynth.numerics.norms import response
 from obsynth.numerics.scaling import power_of_two_below

@@ -30,7 +30,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from obsynth.errors import SolverError
-from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value
+from obsynth.numerics.arguments import SMALLEST, FloatArray, largest_singular_value
 from obsynth.numerics.doubling import FEWEST_STATES, MOST_JUMPS, doubled_riccati_solution, is_positive
 from obsynth.numerics.matrix_equations import bounded_real_matrix, normalising_change, stabilising_gain
 from obsynth.numerics.modal_response import Modes

@@ -16,10 +16,23 @@ import numpy as np
 from flint import fmpq, fmpq_mat
 
 from obsynth.analysis.conditions import Condition, up_to_failure
-from obsynth.analysis.existence.named_pencils import ROUNDING_LEVEL, WITNESS_DIGITS
-from obsynth.analysis.existence.numbers import SystemFacts, numbers_of
-from obsynth.analysis.existence.statements import DECIDER, Evaluator, FullRank, NoZeroOutside, reconsidered
-from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
+from obsynth.analysis.existence.named_pencils import (
+    ROUNDING_LEVEL,
+    WITNESS_DIGITS,
+    EntryChange,
+    Unclear,
+    Witness,
+    rational_matrices,
+)
+from obsynth.analysis.existence.statements import (
+    DECIDER,
+    Evaluator,
+    FullRank,
+    NoZeroOutside,
+    SystemFacts,
+    numbers_of,
+    reconsidered,
+)
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import MOST_NAMES, Zero, hidden_faults, leading_names, regularity_of, zero_at
 from obsynth.errors import PreconditionError
@@ -33,7 +46,7 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import (
     prepare,
     with_sensor_faults_as_states,
 )
-from obsynth.numerics.arrays import FloatArray, remembered
+from obsynth.numerics.arguments import FloatArray, remembered
 from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import blocks, picked_columns, pivot_columns, zeros_matrix

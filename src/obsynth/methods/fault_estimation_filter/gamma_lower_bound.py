@@ -29,7 +29,7 @@ from obsynth.methods.fault_estimation_filter.least_gain_proof import (
     PROVED_SHARE,
     InvisiblePairs,
 )
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, largest_singular_value
 from obsynth.numerics.matrix_equations import lyapunov_solution
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem

@@ -20,7 +20,7 @@ import flint
 import numpy as np
 from flint import fmpq_mat
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import arb_matrix, undecided_pivot
 from obsynth.proofs.covariances import squared_norm

@@ -24,8 +24,15 @@ from obsynth.methods.method import (
     own_term_conflicts,
     own_terms,
 )
-from obsynth.numerics.arguments import FewSamples, OpenUnitInterval, Positive, WrittenAs, checked_value, shown
-from obsynth.numerics.arrays import require_no_overflow
+from obsynth.numerics.arguments import (
+    FewSamples,
+    OpenUnitInterval,
+    Positive,
+    WrittenAs,
+    checked_value,
+    require_no_overflow,
+    shown,
+)
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel

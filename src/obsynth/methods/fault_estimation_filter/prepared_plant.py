@@ -21,13 +21,11 @@ import numpy as np
 from flint import fmpq_mat
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.existence.numbers import PlantNumbers, numbers_of
-from obsynth.analysis.existence.statements import settled_rank
+from obsynth.analysis.existence.statements import PlantNumbers, numbers_of, settled_rank
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations.recovery import augment_faults
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import require_shape
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, largest_singular_value, require_shape
 from obsynth.numerics.ranks import (
     CANCELLATION_TOLERANCE,
     DEAD_CHAIN_TOLERANCE,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import require_all
-from obsynth.analysis.transformations.sampling import SLOW_ZERO_RADIUS, sampling_zero_warnings
+from obsynth.analysis.transformations.elimination import SLOW_ZERO_RADIUS, sampling_zero_warnings
 from obsynth.errors import SpecError
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.fault_estimation_filter.prepared_plant import (
@@ -28,8 +28,7 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import (
 )
 from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
 from obsynth.numerics import lapack
-from obsynth.numerics.arguments import is_whole, require_shape
-from obsynth.numerics.arrays import FloatArray, as_matrix, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, as_matrix, is_whole, largest_singular_value, require_shape
 from obsynth.numerics.doubling import FEWEST_STATES
 from obsynth.numerics.matrix_equations import bounded_real_matrix, normalising_change
 from obsynth.numerics.norms import output_covariance, state_units

@@ -66,7 +66,7 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import (
 )
 from obsynth.methods.fault_estimation_filter.realisation import bounded_real_certificate, notes, realise_filter
 from obsynth.methods.method import Synthesis
-from obsynth.numerics.arrays import FloatArray, as_matrix, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, as_matrix, largest_singular_value
 from obsynth.numerics.regions import disk
 from obsynth.observers.linear.observer import LinearObserver, averaged
 from obsynth.plants.descriptor import DescriptorSystem

@@ -14,7 +14,7 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.functional_filter.conditions import conditions, residual_sets
 from obsynth.methods.ui_pi_observer.augmented_plant import shipped_model
 from obsynth.methods.ui_pi_observer.checks import decoupling_norms
-from obsynth.numerics.arrays import FloatArray, reachable
+from obsynth.numerics.arguments import FloatArray, reachable
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import arb_matrix

@@ -9,16 +9,13 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.diagnosis.decoupled import fault_numbers
 from obsynth.analysis.diagnosis.diagnosing import model_points
-from obsynth.analysis.diagnosis.explanations import hidden_motion
-from obsynth.analysis.diagnosis.fault_columns import Question, dc_point, question
+from obsynth.analysis.diagnosis.fault_columns import Question, dc_point, fault_numbers, hidden_motion, question
 from obsynth.analysis.existence.named_pencils import ROUNDING_LEVEL, NamedPencil
-from obsynth.analysis.existence.numbers import COMPUTED_STATES
-from obsynth.analysis.existence.statements import Evaluator, FullRank
+from obsynth.analysis.existence.statements import COMPUTED_STATES, Evaluator, FullRank
 from obsynth.errors import SpecError
 from obsynth.methods.method import OPTIONS_PATH
-from obsynth.numerics.arrays import remembered
+from obsynth.numerics.arguments import remembered
 from obsynth.numerics.spectra import pole_text
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem

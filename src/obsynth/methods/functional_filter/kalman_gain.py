@@ -17,11 +17,11 @@ from itertools import product
 
 import numpy as np
 
-from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled
+from obsynth.analysis.diagnosis.fault_columns import DecoupledPlant, decoupled
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import structure_of
 from obsynth.errors import ObsynthError, PreconditionError, SolverError
-from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value
+from obsynth.numerics.arguments import SMALLEST, FloatArray, largest_singular_value
 from obsynth.numerics.matrix_equations import (
     continuous_lyapunov,
     continuous_solution,

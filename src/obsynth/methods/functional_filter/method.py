@@ -13,8 +13,7 @@ from annotated_types import Ge
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
 from obsynth.methods.method import OPTIONS_PATH, ClaimMeaning, Method, PlantKind, Purpose
-from obsynth.numerics.arguments import FewSamples, NonNegative, WrittenAs, is_finite_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FewSamples, FloatArray, NonNegative, WrittenAs, is_finite_number
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel

@@ -18,7 +18,7 @@ from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.guaranteed_test.problem import problem_of, window_as_designed
 from obsynth.methods.guaranteed_test.proofs import Repaired, proved_ray, proved_threshold, repaired_multipliers
 from obsynth.methods.guaranteed_test.windows import courses_of
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, lower_bound_check, upper_bound_check

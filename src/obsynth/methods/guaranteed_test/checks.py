@@ -28,11 +28,11 @@ from obsynth.methods.guaranteed_test.proofs import (
     repaired_point,
 )
 from obsynth.methods.guaranteed_test.windows import MEAN_ROOM, Window, mean_over_record, part_beside
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.constants import shown
-from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
 from obsynth.results.checks import Check, information, lower_bound_check, nothing_wrong, upper_bound_check

@@ -13,9 +13,8 @@ from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.guaranteed_test.problem import Problem, missing_bounds, problem_of, samples_given
 from obsynth.methods.guaranteed_test.proofs import Condensed, proved_ray, repaired_multipliers
 from obsynth.methods.guaranteed_test.windows import Window, fault_names
-from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.arguments import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 
 SOURCE = "duality of linear programmes"
 #: Values of a hidden course below this share of its largest are not told.

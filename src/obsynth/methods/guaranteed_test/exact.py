@@ -18,7 +18,7 @@ from obsynth.methods.guaranteed_test.problem import rounding_of, window_as_desig
 from obsynth.methods.guaranteed_test.programs import TOLERANCE
 from obsynth.methods.guaranteed_test.proofs import Repaired, Square, proved_threshold, repaired_multipliers
 from obsynth.methods.guaranteed_test.windows import Window, rows_before, window_of
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.proofs.balls import UNIT_ROUNDOFF, gamma, rounded_up
 from obsynth.results.design import ObserverDesign
 

@@ -12,9 +12,8 @@ from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario

@@ -22,13 +22,11 @@ from obsynth.methods.guaranteed_test.windows import (
     side_by_side,
     window_of,
 )
-from obsynth.numerics.arguments import is_finite_number, real_number
-from obsynth.numerics.arrays import LARGEST, FloatArray, require_no_overflow
+from obsynth.numerics.arguments import LARGEST, FloatArray, is_finite_number, real_number, require_no_overflow
 from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.windows import WindowObserver
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.proofs.exact_arithmetic import ExactPencil
 
 #: What each course covers, and what not.

@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.methods.guaranteed_test.windows import Window
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 
 #: Tightest tolerance that HiGHS takes.
 TOLERANCE = 1e-10

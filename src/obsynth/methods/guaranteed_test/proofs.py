@@ -25,7 +25,7 @@ from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from obsynth.methods.guaranteed_test.problem import rounded_outward
 from obsynth.methods.guaranteed_test.windows import Window
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, arb_matrix, rounded_up

@@ -13,14 +13,12 @@ from obsynth.methods.functions import design_function
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import Programmes, free_faults, problem_as_designed, window_as_designed
 from obsynth.methods.guaranteed_test.windows import courses_of, rows_before
-from obsynth.numerics.arguments import arguments_checked, real_array, whole_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray, arguments_checked, real_array, whole_number
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import measured_record
 from obsynth.observers.running import Estimates
 from obsynth.observers.windows import WindowObserver
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:

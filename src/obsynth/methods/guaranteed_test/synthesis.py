@@ -69,10 +69,9 @@ from obsynth.methods.guaranteed_test.windows import (
 )
 from obsynth.methods.method import Synthesis, silent
 from obsynth.methods.verifying import tracking_of
-from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.arguments import FloatArray
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
 from obsynth.results.design import Certificate
 from obsynth.simulation.linear import scenario_runs, scenario_stepper

@@ -25,12 +25,11 @@ import numpy as np
 
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.windows import WindowObserver
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.adaptive_bound import Start, Thresholds, adaptive_bound, thresholds_of_records

@@ -27,14 +27,13 @@ import numpy as np
 
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 from obsynth.methods.pd_observer.realisation import PdErrorSystem, solved, with_faults_as_states, with_sensor_noise
-from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
+from obsynth.numerics.arguments import ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.norms import HinfNorm
 from obsynth.numerics.ranks import RANK_TOLERANCE, rounding_rank
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.numerics.spectra import abscissa, abscissa_of, eigenvalues, pole_text
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.validation import listed
+from obsynth.plants.descriptor import DescriptorSystem, listed
 from obsynth.proofs.balls import Ball, Enclosed, block
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite
 from obsynth.results.checks import Check, fitting_check, information, lower_bound_check, upper_bound_check

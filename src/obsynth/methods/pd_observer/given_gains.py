@@ -19,8 +19,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.method import Synthesis
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
 from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states
-from obsynth.numerics.arguments import require_shape
-from obsynth.numerics.arrays import FloatArray, as_matrix, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, as_matrix, largest_singular_value, require_shape
 from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_solution
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.scaling import balanced_matrix

@@ -19,7 +19,7 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.methods.conic import lmi
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.doubling import symmetric
 
 #: How far inside the cone the inequalities must hold, with ``P3 + P3' >= 2 I`` as the scale.

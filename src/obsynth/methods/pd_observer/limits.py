@@ -10,7 +10,7 @@ from obsynth.analysis.structure import analyse_structure
 from obsynth.errors import InfeasibleError
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import with_sensor_noise
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, largest_singular_value
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE, decide_rank
 from obsynth.numerics.scaling import balanced_matrix, equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem

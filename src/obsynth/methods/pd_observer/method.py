@@ -22,8 +22,7 @@ from obsynth.methods.method import (
     Synthesis,
     own_term_conflicts,
 )
-from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, real_array, shown
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arguments import FloatArray, NonNegative, Positive, WrittenAs, as_matrix, real_array, shown
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel

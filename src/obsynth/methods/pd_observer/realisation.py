@@ -18,7 +18,7 @@ from functools import cached_property
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.continuous import ContinuousNorms
 from obsynth.numerics.norms import HinfNorm
 from obsynth.observers.linear.observer import LinearObserver

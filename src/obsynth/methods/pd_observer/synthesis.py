@@ -41,7 +41,7 @@ from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve
 from obsynth.methods.pd_observer.limits import default_delta, fastest_mode, require_possible
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states, with_sensor_noise
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, largest_singular_value
 from obsynth.numerics.doubling import EQUATION_TOLERANCE, continuous_riccati_solution, symmetric
 from obsynth.numerics.matrix_equations import continuous_solution
 from obsynth.numerics.ranks import NEGLIGIBLE_SHARE

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, largest_singular_value
+from obsynth.numerics.arguments import SMALLEST, ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.spectra import SAME_POLE, decay_rates, spectrum_error
 
 #: Random starts of the search, and fewer for large pairs; each step costs two Sylvester equations.

@@ -16,8 +16,7 @@ import numpy as np
 
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.conic import lmi
-from obsynth.numerics.arguments import is_finite_number
-from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value
+from obsynth.numerics.arguments import SMALLEST, FloatArray, is_finite_number, largest_singular_value
 from obsynth.numerics.doubling import continuous_riccati_solution
 from obsynth.numerics.matrix_equations import (
     continuous_lyapunov,

@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from obsynth.analysis.time_varying import HorizonRanks, horizon_ranks
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.methods.recursive.conditions import SOURCE, recursive_conditions
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.matrix_equations import discrete_lyapunov
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import KNOWN_SHARE, RANK_TOLERANCE, numerical_rank
@@ -51,8 +51,7 @@ from obsynth.observers.recursive.gain_schedule import (
 from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options
 from obsynth.observers.recursive.step_model import StepMatrices
 from obsynth.observers.running import plain_recursion
-from obsynth.plants.time_varying import MatrixSequence, TimeVaryingDescriptorSystem
-from obsynth.plants.validation import listed
+from obsynth.plants.descriptor import MatrixSequence, TimeVaryingDescriptorSystem, listed
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction, proved_rate
 from obsynth.proofs.definiteness import prove_positive_definite

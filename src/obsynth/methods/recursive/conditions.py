@@ -18,8 +18,7 @@ import numpy as np
 from flint import fmpz_poly
 
 from obsynth.analysis.conditions import Condition, rank_condition
-from obsynth.analysis.existence.numbers import SystemFacts
-from obsynth.analysis.existence.statements import Evaluator, FullRank, NoZeroOutside, settled_rank
+from obsynth.analysis.existence.statements import Evaluator, FullRank, NoZeroOutside, SystemFacts, settled_rank
 from obsynth.analysis.time_varying import (
     STEPS_WITHOUT_HORIZON,
     HorizonRanks,
@@ -32,7 +31,7 @@ from obsynth.analysis.time_varying import (
 )
 from obsynth.analysis.zeros import are_outside, leading_names
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, remembered
+from obsynth.numerics.arguments import FloatArray, remembered
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import (
     NAMED_SHARE,
@@ -45,8 +44,7 @@ from obsynth.numerics.ranks import (
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
 from obsynth.numerics.spectra import pole_text
 from obsynth.numerics.square_root_estimation import OUTGROWN, least_squares_step, rank_revealing_step
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 
 
 def constant_plant(

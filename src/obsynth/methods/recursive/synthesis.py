@@ -32,8 +32,14 @@ from obsynth.analysis.zeros import are_outside, leading_names
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.method import Method, Synthesis
 from obsynth.methods.recursive.conditions import described_mode, detectability_condition, recursive_conditions
-from obsynth.numerics.arguments import arguments_checked, require_shape
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only, require_no_overflow
+from obsynth.numerics.arguments import (
+    FloatArray,
+    arguments_checked,
+    as_matrix,
+    read_only,
+    require_no_overflow,
+    require_shape,
+)
 from obsynth.numerics.matrix_equations import discrete_lyapunov, discrete_riccati
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencils import finite_zeros
@@ -53,8 +59,7 @@ from obsynth.observers.recursive.gain_schedule import (
 )
 from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options, plain_options
 from obsynth.observers.recursive.step_model import stacked_noise
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.results.design import Certificate
 
 #: Prior deviation of an unknown input at the first sample, relative to the one that moves a state by its own prior

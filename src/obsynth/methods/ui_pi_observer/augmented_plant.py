@@ -20,12 +20,10 @@ import numpy as np
 from flint import fmpz_poly
 from numpy.typing import NDArray
 
-from obsynth.analysis.existence.numbers import PlantNumbers, SystemFacts
-from obsynth.analysis.existence.statements import Evaluator
+from obsynth.analysis.existence.statements import Evaluator, PlantNumbers, SystemFacts
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import require_shape
-from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.arguments import FloatArray, largest_singular_value, require_shape
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank, numerical_rank, product_but_rounding, real_but_rounding
 from obsynth.numerics.scaling import equilibrating_factors
 from obsynth.numerics.spectra import pole_text

@@ -28,8 +28,7 @@ from obsynth.analysis.zeros import is_outside, leading_names, system_pencil, sys
 from obsynth.errors import SpecError
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant, equilibrated, number, numbers, shipped_model
 from obsynth.methods.ui_pi_observer.conditions import existence_conditions
-from obsynth.numerics.arguments import arguments_checked, real_array
-from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
+from obsynth.numerics.arguments import ComplexArray, FloatArray, arguments_checked, largest_singular_value, real_array
 from obsynth.numerics.lapack import LAPACK_BLOCK
 from obsynth.numerics.modal_response import pencils_at
 from obsynth.numerics.norms import balanced_realisation, response

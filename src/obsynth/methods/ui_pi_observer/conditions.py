@@ -23,19 +23,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.existence.named_pencils import NamedPencil, least_share, named_augmented, zeros_at_rounding_level
-from obsynth.analysis.existence.numbers import SystemFacts
+from obsynth.analysis.existence.named_pencils import (
+    NamedPencil,
+    Unclear,
+    least_share,
+    named_augmented,
+    zeros_at_rounding_level,
+)
 from obsynth.analysis.existence.statements import (
     SCATTER,
     Evaluator,
     FullRank,
     NoZeroOutside,
+    SystemFacts,
     believed,
     reconsidered,
     settled_rank,
     zero_verdict,
 )
-from obsynth.analysis.existence.witnesses import Unclear
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations.elimination import (
     dynamic_coordinates,
@@ -65,7 +70,7 @@ from obsynth.methods.ui_pi_observer.augmented_plant import (
     number,
     numbers,
 )
-from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
+from obsynth.numerics.arguments import ComplexArray, FloatArray, remembered
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil

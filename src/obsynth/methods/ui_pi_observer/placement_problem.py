@@ -33,8 +33,7 @@ from obsynth.methods.ui_pi_observer.augmented_plant import (
     paper_decoupling,
     realise,
 )
-from obsynth.numerics.arguments import require_shape
-from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, largest_singular_value
+from obsynth.numerics.arguments import ComplexArray, FloatArray, as_matrix, largest_singular_value, require_shape
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE, product_but_rounding
 from obsynth.numerics.scaling import LogBalance

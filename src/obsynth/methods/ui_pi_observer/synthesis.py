@@ -30,7 +30,7 @@ from obsynth.methods.ui_pi_observer.placement_problem import (
     kalman_problem,
     placement_problem,
 )
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE
 from obsynth.numerics.spectra import decay_rates
 from obsynth.plants.descriptor import DescriptorSystem

@@ -13,13 +13,12 @@ import numpy as np
 
 from obsynth.analysis.dae_structure import Identifiability, identifiability, index_report
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, read_only
 from obsynth.numerics.lapack import pencil_eigenvalues
 from obsynth.observers.dae.estimates import DAERow, GatheredRows
 from obsynth.observers.dae.observer import DAEObserver, advanced
 from obsynth.observers.records import named_bounds, named_covariance, named_vector
-from obsynth.plants.dae.functions import local_equations
-from obsynth.plants.dae.model import DAEModel, step_length
+from obsynth.plants.dae import DAEModel, local_equations, step_length
 
 #: Radians that a mode may turn in one step of backward Euler: its amplitude then falls by an eighth of a per cent.
 LARGEST_TURN = 0.05

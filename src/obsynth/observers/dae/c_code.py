@@ -1,6 +1,6 @@
 """An observer of a DAE as C99 or a shared library: CasADi writes its graph, around it stands the loop of Newton.
 
-The loop is that of `obsynth.numerics.newton` and `obsynth.plants.dae.step`; outliers, jumps, bounds of states and
+The loop is that of `obsynth.numerics.newton` and `obsynth.plants.dae`; outliers, jumps, bounds of states and
 sensors of their own times are those of `obsynth.observers.dae.steps`.
 """
 
@@ -24,15 +24,14 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics import newton
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.ranks import DEPENDENT_BOUND
 from obsynth.observers.dae.settings import initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import Steps
 from obsynth.observers.outliers import COMPARABLE, FAR_OUT, LONGEST_LEFT_OUT, NO_SQUARE, RESET_WINDOW, chi_square_limit
-from obsynth.plants.dae import step as implicit_step
-from obsynth.plants.dae.functions import DAEFunctions
-from obsynth.plants.dae.step import PROJECTION_NOTICE, PROJECTION_SHARE, step_graph
+from obsynth.plants import dae
+from obsynth.plants.dae import PROJECTION_NOTICE, PROJECTION_SHARE, DAEFunctions, step_graph
 
 #: What ``record.c`` hands out of a batch, in this order.
 BATCH_PARTS = ("posterior", "theta", "spread", "innovation", "nis", "residual")
@@ -130,11 +129,11 @@ def _constants(steps: Steps, graph: ObserverGraph, functions: Iterable[Any]) -> 
         "AT_RESIDUAL": graph.row.slices["residual"].start,
         "MOST_ITERATIONS": newton.MOST_ITERATIONS,
         "MOST_HALVINGS": newton.MOST_HALVINGS,
-        "MOST_SUBSOLVES": implicit_step.MOST_SUBSOLVES,
+        "MOST_SUBSOLVES": dae.MOST_SUBSOLVES,
         "LAST_STEP": newton.LAST_STEP,
         "LARGEST_RESIDUAL": newton.LARGEST_RESIDUAL,
-        "FIRST_FRACTION": implicit_step.FIRST_FRACTION,
-        "LEAST_FRACTION": implicit_step.LEAST_FRACTION,
+        "FIRST_FRACTION": dae.FIRST_FRACTION,
+        "LEAST_FRACTION": dae.LEAST_FRACTION,
         "PROJECTION_NOTICE": PROJECTION_NOTICE,
         "LARGEST_MOVE": "HUGE_VAL" if move is None else float(move),
         **{f"WORK_{name.upper()}": size for name, size in work.items()},

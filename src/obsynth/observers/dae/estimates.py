@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from obsynth.analysis.dae_structure import involved
 from obsynth.errors import SolverError
 from obsynth.numerics import lapack
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, read_only
 from obsynth.numerics.ranks import SINGULAR_CONDITION
 from obsynth.observers.running import NO_NUMBERS, STEP_RESIDUAL, Estimates, named_estimates
 

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arguments import checked_value, real_array
-from obsynth.numerics.arrays import FloatArray, all_finite, as_given
+from obsynth.numerics.arguments import FloatArray, all_finite, as_given, checked_value, real_array
 from obsynth.numerics.ranks import SINGULAR_CONDITION
 from obsynth.observers.dae.c_code import DAELibrary
 from obsynth.observers.dae.estimates import DAERow, GatheredRows, SampleEstimates, require_regular
@@ -23,8 +22,7 @@ from obsynth.observers.dae.steps import DAEState, Steps
 from obsynth.observers.progress import shown_progress
 from obsynth.observers.records import measured_record, require_inputs
 from obsynth.observers.running import Estimates
-from obsynth.plants.dae.functions import Compiled, take_samples
-from obsynth.plants.dae.model import checked_inputs
+from obsynth.plants.dae import Compiled, checked_inputs, take_samples
 
 #: Samples in one call of the C: a tenth of a second or less, so that progress shows and memory stays small.
 SAMPLES_PER_CALL = 10_000
@@ -130,7 +128,7 @@ class DAEObserver(DAESettings):
     integration : {"backward-euler", "radau"}
         How F is discretised.
     largest_move : float or None
-        In nominal sizes of the states; see `obsynth.plants.dae.step.ImplicitStep`.
+        In nominal sizes of the states; see `obsynth.plants.dae.ImplicitStep`.
     window : int
         Samples over which excitation is watched.
     outliers, outlier_limit, outlier_sizes, sensors, state_bounds

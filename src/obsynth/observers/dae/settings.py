@@ -13,18 +13,19 @@ from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import (
     Count,
+    FloatArray,
     ForgettingFactor,
     Positive,
     Probability,
+    as_matrix,
+    read_only,
     require_kind,
     require_shape,
 )
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import covariance_factor, is_definite
 from obsynth.observers.outliers import Outliers
 from obsynth.observers.running import StepObserver
-from obsynth.plants.dae.functions import BUTCHER
-from obsynth.plants.dae.model import DAEModel, finite_vector, step_length
+from obsynth.plants.dae import BUTCHER, DAEModel, finite_vector, step_length
 
 Form: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman"]
 Guard: TypeAlias = Literal["regularise", "none"]

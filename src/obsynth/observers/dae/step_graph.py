@@ -15,8 +15,7 @@ import numpy as np
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.newton import definite_solved
 from obsynth.observers.dae.settings import DAESettings, Layout, memory_layout, row_layout
-from obsynth.plants.dae.functions import DAEFunctions
-from obsynth.plants.dae.step import StepGraph, input_effect, step_graph
+from obsynth.plants.dae import DAEFunctions, StepGraph, input_effect, step_graph
 
 Arrays = dict[str, Any]
 

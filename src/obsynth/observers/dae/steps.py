@@ -10,15 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.errors import SolverError
-from obsynth.numerics.arrays import FloatArray, all_finite, read_only
+from obsynth.numerics.arguments import FloatArray, all_finite, read_only
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.settings import DAESettings, initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph, observer_graph
 from obsynth.observers.outliers import checked_limit, has_jumped, no_refusals, projected, robust_advance, with_surprise
 from obsynth.observers.records import TakenInputs, held_inputs, no_inputs, over_samples, taken_inputs
-from obsynth.plants.dae.functions import Compiled
-from obsynth.plants.dae.step import ImplicitStep, onto_constraint
+from obsynth.plants.dae import Compiled, ImplicitStep, onto_constraint
 
 
 class DAEState(NamedTuple):

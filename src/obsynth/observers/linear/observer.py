@@ -18,16 +18,20 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import (
+    ComplexArray,
+    FloatArray,
     arguments_checked,
+    as_matrix,
     is_finite_number,
     is_whole,
+    read_only,
     real_array,
     real_number,
+    remembered,
     require_kind,
     require_shape,
     shown,
 )
-from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, read_only, remembered
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.spectra import abscissa, eigenvalues, speeds

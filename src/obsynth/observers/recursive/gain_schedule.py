@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.analysis.time_varying import STEPS_WITHOUT_HORIZON
 from obsynth.errors import PreconditionError, SolverError, SpecError
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arguments import FloatArray, read_only
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.numerics.spectra import abscissa

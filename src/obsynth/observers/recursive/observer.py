@@ -25,11 +25,14 @@ from obsynth.analysis.time_varying import IntArray, early_rows
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import (
     Count,
+    FloatArray,
     ForgettingFactor,
     Probability,
+    as_matrix,
     check_fields,
     checked_value,
     is_number,
+    read_only,
     real_array,
     real_number,
     real_vector,
@@ -37,7 +40,6 @@ from obsynth.numerics.arguments import (
     require_shape,
     truth,
 )
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import UNDETERMINED_SHARE, covariance_factor, rounding_rank
 from obsynth.numerics.square_root_estimation import (
     DEPENDENT_COLUMN,
@@ -79,7 +81,7 @@ from obsynth.observers.recursive.step_model import (
     with_missing_inputs,
 )
 from obsynth.observers.running import Estimates, StepObserver, named_estimates
-from obsynth.plants.time_varying import MatrixSequence, TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import MatrixSequence, TimeVaryingDescriptorSystem
 
 Form: TypeAlias = Literal["innovation", "literal", "random-walk"]
 Guard: TypeAlias = Literal["regularise", "directional", "none"]

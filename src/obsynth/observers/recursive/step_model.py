@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.analysis.time_varying import IntArray
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.numerics.square_root_estimation import (
     OUTGROWN,
@@ -25,7 +25,7 @@ from obsynth.numerics.square_root_estimation import (
     projection_of,
     row_sizes,
 )
-from obsynth.plants.time_varying import MatrixSequence, TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import MatrixSequence, TimeVaryingDescriptorSystem
 
 #: From so many rows on the noise that stays the same is brought to a triangle once, and only what moves is added to it.
 MANY_ROWS = 100

@@ -1,6 +1,11 @@
-"""A finished design for people: what its plant is, what it promises, and what it may still not do.
+"""Designs, plants and scenarios for people, as tables and sentences.
 
-A finished design in about twelve lines: what it is, what each fault estimate is worth, what it rests on.
+A finished design: what its plant is, what it promises, and what it may still not do; in about twelve lines: what it is,
+what each fault estimate is worth, what it rests on.
+
+A plant: its structure, what can be diagnosed on it, which methods can serve it, its matrices as text.
+
+Simulations, evaluations and comparisons: how far estimates were off, how often alarms were right.
 """
 
 from __future__ import annotations
@@ -8,35 +13,42 @@ from __future__ import annotations
 import math
 import re
 import textwrap
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
-from typing import Any
+from textwrap import fill
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from obsynth.analysis.diagnosis.diagnosing import Diagnosis
 from obsynth.analysis.diagnosis.fault_columns import dc_point, others, question
-from obsynth.analysis.structure import questions
+from obsynth.analysis.structure import Structure, questions
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.errors import ObsynthError, PreconditionError
+from obsynth.experiments.monitors.monitor import Monitor
+from obsynth.experiments.monte_carlo import Evaluation, Interval
+from obsynth.experiments.simulation import Simulation
+from obsynth.files.outputs import yaml_text
 from obsynth.files.tables import html_table
 from obsynth.methods.fault_figures import SETTLING_SAMPLES, FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.kalman_gain import DelayCurve, delay_curve, settling_time
 from obsynth.methods.registry import REGISTRY, method_class
+from obsynth.observers.decisions import ParameterMonitor
 from obsynth.observers.linear.observer import SETTLED_TO, LinearObserver, sample_observer, transient
 from obsynth.observers.windows import WindowObserver
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.plants.validation import listed
-from obsynth.plotting.spectra import FaultGains, fault_gains
-from obsynth.results.checks import FITS
-from obsynth.results.design import ObserverDesign
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem, listed
+from obsynth.plotting.trade_off import FaultGains, fault_gains
+from obsynth.results.checks import FITS, Check
+from obsynth.results.design import ObserverDesign, VerificationReport
 from obsynth.results.layout import (
+    checks_table,
+    complex_numbers,
     facts_table,
     headed_table,
     name_list,
@@ -45,6 +57,10 @@ from obsynth.results.layout import (
     print_section,
     verdict_line,
 )
+from obsynth.verification.plant import PLANT_MATRICES
+
+if TYPE_CHECKING:
+    from obsynth.comparison.comparing import Comparison
 
 
 def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
@@ -580,3 +596,374 @@ def _table(headings: Sequence[str], rows: Sequence[Sequence[str]], width: int) -
     yield line(headings), "bold"
     for row in rows:
         yield line(row), ""
+
+
+def check_report(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel,
+    structures: Mapping[str, Structure],
+    methods: Mapping[str, VerificationReport],
+    *,
+    console: Console,
+    transformation: str = "",
+) -> None:
+    """Print the structure of a plant, and for each method whether it can serve this plant."""
+    facts = list(plant_facts(plant))
+    if transformation:
+        facts.insert(0, ("transformed", transformation))
+    print_section(console, "Plant", facts_table(facts))
+    columns = [structure_facts(structure) for structure in structures.values()]
+    if columns:
+        rows = [(label, *(column[label] for column in columns)) for label in columns[0]]
+        headings = ["", *structures] if len(columns) > 1 else []
+        print_section(console, "Structure (information, no verdict)", facts_table(rows, headings=headings))
+    for method, report in methods.items():
+        title = f"Existence conditions of {method}"
+        print_section(console, title, checks_table(report.checks, width=console.width))
+        console.print(_existence_line(method, report))
+
+
+def _existence_line(method: str, report: VerificationReport) -> Text:
+    if report.passed:
+        return Text(f"{method}: all conditions hold, so a design exists.", style="green")
+    failed = ", ".join(check.name for check in report.failures) or "no condition was checked"
+    if {check.name for check in report.failures} & _ASKED:
+        return Text(f"{method}: needs more options: {failed}.", style="yellow")
+    return Text(f"{method}: {_verdict(report.failures)} for this plant: {failed}.", style="bold red")
+
+
+def is_unclear(failed: Sequence[Check]) -> bool:
+    """Whether all conditions that do not hold are undecided."""
+    return bool(failed) and all(check.unclear for check in failed)
+
+
+def _verdict(failed: Sequence[Check]) -> str:
+    return "UNCLEAR" if is_unclear(failed) else "IMPOSSIBLE"
+
+
+def structure_facts(structure: Structure) -> dict[str, str]:
+    """Return the facts about a plant's structure."""
+    blocks = [f"{size}" for size in structure.infinite_block_sizes]
+    return {
+        "pencil A - zE": "regular" if structure.regular else "NOT regular",
+        "index": "-" if structure.index is None else str(structure.index),
+        "rank of E": structure.rank_of_E.describe(),
+        "finite eigenvalues": complex_numbers(structure.finite_eigenvalues),
+        "infinite blocks": f"{len(blocks)}, of size {name_list(sorted(set(blocks)))}" if blocks else "none",
+        "impulse-free": _yes(structure.impulse_free),
+        "stable": _yes(structure.stable),
+        "admissible": _yes(structure.admissible),
+        "finitely observable": _yes(structure.finitely_observable),
+        "unobservable modes": complex_numbers(structure.unobservable_modes),
+        "detectable": _yes(structure.detectable),
+        "undetectable modes": complex_numbers(structure.undetectable_modes),
+        "impulse observable": _yes(structure.impulse_observable),
+        "rank [E; C] = nx": _yes(structure.causally_observable),
+        "unclear ranks": name_list(structure.unclear),
+    }
+
+
+def _yes(value: bool) -> str:
+    return "yes" if value else "no"
+
+
+#: Of a bank of residuals so many rows are shown.
+MOST_BANK_ROWS = 12
+#: What the columns of numbers mean.
+_COLUMN_MEANINGS = (
+    "detectable: some residual responds to the fault; steady state: also to a constant one. as a step, any signal: the "
+    "fault can be estimated if it is a step, or whatever its time course. delay: samples, or derivatives of the "
+    "outputs in continuous time. residual, filter: order of the smallest residual generator, and of a filter that "
+    "estimates the fault."
+)
+
+
+def diagnosis_report(diagnosis: Diagnosis, *, console: Console, everything: bool = True) -> None:
+    """Print what can be diagnosed: verdicts and sentences; isolability and banks with ``everything``."""
+    if not diagnosis.faults:
+        return
+    print_section(console, diagnosis.heading, _rich_table(diagnosis.verdict_rows()))
+    console.print(Text(_COLUMN_MEANINGS, style="dim"))
+    if everything and len(diagnosis.faults) > 1:
+        rows = diagnosis.bank_rows()
+        print_section(
+            console,
+            "Isolability: which fault (row) can be distinguished from which (column)",
+            _rich_table(diagnosis.isolability_rows()),
+        )
+        more = len(rows) - 1 - MOST_BANK_ROWS
+        title = "Structured residuals" + (f" ({more} more are not shown; --json has them)" if more > 0 else "")
+        if len(rows) > 1:
+            print_section(console, title, _rich_table(rows[: MOST_BANK_ROWS + 1]))
+    for sentence in diagnosis.sentences:
+        console.print(Text(sentence))
+    for warning in diagnosis.warnings:
+        console.print(Text(f"Warning: {warning}", style="yellow"))
+    if diagnosis.sentences or diagnosis.warnings:
+        console.print()
+
+
+def _rich_table(rows: Sequence[Sequence[str]]) -> Table:
+    table = headed_table(*rows[0])
+    for column, (heading, *cells) in zip(table.columns, zip(*rows, strict=True), strict=True):
+        column.overflow = "fold"
+        # A column that cannot fold must not be narrowed: the last columns would be cut off.
+        column.no_wrap = " " not in heading and all(len(cell) <= len(heading) for cell in cells)
+    for row in rows[1:]:
+        table.add_row(*(Text(text) for text in row))
+    return table
+
+
+#: Conditions that ask for another time than the plant's, and what to do about each.
+_TIME_CONDITIONS = {
+    "exists: continuous time": "continuous only: design for the plant in continuous time (dt: 0, without sample_time), "
+    "and sample the observer afterwards (obsynth.sample_observer)",
+    "exists: discrete time": "discrete only: sample the plant first (transform: {sample_time: ...})",
+}
+#: Conditions on what a spec says, which the plant cannot fail.
+_ASKED = {"exists: bounds stated", "exists: fault named", "exists: region stated", "exists: stated"}
+_PLANT_KIND, _OF_THIS_KIND = "exists: kind of plant", "exists: plant of this kind"
+
+
+def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") -> Iterator[tuple[str, str, str]]:
+    """Yield method, verdict in words and style; methods for other kinds of plants come last, in one line."""
+    others = []
+    for method, report in methods.items():
+        failed = report.failures
+        names = {check.name for check in failed}
+        asked = " (the spec's method)" if method == own else ""
+        if report.passed:
+            yield method, f"all conditions hold, so a design exists{asked}", "green"
+        elif _PLANT_KIND in names and method != own:
+            others.append(method)
+        elif names & set(_TIME_CONDITIONS):
+            yield method, next(text for name, text in _TIME_CONDITIONS.items() if name in names) + asked, "yellow"
+        elif _OF_THIS_KIND in names:
+            reason = next(check.detail for check in failed if check.name == _OF_THIS_KIND)
+            yield method, f"not for this plant{asked}: {reason}".rstrip("."), "yellow"
+        elif names & _ASKED:
+            reason = " ".join(check.detail for check in failed if check.name in _ASKED)
+            yield method, f"needs more options{asked}: {reason}".rstrip("."), "yellow"
+        else:
+            yield method, f"{_verdict(failed)} for this plant{asked}: {_reason(failed)}", "bold red"
+    if others:
+        yield "for other kinds of plants", ", ".join(others), "dim"
+
+
+def print_methods(methods: Mapping[str, VerificationReport], *, own: str, console: Console) -> None:
+    """Print the lines of all methods."""
+    for method, text, style in method_lines(methods, own=own):
+        lines = textwrap.wrap(
+            f"{method}: {text}", min(console.width, 120), subsequent_indent="  ", break_on_hyphens=False
+        )
+        for line in lines:
+            console.print(Text(line, style=style), soft_wrap=True)
+
+
+def _reason(failed: Sequence[Check]) -> str:
+    if not failed:
+        return "no condition was checked"
+    first, *more = failed
+    told = f"the condition '{first.name.removeprefix('exists: ')}' FAILS. Needed: {first.claim}".rstrip(".")
+    told += f". Found: {first.detail}".rstrip(".") if first.detail else ""
+    return f"{told}." + (f" {_more_fail(len(more))}" if more else "")
+
+
+def _more_fail(count: int) -> str:
+    return "1 more condition fails (-v)." if count == 1 else f"{count} more conditions fail (-v)."
+
+
+_PLANT_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names")
+
+
+def linear_plant_text(plant: DescriptorSystem) -> str:
+    """Return operating point and matrices, each with its signals."""
+    lines = ["Operating point:"]
+    for name, value in plant.operating_point.items():
+        unit = plant.units.get(name, "1")
+        lines.append(f"  {name} = {value:.8g}{'' if unit == '1' else ' ' + unit}")
+    for name, signals in (
+        ("E", plant.state_names),
+        ("A", plant.state_names),
+        ("B", plant.input_names),
+        ("C", plant.state_names),
+        ("Bf", plant.fault_names),
+        ("Df", plant.fault_names),
+        ("Bd", plant.disturbance_names),
+    ):
+        matrix = getattr(plant, name)
+        if matrix.size and (np.any(matrix) or name in "EABC"):
+            lines += [f"{name}, columns {', '.join(signals)}:"]
+            lines += ["  " + "  ".join(f"{value + 0.0:>11.5g}" for value in row) for row in matrix]
+    return "\n".join(lines)
+
+
+def plant_document(plant: DescriptorSystem, source: str) -> str:
+    """Return the plant as YAML that a spec can name; every number as exact as it is."""
+    data: dict[str, Any] = {"schema_version": 1, "dt": float(plant.dt)}
+    for name in PLANT_MATRICES:
+        matrix = getattr(plant, name)
+        if matrix.size and (np.any(matrix) or name in "EAC"):
+            data[name] = [[float(value) + 0.0 for value in row] for row in matrix]
+    data |= {name: list(getattr(plant, name)) for name in _PLANT_NAMES if getattr(plant, name)}
+    data["operating_point"] = {name: float(value) for name, value in plant.operating_point.items()}
+    data["units"] = dict(plant.units)
+    where = "at the operating point below and at nominal values of all constants"
+    return f"# Linearised by obsynth from {source}, {where}.\n{yaml_text(data)}"
+
+
+#: Rows of a table; of a large plant the worst estimates are shown.
+SHOWN_ROWS = 12
+_DECISIONS = {
+    "false_alarm_rate": ("false alarms", "share of runs"),
+    "missed_detection_rate": ("missed detections", "share of runs"),
+    "detection_delay": ("detection delay", "s"),
+    "isolation_error_rate": ("wrong fault named", "share of detections"),
+}
+
+
+def evaluation_report(
+    name: str,
+    found: Evaluation,
+    *,
+    monitor: Monitor | ParameterMonitor | None,
+    console: Console,
+    units: Mapping[str, str],
+    beside: Sequence[str] = (),
+) -> None:
+    """Print rates, delays and errors over many runs; ``beside``: sentences on thresholds."""
+    share = f"{100.0 * found.confidence:g} % interval"
+    console.print(Text(f"{name}: {found.runs} runs", style="bold"))
+    console.print()
+    if monitor is not None:
+        table = headed_table("decisions", "value", share, "of", "unit")
+        for key, (title, unit) in _DECISIONS.items():
+            item: Interval = getattr(found, key)
+            if item.count:
+                table.add_row(Text(title), number(item.value), _interval(item), str(item.count), Text(unit))
+        kind, statement = described(monitor)
+        print_section(console, f"Monitor {kind}", table)
+        end = final_threshold(monitor)
+        size = "" if end is None else f" ({number(end)} at the end of a run)"
+        console.print(Text(f"Its threshold{size}: {statement}."))
+        console.print()
+    for sentence in beside:
+        console.print(Text(sentence))
+    for title, errors in (("Fault estimates", found.fault_rmse), ("State estimates", found.state_rmse)):
+        if errors:
+            table = headed_table("signal", "RMSE after warm-up", share, "unit")
+            title, rows = _worst(title, list(errors.items()), lambda row: row[1].value)
+            for signal, item in rows:
+                table.add_row(Text(signal), number(item.value), _interval(item), Text(units.get(signal, "")))
+            print_section(console, f"{title} (mean over runs)", table)
+
+
+def _worst(title: str, rows: list[Any], size: Callable[[Any], float]) -> tuple[str, list[Any]]:
+    """Return title and rows of a table; of many the worst."""
+    if len(rows) <= SHOWN_ROWS:
+        return title, rows
+    return f"{title}: the worst {SHOWN_ROWS} of {len(rows)}", sorted(rows, key=lambda row: -size(row))[:SHOWN_ROWS]
+
+
+def described(monitor: Monitor | ParameterMonitor) -> tuple[str, str]:
+    """Return which monitor it is, and what its threshold means."""
+    if isinstance(monitor, Monitor):
+        return monitor.kind, monitor.statement
+    return monitor.statistic, (
+        "of a decision on parameters, passed in a run without a change with about the stated probability "
+        f"({monitor.false_alarms:g})"
+    )
+
+
+def final_threshold(monitor: Monitor | ParameterMonitor) -> float | None:
+    """Return the threshold at the end of a run; ``None`` where it is not the same in each run, or decides nothing."""
+    if not isinstance(monitor, Monitor) or not monitor.threshold.size or not np.isfinite(monitor.threshold[-1]):
+        return None
+    return float(monitor.threshold[-1])
+
+
+def _interval(item: Interval) -> str:
+    return "-" if math.isnan(item.low) else f"{number(item.low)} to {number(item.high)}"
+
+
+#: Columns left out where the console is narrower than so many characters.
+NARROW = 130
+_LESS = ("order", "s to 50 %", "at horizon", "peak", "bias", "s to alarm", "smallest", "ms")
+#: Columns of names, how wide they are there (eighty columns less six of numbers), and how wide headings of numbers.
+_NAME_COLUMNS = ("method", "fault")
+_NAME_WIDTH, _HEADING_WIDTH = 11, 8
+
+
+def comparison_report(found: Comparison, *, console: Console, file: Path | None = None) -> None:
+    """Print what was compared, the table, the refusals and the recommendation."""
+    header, *rows = found.rows()
+    wide = console.width >= NARROW
+    kept = [i for i, name in enumerate(header) if wide or name not in _LESS]
+    table = headed_table(
+        *(header[i] if wide else fill(header[i], _HEADING_WIDTH, break_long_words=False) for i in kept)
+    )
+    # Only names break, and at their hyphens and blanks: a number that is cut is another number.
+    for column, i in zip(table.columns, kept, strict=True):
+        column.no_wrap = header[i] not in _NAME_COLUMNS
+        if not column.no_wrap:
+            words = [word for row in rows for word in row[i].replace("-", "- ").split()]
+            column.min_width = min(max(map(len, [header[i], *words])), _NAME_WIDTH)
+    for row in rows:
+        texts = [row[i] if wide or header[i] not in _NAME_COLUMNS else fill(row[i], _NAME_WIDTH) for i in kept]
+        table.add_row(*map(Text, texts))
+    console.print(Text(found.setting))
+    for note in found.notes:
+        console.print(Text(note, style="yellow"))
+    if rows:
+        print_section(console, "", table)
+        console.print(Text(found.meanings([header[i] for i in kept]), style="dim"))
+    for refusal in found.refusals:
+        console.print(Text(refusal, style="yellow"))
+    console.print(Text(found.advice, style="bold"))
+    if file is not None:
+        console.print(Text(f"Written: {file}"), soft_wrap=True)
+
+
+def simulation_report(
+    name: str,
+    found: Simulation,
+    *,
+    console: Console,
+    units: Mapping[str, str],
+    file: str | None = None,
+) -> None:
+    """Print errors of all estimates: after warm-up for linear designs, with the coverage of their bands for others."""
+    summary = found.summary()
+    console.print(Text(f"{name}: {summary['samples']} samples, {found.time[-1]:g} s", style="bold"))
+    console.print()
+    linear = not found.estimates.has_deviations
+    for kind, title in (
+        ("faults", "Fault estimates" if linear else "Parameter estimates"),
+        ("states", "State estimates"),
+    ):
+        if not summary[kind]:
+            continue
+        lasts = _last_column(found, kind)
+        table = headed_table("signal", "RMSE", "largest error", next(lasts), "unit")
+        title, rows = _worst(title, list(zip(summary[kind].items(), lasts, strict=True)), lambda row: row[0][1]["rmse"])
+        for (signal, row), last in rows:
+            table.add_row(Text(signal), number(row["rmse"]), number(row["largest"]), last, Text(units.get(signal, "")))
+        told = "errors of the whole record"
+        if linear and (end := summary[f"{kind[:-1]}_warm_up"]) is None:
+            told = "the initial-condition response has not settled: errors of the whole record"
+        elif linear:
+            told = f"errors after the warm-up, which ended at {end:g} s"
+        print_section(console, f"{title} ({told})", table)
+    for note in summary["notes"]:
+        console.print(Text(note))
+    if file is not None:
+        console.print(Text(f"Written: {file}"))
+
+
+def _last_column(found: Simulation, kind: str) -> Iterator[str]:
+    """Yield a heading, and a cell for each signal: delays of a linear observer, coverage of a recursive one."""
+    if not found.estimates.has_deviations:
+        yield "delay (samples)"
+        yield from map(str, found.estimates.fault_delays if kind == "faults" else found.estimates.state_delays)
+    else:
+        yield "in its 95 % band"
+        yield from (f"{100.0 * row['within_band']:.0f} %" for row in found.summary()[kind].values())

@@ -1,1 +1,0 @@
-"""Nonlinear differential-algebraic plants."""
