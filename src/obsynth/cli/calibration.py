@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import obsynth
@@ -96,7 +95,7 @@ def run_linearise(options: argparse.Namespace) -> int:
 
 def run_calibrate(options: argparse.Namespace) -> int:
     """Run ``calibrate``: spec and log in, constants with their box and a verdict out."""
-    from obsynth.calibration.spec_writing import calibrated_spec
+    from obsynth.calibration.spec_writing import CALIBRATED_SPEC, calibrated_spec
     from obsynth.results.certificate_files import CALIBRATION_KIND, calibration_text
     from obsynth.results.design import plain
     from obsynth.spec.loader import load_plant
@@ -110,7 +109,12 @@ def run_calibrate(options: argparse.Namespace) -> int:
             raise SpecError("There is no log: give --data, or calibrate.log in the spec.", path="calibrate.log")
         protect(log)
         target = None if options.out is None else output_file(options.out, CALIBRATION, options)
-        written = None if options.write_spec is None else _spec_file(options)
+        written = None if options.write_spec is None else output_file(options.write_spec, CALIBRATED_SPEC, options)
+        if written is not None and written.resolve().parent != options.system.resolve().parent:
+            raise SpecError(
+                f"{written} is in another folder than {options.system}, whose files it refers to: write it to that "
+                "folder.", path="write-spec",
+            )  # fmt: skip
         found = obsynth.calibrate(plant, log, progress=report_stage, **asked)
         if digest is not None and digest != found.box.digest:
             raise SpecError(
@@ -128,19 +132,6 @@ def run_calibrate(options: argparse.Namespace) -> int:
     return 0
 
 
-def _spec_file(options: argparse.Namespace) -> Path:
-    """Return where the calibrated spec is written: beside the one that was read, whose files it names too."""
-    from obsynth.calibration.spec_writing import CALIBRATED_SPEC
-
-    target = output_file(options.write_spec, CALIBRATED_SPEC, options)
-    if target.resolve().parent != options.system.resolve().parent:
-        raise SpecError(
-            f"{target} is in another folder than {options.system}, whose files it refers to: write it to that folder.",
-            path="write-spec",
-        )
-    return target
-
-
 def _asked(spec: obsynth.Spec | None, options: argparse.Namespace) -> dict[str, Any]:
     """Return the arguments of `calibrate`: of the spec, those of its nonlinear method, and of the command line."""
     asked: dict[str, Any] = {"log": None}
@@ -152,8 +143,11 @@ def _asked(spec: obsynth.Spec | None, options: argparse.Namespace) -> dict[str, 
             for name in ("dt", "initial_state", "initial_covariance"):
                 if method.get(name) is not None:
                     asked[name] = _without_offsets(method[name], spec)
-        for name, value in (spec.noise or {}).items():
-            asked[name] = value if name != "sensor_noise" else _coloured(value)
+        asked |= spec.noise or {}
+        if "sensor_noise" in asked:
+            # White noise is calibrated anew.
+            coloured = {name: item for name, item in asked["sensor_noise"].items() if isinstance(item, dict)}
+            asked["sensor_noise"] = coloured or None
         asked |= dict(spec.calibrate or {})
         if asked["log"] is not None:
             asked["log"] = spec.path.parent / asked["log"]
@@ -178,11 +172,6 @@ def _without_offsets(stated: Any, spec: obsynth.Spec) -> Any:
     if not (offsets and isinstance(stated, Mapping)):
         return stated
     return {name: value for name, value in stated.items() if name not in offsets} or None
-
-
-def _coloured(noise: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the coloured noise that a spec states; none where all that it states is white."""
-    return {name: item for name, item in noise.items() if isinstance(item, dict)} or None
 
 
 def run_validate(options: argparse.Namespace) -> int:

@@ -124,7 +124,7 @@ def run_check(options: argparse.Namespace) -> int:
     _ask(spec)
     from obsynth.methods.registry import AUTO
     from obsynth.numerics.libraries import failure_of
-    from obsynth.report.tables import is_unclear
+    from obsynth.report.tables import check_report, diagnosis_report, is_unclear, print_methods
 
     if not isinstance(spec.plant, obsynth.DescriptorSystem):
         refuse_given(options, ("whole_bank",), "linear plants with constant matrices")
@@ -145,8 +145,6 @@ def run_check(options: argparse.Namespace) -> int:
     passed = any(report.passed for report in own)
 
     def told() -> None:
-        from obsynth.report.tables import check_report, diagnosis_report, print_methods
-
         console = stdout_console()
         if diagnosis is not None:
             diagnosis_report(diagnosis, console=console, everything=options.verbose)

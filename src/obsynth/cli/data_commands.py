@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import obsynth
-from obsynth.cli.commands import designed_or_loaded, spec_output
+from obsynth.cli.commands import designed_or_loaded, require_same_signals, spec_output
 from obsynth.cli.output import (
     MONITOR_NAMES,
     STREAM,
@@ -60,7 +60,8 @@ from obsynth.results.certificate_files import RESULT_FILE
 
 def protect_inputs(options: argparse.Namespace) -> None:
     """Refuse to write over what is read."""
-    for file in (options.gains, options.system, None if options.data in (None, STREAM) else Path(options.data)):
+    log = None if options.data in (None, STREAM) else Path(options.data)
+    for file in (options.gains, getattr(options, "system", None), log):
         if file is not None:
             protect(file)
     if options.data == STREAM:
@@ -95,11 +96,17 @@ def run_of(
     return found
 
 
+def stated_delay(options: argparse.Namespace) -> int | None:
+    """Return by how many rows the inputs of a log act later, as the command line says it."""
+    if options.input_delay == "auto":
+        raise SpecError("--input-delay auto is for calibrate: give a number of rows.", path="--input-delay")
+    rows: int | None = options.input_delay
+    return rows
+
+
 def with_input_delay(design: obsynth.ObserverDesign, options: argparse.Namespace) -> obsynth.ObserverDesign:
     """Return a design for a log whose inputs act as many rows later as the command line says."""
-    rows = options.input_delay
-    if rows == "auto":
-        raise SpecError("--input-delay auto is for calibrate: give a number of rows.", path="--input-delay")
+    rows = stated_delay(options)
     return design if rows is None else design.replace(input_delay=rows)
 
 
@@ -146,8 +153,6 @@ def monitor_of(
         refuse_given(options, ("sample_time", *(() if has_scenario else ("system",))), "monitors of linear designs")
     # Of other designs, and beside thresholds that were learned, a scenario is there for the pictures alone.
     if options.system is not None and not (has_scenario and (not linear or options.monitor == "learned")):
-        from obsynth.cli.commands import require_same_signals
-
         spec = obsynth.load_spec(options.system)
         require_same_signals(design, options.gains, spec)
         scenario = required_scenario(spec)
@@ -162,7 +167,7 @@ def monitor_of(
 
 def summary_of_run(found: obsynth.types.DataRun, watched: obsynth.types.Monitor | None) -> str:
     """Return what a run was, in a few lines."""
-    from obsynth.data.alarm_events import silence
+    from obsynth.data.alarm_events import alarm_notes, alarm_rows, silence
 
     counts = ", ".join(f"{count} {status}" for status, count in found.statuses.items())
     lines = [f"{found.rows} rows: {counts}."]
@@ -181,22 +186,14 @@ def summary_of_run(found: obsynth.types.DataRun, watched: obsynth.types.Monitor 
         clear = watched is not None and name == watched.kind and first is not None and first.clear
         fault = f"; it points to {first.fault}" if clear and first is not None else ""
         lines.append(f"Alarm: {name} first above its threshold at {found.stamps.shown(time)}{fault}.")
-    lines += _alarm_table(found)
+    rows, more = alarm_rows(found.events, found.stamps.shown)
+    table = [*(text_table(rows) if rows else []), *([f"and {more} more"] if more else [])]
+    lines += [*(f"  {line}" for line in table), *alarm_notes(found.events)]
     if watched is not None or found.thresholds:
         lines += silence(found, watched.kind if watched else "any threshold")
     if watched is not None:
         lines.append(f"The {watched.kind} threshold: {watched.statement}.")
     return "\n".join(lines)
-
-
-def _alarm_table(found: obsynth.types.DataRun) -> list[str]:
-    """Return lines of a table of all alarms."""
-    from obsynth.data.alarm_events import alarm_notes, alarm_rows
-
-    rows, more = alarm_rows(found.events, found.stamps.shown)
-    lines = text_table(rows) if rows else []
-    lines = [f"  {line}" for line in (*lines, *([f"and {more} more"] if more else []))]
-    return lines + alarm_notes(found.events)
 
 
 @contextmanager
@@ -300,11 +297,7 @@ def run_thresholds(options: argparse.Namespace) -> int:
 
     is_stream = options.data == STREAM
     require_distinct({"--gains": options.gains, "--out": options.out, "--data": None if is_stream else options.data})
-    protect(options.gains)
-    if is_stream:
-        protect_stream(sys.stdin)
-    else:
-        protect(Path(options.data))
+    protect_inputs(options)
     target = None if options.out is None else output_file(options.out, LEARNED, options)
     if target is not None and target.suffix.lower() != ".json":
         raise SpecError(f"{target}: thresholds are written as JSON (.json).", path="--out")
@@ -512,8 +505,6 @@ def run_report(options: argparse.Namespace) -> int:
 
 def _run_robustness(options: argparse.Namespace) -> int:
     """Write what holds for every plant within its tolerances as a certificate."""
-    from obsynth.results.certificate_files import RESULT_FILE
-
     refuse_given(
         options,
         [name for name in vars(options) if name not in ("gains", "out", "force", "json")],
@@ -561,28 +552,26 @@ def run_plot(options: argparse.Namespace) -> int:
     design, mark = gains_to_hand_on(options.gains, unverified=options.unverified)
     watched = monitor_of(design, options, has_scenario=True)
     found = run_of(design, options, watched)
-    _draw(found, design, parts, target)
-    if options.json or not options.quiet:
-        told = "\n".join([*([mark] if mark else []), summary_of_run(found, watched)])
-        unverified = {"unverified": mark} if mark else {}
-        answer(options, {"gains": options.gains, "file": target, **found.as_dict(), **unverified}, told)
-    return 0
-
-
-def _draw(found: obsynth.types.DataRun, design: obsynth.ObserverDesign, parts: list[str], target: Path | None) -> None:
     from obsynth.plotting.estimates import panel_count, plot_data
 
     if target is not None:
         count = panel_count(found, parts, design=design)
         written_picture(target, count, lambda axes: plot_data(found, design=design, show=parts, axes=axes))
-        return
-    import matplotlib as mpl
-    import matplotlib.pyplot as plt
+    else:
+        import matplotlib as mpl
+        import matplotlib.pyplot as plt
 
-    if mpl.get_backend().lower() == "agg":
-        raise SpecError("There is no screen to open a window on: give --out a file (.png, .svg or .pdf).", path="--out")
-    plot_data(found, design=design, show=parts)
-    plt.show()
+        if mpl.get_backend().lower() == "agg":
+            raise SpecError(
+                "There is no screen to open a window on: give --out a file (.png, .svg or .pdf).", path="--out"
+            )
+        plot_data(found, design=design, show=parts)
+        plt.show()
+    if options.json or not options.quiet:
+        told = "\n".join([*([mark] if mark else []), summary_of_run(found, watched)])
+        unverified = {"unverified": mark} if mark else {}
+        answer(options, {"gains": options.gains, "file": target, **found.as_dict(), **unverified}, told)
+    return 0
 
 
 def picture_kind(target: Path) -> FileKind:
@@ -697,7 +686,13 @@ def run_evaluate(options: argparse.Namespace) -> int:
         if options.monitor is not None and isinstance(design.observer, obsynth.LinearObserver):
             watched = obsynth.monitor(design, scenario, options.monitor, **monitor_settings(design, options))
         elif options.monitor is not None:
-            watched = _parameter_monitor(options)
+            table = {**PARAMETER_OPTIONS, "glr": ("false_alarms",)}
+            refuse_idle(table, options.monitor, stated_settings(options), called=flag_of)
+            watched = obsynth.ParameterMonitor(
+                options.monitor,
+                false_alarms=options.false_alarms or FALSE_ALARMS,
+                change=(options.change or CHANGE) if options.monitor == "cusum" else None,
+            )
         with chosen_executor(options.jobs, None) as executor:
             found = obsynth.evaluate(
                 design,
@@ -733,22 +728,6 @@ def run_evaluate(options: argparse.Namespace) -> int:
     return 0
 
 
-def _parameter_monitor(options: argparse.Namespace) -> obsynth.ParameterMonitor:
-    """Return the decision on parameters that is asked for."""
-    table = {**PARAMETER_OPTIONS, "glr": ("false_alarms",)}
-    refuse_idle(table, options.monitor, stated_settings(options), called=flag_of)
-    change = (options.change or CHANGE) if options.monitor == "cusum" else None
-    return obsynth.ParameterMonitor(options.monitor, false_alarms=options.false_alarms or FALSE_ALARMS, change=change)
-
-
-def _compared_delay(spec: obsynth.Spec, options: argparse.Namespace) -> int:
-    """Return rows by which the inputs of the log act later than linear designs on samples take them."""
-    if options.input_delay == "auto":
-        raise SpecError("--input-delay auto is for calibrate: give a number of rows.", path="--input-delay")
-    told = options.input_delay if options.input_delay is not None else spec.input_delay(spec.plant)
-    return told or 0
-
-
 def run_compare(options: argparse.Namespace) -> int:
     """Run ``compare``: spec in, table and recommendation out; 3 where no method exists."""
     from obsynth.comparison.comparing import COMPARISON_PAGE
@@ -762,6 +741,7 @@ def run_compare(options: argparse.Namespace) -> int:
             output_file(options.out, RESULT_FILE if _is_json(options.out) else COMPARISON_PAGE, options)
         plant, clock = _plant_and_clock(spec, options.sample_time)
         given = {} if spec.method == "auto" else {spec.method: spec.options}
+        rows = stated_delay(options)
         found = obsynth.compare(
             plant,
             scenario=spec.scenario,
@@ -773,7 +753,7 @@ def run_compare(options: argparse.Namespace) -> int:
             data=options.data,
             columns=columns_of(options),
             scales=numbers_of(options.scale),
-            input_delay=_compared_delay(spec, options),
+            input_delay=(spec.input_delay(spec.plant) if rows is None else rows) or 0,
             progress=report_stage,
         )
         if options.out is not None:

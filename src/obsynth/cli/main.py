@@ -662,11 +662,6 @@ def obsynth_parser(asked: Collection[str] | None = None) -> argparse.ArgumentPar
     return parser
 
 
-def design_parser() -> argparse.ArgumentParser:
-    """Return the parser of ``design``, which is ``obsynth design``."""
-    return _fill("design", _parser("design", VERBS["design"].told))
-
-
 def _parser(name: str, told: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=name,
@@ -709,7 +704,8 @@ BROKEN_PIPE = 141
 def usable_streams() -> Iterator[None]:
     """Let texts go to nowhere where a stream is closed, print characters that an encoding lacks, warn in one line."""
     with warnings.catch_warnings(), ExitStack() as stack:
-        warnings.showwarning = _told_warning
+        # Where in a library it arose is no use to the user.
+        warnings.showwarning = lambda message, *_, **__: print(f"Warning: {message}", file=sys.stderr)
         for name in ("stdout", "stderr"):
             stream = getattr(sys, name)
             if stream is None:
@@ -719,11 +715,6 @@ def usable_streams() -> Iterator[None]:
             elif hasattr(stream, "reconfigure"):
                 stream.reconfigure(errors="backslashreplace")
         yield
-
-
-def _told_warning(message: Warning | str, *_: object, **__: object) -> None:
-    # Where in a library it arose is no use to the user.
-    print(f"Warning: {message}", file=sys.stderr)
 
 
 def unwritable_output(error: OSError) -> int:
@@ -762,7 +753,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def design_command(arguments: Sequence[str] | None = None) -> int:
     """Run ``design``, which is ``obsynth design``."""
-    return _run(design_parser(), arguments)
+    return _run(_fill("design", _parser("design", VERBS["design"].told)), arguments)
 
 
 def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
@@ -819,18 +810,13 @@ def _refuse_words(prog: str, verb: str, rest: Sequence[str]) -> NoReturn:
     own.error(f"there is no option {wrong[0]}.{meant} See {own.prog} --help.")
 
 
-def _require_written(options: argparse.Namespace) -> None:
-    """Refuse ``--force`` where no file is written."""
-    files = ("output", "out", "write_spec", "to", "state", "prove")
-    places = [getattr(options, name) for name in files if hasattr(options, name)]
-    if getattr(options, "force", False) and options.verb != "design" and all(place in (None, "-") for place in places):
-        raise SpecError("--force replaces a file, and none is written here: give --out.", path="--force")
-
-
 def _outcome(options: argparse.Namespace) -> int:
     """Run the verb; return its exit code, or that of its error after telling it."""
     try:
-        _require_written(options)
+        named = ("output", "out", "write_spec", "to", "state", "prove")
+        is_written = options.verb == "design" or any(getattr(options, name, None) not in (None, "-") for name in named)
+        if getattr(options, "force", False) and not is_written:
+            raise SpecError("--force replaces a file, and none is written here: give --out.", path="--force")
         module, _, function = VERBS[options.verb].run.partition(":")
         run: Callable[[argparse.Namespace], int] = getattr(import_module(f"obsynth.cli.{module}"), function)
         return run(options)

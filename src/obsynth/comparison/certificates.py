@@ -91,8 +91,7 @@ def designs_inside(path: Path) -> list[ObserverDesign]:
 
 
 def _verified_result(path: str | Path, data: str | Path | None) -> VerificationReport:
-    again = "make it again"
-    kind, body, intact = opened(Path(path), RESULTS, RESULT_VERSION, "certificate of a result", again)
+    kind, body, intact = opened(Path(path), RESULTS, RESULT_VERSION, "certificate of a result", "make it again")
     rows = [nothing_wrong("digest", "the file is as it was written", [] if intact else ["sha256"], source=_SOURCE)]
     try:
         for row in _rows(kind, body, None if data is None else Path(data)):

@@ -282,11 +282,6 @@ class Comparison:
                 )
         return (_HEADER, *rows)
 
-    def _rows_with_units(self) -> tuple[tuple[str, ...], ...]:
-        """Return the table with the unit of each fault, in which its figures are."""
-        head, *rows = self.rows()
-        return (head, *((method, with_unit(fault, self._units), *others) for method, fault, *others in rows))
-
     @property
     def _units(self) -> dict[str, str]:
         return next((dict(entry.design.plant.units) for entry in self.methods if entry.design is not None), {})
@@ -380,7 +375,7 @@ class Comparison:
         from matplotlib.figure import Figure
 
         shown = [entry for entry in self.methods if entry.faults]
-        count = max(len(self.fault_names), 1)
+        count = len(self.fault_names)
         figure = Figure(figsize=(11.0, 2.8 * count), layout="constrained")
         axes = figure.subplots(count, 2, squeeze=False)
         for row, name in enumerate(self.fault_names):
@@ -409,9 +404,8 @@ class Comparison:
             for panel in (left, right):
                 label_time(panel)
                 tidy(panel)
-        if len(self.fault_names):
-            legend_above(axes[0, 0])
-            legend_above(axes[0, 1])
+        legend_above(axes[0, 0])
+        legend_above(axes[0, 1])
         return figure
 
     def _range(self, shown: Sequence[ComparedMethod], row: int) -> tuple[float, float]:
@@ -443,11 +437,14 @@ class Comparison:
         picture = data_url(written(self.plot()))
         meanings = "".join(f"<li>{escape(f'{name}: {text}')}</li>" for name, text in _FIGURE_MEANINGS.items())
         refused = "".join(f"<li>{escape(text)}</li>" for text in self.refusals)
+        head, *rows = self.rows()
+        # With the unit of each fault, in which its figures are.
+        table = (head, *((method, with_unit(fault, self._units), *others) for method, fault, *others in rows))
         body = [
             f'<p class="verdict {"holds" if self.recommended else "fails"}">{escape(self.advice)}</p>',
             f"<p>{escape(self.setting)}</p>",
             *(f"<p>{escape(text)}</p>" for text in self.notes),
-            f'<div class="scroll figures">{html_table(self._rows_with_units())}</div>',
+            f'<div class="scroll figures">{html_table(table)}</div>',
             f'<div class="scroll"><figure><img alt="Estimates of each method" src="{picture}"></figure></div>',
             "<h2>What the columns mean</h2>",
             f'<ul class="soft">{meanings}</ul>',
@@ -763,31 +760,31 @@ def compare(
                         path="disturbance")  # fmt: skip
     if plant.dt and sample_time not in (None, plant.dt):
         raise SpecError(f"sample_time is for continuous plants: this one has {plant.dt:g} s.", path="sample_time")
-    ids = _checked_methods(methods)
+    known = [spec.id for spec in linear_methods()]
+    unknown = [name for name in methods or () if name not in known]
+    if unknown:
+        raise SpecError(f"{', '.join(map(repr, unknown))}: use some of {', '.join(known)}.", path="methods")
+    ids = known if methods is None else list(methods)
     for method in options or {}:
         if method not in ids:
             raise SpecError(f"options has {method!r}, which is not compared: {', '.join(ids)} are.", path="options")
-    numbers: dict[str, Any] = {
-        "sample_time": sample_time,
-        "within": within,
-        "tolerance": float(tolerance),
-        "disturbance": float(disturbance),
-        "runs": int(runs),
-        "false_alarms": float(false_alarms),
-        "input_delay": int(input_delay),
-    }
-    chosen = options or {}
     return side_by_side(
         plant,
         scenario,
         ids,
         lambda given, method, own: design(given, method, **own),
-        options=chosen,
+        sample_time=sample_time,
+        within=within,
+        tolerance=float(tolerance),
+        disturbance=float(disturbance),
+        runs=int(runs),
+        false_alarms=float(false_alarms),
+        input_delay=int(input_delay),
+        options=options or {},
         data=data,
         columns=columns,
         scales=scales,
         progress=progress,
-        **numbers,
     )
 
 
@@ -899,16 +896,6 @@ def _is_of(made: ObserverDesign, plants: Sequence[DescriptorSystem]) -> bool:
     """Whether a design is for one of some plants, as it was written or transformed."""
     own = [made.plant] if made.source is None else [made.source.plant, made.plant]
     return any(isinstance(one, DescriptorSystem) and agree(one.dense(), other) for one in own for other in plants)
-
-
-def _checked_methods(methods: Sequence[str] | None) -> list[str]:
-    known = [spec.id for spec in linear_methods()]
-    if methods is None:
-        return known
-    unknown = [name for name in methods if name not in known]
-    if unknown:
-        raise SpecError(f"{', '.join(map(repr, unknown))}: use some of {', '.join(known)}.", path="methods")
-    return list(methods)
 
 
 def _scenario(plant: DescriptorSystem, given: Scenario | None, dt: float, disturbance: float) -> Scenario:

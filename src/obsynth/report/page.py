@@ -467,16 +467,12 @@ def agreement_section(design: ObserverDesign, run: DataRun, rows: str | None) ->
             raise
         yield f"<p>This log was not compared with the design: {escape(str(error))}</p>"
         return
-    state = "holds" if found.passed else "fails"
     if rows is None:
         said = "The log agrees" if found.passed else "The log, taken as free of faults, does not agree"
     else:
         said = f"Rows {rows} of the log {'agree' if found.passed else 'do not agree'}"
-    sentence = f"{said} with the design."
-    yield f'<p class="verdict {state}">{sentence}</p>'
-    yield "<ul>"
-    yield from (f"<li>{escape(text)}</li>" for text in found.verdict)
-    yield "</ul>"
+    yield f'<p class="verdict {"holds" if found.passed else "fails"}">{said} with the design.</p>'
+    yield from _listed(found.verdict)
     yield from fact_rows(_facts(found, rows))
     yield from copied_table(_sensors(design, found))
     panels = 2 * len(found.sensors) + len(found.estimates)
@@ -628,45 +624,34 @@ def html_report(
             "Comparison with your data": list(agreement_section(design, run, rows)),
         }
     shown = design if report in (None, design.report) else design.replace(report=report)
-    reproduction = list(_reproduction(shown, digest, gains_file, system_file, data_file))
-    return write_atomically(path, _page_text(shown, scenario, own, reproduction))
-
-
-def _page_text(
-    design: ObserverDesign, scenario: Scenario | None, own: Mapping[str, list[str]], reproduction: list[str]
-) -> str:
-    report = design.report
-    title = escape(f"{design.name}: {design.method}")
-    state = "holds" if report.passed else "fails"
+    # What else the summary says stands in sections of its own.
+    short, facts = summary(shown), tolerance_facts(shown) if _fits(shown) else []
     sections = {
         **own,
-        "Summary": list(_in_short(design)),
-        "Pictures": list(_pictures(design, scenario)),
-        "Claims": [*fact_rows(promises(design)), *_fault_estimates(design), *_recovered(design)],
-        "Within the tolerances of the plant": list(_tolerances(design)),
-        "Deviation against delay": list(_delay(design)),
-        "Notes": list(_notes(design.notes)),
-        "The plant": list(fact_rows(plant_facts(design.plant))),
-        "Checks": list(check_rows(report.checks)) if report.checks else [],
-        "Gains": list(_gains(design)),
-        "How to reproduce this": reproduction,
+        "Summary": [
+            *fact_rows(short.facts),
+            *(f'<p class="warning">Warning: {escape(text)}</p>' for text in short.warnings),
+        ],
+        "Pictures": list(_pictures(shown, scenario)),
+        "Claims": [*fact_rows(promises(shown)), *_fault_estimates(shown), *_recovered(shown)],
+        "Within the tolerances of the plant": list(fact_rows(facts)) if facts else [],
+        "Deviation against delay": list(_delay(shown)),
+        "Notes": list(_listed(shown.notes)) if shown.notes else [],
+        "The plant": list(fact_rows(plant_facts(shown.plant))),
+        "Checks": list(check_rows(shown.report.checks)) if shown.report.checks else [],
+        "Gains": list(_gains(shown)),
+        "How to reproduce this": list(_reproduction(shown, digest, gains_file, system_file, data_file)),
     }
-    shown = {heading: lines for heading, lines in sections.items() if lines}
-    links = "".join(f'<a href="#{_anchor(heading)}">{heading}</a>' for heading in shown)
+    sections = {heading: lines for heading, lines in sections.items() if lines}
+    links = "".join(f'<a href="#{_anchor(heading)}">{heading}</a>' for heading in sections)
+    state = "holds" if shown.report.passed else "fails"
     parts = [
-        f'<p class="verdict {state}">{escape(verdict_line(report.checks).plain)}</p>',
+        f'<p class="verdict {state}">{escape(verdict_line(shown.report.checks).plain)}</p>',
         f"<nav>{links}</nav>",
     ]
-    for heading, lines in shown.items():
+    for heading, lines in sections.items():
         parts += [f'<section id="{_anchor(heading)}">', f"<h2>{heading}</h2>", *lines, "</section>"]
-    return standing_page(title, parts)
-
-
-def _in_short(design: ObserverDesign) -> Iterator[str]:
-    """Yield the facts of the summary and its warnings; what else it says stands in sections of its own."""
-    found = summary(design)
-    yield from fact_rows(found.facts)
-    yield from (f'<p class="warning">Warning: {escape(text)}</p>' for text in found.warnings)
+    return write_atomically(path, standing_page(escape(f"{shown.name}: {shown.method}"), parts))
 
 
 def _anchor(heading: str) -> str:
@@ -686,11 +671,6 @@ def _recovered(design: ObserverDesign) -> Iterator[str]:
         yield from fact_rows(recovered_states(design.recovery))
 
 
-def _tolerances(design: ObserverDesign) -> Iterator[str]:
-    if _fits(design) and (facts := tolerance_facts(design)):
-        yield from fact_rows(facts)
-
-
 def _fits(design: ObserverDesign) -> bool:
     """Whether observer and plant can be run together."""
     return all(check.name != FITS for check in design.report.failures)
@@ -703,11 +683,10 @@ def _delay(design: ObserverDesign) -> Iterator[str]:
         yield f"<p>{escape(curve.sentence)}</p>"
 
 
-def _notes(notes: Sequence[str]) -> Iterator[str]:
-    if notes:
-        yield "<ul>"
-        yield from (f"<li>{escape(note)}</li>" for note in notes)
-        yield "</ul>"
+def _listed(texts: Sequence[str]) -> Iterator[str]:
+    yield "<ul>"
+    yield from (f"<li>{escape(text)}</li>" for text in texts)
+    yield "</ul>"
 
 
 def _pictures(design: ObserverDesign, scenario: Scenario | None) -> Iterator[str]:

@@ -765,11 +765,7 @@ def _reason(failed: Sequence[Check]) -> str:
     first, *more = failed
     told = f"the condition '{first.name.removeprefix('exists: ')}' FAILS. Needed: {first.claim}".rstrip(".")
     told += f". Found: {first.detail}".rstrip(".") if first.detail else ""
-    return f"{told}." + (f" {_more_fail(len(more))}" if more else "")
-
-
-def _more_fail(count: int) -> str:
-    return "1 more condition fails (-v)." if count == 1 else f"{count} more conditions fail (-v)."
+    return f"{told}." + (f" {len(more)} more condition{' fails' if len(more) == 1 else 's fail'} (-v)." if more else "")
 
 
 _PLANT_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names")

@@ -34,14 +34,6 @@ def number(value: float, *, digits: int = 4) -> str:
     return f"{value:.{digits}g}"
 
 
-def complex_number(value: complex) -> str:
-    """Return a real or complex value with four digits, such as ``0.9701 + 0.1277j``."""
-    if value.imag == 0.0:
-        return number(value.real)
-    sign = "+" if value.imag > 0 else "-"
-    return f"{number(value.real)} {sign} {number(abs(value.imag))}j"
-
-
 def complex_numbers(values: Iterable[complex]) -> str:
     """Return several values as text, largest first; conjugate pairs once, as ``a +- bj``; long lists are cut."""
     waiting = sorted((complex(value) for value in values), key=lambda value: (-abs(value), -value.real, -value.imag))
@@ -49,11 +41,14 @@ def complex_numbers(values: Iterable[complex]) -> str:
     while waiting:
         value = waiting.pop(0)
         partner = next((w for w in waiting if abs(w - value.conjugate()) <= SAME_NUMBER * max(1.0, abs(value))), None)
-        if value.imag == 0.0 or partner is None:
-            shown.append(complex_number(value))
+        real, size = number(value.real), number(abs(value.imag))
+        if value.imag == 0.0:
+            shown.append(real)
+        elif partner is None:
+            shown.append(f"{real} {'+' if value.imag > 0 else '-'} {size}j")
         else:
             waiting.remove(partner)
-            shown.append(f"{number(value.real)} +- {number(abs(value.imag))}j")
+            shown.append(f"{real} +- {size}j")
     return name_list(shown, limit=MOST_LISTED_VALUES)
 
 

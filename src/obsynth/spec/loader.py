@@ -696,7 +696,8 @@ def joined(prefix: str, name: str) -> str:
 
 
 def read_value(value: Any, folder: Path, where: str, problems: DocumentProblems, *, keep_sparse: bool = False) -> Any:
-    """Return rows as an array, files read, picks as lists of names, sections as mappings, all else as it is."""
+    """Return rows as an array, files read (matrices, or names), picks as lists of names, sections as mappings, all else
+    as it is."""
     if isinstance(value, list):
         entries = (entry for row in value for entry in (row if isinstance(row, list) else [row]))
         is_matrix = all(isinstance(row, list) for row in value) and not any(isinstance(entry, str) for entry in entries)
@@ -704,6 +705,8 @@ def read_value(value: Any, folder: Path, where: str, problems: DocumentProblems,
     if hasattr(value, "file"):
         path = folder / value.file
         try:
+            if not hasattr(value, "variable"):
+                return read_names(path, where=where)
             if hasattr(value, "stack"):
                 return read_matrices(path, variable=value.variable, count=value.stack, where=where)
             return read_matrix(path, variable=value.variable, where=where, keep_sparse=keep_sparse)
@@ -715,16 +718,6 @@ def read_value(value: Any, folder: Path, where: str, problems: DocumentProblems,
     if isinstance(value, dict):
         return {name: entry.model_dump() if hasattr(entry, "model_dump") else entry for name, entry in value.items()}
     return value.model_dump(exclude_unset=True) if hasattr(value, "model_dump") else value
-
-
-def _names(value: Any, folder: Path, where: str, problems: DocumentProblems) -> list[str] | None:
-    if hasattr(value, "file"):
-        try:
-            return read_names(folder / value.file, where=where)
-        except SpecError as error:
-            problems.add(where, str(error))
-            return None
-    return None if value is None else list(value)
 
 
 def _read(
@@ -740,12 +733,10 @@ def _read(
     """Return entries of a section by name: some as they are, matrices and lists of names with their files read."""
     problems = DocumentProblems(source, what="plant" if not prefix else "spec")
     arguments: dict[str, Any] = {name: getattr(section, name) for name in kept}
-    for name in matrices:
-        arguments[name] = read_value(
-            getattr(section, name), source.parent, joined(prefix, name), problems, keep_sparse=keep_sparse
-        )
-    for name in names:
-        arguments[name] = _names(getattr(section, name), source.parent, joined(prefix, name), problems)
+    for name in (*matrices, *names):
+        value, where = getattr(section, name), joined(prefix, name)
+        # A list without names is no matrix.
+        arguments[name] = value and read_value(value, source.parent, where, problems, keep_sparse=keep_sparse)
     problems.raise_if_any()
     return arguments
 

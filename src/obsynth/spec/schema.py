@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import cache
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
     BaseModel,
@@ -59,19 +59,21 @@ def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
         {"row": ragged[0], "found": ragged[1], "first": listed[0][0], "expected": listed[0][1]},
     )
     others: list[InitErrorDetails] = []
+    own: Any = get_args(ErrorType)
     try:
         check_entries(rows)
     except ValidationError as error:
         others = [
-            InitErrorDetails(type=_kind_of_error(item), loc=item["loc"], input=item["input"], ctx=item.get("ctx", {}))
+            InitErrorDetails(
+                # Kinds of our own are unknown to pydantic by name.
+                type=item["type"] if item["type"] in own else PydanticCustomError(item["type"], item["msg"]),
+                loc=item["loc"],
+                input=item["input"],
+                ctx=item.get("ctx", {}),
+            )
             for item in error.errors()
         ]
     raise ValidationError.from_exception_data("matrix", [*others, InitErrorDetails(type=problem, input=None)])
-
-
-def _kind_of_error(item: Any) -> Any:
-    """Return what an error is raised again as: kinds of our own are unknown to pydantic by name."""
-    return item["type"] if item["type"] in get_args(ErrorType) else PydanticCustomError(item["type"], item["msg"])
 
 
 def _kind_of_matrix(value: Any) -> str:
@@ -260,17 +262,11 @@ OPTION_KINDS: Mapping[str, Any] = {
 def options_schema(method: str) -> type[Section]:
     """Return the schema of the options of a method, made from its typed options."""
     options: Any = method_class(method)
-    types, defaults = field_types(options), {field.name: field.default for field in fields(options)}
-    entries: dict[str, Any] = {name: (_in_document(kind), defaults[name]) for name, kind in types.items()}
+    defaults, entries = {field.name: field.default for field in fields(options)}, dict[str, Any]()
+    for name, kind in field_types(options).items():
+        written = [OPTION_KINDS[mark.kind] for mark in get_args(kind)[1:] if isinstance(mark, WrittenAs)]
+        entries[name] = ((written or [kind])[0], defaults[name])
     return create_model(options.__name__, __base__=Section, __doc__=options.__doc__, **entries)
-
-
-def _in_document(kind: Any) -> Any:
-    if get_origin(kind) is Annotated:
-        marks = [mark for mark in get_args(kind)[1:] if isinstance(mark, WrittenAs)]
-        if marks:
-            return OPTION_KINDS[marks[0].kind]
-    return kind
 
 
 _COLOURED = "<coloured>"
@@ -491,12 +487,8 @@ RARE_KINDS = ("time-varying", "dae")
 
 
 def plant_section(kind: object) -> type[Section]:
-    """Return the section of a plant of this kind; the kinds that are rare are made when they are asked for."""
-    if kind == "time-varying":
-        return TimeVaryingSection
-    if kind == "dae":
-        return DAESection
-    return PlantSection
+    """Return the section of a plant of this kind."""
+    return TimeVaryingSection if kind == "time-varying" else DAESection if kind == "dae" else PlantSection
 
 
 @cache
@@ -570,7 +562,4 @@ def section_of(name: str, value: Any) -> type[Section]:
         given = value if isinstance(value, dict) else {}
         kind = given.get("kind")
         return PlantReference if "file" in given and kind not in RARE_KINDS else plant_section(kind)
-    if name == "scenario":
-        return ScenarioSection
-
-    return InputsSection if name == "inputs" else CalibrateSection
+    return ScenarioSection if name == "scenario" else InputsSection if name == "inputs" else CalibrateSection

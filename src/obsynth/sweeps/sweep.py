@@ -756,8 +756,7 @@ def _files(given: Any, endings: tuple[str, ...], what: str) -> list[Path]:
         require_kind(name, (str, Path), what, "names of files or of folders")
     found: list[Path] = []
     for path in map(Path, listed):
-        inside = sorted(p for p in path.iterdir() if p.name.endswith(endings)) if path.is_dir() else [path]
-        found += inside
+        found += sorted(p for p in path.iterdir() if p.name.endswith(endings)) if path.is_dir() else [path]
     if not found:
         raise SpecError(f"{', '.join(map(str, listed))}: there is no file *{' or *'.join(endings)}.", path=what)
     missing = [str(path) for path in found if not path.is_file()]
