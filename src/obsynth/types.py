@@ -26,7 +26,7 @@ _TYPE_NAMES = {
     "methods.recursive.synthesis": "SteadyState",
     "observers.decisions": "Alarm Decision",
     "observers.running": "Estimates RunningObserver",
-    "observers.windows": "WindowObserver",
+    "observers.linear.observer": "WindowObserver",
     "plants.constants": "CalibratedBox Constant ConstantsBox Uncertainty",
     "results.checks": "Check",
     "simulation.scenario": "Trajectory",

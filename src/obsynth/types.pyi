@@ -25,9 +25,9 @@ from obsynth.methods.fault_figures import FaultFigures as FaultFigures
 from obsynth.methods.recursive.synthesis import SteadyState as SteadyState
 from obsynth.observers.decisions import Alarm as Alarm
 from obsynth.observers.decisions import Decision as Decision
+from obsynth.observers.linear.observer import WindowObserver as WindowObserver
 from obsynth.observers.running import Estimates as Estimates
 from obsynth.observers.running import RunningObserver as RunningObserver
-from obsynth.observers.windows import WindowObserver as WindowObserver
 from obsynth.plants.constants import CalibratedBox as CalibratedBox
 from obsynth.plants.constants import Constant as Constant
 from obsynth.plants.constants import ConstantsBox as ConstantsBox

@@ -13,9 +13,8 @@ from scipy.integrate import quad
 from scipy.linalg import expm
 
 import obsynth
-from obsynth import SpecError
-from obsynth.experiments.monitors.between_samples import BetweenSamples
-from obsynth.experiments.monitors.residual_model import residual_model
+from obsynth.errors import SpecError
+from obsynth.experiments.monitors.residual_model import BetweenSamples, residual_model
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import absolute_gains, gathered, interval_pieces, peak_sums, prove_contraction
 from obsynth.proofs.products import energy, exponential

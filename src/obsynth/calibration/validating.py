@@ -38,10 +38,9 @@ from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.numerics.arguments import FloatArray, arguments_checked, read_only
 from obsynth.observers.dae.estimates import GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, WindowObserver
 from obsynth.observers.recursive.observer import RecursiveObserver, recursive_estimates
 from obsynth.observers.running import Estimates, changed
-from obsynth.observers.windows import WindowObserver
 from obsynth.results.design import ObserverDesign
 
 #: Shares of a stated variance that are tried, from all of it: a factor of four apart, so that the right one is missed

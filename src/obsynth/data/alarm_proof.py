@@ -35,7 +35,7 @@ from obsynth.files.outputs import path_of
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import FloatArray, arguments_checked, is_whole, whole_number
-from obsynth.observers.windows import WindowObserver
+from obsynth.observers.linear.observer import WindowObserver
 from obsynth.results.certificate_files import SHOWN_DIGITS, opened
 from obsynth.results.checks import Check, information
 from obsynth.results.design import ObserverDesign, VerificationReport, loaded, restored

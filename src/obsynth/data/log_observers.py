@@ -21,12 +21,11 @@ from obsynth.experiments.monitors.monitor import Evidence, LinearSample
 from obsynth.numerics.arguments import FloatArray, real_number
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.observer import LinearObserver, noise_variances, transient
+from obsynth.observers.linear.observer import LinearObserver, WindowObserver, noise_variances, transient
 from obsynth.observers.records import no_inputs, over_samples, taken_inputs
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import as_run
 from obsynth.observers.smoothing import Chain
-from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 
@@ -539,7 +538,6 @@ def log_observer(
         return LinearLogObserver(design, gap=gap, warm_up=warm_up)
     if gap is not None:
         raise SpecError(SAMPLED_GAP, path="gap")
-    # What most logs do not need is loaded only where it is used: a run starts in a fraction of a second.
     if isinstance(design.observer, WindowObserver):
         if outliers not in (None, "none"):
             raise SpecError("outliers is for recursive and nonlinear designs: leave it out.", path="outliers")

@@ -23,11 +23,10 @@ from obsynth.numerics.arguments import FloatArray, arguments_checked, freeze, re
 from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.observer import LinearObserver, sample_observer, split_rows
+from obsynth.observers.linear.observer import LinearObserver, WindowObserver, sample_observer, split_rows
 from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import BAND_WIDTH, Estimates
-from obsynth.observers.windows import WindowObserver
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem, MatrixSequence, TimeVaryingDescriptorSystem, index_of
 from obsynth.results.design import ObserverDesign

@@ -42,10 +42,10 @@ from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.numerics.arguments import FloatArray, arguments_checked
 from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.linear.observer import WindowObserver
 from obsynth.observers.outliers import Outliers
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.sensor_timing import require_plain
-from obsynth.observers.windows import WindowObserver
+from obsynth.observers.running import require_plain
 from obsynth.results.design import ObserverDesign, gain_set_digest, require_verified
 from obsynth.verification.adaptive_bound import AdaptiveBound
 

@@ -29,8 +29,8 @@ from obsynth.verification.error_system import ErrorModel
 
 if TYPE_CHECKING:
     from obsynth.observers.dae.observer import DAEObserver
+    from obsynth.observers.linear.observer import WindowObserver
     from obsynth.observers.recursive.observer import RecursiveObserver
-    from obsynth.observers.windows import WindowObserver
 
 
 #: A function of the variables by name that returns cvxpy constraints.

@@ -44,9 +44,8 @@ from obsynth.numerics.arguments import FloatArray, arguments_checked
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import Decision, decide
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, WindowObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plotting.estimates import panel_count, plot_data, plot_hidden_course, plot_simulation, plot_states
 from obsynth.plotting.panels import data_url, image_of

@@ -39,8 +39,7 @@ from obsynth.methods.fault_figures import SETTLING_SAMPLES, FaultFigures, fault_
 from obsynth.methods.functional_filter.kalman_gain import DelayCurve, delay_curve, settling_time
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.decisions import ParameterMonitor
-from obsynth.observers.linear.observer import SETTLED_TO, LinearObserver, sample_observer, transient
-from obsynth.observers.windows import WindowObserver
+from obsynth.observers.linear.observer import SETTLED_TO, LinearObserver, WindowObserver, sample_observer, transient
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem, listed
 from obsynth.plotting.trade_off import FaultGains, fault_gains

@@ -29,7 +29,7 @@ from obsynth.extensions import extension
 from obsynth.files.outputs import FileKind, input_file, json_data, path_of, read_json, write_atomically
 from obsynth.numerics.arguments import FloatArray, arguments_checked, freeze, is_number, read_only, require_kind
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.sensor_timing import LONGEST_DELAY
+from obsynth.observers.running import LONGEST_DELAY
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem, listed
 from obsynth.results.checks import Check, all_hold
@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     import control
 
     from obsynth.observers.dae.observer import DAEObserver
+    from obsynth.observers.linear.observer import WindowObserver
     from obsynth.observers.recursive.observer import RecursiveObserver
-    from obsynth.observers.windows import WindowObserver
     from obsynth.plants.descriptor import TimeVaryingDescriptorSystem
 
 
@@ -138,7 +138,7 @@ def types_of(kind: str | None) -> tuple[Any, Any]:
 
         return TimeVaryingDescriptorSystem, RecursiveObserver
     if kind == "window":
-        from obsynth.observers.windows import WindowObserver
+        from obsynth.observers.linear.observer import WindowObserver
         from obsynth.plants.descriptor import TimeVaryingDescriptorSystem
 
         return TimeVaryingDescriptorSystem, WindowObserver

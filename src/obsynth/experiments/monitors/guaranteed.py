@@ -21,7 +21,7 @@ from obsynth.methods.guaranteed_test.problem import window_as_designed
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.windows import noisy_as_bounded, rows_before
 from obsynth.numerics.arguments import FloatArray
-from obsynth.observers.windows import WindowObserver
+from obsynth.observers.linear.observer import WindowObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.tolerances.robustness import with_tolerances

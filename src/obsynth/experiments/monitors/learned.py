@@ -42,10 +42,9 @@ from obsynth.methods.registry import error_model
 from obsynth.numerics.arguments import FloatArray, arguments_checked, is_finite_number, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, WindowObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import changed
-from obsynth.observers.windows import WindowObserver
 from obsynth.plants.noise_model import offset_state
 from obsynth.results.certificate_files import opened, sealed
 from obsynth.results.design import ObserverDesign, digest_of, gain_set_digest, plain, restored

@@ -17,9 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.monitors.between_samples import InputResponse
 from obsynth.experiments.monitors.monitor import Judged, LinearSample, Monitor, Rule, Sample
-from obsynth.experiments.monitors.residual_model import ResidualModel, UnlimitedHorizonBound
+from obsynth.experiments.monitors.residual_model import InputResponse, ResidualModel, UnlimitedHorizonBound
 from obsynth.numerics.arguments import FloatArray, largest_singular_value, real_number
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import NIS_WINDOW, WALKING_FORMS, alone, two_sided_sums

@@ -29,8 +29,7 @@ from obsynth.methods.guaranteed_test.proofs import (
 )
 from obsynth.methods.guaranteed_test.windows import MEAN_ROOM, Window, mean_over_record, part_beside
 from obsynth.numerics.arguments import FloatArray
-from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.windows import WindowObserver
+from obsynth.observers.linear.observer import LinearObserver, WindowObserver
 from obsynth.plants.constants import shown
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem

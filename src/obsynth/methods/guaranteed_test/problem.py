@@ -24,8 +24,7 @@ from obsynth.methods.guaranteed_test.windows import (
 )
 from obsynth.numerics.arguments import LARGEST, FloatArray, is_finite_number, real_number, require_no_overflow
 from obsynth.numerics.ranks import decide_rank
-from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.windows import WindowObserver
+from obsynth.observers.linear.observer import LinearObserver, WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.proofs.exact_arithmetic import ExactPencil
 

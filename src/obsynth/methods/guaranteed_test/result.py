@@ -14,10 +14,9 @@ from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import Programmes, free_faults, problem_as_designed, window_as_designed
 from obsynth.methods.guaranteed_test.windows import courses_of, rows_before
 from obsynth.numerics.arguments import FloatArray, arguments_checked, real_array, whole_number
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, WindowObserver
 from obsynth.observers.records import measured_record
 from obsynth.observers.running import Estimates
-from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 

@@ -27,8 +27,7 @@ from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.ranks import decide_rank
-from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.windows import WindowObserver
+from obsynth.observers.linear.observer import LinearObserver, WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
 from obsynth.results.design import ObserverDesign

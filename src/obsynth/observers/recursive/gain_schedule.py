@@ -24,8 +24,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import batch_record, require_horizon
 from obsynth.observers.recursive.observer import RecursiveObserver, excitation_levels, posterior_residual
 from obsynth.observers.recursive.step_model import PreparedStep, StepMatrices, spreads
-from obsynth.observers.running import Estimates, named_estimates
-from obsynth.observers.sensor_timing import require_plain
+from obsynth.observers.running import Estimates, named_estimates, require_plain
 
 
 class GainStep(NamedTuple):
