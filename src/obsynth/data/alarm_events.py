@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -162,11 +162,6 @@ class AlarmLog:
         return tuple(sorted([*self._closed, *self._open.values()], key=lambda event: (event.first_row, event.by)))
 
 
-def silent_rows(silent: Mapping[str, int]) -> list[str]:
-    """Return a text for each reason why rows were without a decision."""
-    return [f"{count} {status}: {REASONS.get(status, status)}" for status, count in silent.items() if status != PARTIAL]
-
-
 #: Alarms that a summary lists.
 MOST_LISTED_ALARMS = 20
 
@@ -203,5 +198,7 @@ def silence(run: Any, by: str) -> list[str]:
         told = f" in the {run.rows - silent} rows that could alarm" if silent else ""
         found.append(f"{NO_ALARM} by {by}{told}.")
     if silent:
-        found.append(f"{silent} of {run.rows} rows were without a decision: {'; '.join(silent_rows(run.silent))}.")
+        why = [f"{count} {status}: {REASONS.get(status, status)}"
+               for status, count in run.silent.items() if status != PARTIAL]  # fmt: skip
+        found.append(f"{silent} of {run.rows} rows were without a decision: {'; '.join(why)}.")
     return found

@@ -223,11 +223,8 @@ def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
     margin = float(programme.proved_least(equal, below)) if fits else float("nan")
     said = statement(assumed, data["window"], len(y), origin, log, body["gain_set"]["sha256"])
     rows = len(y) == data["row"] and len(u) == len(y)
-    stated = float(data["margin"])
     told = said == data["statement"] and origin == data["origin"]
-    yield _row("rows", "the record ends at the stated row", float(rows), 1.0, rows)
-    yield _row("statement", said, float(told), 1.0, told)
-    yield _row(
+    proof = _row(
         "proof",
         "least excess over all bounds, from the multipliers, in exact arithmetic",
         margin,
@@ -235,7 +232,7 @@ def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
         margin > 0.0,
         kind="proved",
     )
-    yield _row("margin", "the stated margin is not above what is proved", stated, margin, 0.0 < stated <= margin)
+    yield from _conclusions(proof, said, float(data["margin"]), rows=rows, told=told)
 
 
 def gain_set_row(design: ObserverDesign, digest: str, name: str = "gain set") -> Check:
@@ -300,11 +297,9 @@ def _checked_by_test(
     """Yield the rows on a certificate of a guaranteed test."""
     row = data["row"]
     ((test, group, margin),) = checked(design, data, u, y)
-    said, stated = statement_of(test, group, row, log, body["gain_set"]["sha256"]), float(data["margin"])
+    said = statement_of(test, group, row, log, body["gain_set"]["sha256"])
     rows = is_whole(row) and row >= len(y) > 0
-    yield _row("rows", "the record ends at the stated row", float(rows), 1.0, rows)
-    yield _row("statement", said, float(said == data["statement"]), 1.0, said == data["statement"])
-    yield Check(
+    proof = Check(
         "proof",
         "share by which all bounds would have to be exceeded: each equation times its number, added up in fractions",
         margin,
@@ -314,4 +309,15 @@ def _checked_by_test(
         "duality of linear programmes",
         "proved",
     )
-    yield _row("margin", "the stated margin is not above what is proved", stated, margin, 0.0 < stated <= margin)
+    yield from _conclusions(proof, said, float(data["margin"]), rows=rows, told=said == data["statement"])
+
+
+def _conclusions(proof: Check, said: str, stated: float, *, rows: bool, told: bool) -> list[Check]:
+    """Return the rows on what a certificate says, with that on its proof."""
+    margin = proof.value
+    return [
+        _row("rows", "the record ends at the stated row", float(rows), 1.0, rows),
+        _row("statement", said, float(told), 1.0, told),
+        proof,
+        _row("margin", "the stated margin is not above what is proved", stated, margin, 0.0 < stated <= margin),
+    ]

@@ -108,10 +108,7 @@ class GapModel:
 
     def start(self, estimate: FloatArray, inputs: Iterable[FloatArray], fault: FloatArray) -> FloatArray:
         """Return the dynamic states now from an estimate ``(nx_source,)`` and the inputs of the samples since."""
-        return self.forward(self.into @ estimate, inputs, fault)
-
-    def forward(self, state: FloatArray, inputs: Iterable[FloatArray], fault: FloatArray) -> FloatArray:
-        """Return the dynamic states after samples of the inputs."""
+        state = self.into @ estimate
         for u in inputs:
             state = self.after(state, 0.0, u, u, fault)
         return np.asarray(state)

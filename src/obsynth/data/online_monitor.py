@@ -218,21 +218,6 @@ def taken_back(pairs: Sequence[Pair], refused: Sequence[FloatArray], y: FloatArr
     return found
 
 
-def chance_of_pairs(refused: FloatArray, seen: NDArray[np.int64]) -> float:
-    """Return how many pairs there are in a row by chance, where so many samples were left out ``(ny,)`` of so many that
-    were measured: a second comes with the same probability as the first, and in half of the cases on the same side."""
-    shares = refused / np.maximum(seen, 1)
-    return float(0.5 * np.sum(shares**2))
-
-
-def are_chance(pairs: int, rate: float, rows: int, every: float) -> bool:
-    """Whether so many pairs in rows are what single wrong samples make at this rate, and leave most of one alarm per
-    ``every`` rows to others."""
-    from scipy.special import pdtrc
-
-    return rate * every <= MOST_OF_RATE and float(pdtrc(pairs - 1, rate * rows)) >= CHANCE
-
-
 #: One false alarm in so many rows, where nothing else is asked for.
 FALSE_ALARM_RATE = "1 per 1000 rows"
 
@@ -315,12 +300,14 @@ def learn_thresholds(
     chosen = (first <= said.numbers) & (said.numbers < last)
     dt = design.observer.dt or float(np.median(np.diff(said.times[chosen])))
     watched, scores = said.watched[chosen], None if said.scores is None else said.scores.chosen(chosen)
+    squares = said.squares[chosen]
+    squares = squares[np.isfinite(squares) & (squares > 0.0)]
     given: dict[str, Any] = {"every": rows_per_alarm(false_alarms, dt), "dt": dt, "seed": seed, "pairs": pairs}
     found = thresholds_from_rows(
         design,
         watched,
         scores=scores,
-        innovation=_usual_innovation(said.squares[chosen]),
+        innovation=float(np.sqrt(squares.mean())) if squares.size else 1.0,
         outlier_sizes=sizes,
         **given,
     )
@@ -393,12 +380,6 @@ def learned_sizes(wrong: Sequence[FloatArray], usual: FloatArray, stated: FloatA
     return found
 
 
-def _usual_innovation(squares: FloatArray) -> float:
-    """Return the root mean square of innovations in the observer's own deviations, from mean squares of rows."""
-    known = squares[np.isfinite(squares) & (squares > 0.0)]
-    return float(np.sqrt(known.mean())) if known.size else 1.0
-
-
 class _Said(NamedTuple):
     """What a design says of a log."""
 
@@ -464,6 +445,8 @@ def _without_pairs(
     design: ObserverDesign, started: Callable[[], LogRun], log: FloatArray, said: _Said, every: float
 ) -> tuple[_Said, WrongPairs]:
     """Return what a design says of rows without pairs of wrong samples, and what there was of these."""
+    from scipy.special import pdtrc
+
     if not said.refused:
         return said, NO_PAIRS
     before = log.shape[1] - said.refused[0].shape[1]
@@ -479,10 +462,12 @@ def _without_pairs(
     wrong = taken_back(pairs, hidden.refused, y)
     seen = np.isfinite(y).sum(axis=0)
     # All of a pair are wrong samples: those that were believed too.
-    chance = chance_of_pairs(
-        hidden.refused[-1][1] + 2.0 * np.bincount([p.output for p in wrong], minlength=len(seen)), seen
-    )
-    if not wrong or not are_chance(len(wrong), chance, len(y), every):
+    refused = hidden.refused[-1][1] + 2.0 * np.bincount([p.output for p in wrong], minlength=len(seen))
+    # A second comes with the same probability as the first, and in half of the cases on the same side.
+    chance = float(0.5 * np.sum((refused / np.maximum(seen, 1)) ** 2))
+    # So many pairs are what single wrong samples make at this rate, and leave most of the alarms to others.
+    are_chance = chance * every <= MOST_OF_RATE and float(pdtrc(len(wrong) - 1, chance * len(y))) >= CHANCE
+    if not wrong or not are_chance:
         return said, NO_PAIRS
     return hidden if len(wrong) == len(pairs) else again(wrong), WrongPairs(len(wrong), chance)
 
@@ -599,7 +584,11 @@ def online_monitor(
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
     _require_noise(model, noise_bound)
-    bounds = _expected_bounds(design, model, disturbance_bounds, scenario)
+    bounds = bounds_of(design, model, disturbance_bounds)
+    if scenario is None:
+        # Only those that are given are known.
+        stated = [name in (disturbance_bounds or {}) for name in design.linear[0].disturbance_names]
+        bounds = np.where(np.array(stated, dtype=bool), bounds, np.inf)
     noisy = noisy_design(design, scenario)
     limited = kind in ("pointwise", "window")
 
@@ -658,17 +647,6 @@ def _require_linear_kind(kind: str, nominal: Mapping[str, float] | None) -> None
         )
     if nominal:
         raise SpecError("nominal is for recursive designs, which estimate parameters.", path="nominal")
-
-
-def _expected_bounds(
-    design: ObserverDesign, model: ResidualModel, given: Mapping[str, float] | None, scenario: Scenario | None
-) -> FloatArray:
-    """Return the bound of each disturbance; without a scenario only those given are known."""
-    bounds = bounds_of(design, model, given)
-    if scenario is not None:
-        return bounds
-    stated = [name in (given or {}) for name in design.linear[0].disturbance_names]
-    return np.where(np.array(stated, dtype=bool), bounds, np.inf)
 
 
 def _require_noise(model: ResidualModel, noise_bound: float | None) -> None:
@@ -736,14 +714,16 @@ def _norm_rule(
 
 def _more_words(kind: str, model: ResidualModel, limit: float, dt: float) -> str:
     """Return what else the sentence of a bound must say."""
-    words = ""
     if kind == "paper" or model.continuous is None:
-        return words
-    if model.Bw[:, model.continuous.sensors.sum() :].any():
-        # The noise of the plant itself is what is gathered between samples: the closer they are, the less, but in all
-        # the more of it that is of one sign.
-        words += _NOT_CLOSER.format(dt=shown(dt))
-    return words + _REGULAR.format(dt=shown(dt)) + model.continuous.between.lasting_words(limit)
+        return ""
+    # The noise of the plant itself is what is gathered between samples: the closer they are, the less, but in all the
+    # more of it that is of one sign.
+    is_gathered = bool(model.Bw[:, model.continuous.sensors.sum() :].any())
+    return (
+        _NOT_CLOSER.format(dt=shown(dt)) * is_gathered
+        + _REGULAR.format(dt=shown(dt))
+        + model.continuous.between.lasting_words(limit)
+    )
 
 
 def _endless_model(

@@ -34,6 +34,7 @@ from obsynth.data.signals import TIME_HEADER, Signals, Stamps
 from obsynth.data.sources import CHUNK_ROWS, Data, check_suffix, chunks, samples
 from obsynth.data.stuck_sensors import RepeatedValues, stuck_texts
 from obsynth.errors import ObsynthError, SpecError
+from obsynth.experiments.monitors.guaranteed import is_guaranteed
 from obsynth.experiments.monitors.learned import LearnedRule, as_learned
 from obsynth.experiments.monitors.learned_levels import HOLD
 from obsynth.experiments.monitors.monitor import LinearSample, Monitor, Sample
@@ -49,7 +50,6 @@ from obsynth.files.outputs import (
     write_atomically,
 )
 from obsynth.files.tables import table_writer
-from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.windows import rows_before
 from obsynth.numerics.arguments import (
@@ -198,22 +198,17 @@ class OperatingPointCheck:
         self._start = np.full(len(signals.names), np.nan)
         self._sum, self._count = np.zeros(len(signals.names)), np.zeros(len(signals.names))
 
-    def take(self, time: float, deviations: FloatArray) -> None:
-        """Take one row: seconds, and deviations ``(nu + ny,)`` of which some may be missing."""
-        if self._begin is None:
-            self._begin, self._start = time, np.array(deviations)
-        if time - self._begin <= FIRST_SECONDS and self._taken < MOST_FIRST_ROWS:
-            self._taken += 1
-            known = np.isfinite(deviations)
-            self._sum[known] += deviations[known]
-            self._count[known] += 1.0
-
-    def take_rows(self, times: Sequence[float], deviations: FloatArray) -> None:
-        """Take rows, as `take` one by one."""
+    def take(self, times: Sequence[float], deviations: FloatArray) -> None:
+        """Take rows: seconds, and deviations ``(n, nu + ny)`` of which some may be missing."""
         for time, row in zip(times, deviations, strict=True):
-            if self._begin is not None and not (time - self._begin <= FIRST_SECONDS and self._taken < MOST_FIRST_ROWS):
+            if self._begin is None:
+                self._begin, self._start = time, np.array(row)
+            if not (time - self._begin <= FIRST_SECONDS and self._taken < MOST_FIRST_ROWS):
                 break
-            self.take(time, row)
+            self._taken += 1
+            known = np.isfinite(row)
+            self._sum[known] += row[known]
+            self._count[known] += 1.0
 
     def alarm_of_the_start(self, design: ObserverDesign, alarms: Sequence[AlarmEvent]) -> tuple[str, ...]:
         """Return a text where an alarm of a linear design may be its initial-condition response: when the warm-up
@@ -393,7 +388,7 @@ class LogRun:
         if found and self.rows == 0:
             self.first.status = found[0].status
         self.rows += len(found)
-        self.first.take_rows(times, values)
+        self.first.take(times, values)
         return [
             row._replace(time=time, deviations=v, at=own)
             for row, time, v, own in zip(found, times, values, at, strict=True)
@@ -481,11 +476,11 @@ class LogRun:
             for name, i, level in self._levels
             if math.isfinite(grown := level * self._share(row, i) + self._excess(row, i))
         ]
-        names = [name for name, evidence in above if evidence > 1.0]
-        for name, evidence in above:
-            if evidence > 1.0:
-                self.alarms.setdefault(name, time)
-                self.alarm_rows.setdefault(name, number)
+        passed = [(name, evidence) for name, evidence in above if evidence > 1.0]
+        names = [name for name, _ in passed]
+        for name in names:
+            self.alarms.setdefault(name, time)
+            self.alarm_rows.setdefault(name, number)
         cells: list[Any] = []
         undecided = not deciding and not above
         if self.monitor is not None:
@@ -503,10 +498,9 @@ class LogRun:
                 self.isolated = self.isolated or seen.fault
                 self.alarm_rows.setdefault(self.monitor.kind, number)
                 names.append(f"{self.monitor.kind}: {seen.fault}" if seen.fault else self.monitor.kind)
-        for name, evidence in above:
-            if evidence > 1.0:
-                fault = name[5:-1] if name.startswith("fhat[") else ""
-                self.events.take(name, fault, evidence, time, number, [*before, *cells])
+        for name, evidence in passed:
+            fault = name[5:-1] if name.startswith("fhat[") else ""
+            self.events.take(name, fault, evidence, time, number, [*before, *cells])
         if undecided:
             self.events.silent[row.status if row.status not in DECIDING else NO_DECISION] += 1
         return [*cells, "; ".join(names)]
@@ -1046,7 +1040,7 @@ def _require_files(*, state: Any, out: Any, data: object) -> None:
 
 def _require_a_window(design: ObserverDesign, rows: int) -> None:
     """Raise `SpecError` where a log is shorter than the window of a guaranteed test, which then says nothing of it."""
-    if design.method != GuaranteedTestMethod.id:
+    if not is_guaranteed(design):
         return
     needed = max(map(rows_before, GuaranteedTest.of(design).tests)) + 1
     if rows < needed:

@@ -294,18 +294,14 @@ Data: TypeAlias = "str | Path | TextIO | pd.DataFrame"
 def chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
     """Yield ``(rows, 1 + nu + ny)``: time and signals, in order; NaN where a sample is missing.  Inputs are those that
     act in a row as the design takes it."""
-    found = _numeric(_chunks(data, signals, stamps, rows), stamps)
+    found = _chunks(data, signals, stamps, rows)
     if not signals.delay or not signals.inputs:
         yield from found
     elif signals.delay > 0:
         yield from _delayed(found, signals, stamps)
     else:
         yield from _advanced(found, signals)
-
-
-def _numeric(found: Iterator[FloatArray], stamps: Stamps) -> Iterator[FloatArray]:
-    """Yield all rows; whether columns hold numbers is known at the end, wherever the words in them stand."""
-    yield from found
+    # Whether columns hold numbers is known at the end, wherever the words in them stand.
     stamps.require_numbers()
 
 
@@ -726,9 +722,7 @@ def _with_time(frame: pd.DataFrame, signals: Signals) -> pd.DataFrame:
     time, names = signals.columns[0], [str(name) for name in frame.columns]
     frame = frame.set_axis(names, axis=1)
     dated = isinstance(frame.index, (pd.DatetimeIndex, pd.TimedeltaIndex))
-    if time in names or not (dated or frame.index.name == time):
-        return frame
-    if time != TIME_HEADER and frame.index.name != time:
+    if time in names or not (frame.index.name == time or (dated and time == TIME_HEADER)):
         return frame
     return frame.assign(**{time: frame.index}).reset_index(drop=True)
 

@@ -27,12 +27,11 @@ from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.experiments.assumptions import Assumptions, Log
 from obsynth.experiments.monitors.adaptive import start_of
-from obsynth.experiments.monitors.guaranteed import refuse_bounds
+from obsynth.experiments.monitors.guaranteed import is_guaranteed, refuse_bounds
 from obsynth.experiments.monitors.options import WINDOW
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.guaranteed_test.checks import while_inside
 from obsynth.methods.guaranteed_test.exact import Programmes
-from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.proofs import (
     columns_of_exact,
     down,
@@ -509,7 +508,7 @@ def proved_alarm(
     """Return the proof for the last sample of a record ``u (steps, nu)``, ``y (steps, ny)`` of deviations.
     A design that fails its own verification proves nothing: `VerificationError`, unless ``unverified``, and then no
     alarm is proved."""
-    if design.method == GuaranteedTestMethod.id:
+    if is_guaranteed(design):
         given = {
             "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound, "initial_set": initial_set,
             "state_bounds": state_bounds,

@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.monitor import Monitor
-from obsynth.experiments.simulation import Bench, Runs, aligned_errors, bench_of, make_bench
+from obsynth.experiments.simulation import Bench, Runs, aligned_errors, bench_of, drawn_designs, make_bench
 from obsynth.numerics.arguments import FloatArray, OpenUnitInterval, arguments_checked, whole_number
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import ParameterMonitor
@@ -23,7 +23,6 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import Estimates
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
-from obsynth.tolerances.robustness import drawn_points, plant_at
 
 
 @dataclass(frozen=True)
@@ -202,8 +201,9 @@ def evaluate(
     runs = max(whole_number(runs, "runs"), 1 if plants is None else whole_number(plants, "plants"))
     seeds = range(scenario.seed, scenario.seed + runs)
     bench = bench_of(design, scenario)
-    _require_fit(bench, monitor, plants)
-    benches = [bench] if plants is None else _drawn_benches(design, scenario, plants)
+    _require_fit(design, bench, monitor, plants)
+    designs = [] if plants is None else drawn_designs(design, plants, scenario.seed)
+    benches = [make_bench(one, scenario) for one in designs] or [bench]
     size = max(1, BATCH_SAMPLES // bench.signals.steps)
     # The first row of a plant with parameters is what was known before: no sample has been used.
     states, faults = ((end or 0) if isinstance(bench.observer, LinearObserver) else 1 for end in bench.warm_ups())
@@ -224,11 +224,18 @@ def evaluate(
     return _summed(parts, design, bench, watched=monitor is not None, level=confidence)
 
 
-def _require_fit(bench: Bench, monitor: Monitor | ParameterMonitor | None, plants: int | None) -> None:
+def _require_fit(
+    design: ObserverDesign, bench: Bench, monitor: Monitor | ParameterMonitor | None, plants: int | None
+) -> None:
     """Raise `SpecError` where a monitor, or drawing plants, is not for such a design."""
     if isinstance(bench.observer, LinearObserver):
         if isinstance(monitor, ParameterMonitor):
             raise SpecError("This design is linear: give monitor=obsynth.monitor(design, scenario).", path="monitor")
+        uncertain = design.linear[0].uncertainty
+        if plants is not None and (uncertain is None or not uncertain.box.names):
+            raise SpecError(
+                "plants are drawn from the tolerances of the plant's constants, and it has none.", path="plants"
+            )
         return
     if plants is not None:
         raise SpecError("plants are drawn for linear designs of a plant with tolerances.", path="plants")
@@ -236,18 +243,6 @@ def _require_fit(bench: Bench, monitor: Monitor | ParameterMonitor | None, plant
         raise SpecError(
             "This design is recursive or nonlinear: give monitor=obsynth.ParameterMonitor(...).", path="monitor"
         )
-
-
-def _drawn_benches(design: ObserverDesign, scenario: Scenario, plants: int) -> list[Bench]:
-    """Return a bench for each of some plants in the box, drawn with the scenario's seed."""
-    plant, _ = design.linear
-    if plant.uncertainty is None or not plant.uncertainty.box.names:
-        raise SpecError(
-            "plants are drawn from the tolerances of the plant's constants, and it has none.", path="plants"
-        )
-    box = plant.uncertainty.box
-    points = drawn_points(len(box.names), plants, scenario.seed)
-    return [make_bench(design.replace(plant=plant_at(plant, box.values(q))), scenario) for q in points]
 
 
 def _judged_residuals(watched: Monitor, bench: Bench, runs: Runs, fault_names: tuple[str, ...]) -> FloatArray:

@@ -40,6 +40,7 @@ from obsynth.simulation.linear import (
     varying_runs,
 )
 from obsynth.simulation.scenario import Scenario, ScenarioSignals, Trajectory, observer_start, resolve_parameters
+from obsynth.tolerances.robustness import drawn_points, plant_at
 
 #: Warm-up ends when the effect of an error at the start has shrunk to this share of its largest, for good.
 WARM_UP_SHARE = 0.01
@@ -155,6 +156,16 @@ def _linear_rows(
     return np.asarray(rows), ()
 
 
+def drawn_designs(design: ObserverDesign, count: int, seed: int) -> list[ObserverDesign]:
+    """Return a linear design for so many plants, drawn from the box of its plant's constants."""
+    plant, _ = design.linear
+    uncertain = plant.uncertainty
+    if uncertain is None:
+        return [design] * count
+    points = drawn_points(len(uncertain.box.names), count, seed)
+    return [design.replace(plant=plant_at(plant, uncertain.box.values(q))) for q in points]
+
+
 def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
     """Return a design and a scenario, ready to run."""
     if isinstance(design.observer, LinearObserver):
@@ -167,14 +178,13 @@ def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
         )
     observer: RecursiveObserver | DAEObserver
     simulated: Callable[..., PlantRuns]
-    watched: Callable[[FloatArray, FloatArray], tuple[Estimates, ...]]
     if isinstance(design.observer, DAEObserver):
         observer = design.observer
         model = observer.model
         drive = resolve_parameters(model, scenario, dt=observer.dt)
         start, inputs, theta = model.nominal_state, model.nominal_input, model.nominal_parameters
         note = "The plant was integrated by Radau IIA, with inputs constant during each step."
-        simulated, watched = partial(_dae_plant, observer), partial(_dae_estimates, observer)
+        simulated = partial(_dae_plant, observer)
     else:
         observer = design.recursive[1]
         adaptation = observer.adaptation
@@ -182,7 +192,7 @@ def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
         start, inputs = observer.initial_state, np.zeros(observer.plant.nu)
         note = "The model begins with y(1): the first row of the outputs is empty."
         theta = np.zeros(observer.plant.nq) if adaptation is None else adaptation.initial_parameters
-        simulated, watched = partial(_varying_plant, observer), partial(_recursive_estimates, observer)
+        simulated = partial(_varying_plant, observer)
     names = observer.state_names
     begin = np.array([scenario.initial_state.get(name, value) for name, value in zip(names, start, strict=True)])
     nu, estimated = len(inputs), tuple(range(len(observer.fault_names)))
@@ -195,7 +205,7 @@ def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
         estimated,
         (note,),
         partial(simulated, drive, begin, *true),
-        partial(_rows_of, watched),
+        partial(_rows_of, observer),
     )
 
 
@@ -270,16 +280,15 @@ def _with_parameters(
 
 
 def _rows_of(
-    watched: Callable[[FloatArray, FloatArray], tuple[Estimates, ...]], outputs: FloatArray, inputs: FloatArray
+    observer: RecursiveObserver | DAEObserver, outputs: FloatArray, inputs: FloatArray
 ) -> tuple[FloatArray, tuple[Estimates, ...]]:
     """Return the rows and the estimates of an observer with parameters; all runs have the same inputs."""
-    estimates = watched(outputs, inputs[:, 0])
+    if isinstance(observer, RecursiveObserver):
+        estimates = _recursive_estimates(observer, outputs, inputs[:, 0])
+    else:
+        estimates = tuple(observer.run(outputs[:, run], inputs[:, 0]) for run in range(outputs.shape[1]))
     rows = np.stack([np.hstack([found.states, found.faults, found.residuals]) for found in estimates], axis=1)
     return rows, estimates
-
-
-def _dae_estimates(observer: DAEObserver, outputs: FloatArray, inputs: FloatArray) -> tuple[Estimates, ...]:
-    return tuple(observer.run(outputs[:, run], inputs) for run in range(outputs.shape[1]))
 
 
 def _recursive_estimates(observer: RecursiveObserver, outputs: FloatArray, inputs: FloatArray) -> tuple[Estimates, ...]:

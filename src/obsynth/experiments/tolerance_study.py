@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.monitors.residual_monitor import monitor
-from obsynth.experiments.simulation import Runs, make_bench
+from obsynth.experiments.simulation import Runs, drawn_designs, make_bench
 from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import text_table
 from obsynth.methods.verifying import verify
@@ -22,7 +22,6 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.certificate_files import SHOWN_DIGITS, STUDY, result_text
 from obsynth.results.design import ObserverDesign, design_as_dict, require_verified
 from obsynth.simulation.scenario import Scenario, Step
-from obsynth.tolerances.robustness import drawn_points, plant_at
 
 #: Tolerances that are tried, by default.
 TOLERANCES = (0.0, 0.01, 0.02, 0.05)
@@ -267,16 +266,11 @@ def _scaled(design: ObserverDesign, factor: float) -> ObserverDesign:
 
 def _both(design: ObserverDesign, scenario: Scenario, fault: str, runs: int) -> tuple[Runs, Runs]:
     """Return the same runs without and with a fault of size 1, each of a plant drawn from the box."""
-    plant, _ = design.linear
-    uncertain = plant.uncertainty
-    count = 0 if uncertain is None else len(uncertain.box.names)
-    points = drawn_points(count, runs, scenario.seed)
     faulty = scenario.replace(faults={fault: Step(size=1.0, start=ONSET * scenario.horizon)})
     found: list[list[Runs]] = [[], []]
-    for i, q in enumerate(points):
-        true = plant if uncertain is None else plant_at(plant, uncertain.box.values(q))
+    for i, true in enumerate(drawn_designs(design, runs, scenario.seed)):
         for kept, what in zip(found, (scenario, faulty), strict=True):
-            kept.append(make_bench(design.replace(plant=true), what).run([scenario.seed + i]))
+            kept.append(make_bench(true, what).run([scenario.seed + i]))
     return _together(found[0]), _together(found[1])
 
 

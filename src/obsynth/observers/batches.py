@@ -150,7 +150,7 @@ def run_batch(
     if isinstance(observer, LinearObserver):
         if options:
             raise SpecError(f"A linear observer has no {', '.join(options)}: leave it out.", path=min(options))
-        return _stacked(observer, y, u)
+        return _one_by_one(observer, y, u)
     # The gains of a recursive observer that judges its samples depend on them.
     judges = isinstance(observer, RecursiveObserver) and observer.outliers != "none"
     if judges or not observer.is_plain:
@@ -160,23 +160,21 @@ def run_batch(
     return gain_schedule.run_batch(observer, y, u, **options)
 
 
-def _stacked(observer: LinearObserver, y: ArrayLike, u: ArrayLike | None) -> Estimates:
-    """Run trials of a linear observer one after another."""
-    outputs, inputs = batch_record(y, u, len(observer.output_names), observer.input_names)
+def _one_by_one(
+    observer: LinearObserver | RecursiveObserver | DAEObserver, y: ArrayLike, u: ArrayLike | None
+) -> Estimates:
+    """Run trials one after another: linear observers, sensors of their own times, bounds on states and judged samples
+    need it."""
+    signals: Any = observer if isinstance(observer, LinearObserver) else observer.plant
+    is_linear = signals is observer
+    outputs, inputs = batch_record(y, u, len(signals.output_names), signals.input_names)
     found = [observer.run(outputs[i], _of_trial(inputs, i)) for i in range(len(outputs))]
-    parts: dict[str, Any] = {name: read_only(np.stack([getattr(each, name) for each in found]))
-             for name in ("states", "faults", "residuals")}  # fmt: skip
-    return replace(found[0], **parts)
-
-
-def _one_by_one(observer: RecursiveObserver | DAEObserver, y: ArrayLike, u: ArrayLike | None) -> Estimates:
-    """Run trials one after another: sensors of their own times, bounds on states and judged samples need it."""
-    outputs, inputs = batch_record(y, u, observer.plant.ny, observer.plant.input_names)
-    found = [observer.run(outputs[i], _of_trial(inputs, i)) for i in range(len(outputs))]
-    names = ("states", "faults", "fault_covariances", "state_deviations", "nis", "nis_degrees", "residuals")
-    stacked = {name: read_only(np.stack([getattr(each, name) for each in found])) for name in names}
+    deviating = ("fault_covariances", "state_deviations", "nis", "nis_degrees")
+    names = ("states", "faults", "residuals", *(() if is_linear else deviating))
+    stacked: dict[str, Any] = {name: read_only(np.stack([getattr(each, name) for each in found])) for name in names}
+    if is_linear:
+        return replace(found[0], **stacked)
     width = max(each.innovations.shape[1] for each in found)
     wide = [np.pad(each.innovations, ((0, 0), (0, width - each.innovations.shape[1])), constant_values=np.nan)
             for each in found]  # fmt: skip
-    changes: dict[str, Any] = {**stacked, "innovations": read_only(np.stack(wide))}
-    return replace(found[0], **changes)
+    return replace(found[0], **stacked, innovations=read_only(np.stack(wide)))

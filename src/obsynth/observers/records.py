@@ -211,7 +211,10 @@ def no_inputs(count: int) -> FloatArray:
 
 
 def require_inputs(u: FloatArray, names: tuple[str, ...], k: int) -> None:
-    """Raise `SpecError` where an input is infinite, or missing (NaN) before it was ever known (``u (nu,)``)."""
+    """Raise `SpecError` unless inputs ``u (nu,)`` are as many as their names; where one is infinite, or missing (NaN)
+    before it was ever known."""
+    if u.shape != (len(names),):
+        raise SpecError(f"u must be {len(names)} finite number(s) at k = {k}.", path="u")
     wrong = np.isinf(u) | (np.isnan(u) if k == 0 else False)
     if wrong.any():
         i = int(np.argmax(wrong))

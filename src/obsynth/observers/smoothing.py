@@ -241,24 +241,20 @@ class _DAELinks(Links):
         seen = row.seen
         _, H, L = self.steps.graph.functions.outputs(x, theta)
         R = self.steps.settings.R[np.ix_(seen, seen)]
+        noise, missing = np.asarray(row.part("noise") @ self.Q), row.part("missing")
+        if missing.any():
+            noise = np.hstack((noise, covariance_factor(0.5 * (missing + missing.T), "covariance")))
         return _Sample(
             x,
             theta,
             row.part("F"),
             row.part("G"),
-            self._noise(row),
+            noise,
             row.innovation[seen],
             H[seen],
             L[seen],
             R,
         )
-
-    def _noise(self, row: DAERow) -> FloatArray:
-        """Return a root of the covariance that a step adds; missing inputs widen it."""
-        noise, missing = row.part("noise") @ self.Q, row.part("missing")
-        if not missing.any():
-            return np.asarray(noise)
-        return np.hstack((noise, covariance_factor(0.5 * (missing + missing.T), "covariance")))
 
     def through(self, state: DAEState) -> FloatArray:
         """Return the derivative of the state after the measurement by the parameters."""
@@ -353,7 +349,7 @@ class _WalkingLinks(_DAELinks):
         """Return the node of a state from which a chain begins."""
         nx, nq = self.nx, self.nq
         spread = self.steps.part(state, "spread")
-        if self._is_joint:
+        if self.steps.settings.form == "augmented-kalman":
             P, cross = self.steps.part(state, "P"), self.steps.part(state, "cross")
             whole = np.block([[P, cross], [cross.T, spread]])
             factor = covariance_factor(0.5 * (whole + whole.T), "covariance")
@@ -362,10 +358,6 @@ class _WalkingLinks(_DAELinks):
             factor = stacked_noise(self.own_factor(state), root)
             factor[:nx, nx:] = self.through(state) @ root
         return Node(self._posterior(state)[:, None], factor, np.zeros((nx + nq, 0)), None)
-
-    @property
-    def _is_joint(self) -> bool:
-        return self.steps.settings.form == "augmented-kalman"
 
     def _posterior(self, state: DAEState) -> FloatArray:
         return np.concatenate((self.steps.part(state, "posterior"), self.steps.part(state, "theta")))

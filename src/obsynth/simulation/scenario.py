@@ -75,16 +75,13 @@ class Profile:
 class Additive(Profile, ABC):
     """A function of time, which is added to its signal."""
 
-    def at(self, time: FloatArray) -> FloatArray:
-        """Return its values at ``time``, seconds."""
-        return self._at(time)
-
     @abstractmethod
-    def _at(self, time: FloatArray) -> FloatArray: ...
+    def _at(self, time: FloatArray) -> FloatArray:
+        """Return its values at ``time``, seconds."""
 
     def sampled(self, steps: int, dt: float) -> tuple[FloatArray, FloatArray]:
         """Return its values at the left and right end of each interval between samples, ``(steps,)`` each."""
-        acts, values = self.active(steps, dt), self.at(dt * np.arange(steps + 1, dtype=np.float64))
+        acts, values = self.active(steps, dt), self._at(dt * np.arange(steps + 1, dtype=np.float64))
         left = np.where(acts, values[:-1], 0.0)
         return left, left.copy() if self.held else np.where(acts, values[1:], 0.0)
 
@@ -232,12 +229,9 @@ class LostEffectiveness(Profile):
 class Random(Profile, ABC):
     """Independent samples, held between samples."""
 
-    def draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
-        """Return ``steps`` samples, drawn with ``rng``."""
-        return self._draw(rng, steps)
-
     @abstractmethod
-    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray: ...
+    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
+        """Return ``steps`` samples, drawn with ``rng``."""
 
     @abstractmethod
     def moments(self) -> tuple[float, float, float]:
@@ -566,7 +560,7 @@ class ScenarioSignals:
         for run, seed in enumerate(seeds):
             rng = np.random.default_rng(seed)
             for column, profile in self.random:
-                signals[:, run, column] += np.where(profile.active(steps, self.dt), profile.draw(rng, steps), 0.0)
+                signals[:, run, column] += np.where(profile.active(steps, self.dt), profile._draw(rng, steps), 0.0)
             if self.noise and nw:
                 noise[:, run] = self.noise * rng.standard_normal((steps, nw))
             if self.deviations.any():

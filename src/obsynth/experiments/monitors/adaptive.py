@@ -316,7 +316,9 @@ def adaptive_step(
     v = np.concatenate([estimates, inputs])
     if bound.first is not None and state.k == 0:
         state = state._replace(psi=np.vstack([state.psi[:-1], bound.first @ inputs]))
-    state, moved, first, shift = (_varying if bound.varying else _constant)(bound, state, v)
+    moved, first, shift = np.zeros(bound.counts[2]), np.zeros((0, no)), np.zeros(no)
+    if bound.counts[0]:
+        state, moved, first, shift = (_varying if bound.varying else _constant)(bound, state, v)
     sizes = np.abs(np.concatenate([inputs, outputs, estimates, np.ones(1)]))
     state = state._replace(largest=np.maximum(state.largest, sizes))
     known = bound.known(estimates, inputs)
@@ -337,9 +339,7 @@ _First: TypeAlias = tuple[AdaptiveState, FloatArray, FloatArray, FloatArray]
 
 
 def _constant(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _First:
-    p, nz, rows, _, no = bound.counts
-    if not p:
-        return state, np.zeros(rows), np.zeros((0, no)), np.zeros(no)
+    _, nz, rows, _, no = bound.counts
     w = bound.drive @ v
     seen = w[:, nz:] + state.psi @ bound.shown.T
     state = state._replace(psi=state.psi @ bound.structure.Az.T + w[:, :nz])
@@ -353,8 +353,6 @@ def _constant(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _Fir
 
 def _varying(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _First:
     p, nz, rows, _, no = bound.counts
-    if not p:
-        return state, np.zeros(rows), np.zeros((0, no)), np.zeros(no)
     eps = np.abs(np.einsum("jprv,jv->jpr", bound.memory, state.past)).sum(axis=0) * bound.spans[:, None]
     sizes = np.abs(bound.drive[:, nz:] @ v) * bound.spans[:, None] + eps[:, : rows + no]
     older = state.moved[0]
@@ -534,10 +532,12 @@ def sampled_problem(design: ObserverDesign, dt: float, bounds: FloatArray, noise
     exact = AffinePlant(plant, uncertain.box, {}, np.eye(plant.nx))
     followed = tracking_of(design, exact).T
     reduced, basis = reduced_family(plant, uncertain)
-    into = _dynamic(plant, uncertain)
-    reading = (2.0 * np.eye(len(basis)) - basis) @ np.linalg.pinv(into)
-    smooth = eliminate_algebraic_states(plant).plant
+    # The plant's state from its dynamic part, the algebraic one left out.
+    is_eliminated = any(kind == ELIMINATED for kind, _ in uncertain.steps)
+    into = np.eye(plant.nx) if is_eliminated else algebraic_coordinates(plant)[1]
     back = 2.0 * np.eye(len(basis)) - basis
+    reading = back @ np.linalg.pinv(into)
+    smooth = eliminate_algebraic_states(plant).plant
     moving, held = affine_zero_order_hold(reduced["A"], reduced["B"], dt)
     pieces = _pieces(reduced["A"], reduced["Bd"], dt)
     nd, nf = plant.nd, plant.nf
@@ -587,13 +587,6 @@ def sampled_problem(design: ObserverDesign, dt: float, bounds: FloatArray, noise
     return SampledProblem(
         affine, sample_observer(observer, dt), Tracking(t, empty), sizes, reading, first, through_y, unknown
     )
-
-
-def _dynamic(plant: DescriptorSystem, uncertain: Uncertainty) -> FloatArray:
-    """Return ``(nx, n)``: the plant's state from its dynamic part, the algebraic one left out."""
-    if any(kind == ELIMINATED for kind, _ in uncertain.steps):
-        return np.eye(plant.nx)
-    return algebraic_coordinates(plant)[1]
 
 
 def _pieces(a: AffineMatrix, bd: AffineMatrix, dt: float) -> list[AffineMatrix]:

@@ -21,20 +21,18 @@ from obsynth.methods.guaranteed_test.problem import window_as_designed
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.windows import noisy_as_bounded, rows_before
 from obsynth.numerics.arguments import FloatArray
-from obsynth.observers.linear.observer import WindowObserver
+from obsynth.observers.linear.observer import LinearObserver, WindowObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.tolerances.robustness import with_tolerances
 
-#: Id of the method whose designs bring their threshold.
-METHOD = "guaranteed-test"
 #: Options that other designs leave to their monitor.
 STATED_BY_DESIGN = ("disturbance_bounds", "noise_bound", "initial_error", "gamma")
 
 
 def is_guaranteed(design: ObserverDesign) -> bool:
     """Whether a design brings its own threshold."""
-    return design.method == METHOD
+    return design.method == GuaranteedTestMethod.id
 
 
 def refuse_bounds(given: Mapping[str, Any]) -> None:
@@ -55,27 +53,22 @@ def _checked(design: ObserverDesign, kind: str, given: Mapping[str, Any]) -> Gua
             f"kind is {kind!r}: a guaranteed test has its own threshold, use pointwise (the default).", path="kind"
         )
     refuse_bounds({name: given[name] for name in STATED_BY_DESIGN})
-    test, constants, initial_set = GuaranteedTest.of(design), given["constants"], given["initial_set"]
+    test, why = GuaranteedTest.of(design), ""
     if isinstance(test.observer, WindowObserver):
-        if constants is not None or initial_set is not None:
-            raise SpecError(
-                "A test of a plant that changes with k is for an exact model from any start: leave this out.",
-                path="constants" if constants is not None else "initial_set",
-            )
-        return test
-    if (test.options.get("exact") or is_bank(test)) and (constants is not None or initial_set is not None):
-        raise SpecError(
+        why = "A test of a plant that changes with k is for an exact model from any start: leave this out."
+    elif test.options.get("exact") or is_bank(test):
+        why = (
             f"{'isolate' if is_bank(test) else 'exact'} is for an exact model: design the test without it for a "
-            "threshold over tolerances.",
-            path="constants" if constants is not None else "initial_set",
+            "threshold over tolerances."
         )
-    beside = bool(test.linear[1].state_names)
-    if not beside and (constants is not None or initial_set is not None):
-        raise SpecError(
+    elif not test.linear[1].state_names:
+        why = (
             "This guaranteed test is for an exact model: design it for a plant whose constants have tolerances, with a "
-            "scenario, so that an observer of the state runs beside it.",
-            path="constants" if constants is not None else "initial_set",
+            "scenario, so that an observer of the state runs beside it."
         )
+    asked = [name for name in ("constants", "initial_set") if given[name] is not None]
+    if why and asked:
+        raise SpecError(why, path=asked[0])
     return test
 
 
@@ -331,21 +324,10 @@ def data_monitor(design: ObserverDesign, kind: str, given: Mapping[str, Any]) ->
     """Return the monitor of data of any length; with constants or a start its threshold follows the signals."""
     test = _checked(design, kind, given)
     constants, initial_set = given["constants"], given["initial_set"]
-    if isinstance(test.observer, WindowObserver):
-        own = test.observer
-        rule_by_row = VaryingRule(test, own)
-        return Monitor(
-            kind,
-            f"{_statement(test)}; each row has its own threshold",
-            rule_by_row,
-            residuals=len(own.residual_names),
-            fault_names=own.fault_names,
-            fault_scales=np.ones(len(own.fault_names)),
-            groups=test.groups,
-        )
-    observer = test.linear[1]
-    statement = _statement(test)
-    rule: Rule = GuaranteedRule(test)
+    own = test.observer if isinstance(test.observer, WindowObserver) else None
+    observer: LinearObserver | WindowObserver = test.linear[1] if own is None else own
+    rule: Rule = GuaranteedRule(test) if own is None else VaryingRule(test, own)
+    statement = _statement(test) + ("" if own is None else "; each row has its own threshold")
     if constants is not None or initial_set is not None:
         changed, bounds = _bounded(test, constants)
         rule, statement = over_box(changed, None, bounds, 1.0, None, initial_set)

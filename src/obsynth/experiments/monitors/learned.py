@@ -669,12 +669,10 @@ def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -
     direction."""
     names = [watched_names(design)[i] for i in kept]
     found = list(np.diag(sizes))
-    if not isinstance(design.observer, LinearObserver):
+    if not isinstance(design.observer, LinearObserver) or expects_fault_courses(design):
         return np.array(found), tuple(names)
     errors = error_model(design)
     observer, plant = errors.observer, errors.plant
-    if expects_fault_courses(design):
-        return np.array(found), tuple(names)
     c, direct, *_ = errors.output(slice(len(observer.state_names), None))
     held = (np.eye(observer.order) if observer.dt > 0.0 else np.zeros_like(observer.Az)) - observer.Az
     try:

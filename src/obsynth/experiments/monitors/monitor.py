@@ -199,7 +199,6 @@ class Rule(ABC):
 
     def passed_in(self, runs: Runs, norm: FloatArray, limits: FloatArray, onset: int | None) -> NDArray[np.bool_]:
         """Return where runs pass thresholds ``limits (steps,)``, ``(steps, runs)``; ``norm``: their statistic."""
-        del runs, onset
         return np.asarray(norm > limits[:, None])
 
 

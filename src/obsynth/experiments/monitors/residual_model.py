@@ -689,6 +689,11 @@ def _windowed_sums(values: FloatArray, window: int) -> FloatArray:
     return np.asarray(np.sum(sliding_window_view(values, window), axis=-1))
 
 
+def norms_of_windows(values: FloatArray, window: int) -> FloatArray:
+    """Return the norm of the last ``window`` values at each of them, of fewer at the start."""
+    return np.array([np.linalg.norm(values[max(k - window + 1, 0) : k + 1]) for k in range(len(values))])
+
+
 def _stacked_columns(shown: list[FloatArray], left: FloatArray, window: int) -> FloatArray:
     """Return the sum of the norms of the columns of every ``window`` successive matrices, one above the other; what
     rounding hides of each, ``left``, is added."""
@@ -707,8 +712,7 @@ def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: 
     """Return what the l2 norm of the residual over the last ``window`` samples never passes.
     Inputs: l2 gain times ``sqrt(window m)``; the error at the start: the root of its energy.  Or the pointwise bounds
     summed up in squares, where less, and for what moves between samples."""
-    one_by_one = pointwise_threshold(model, inputs, initial_error)
-    summed = np.array([np.linalg.norm(one_by_one[max(k - window + 1, 0) : k + 1]) for k in range(model.steps)])
+    summed = norms_of_windows(pointwise_threshold(model, inputs, initial_error), window)
     if model.continuous is not None or model.sampled is not None:
         return summed
     powers, (gain, count) = model.powers(), _window_gain(model, inputs)

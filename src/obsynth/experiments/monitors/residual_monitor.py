@@ -20,6 +20,7 @@ from obsynth.experiments.monitors.monitor import MONITOR_KINDS, Monitor, Rule, s
 from obsynth.experiments.monitors.options import LINEAR_OPTIONS, checked_options
 from obsynth.experiments.monitors.residual_model import (
     ResidualModel,
+    norms_of_windows,
     paper_threshold,
     pointwise_threshold,
     residual_model,
@@ -34,6 +35,7 @@ from obsynth.experiments.monitors.rules import NormRule, WhitenedRule
 from obsynth.experiments.simulation import Bench, make_bench
 from obsynth.numerics.arguments import FloatArray, arguments_checked, chosen, real_number
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.outliers import chi_square_limit
 from obsynth.plants.descriptor import DescriptorSystem, index_of
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.simulation.scenario import Scenario, observer_start
@@ -230,12 +232,10 @@ def _statistical(
 ) -> FloatArray:
     """Return thresholds by Bonferroni's inequality over all looks (chi-square), or Ville's over all white sums; they
     are infinite before the ``first`` look."""
-    from scipy.special import chdtri
-
     threshold = np.full(model.steps, np.inf)
     looks = model.steps - first
     if kind == "chi-square":
-        threshold[first:] = float(chdtri(degrees, false_alarms / looks))
+        threshold[first:] = chi_square_limit(degrees, false_alarms / looks)
     else:
         # Two signs for each component; a sum may start at every look.
         sums = looks if white else looks * (looks + 1) / 2
@@ -274,4 +274,4 @@ def _straight_lines(
     )
     if kind == "pointwise":
         return sizes
-    return np.array([np.linalg.norm(sizes[max(k - window + 1, 0) : k + 1]) for k in range(model.steps)])
+    return norms_of_windows(sizes, window)

@@ -22,6 +22,7 @@ from obsynth.experiments.monitors.residual_model import InputResponse, ResidualM
 from obsynth.numerics.arguments import FloatArray, largest_singular_value, real_number
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import NIS_WINDOW, WALKING_FORMS, alone, two_sided_sums
+from obsynth.observers.outliers import chi_square_limit
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.descriptor import index_of
 from obsynth.verification.error_system import ErrorModel
@@ -401,9 +402,7 @@ class WhitenedRule(Rule):
         state = state._replace(looks=state.looks + 1)
         probability, degrees = self._probability * share_of_look(state.looks), len(self.whitener)
         if self._change is None:
-            from scipy.special import chdtri
-
-            return state, Judged(float(value), float(chdtri(degrees, probability)))
+            return state, Judged(float(value), chi_square_limit(degrees, probability))
         # Sums of what is not white are counted one by one: as many end here as there were looks.
         ending = 1 if self._white else state.looks
         return state, Judged(float(value), math.log(2 * degrees * ending / probability))
@@ -468,12 +467,10 @@ class ParameterRule(Rule):
             levels = two_sided_sums(state.levels, along, information, self._change)
             which = int(np.argmax(levels)) % len(self._nominal)
             return looked._replace(levels=levels), Judged(float(levels.max()), math.log(len(levels) / share), which)
-        from scipy.special import chdtri
-
         if self._kind == "chi-square":
             away = found.theta - self._nominal
             weights = np.linalg.pinv(found.parameter_covariance, hermitian=True)
-            value, limit = float(away @ weights @ away), float(chdtri(len(away), share))
+            value, limit = float(away @ weights @ away), chi_square_limit(len(away), share)
             return looked, Judged(value, limit, alone(weights @ away, np.diag(weights)))
         gap = found.whitened
         if found.regressor.size:
@@ -482,7 +479,7 @@ class ParameterRule(Rule):
         if not sum(degrees):
             return state._replace(squares=squares, degrees=degrees), NOT_DECIDED
         looked = looked._replace(squares=squares, degrees=degrees)
-        return looked, Judged(sum(squares), float(chdtri(sum(degrees), share)))
+        return looked, Judged(sum(squares), chi_square_limit(sum(degrees), share))
 
     def restart(self, state: ParameterState, skipped: int = 0) -> ParameterState:
         """Clear the sums; the covariance of the filter accounts for missing rows."""

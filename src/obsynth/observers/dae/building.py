@@ -166,14 +166,19 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
     """Run an observer on its own model at nominal inputs and parameters."""
     model = observer.model
     u = np.array(model.nominal_input)
-    truth = _nominal_outputs(observer, u)
+    # The outputs of the model from the observer's initial state, without noise.
+    step, outputs = observer.steps.implicit, []
+    x, theta = np.array(observer.initial_state), np.array(observer.initial_parameters)
+    for k in range(NOMINAL_STEPS + 1):
+        x = step.solve(x, u, theta, k=k).x
+        outputs.append(step.functions.outputs(x, theta)[0])
     gathered, kept = GatheredRows(observer), []
 
     def add(rows: DAERow) -> None:
         gathered.add(rows)
         kept.append(np.array(rows.several.part("kept")))
 
-    end = advanced(observer.steps, truth, np.tile(u, (len(truth), 1)), add)
+    end = advanced(observer.steps, np.array(outputs), np.tile(u, (len(outputs), 1)), add)
     found = gathered.estimates()
     covariance = found.parameter_covariances[-1]
     deviations = np.sqrt(np.diag(covariance))
@@ -203,14 +208,3 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
         read_only(np.concatenate(kept)[1:]),
         read_only(covariance),
     )
-
-
-def _nominal_outputs(observer: DAEObserver, u: FloatArray) -> FloatArray:
-    """Return the outputs of the model from the observer's initial state, without noise."""
-    step = observer.steps.implicit
-    x, theta = np.array(observer.initial_state), np.array(observer.initial_parameters)
-    outputs = []
-    for k in range(NOMINAL_STEPS + 1):
-        x = step.solve(x, u, theta, k=k).x
-        outputs.append(step.functions.outputs(x, theta)[0])
-    return np.array(outputs)

@@ -215,7 +215,9 @@ def _generated(functions: dict[str, Any]) -> str:
     options: Any = {"with_header": False, "with_mem": False, "casadi_int": "int", "main": False, "verbose": False}
     generator = ca.CodeGenerator("observer", options)
     for name, function in functions.items():
-        generator.add(_renamed(function, name))
+        inputs = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
+        is_named = function.name() == name
+        generator.add(function if is_named else ca.Function(name, inputs, function.call(inputs)))
     return "\n".join(
         [
             "/* What follows was written by CasADi, with parameters and functions that are not used. */",
@@ -236,13 +238,6 @@ def _generated(functions: dict[str, Any]) -> str:
             "#endif",
         ]
     )
-
-
-def _renamed(function: Any, name: str) -> Any:
-    if function.name() == name:
-        return function
-    inputs = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
-    return ca.Function(name, inputs, function.call(inputs))
 
 
 #: Tried in turn when the environment does not name one in ``CC``.

@@ -167,8 +167,6 @@ class DAEObserver(DAESettings):
             inputs = np.atleast_1d(real_array(u, "u"))
         except SpecError:
             inputs = np.zeros((0, 0))
-        if inputs.shape != (self.model.nu,):
-            raise SpecError(f"u must be {self.model.nu} finite number(s) at k = {state.k}.", path="u")
         require_inputs(inputs, self.model.input_names, state.k)
         return outputs, inputs
 

@@ -39,12 +39,26 @@ class ObserverGraph:
     def unknown(self) -> Any:
         """From memory, stages, inputs and variances of these to what missing inputs add to the covariance; `None`
         without inputs."""
-        return _unknown(self.settings, self.functions, self.memory) if self.settings.model.nu else None
+        if not self.settings.model.nu:
+            return None
+        effect = input_effect(self.functions, self.settings.dt)
+        packed, variances = ca.MX.sym("memory", self.memory.size), ca.MX.sym("variances", self.settings.model.nu)
+        X, u = effect.mx_in(0), effect.mx_in(2)
+        before = self.memory.symbols(packed)
+        moved = effect(X, before["posterior"], u, before["theta"])
+        return ca.Function("unknown", [packed, X, u, variances], [moved @ ca.diag(variances) @ moved.T])
 
     @cached_property
     def forecast(self) -> Any:
         """From memory and row of a sample that nothing was seen of to mean and covariance of its outputs."""
-        return _forecast(self.settings, self.functions, self.memory, self.row)
+        packed, said = ca.MX.sym("memory", self.memory.size), ca.MX.sym("said", self.row.size)
+        found = {**self.memory.symbols(packed), **self.row.symbols(said)}
+        spread = found["spread"]
+        y, H, L = self.functions.output_function(found["posterior"], found["theta"])
+        cross = found["cross"] if self.settings.form == "augmented-kalman" else found["Upsilon"] @ spread
+        both = H @ cross @ L.T
+        whole = H @ found["covariance"] @ H.T + both + both.T + L @ spread @ L.T + ca.DM(self.settings.R)
+        return ca.Function("forecast", [packed, said], [ca.densify(y), ca.densify(whole)])
 
     def over(self, samples: int) -> Any:
         """Return `whole` over several samples: from memory and arriving columns to columns of memory and row."""
@@ -83,28 +97,6 @@ def observer_graph(observer: DAESettings) -> ObserverGraph:
     said = ca.vertcat(said[: row.size - 2], residual, trusted)
     whole = ca.Function("whole", [packed, arriving], [after, said])
     return ObserverGraph(observer, memory, row, functions, step, first, sample, whole)
-
-
-def _unknown(observer: DAESettings, functions: DAEFunctions, memory: Layout) -> Any:
-    """Return the function to what missing inputs add to the covariance of the state in a step ``(nx, nx)``."""
-    effect = input_effect(functions, observer.dt)
-    packed, variances = ca.MX.sym("memory", memory.size), ca.MX.sym("variances", observer.model.nu)
-    X, u = effect.mx_in(0), effect.mx_in(2)
-    before = memory.symbols(packed)
-    moved = effect(X, before["posterior"], u, before["theta"])
-    return ca.Function("unknown", [packed, X, u, variances], [moved @ ca.diag(variances) @ moved.T])
-
-
-def _forecast(observer: DAESettings, functions: DAEFunctions, memory: Layout, row: Layout) -> Any:
-    """Return the function from memory and row of a sample to mean ``(ny,)`` and covariance of its outputs."""
-    packed, said = ca.MX.sym("memory", memory.size), ca.MX.sym("said", row.size)
-    found = {**memory.symbols(packed), **row.symbols(said)}
-    spread = found["spread"]
-    y, H, L = functions.output_function(found["posterior"], found["theta"])
-    cross = found["cross"] if observer.form == "augmented-kalman" else found["Upsilon"] @ spread
-    both = H @ cross @ L.T
-    whole = H @ found["covariance"] @ H.T + both + both.T + L @ spread @ L.T + ca.DM(observer.R)
-    return ca.Function("forecast", [packed, said], [ca.densify(y), ca.densify(whole)])
 
 
 def _outcome(found: Arrays, memory: Layout, row: Layout) -> list[Any]:

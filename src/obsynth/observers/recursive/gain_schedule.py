@@ -22,7 +22,7 @@ from obsynth.numerics.spectra import abscissa
 from obsynth.numerics.square_root_estimation import least_squares_step, rank_revealing_step, update
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import batch_record, require_horizon
-from obsynth.observers.recursive.observer import RecursiveObserver, excitation_levels, posterior_residual
+from obsynth.observers.recursive.observer import RecursiveObserver, deviations_in, excitation_levels, posterior_residual
 from obsynth.observers.recursive.step_model import PreparedStep, StepMatrices, spreads
 from obsynth.observers.running import Estimates, named_estimates, require_plain
 
@@ -364,10 +364,10 @@ def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_st
     (contraction, span), ne = kept if kept is not None else product.contraction(), len(last.step.A)
     window = observer.adaptation.window if observer.adaptation is not None else 1
     levels = excitation_levels(regressors, window)[window - 1 :]
-    deviations, state_deviations = _lengths(last.spread), _lengths(last.factor)
+    deviations, state_deviations = deviations_in(last.spread), deviations_in(last.factor)
     if random_walk:
         *_, end = gains(observer, steps)
-        lengths = _lengths(end.factor)
+        lengths = deviations_in(end.factor)
         state_deviations, deviations = lengths[: observer.plant.nx], lengths[observer.plant.nx :]
     return GainScheduleSummary(
         steps=len(regressors),
@@ -382,10 +382,6 @@ def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_st
         deviations=deviations,
         state_deviations=state_deviations,
     )
-
-
-def _lengths(factor: FloatArray) -> FloatArray:
-    return np.asarray(np.sqrt(np.einsum("ij,ij->i", factor, factor)))
 
 
 def _first_end(observer: RecursiveObserver, steps: int) -> int:

@@ -142,10 +142,14 @@ class Adaptation:
                 raise SpecError(f"{option} (S_0) must be positive definite.", path=option)
 
 
-def deviations_in(factor: FloatArray, diffuse: FloatArray) -> FloatArray:
+def deviations_in(factor: FloatArray, diffuse: FloatArray | None = None) -> FloatArray:
     """Return standard deviations ``(n,)``, infinite where a state is undetermined."""
-    deviations = np.sqrt(np.einsum("ij,ij->i", factor, factor))
-    return np.where((np.abs(diffuse) > UNDETERMINED_SHARE).any(axis=1), np.inf, deviations)
+    deviations = np.asarray(np.sqrt(np.einsum("ij,ij->i", factor, factor)))
+    return (
+        deviations
+        if diffuse is None
+        else np.where((np.abs(diffuse) > UNDETERMINED_SHARE).any(axis=1), np.inf, deviations)
+    )
 
 
 class RawEstimate(NamedTuple):
@@ -959,8 +963,6 @@ class RecursiveObserver(StepObserver):
     def _sample(self, state: RecursiveState, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
         outputs = measured_record(np.atleast_2d(real_array(y, "y")), self.plant.ny)[0]
         inputs = np.atleast_1d(real_array(u, "u"))
-        if inputs.shape != (self.plant.nu,):
-            raise SpecError(f"u must be {self.plant.nu} finite number(s) at k = {state.k}.", path="u")
         require_inputs(inputs, self.plant.input_names, state.k)
         return outputs, inputs
 
