@@ -92,6 +92,21 @@ def test_texts_and_picture(bicycle: obsynth.Comparison) -> None:
     json.dumps(bicycle.to_dict())
 
 
+def test_options_are_those_of_the_plant_as_it_is_given() -> None:
+    """The paper's poles -2 .. -6 and its decoupling are of its plant: for the samples, the method was refused."""
+    spec = load_spec(DESIGNS / "sharepasand" / "spec.yaml")
+    options = {spec.method: spec.options}
+    found = obsynth.compare(spec.plant, scenario=spec.scenario, options=options, methods=[spec.method], runs=1)
+    own = obsynth.ui_pi_observer(spec.plant, **spec.options)
+    assert found[spec.method].design.gains["K_a"] == pytest.approx(own.gains["K_a"])
+    # Of a plant that a spec samples they are of the samples, whatever else is compared on the plant before.
+    sampled = load_spec(DESIGNS / "motor" / "sampled.yaml")
+    options, methods = {sampled.method: sampled.options}, [sampled.method, "pd-observer"]
+    found = obsynth.compare(sampled.transformation, options=options, methods=methods, runs=1)
+    assert found[sampled.method].design.plant.dt == sampled.plant.dt
+    assert found["pd-observer"].design.plant.dt == 0.0
+
+
 def test_tolerances_make_a_bias() -> None:
     spec = load_spec(DESIGNS / "motor" / "sampled.yaml")
     scenario = spec.scenario.replace(horizon=3.0, faults={"torque": obsynth.Step(size=0.1, start=1.0)})

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import obsynth
+from obsynth.analysis.transformations.recovery import linear_plant
 from obsynth.cli.commands import designed_or_loaded, require_same_signals, spec_output
 from obsynth.cli.output import (
     MONITOR_NAMES,
@@ -739,14 +740,13 @@ def run_compare(options: argparse.Namespace) -> int:
             refuse_given(options, ("map", "scale", "time_column", "input_delay"), "a log: give --data")
         if options.out is not None:
             output_file(options.out, RESULT_FILE if _is_json(options.out) else COMPARISON_PAGE, options)
-        plant, clock = _plant_and_clock(spec, options.sample_time)
         given = {} if spec.method == "auto" else {spec.method: spec.options}
         rows = stated_delay(options)
         found = obsynth.compare(
-            plant,
+            spec.transformation or linear_plant(spec.plant),
             scenario=spec.scenario,
             options=given,
-            sample_time=clock,
+            sample_time=options.sample_time,
             within=options.within,
             tolerance=options.tolerance,
             runs=options.runs,
@@ -770,22 +770,6 @@ def run_compare(options: argparse.Namespace) -> int:
         lambda: comparison_report(found, console=stdout_console(), file=options.out),
     )
     return 0 if found.recommended else PreconditionError.exit_code
-
-
-def _plant_and_clock(spec: obsynth.Spec, sample_time: float | None) -> tuple[obsynth.DescriptorSystem, float | None]:
-    """Return the plant before it was sampled, and the clock: some methods are continuous, and so are tolerances."""
-    plant = spec.plant
-    if not isinstance(plant, obsynth.DescriptorSystem):
-        raise SpecError(
-            "compare is for linear plants with constant matrices; of a plant of equations give the linear one that its "
-            "spec makes with transform: {linearise: {at: equilibrium, faults: [...]}, sample_time: ...}.",
-            path="plant",
-        )
-    if spec.transformation is None:
-        return plant, sample_time
-    source = spec.transformation.source
-    # Faults and unknown inputs are those of the plant as written.
-    return source, sample_time if sample_time is not None else (plant.dt or None)
 
 
 PICTURE = FileKind("a picture", rb"\A\x89PNG")

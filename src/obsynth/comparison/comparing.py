@@ -34,6 +34,7 @@ from obsynth.methods.functional_filter.kalman_gain import settling_time
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import MOST_STATES, problem_of
 from obsynth.methods.guaranteed_test.programs import largest_hidden_fault
+from obsynth.methods.registry import method_class
 from obsynth.numerics.arguments import (
     Count,
     FloatArray,
@@ -708,6 +709,8 @@ def compare(
     ----------
     plant : DescriptorSystem or Transformation
         Either time, with faults.  A continuous one is sampled: methods are designed for the samples where they can be.
+        Options such as poles are for the plant: such a method of either time is designed for it, and sampled
+        afterwards.  Of a transformation they are for the plant that it makes; compared is the one it starts from.
     scenario : Scenario, optional
         What happens; by default each fault in turn is a step, while every unknown input is a sinusoid.
     options : mapping of str to mapping, optional
@@ -749,7 +752,10 @@ def compare(
     ----------
     Ours: see `Comparison` for what each number means.
     """
-    plant = linear_plant(plant)
+    made = linear_plant(plant)
+    # Some methods are continuous, and so are tolerances; faults and unknown inputs are those of the plant as written.
+    plant, clock = (plant.source, made.dt or None) if isinstance(plant, Transformation) else (made, None)
+    sample_time = clock if sample_time is None else sample_time
     if plant.nf == 0:
         raise SpecError("The plant has no faults, so there are no fault estimates to compare.", path="plant")
     unused = sorted(name for name, given in (("columns", columns), ("scales", scales)) if given and data is None)
@@ -781,6 +787,7 @@ def compare(
         false_alarms=float(false_alarms),
         input_delay=int(input_delay),
         options=options or {},
+        of_samples=made.dt > 0.0,
         data=data,
         columns=columns,
         scales=scales,
@@ -802,12 +809,16 @@ def side_by_side(
     false_alarms: float,
     input_delay: int = 0,
     options: Mapping[str, Mapping[str, Any]] | None = None,
+    of_samples: bool = True,
     data: Any = None,
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Comparison:
-    """Return the designs that ``maker(plant, method, options)`` gives side by side; arguments as for `compare`."""
+    """Return the designs that ``maker(plant, method, options)`` gives side by side; arguments as for `compare`.
+
+    ``of_samples``: options are for the sampled plant.
+    """
     report_stage = progress or (lambda _: None)
     asked = {"plant": plant.as_dict(), "scenario": None if scenario is None else scenario.as_dict(),
              "sample_time": sample_time, "within": within, "tolerance": tolerance, "disturbance": disturbance,
@@ -825,7 +836,9 @@ def side_by_side(
     found = []
     for method in methods:
         report_stage(f"designing by {method}")
-        found.append(candidate(method, plant, sampled, steps, maker, (options or {}).get(method, {})))
+        own = (options or {}).get(method, {})
+        in_own_time = bool(own) and not of_samples and method_class(method).time == "both"
+        found.append(candidate(method, plant, sampled, steps, maker, own, continuous=in_own_time))
     report_stage("running the scenario")
     faulty, healthy = drawn_runs(
         plant, sampled, happening, runs=runs, tolerance=tolerance, seed=COMPARISON_SEED, feedback=feedback
