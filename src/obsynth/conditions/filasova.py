@@ -30,6 +30,7 @@ import numpy as np
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import SpecError
+from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.conic import lmi
 from obsynth.methods.designing import design_from_gains
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
@@ -147,8 +148,6 @@ def _theorem(
     margin: float,
     region: LMIRegion | None,
 ) -> Conditions:
-    import cvxpy as cp
-
     for name, number, least in (("delta", delta, "above 0"), ("decay", decay, "at least 0")):
         if not is_finite_number(number) or number < 0.0 or (name == "delta" and number == 0.0):
             raise SpecError(f"{name} is {shown(number)}: give a number {least}.", path=name)
@@ -221,8 +220,6 @@ def _region(where: LMIRegion, P: Any, moving: Any, still: Any, delta: float, mar
     ``[L x P, M x P; M' x P, 0] + He([I x Ae'; -I x D'] (I x P3) [I, delta I]) < 0`` with a P of its own: with
     ``(Ae - s D) x = 0`` the vector ``[v x x; s v x x]`` makes ``(v* (L + s M + conj(s) M') v) x* P x < 0`` of it.
     """
-    import cvxpy as cp
-
     n, k = still.shape[0], len(where.L)
     left, right = cp.kron(np.eye(k), moving), cp.kron(np.eye(k), still)
     whole = lmi.symmetric_blocks(

@@ -25,6 +25,7 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.conditions import atoms
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import ObsynthError, VerificationError
+from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.functions import descriptor_kalman
 from obsynth.methods.recursive.synthesis import (
     kalman_conditions,
@@ -119,8 +120,6 @@ def steady_gain(
     design: Callable[[dict[str, FloatArray], str], ObserverDesign],
 ) -> Conditions:
     """Return the inequalities of a plant without unknown inputs, constant matrices, with its covariances."""
-    import cvxpy as cp
-
     E, A, C = varying.E.at(1), varying.A.at(0), varying.C.at(1)
     ne, n = E.shape
 

@@ -19,6 +19,7 @@ from obsynth.conditions.problem import Conditions, named_constraints
 from obsynth.conditions.share_pasand import sharepasand
 from obsynth.conditions.wang import error_norm, h2_terms, noise_paths, wang2015
 from obsynth.errors import PreconditionError, SolverError
+from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.conic.lmi import SOLVER_SETTINGS, USABLE_STATUSES, semidefinite_solvers
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
@@ -54,8 +55,6 @@ def filter_by_inequality(
     plant: DescriptorSystem, asked: FaultEstimationFilter, *, progress: Callable[[str], None]
 ) -> Synthesis:
     """Return a fault-estimation filter by (45) with what was asked for in it; see `obsynth.fault_estimation_filter`."""
-    import cvxpy as cp
-
     progress("checking the existence conditions")
     require_all(fault_filter_conditions(plant))
     free = bool(asked.free_residual_weight)
@@ -215,8 +214,6 @@ def _require_inside(closed: FloatArray, where: LMIRegion | None) -> None:
 
 def _h2_terms(plant: DescriptorSystem, found: Conditions, added: dict[str, Any]) -> Any:
     """Add the H2 inequalities from unit white disturbances and noise to the fault errors; return what is minimised."""
-    import cvxpy as cp
-
     work = with_sensor_faults_as_states(plant)
     b, d = np.hstack([work.Bd, work.Bw]), np.hstack([work.Dd, work.Dw])
     added["H2 stable"], added["H2"], Z = h2_terms(plant, found, *noise_paths(plant, found, b, d))

@@ -12,6 +12,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SolverError, SpecError, VerificationError, a_kind
+from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.designing import failed_rows
 from obsynth.numerics.arguments import FloatArray, freeze, read_only, require_kind, shown
 from obsynth.results.design import ObserverDesign, VerificationReport
@@ -157,8 +158,6 @@ class Conditions:
         SpecError
             Something is no constraint or no objective, or there is no constraint of a name to drop.
         """
-        import cvxpy
-
         unknown = [key for key in drop if key not in self.constraints]
         if unknown:
             raise SpecError(
@@ -168,7 +167,7 @@ class Conditions:
         kept = {key: value for key, value in self.constraints.items() if key not in set(drop)}
         kept |= named_constraints(constraints, len(kept))
         goal = self.problem.objective if objective is None else checked_objective(objective)
-        return replace(self, problem=cvxpy.Problem(goal, list(kept.values())), constraints=kept)
+        return replace(self, problem=cp.Problem(goal, list(kept.values())), constraints=kept)
 
     def _value(self, name: str, variable: Any) -> FloatArray:
         value = variable.value
@@ -206,16 +205,14 @@ def named_constraints(given: Any, count: int = 0) -> dict[str, Any]:
 
 def checked_objective(given: Any) -> Any:
     """Return a cvxpy objective, minimising an expression; raise `SpecError` for anything else."""
-    import cvxpy
-
-    if isinstance(given, (cvxpy.Minimize, cvxpy.Maximize)):
+    if isinstance(given, (cp.Minimize, cp.Maximize)):
         return given
-    if not isinstance(given, cvxpy.Expression) or given.size != 1:
+    if not isinstance(given, cp.Expression) or given.size != 1:
         raise SpecError(
             f"The objective is {a_kind(given)}: give cvxpy.Minimize(...), or a scalar expression.",
             path="objective",
         )
-    return cvxpy.Minimize(given)
+    return cp.Minimize(given)
 
 
 def require_data(conditions: Sequence[Condition], *, solvers: tuple[str, ...]) -> None:

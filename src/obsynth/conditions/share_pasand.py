@@ -28,6 +28,7 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.conditions import atoms
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import SpecError
+from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.conic import lmi
 from obsynth.methods.designing import design_from_gains
 from obsynth.methods.placement.eigenstructure import checked_poles, place
@@ -141,8 +142,6 @@ def augmented_problem(
     X: FloatArray | None = None,
 ) -> Conditions:
     """Return the conditions for given ``U_a (na, na)`` and ``D_a (na, ny)`` (19), in coordinates ``X (na, na)``."""
-    import cvxpy as cp
-
     whole = AugmentedPlant.of(plant, model)  # (13)
     U_a, D_a = decoupling
     # Outputs that show d directly are solved for it; the others are left for the gain.

@@ -25,6 +25,7 @@ from obsynth.conditions import atoms
 from obsynth.conditions.atoms import MARGIN
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import SpecError
+from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.conic import lmi
 from obsynth.methods.designing import design_from_gains
 from obsynth.methods.fault_estimation_filter.central_filter import GainProblem, normalise, null_basis, search_least_gain
@@ -114,8 +115,6 @@ def wang2015(
     ----------
     .. [Wang2015] Fault estimation filter design for discrete-time descriptor systems, IET Control Theory Appl. 9 (10).
     """
-    import cvxpy as cp
-
     own = linear_plant(plant).dense()
     held, _ = examine_fault_filter(own)
     require_data(held, solvers=("fault zeros",))
@@ -313,8 +312,6 @@ def h2_terms(
 
     They are a constraint of stability and one of variance; the third is the variable whose trace bounds the variance.
     """
-    import cvxpy as cp
-
     if not free.shape[1]:
         # Older cvxpy has no variable without entries: an input that does nothing stands for none.
         entering, free = np.zeros((len(entering), 1)), np.zeros((len(free), 1))

@@ -9,16 +9,14 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from obsynth.errors import SolverError, SpecError
+from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.method import ChosenSolver
 from obsynth.numerics.arguments import FloatArray
-
-if TYPE_CHECKING:
-    import cvxpy
 
 #: Statuses that come with numbers; whether they count is decided by verification, not here.
 USABLE_STATUSES = ("optimal", "optimal_inaccurate")
@@ -32,12 +30,11 @@ SOLVER_SETTINGS: dict[str, dict[str, Any]] = {
 @cache
 def semidefinite_solvers() -> tuple[str, ...]:
     """Return the installed solvers of cvxpy that take semidefinite constraints."""
-    import cvxpy
     from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC
 
     taken = {
         name: {cone.__name__ for cone in SOLVER_MAP_CONIC[name].SUPPORTED_CONSTRAINTS}
-        for name in cvxpy.installed_solvers()
+        for name in cp.installed_solvers()
         if name in SOLVER_MAP_CONIC
     }
     # Newer versions know a cone of scaled triangles besides that of matrices.
@@ -69,23 +66,12 @@ _SETTINGS_OF_CVXPY = {"canon_backend", "ignore_dpp", "use_quad_obj", "verbose", 
 
 def symmetric_variable(size: int) -> Any:
     """Return a symmetric matrix variable ``(size, size)``."""
-    import cvxpy
-
-    return cvxpy.Variable((size, size), symmetric=True)
+    return cp.Variable((size, size), symmetric=True)
 
 
 def matrix_variable(rows: int, columns: int) -> Any:
     """Return a matrix variable ``(rows, columns)``; a constant zero block where a dimension is 0."""
-    import cvxpy
-
-    return cvxpy.Variable((rows, columns)) if rows and columns else np.zeros((rows, columns))
-
-
-def scalar_variable() -> Any:
-    """Return a scalar variable that is not negative."""
-    import cvxpy
-
-    return cvxpy.Variable(nonneg=True)
+    return cp.Variable((rows, columns)) if rows and columns else np.zeros((rows, columns))
 
 
 def symmetric_blocks(lower: Sequence[Sequence[Any]]) -> Any:
@@ -94,10 +80,8 @@ def symmetric_blocks(lower: Sequence[Sequence[Any]]) -> Any:
     `at_least` and `at_most` ask something of the symmetric part: each block stands here once, since cvxpy works through
     an expression as often as it is written.  For the same reason ``2 X`` does for ``X + X'`` on the diagonal.
     """
-    import cvxpy
-
     kept = [i for i, row in enumerate(lower) if row[i].shape[0] > 0]
-    return cvxpy.bmat(
+    return cp.bmat(
         [
             [lower[i][j] if j == i else 2.0 * lower[i][j] if j < i else np.zeros(lower[j][i].shape[::-1]) for j in kept]
             for i in kept
@@ -119,34 +103,6 @@ def _symmetric_part(expression: Any) -> Any:
     return expression if expression.is_symmetric() else 0.5 * (expression + expression.T)
 
 
-def trace(expression: Any) -> Any:
-    """Return the trace of a square matrix expression."""
-    import cvxpy
-
-    return cvxpy.trace(expression)
-
-
-def frobenius_norm(*blocks: Any) -> Any:
-    """Return the Frobenius norm of blocks side by side, as a convex expression."""
-    import cvxpy
-
-    return cvxpy.norm(cvxpy.hstack(blocks), "fro")
-
-
-def stacked(*blocks: Any) -> Any:
-    """Return blocks with the same number of columns, one above the other."""
-    import cvxpy
-
-    return cvxpy.vstack(blocks)
-
-
-def scalar_block(expression: Any) -> Any:
-    """Return a scalar expression as a matrix ``(1, 1)``."""
-    import cvxpy
-
-    return cvxpy.reshape(expression, (1, 1), order="C")
-
-
 def value_of(variable: Any) -> FloatArray:
     """Return the value of a variable or constant block as an array; raise `SolverError` when there is none."""
     value = variable if isinstance(variable, np.ndarray) else variable.value
@@ -157,13 +113,11 @@ def value_of(variable: Any) -> FloatArray:
 
 def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: str = "CLARABEL") -> dict[str, Any]:
     """Minimise a linear or convex objective under the constraints and return the record of the run."""
-    import cvxpy
-
-    problem: cvxpy.Problem = cvxpy.Problem(cvxpy.Minimize(0 if objective is None else objective), list(constraints))
+    problem = cp.Problem(cp.Minimize(0 if objective is None else objective), list(constraints))
     return solved(problem, what, solver)
 
 
-def solved(problem: cvxpy.Problem, what: str, solver: str) -> dict[str, Any]:
+def solved(problem: Any, what: str, solver: str) -> dict[str, Any]:
     """Solve a problem by one solver and return the record."""
     settings = {**SOLVER_SETTINGS.get(solver, {}), **getattr(solver, "options", {})}
     record: dict[str, Any] = {"what": what, "solver": str(solver), "version": _version(solver), "settings": settings}

@@ -14,6 +14,7 @@ from itertools import product
 import numpy as np
 
 from obsynth.errors import SolverError
+from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.conic import lmi
 from obsynth.methods.fault_estimation_filter.central_filter import (
     GainProblem,
@@ -259,17 +260,17 @@ def _best_dual_point(dual: _DualProblem, *, solver: str) -> tuple[FloatArray, Fl
     (n, size), nd = dual.top.shape, dual.bottom.shape[0]
     z1 = lmi.symmetric_variable(size)
     q = dual.image @ z1 @ dual.image.T - dual.top @ z1 @ dual.top.T
-    shown = lmi.trace(dual.shown @ z1 @ dual.shown.T)
-    energy = lmi.trace(dual.bottom @ z1 @ dual.bottom.T)
+    shown = cp.trace(dual.shown @ z1 @ dual.shown.T)
+    energy = cp.trace(dual.bottom @ z1 @ dual.bottom.T)
     second, corner, last = q, np.zeros((nd, n)), np.zeros((nd, nd))
     if not dual.free_weight:
         corner, last = lmi.matrix_variable(nd, n), lmi.symmetric_variable(nd)
         second = lmi.symmetric_blocks([[q], [corner, last]])
-        shown, energy = shown + lmi.trace(dual.outputs @ second @ dual.outputs.T), energy + lmi.trace(last)
+        shown, energy = shown + cp.trace(dual.outputs @ second @ dual.outputs.T), energy + cp.trace(last)
     constraints = [
         lmi.at_least(z1, DUAL_MARGIN * 2),
         lmi.at_least(second, DUAL_MARGIN * 2),
-        lmi.at_most(lmi.scalar_block(energy), 1.0),
+        lmi.at_most(cp.reshape(energy, (1, 1), order="C"), 1.0),
     ]
     lmi.minimise(-shown, constraints, what="lower bound on the gain", solver=solver)
     return lmi.value_of(z1), lmi.value_of(corner), lmi.value_of(last)

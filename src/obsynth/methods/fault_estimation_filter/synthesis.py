@@ -35,6 +35,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import require_all
 from obsynth.errors import InfeasibleError, SolverError
+from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.conic.lmi import chosen_solver, solved
 from obsynth.methods.fault_estimation_filter.central_filter import (
     AT_THE_BOUND,
@@ -155,8 +156,6 @@ class PrintedInequality:
         self, problem: GainProblem, level: float, records: list[dict[str, Any]], *, decay: float = 1.0
     ) -> Injection | None:
         """Return a filter of small gains, or of little noise, at a level; ``None`` where the solver gives none."""
-        import cvxpy as cp
-
         from obsynth.conditions.atoms import region
         from obsynth.conditions.wang import h2_terms, noise_paths
 
@@ -180,8 +179,6 @@ class PrintedInequality:
     def _filter(
         self, what: str, found: Conditions, limit: WeightLimit | None, records: list[dict[str, Any]]
     ) -> Injection | None:
-        import cvxpy as cp
-
         if limit is not None and found.weight is not None:
             found = found.changed(constraints={"weight": cp.norm(found.weight, 2) <= limit.bound})
         try:

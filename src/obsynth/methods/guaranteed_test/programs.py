@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SolverError
+from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arguments import FloatArray
 
@@ -73,8 +74,6 @@ def largest_hidden_fault(window: Window) -> Optimum:
 
 def _in_ellipsoids(window: Window) -> Optimum:
     """Return the same where noise and disturbances of each sample lie in an ellipsoid, by Clarabel."""
-    import cvxpy as cp
-
     rows, columns = window.scales
     from scipy.sparse import csr_array, diags_array
 

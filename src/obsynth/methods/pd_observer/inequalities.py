@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SolverError
+from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.conic import lmi
 from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.doubling import symmetric
@@ -75,7 +76,7 @@ def solve(task: PdTask, *, solver: str) -> PdSolution:
     for (a, c), p in zip(task.plants, own, strict=True):
         constraints += [lmi.at_least(p, PD_MARGIN), lmi.at_most(_stability(task, found, a, c, p), -PD_MARGIN)]
     constraints += _further(task, found)
-    size = lmi.frobenius_norm(found.Y, found.Z) + lmi.frobenius_norm(p3)
+    size = cp.norm(cp.hstack([found.Y, found.Z]), "fro") + cp.norm(cp.hstack([p3]), "fro")
     record = lmi.minimise(size, constraints, what=f"a PD observer by Theorem {task.theorem}", solver=solver)
     p3_value = lmi.value_of(p3)
     try:
@@ -122,7 +123,7 @@ def _further(task: PdTask, found: _Variables) -> list[Any]:
         constraints += _gain(task, found, moving, c, row.T, task.rate_gain)
     if task.noise_gain is not None:
         direct = found.P3.T @ task.process - proportional @ task.sensor
-        row = lmi.stacked(direct.T, -(found.Z @ task.sensor_rate).T)
+        row = cp.vstack([direct.T, -(found.Z @ task.sensor_rate).T])
         constraints += _gain(task, found, moving, c, row, task.noise_gain)
     return constraints
 
@@ -142,7 +143,7 @@ def _bounded(task: PdTask, found: _Variables, proportional: Any, bound: float) -
 
 def _gain(task: PdTask, found: _Variables, moving: Any, c: FloatArray, row: Any, level: float) -> list[Any]:
     """Return the bounded real inequality of the pencil; the scale theta of the fault error is free."""
-    p, theta = lmi.symmetric_variable(task.shown.shape[1]), lmi.scalar_variable()
+    p, theta = lmi.symmetric_variable(task.shown.shape[1]), cp.Variable(nonneg=True)
     stability = _blocks(task, found, moving, c, p, (0.0, 1.0, 0.0))
     stability[0][0] = stability[0][0] + theta * (task.shown.T @ task.shown)
     inputs = row.shape[0]

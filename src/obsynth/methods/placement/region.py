@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SolverError, SpecError
+from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.conic import lmi
 from obsynth.numerics.arguments import SMALLEST, FloatArray, is_finite_number, largest_singular_value
 from obsynth.numerics.doubling import continuous_riccati_solution
@@ -377,7 +378,7 @@ def _by_inequality(problem: KalmanProblem, region: Region, *, solver: str) -> tu
     else:
         constraints.append(lmi.at_most(moved + moved.T + weight, 0.0))
         constraints += _continuous_region(region, p, moved)
-    record = lmi.minimise(lmi.trace(z), constraints, what="poles in a region", solver=solver)
+    record = lmi.minimise(cp.trace(z), constraints, what="poles in a region", solver=solver)
     return np.asarray(change @ np.linalg.solve(lmi.value_of(p), lmi.value_of(y))), record
 
 
