@@ -60,20 +60,33 @@ def filter_by_inequality(
     free = bool(asked.free_residual_weight)
     found = wang2015(plant, S=asked.S, W="free" if free else None, gamma=None)
     squared, P, Y = found.variables["gamma_squared"], found.variables["P"], found.variables["Y"]
-    where = _region_of(asked, plant.dt)
+    parts = [] if asked.region is None else [checked_region(asked.region)]
+    if asked.decay is not None:
+        parts.append(disk(0.0, float(np.exp(-asked.decay * plant.dt))))
+    where = None if not parts else parts[0] if len(parts) == 1 else parts[0] & parts[1]
     added: dict[str, Any] = {}
     if where is not None:
-        _require_origin(where)
+        if not where.contains([0.0]):
+            raise PreconditionError(
+                f"No filter has all its eigenvalues in {where}: (32) puts those of the fault directions at 0. Give a "
+                "region with 0 in it.",
+                condition="region",
+                mode=0j,
+            )
         added["region"] = atoms.region(found.data["A1"], P, where, Y=Y, Cy=found.data["C1"])[1]
     if asked.gamma is not None:
         added["gamma"] = squared <= asked.gamma**2
     goal: Any = None
     drop: tuple[str, ...] = ()
-    if asked.objective is not None:
-        wanted = _h2_terms(plant, found, added) if asked.objective == "h2" else None
-        goal = wanted if wanted is not None else asked.objective(found.variables)
-        drop = ("(45)",) if asked.gamma is None and asked.objective == "h2" else ()
-        found = _with_z(found, added)
+    if asked.objective == "h2":
+        # From unit white disturbances and noise to the fault errors.
+        work = with_sensor_faults_as_states(plant)
+        b, d = np.hstack([work.Bd, work.Bw]), np.hstack([work.Dd, work.Dw])
+        added["H2 stable"], added["H2"], Z = h2_terms(plant, found, *noise_paths(plant, found, b, d))
+        goal, found = cp.trace(Z), replace(found, variables={**found.variables, "Z": Z})
+        drop = ("(45)",) if asked.gamma is None else ()
+    elif asked.objective is not None:
+        goal = asked.objective(found.variables)
     found = found.changed(constraints=_with_own(asked, found, added), objective=goal, drop=drop)
     progress("solving the matrix inequality")
     runs = [_solved(found, asked)]
@@ -164,13 +177,6 @@ def _with_own(asked: Any, found: Conditions, added: Mapping[str, Any]) -> dict[s
     return {**added, **own}
 
 
-def _region_of(asked: FaultEstimationFilter, dt: float) -> LMIRegion | None:
-    parts = [] if asked.region is None else [checked_region(asked.region)]
-    if asked.decay is not None:
-        parts.append(disk(0.0, float(np.exp(-asked.decay * dt))))
-    return None if not parts else parts[0] if len(parts) == 1 else parts[0] & parts[1]
-
-
 def _region_of_poles(asked: UiPiObserver, dt: float) -> LMIRegion | None:
     """Return the region of an observer's poles, by name too: decay, radius, damping."""
     given = dict(asked.region) if isinstance(asked.region, Mapping) else {}
@@ -189,17 +195,6 @@ def _region_of_poles(asked: UiPiObserver, dt: float) -> LMIRegion | None:
     return whole
 
 
-def _require_origin(where: LMIRegion) -> None:
-    """Raise where a region leaves out 0, which every filter of this structure has among its eigenvalues."""
-    if not where.contains([0.0]):
-        raise PreconditionError(
-            f"No filter has all its eigenvalues in {where}: (32) puts those of the fault directions at 0. Give a "
-            "region with 0 in it.",
-            condition="region",
-            mode=0j,
-        )
-
-
 def _require_inside(closed: FloatArray, where: LMIRegion | None) -> None:
     """Raise where the eigenvalues that a solver's gains have are outside the region that was asked for."""
     if where is None:
@@ -210,22 +205,6 @@ def _require_inside(closed: FloatArray, where: LMIRegion | None) -> None:
             f"The solver ended with eigenvalues outside {where}, by {-worst:.3g}: the result is inconclusive. "
             "Take another solver, or a wider region."
         )
-
-
-def _h2_terms(plant: DescriptorSystem, found: Conditions, added: dict[str, Any]) -> Any:
-    """Add the H2 inequalities from unit white disturbances and noise to the fault errors; return what is minimised."""
-    work = with_sensor_faults_as_states(plant)
-    b, d = np.hstack([work.Bd, work.Bw]), np.hstack([work.Dd, work.Dw])
-    added["H2 stable"], added["H2"], Z = h2_terms(plant, found, *noise_paths(plant, found, b, d))
-    return cp.trace(Z)
-
-
-def _with_z(found: Conditions, added: Mapping[str, Any]) -> Conditions:
-    """Return the conditions with the variable of the H2 norm among the others."""
-    if "H2" not in added:
-        return found
-    (Z,) = (variable for variable in added["H2"].variables() if variable.name() == "Z")
-    return replace(found, variables={**found.variables, "Z": Z})
 
 
 def _solved(found: Conditions, asked: Any) -> dict[str, Any]:

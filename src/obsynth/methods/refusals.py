@@ -53,7 +53,13 @@ def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method
     """Return the refusal with what would help at its end; as it is where the existence conditions hold."""
     from obsynth.analysis.diagnosis.fault_columns import least_additions, listed_sets, state_sensors
 
-    holds = _asker(asked)
+    def holds(plant: DescriptorSystem) -> bool:
+        # What would help is told to be tried, not proved: the tried plant is decided exactly then.
+        try:
+            return all(condition.holds for condition in asked.for_plant(plant).existence(plant, exactly=False))
+        except (ObsynthError, np.linalg.LinAlgError):
+            return False
+
     if holds(plant):
         return error
     sets = least_additions(plant, state_sensors(plant), holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
@@ -73,19 +79,6 @@ def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method
         add=sets,
         unclear=error.unclear,
     )
-
-
-def _asker(asked: Method) -> Callable[[DescriptorSystem], bool]:
-    """Return what says whether all existence conditions of a method hold for a plant."""
-
-    def holds(plant: DescriptorSystem) -> bool:
-        # What would help is told to be tried, not proved: the tried plant is decided exactly then.
-        try:
-            return all(condition.holds for condition in asked.for_plant(plant).existence(plant, exactly=False))
-        except (ObsynthError, np.linalg.LinAlgError):
-            return False
-
-    return holds
 
 
 def _drops(plant: DescriptorSystem, holds: Callable[[DescriptorSystem], bool]) -> list[str]:

@@ -141,19 +141,14 @@ def proved_contractions(
     bound = float(np.max(np.abs(values))) if discrete else float(-np.max(values.real))
     if not (bound < 1.0 if discrete else bound > 0.0):
         return
-    room = _in_few_digits(1.0 - bound if discrete else bound)
+    mantissa, exponent = math.frexp(1.0 - bound if discrete else bound)
+    room = math.ldexp(round(math.ldexp(mantissa, ROOM_DIGITS)), exponent - ROOM_DIGITS)
     for share in TRIED_RATES:
         tried = 1.0 - (1.0 - share) * room if discrete else (1.0 - share) * room
         # Sums of squares lose no digits to the slowest mode; with many states they take too long.
         found = _tried(ball, tried, discrete=discrete, sums_first=len(a) <= MOST_STATES_FOR_SUMS)
         if found is not None:
             yield found
-
-
-def _in_few_digits(size: float) -> float:
-    """Return a number to `ROOM_DIGITS` binary digits."""
-    mantissa, exponent = math.frexp(size)
-    return math.ldexp(round(math.ldexp(mantissa, ROOM_DIGITS)), exponent - ROOM_DIGITS)
 
 
 def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> float | None:

@@ -70,14 +70,6 @@ def plant_at(plant: DescriptorSystem, values: Mapping[str, float]) -> Descriptor
     return found.replace(uncertainty=Uncertainty(ConstantsBox({}), {}, shift=shift)) if shift else found
 
 
-def moving_at(plant: DescriptorSystem, values: Mapping[str, float]) -> FloatArray:
-    """Return A of the plant for values of its constants, reduced, and before it was sampled."""
-    bare = plant if plant.uncertainty is None else _written_at(plant, plant.uncertainty, values)
-    # Of the signals nothing is asked: without them the elimination has a tenth of the columns.
-    moving = DescriptorSystem(E=bare.E, A=bare.A, C=np.zeros((1, bare.nx)), dt=bare.dt)
-    return eliminate_algebraic_states(moving).plant.A
-
-
 def _written_at(plant: DescriptorSystem, uncertain: Uncertainty, values: Mapping[str, float]) -> DescriptorSystem:
     """Return the plant as it was written, for values of its constants."""
     matrices: dict[str, Any] = uncertain.filled(as_written(plant, uncertain), values)
@@ -843,7 +835,10 @@ def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict
     back = 2.0 * np.eye(len(basis)) - basis
 
     def exactly(q: FloatArray) -> FloatArray:
-        found = moving_at(plant, box.values(q))
+        bare = plant if plant.uncertainty is None else _written_at(plant, plant.uncertainty, box.values(q))
+        # Of the signals nothing is asked: without them the elimination has a tenth of the columns.
+        moving = DescriptorSystem(E=bare.E, A=bare.A, C=np.zeros((1, bare.nx)), dt=bare.dt)
+        found = eliminate_algebraic_states(moving).plant.A
         return np.asarray((back @ found @ basis)[np.ix_(rest, rest)])
 
     def build(lower: FloatArray, upper: FloatArray) -> AffineMatrix:

@@ -42,13 +42,15 @@ def plant_information(plant: DescriptorSystem) -> Iterator[Check]:
     if structure.regular:
         admissible = not unstable_poles(plant) and (structure.index or 0) <= 1
         verdict = "admissible" if admissible else "not admissible: an observer may exist all the same"
+        ordered = sorted((complex(value) for value in structure.finite_eigenvalues), key=abs, reverse=True)
+        texts = [f"{v.real:.4g}" if abs(v.imag) < SHOWN_AS_REAL else f"{v.real:.4g}{v.imag:+.4g}j" for v in ordered]
         rows += [
             ("index", "index of the pencil (0: E nonsingular)", float(structure.index or 0), ""),
             (
                 "finite eigenvalues",
                 "number of dynamic modes",
                 float(len(structure.finite_eigenvalues)),
-                _eigenvalue_text(structure.finite_eigenvalues),
+                listed(texts, most=MOST_EIGENVALUES),
             ),
             (
                 "infinite eigenvalues",
@@ -60,12 +62,6 @@ def plant_information(plant: DescriptorSystem) -> Iterator[Check]:
         ]
     for name, claim, value, detail in rows:
         yield information(f"plant: {name}", claim, value, source="the plant", detail=detail)
-
-
-def _eigenvalue_text(values: Iterable[complex]) -> str:
-    ordered = sorted((complex(value) for value in values), key=abs, reverse=True)
-    texts = [f"{v.real:.4g}" if abs(v.imag) < SHOWN_AS_REAL else f"{v.real:.4g}{v.imag:+.4g}j" for v in ordered]
-    return listed(texts, most=MOST_EIGENVALUES)
 
 
 def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:

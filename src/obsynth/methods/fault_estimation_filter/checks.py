@@ -232,11 +232,6 @@ class Equations:
         return found
 
 
-def filter_of(like: LinearObserver, matrices: Mapping[str, FloatArray]) -> LinearObserver:
-    """Return an observer with these matrices and the signals of another one."""
-    return LinearObserver(**{**like.as_dict(), **matrices})
-
-
 _FILTER_IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az V E + By C = V A", "Wang 2015, eqs. (7), (26)"),
     "inputs": ("unbiased: inputs", "Bu + By D = V B", "Wang 2015, eq. (23)"),
@@ -278,16 +273,29 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield from fault_rows(plant, observer, tracking, errors, scaling, allowances)
     modes = modes_of(observer)
     radius = modes.radius
+    slowest = f"slowest time constant {-plant.dt / np.log(radius):.3g} s" if 0.0 < radius < 1.0 else "no time constant"
     yield upper_bound_check(
         "spectral radius",
         "the observer is stable",
         radius,
         np.nextafter(1.0, 0.0),
         source="Wang 2015, Theorem 2",
-        detail=f"eigenvalues computed; their proof is the row 'LMI'; {_time_constant(radius, plant.dt)}",
+        detail=f"eigenvalues computed; their proof is the row 'LMI'; {slowest}",
     )
     yield from _norm_rows(design, errors, modes, tracking, factor)
-    yield from _noise_rows(plant, errors)
+    if not plant.nw:
+        return
+    covariance = certain_noise_covariance(
+        errors.Az, errors.noise, -errors.fault_output[0], errors.fault_output[3], plant.dt
+    )
+    for fault, variance in zip(plant.fault_names, np.diag(covariance), strict=True):
+        yield information(
+            f"noise in fhat[{fault}]",
+            "standard deviation of the fault estimate under the stated noise",
+            float(np.sqrt(variance)),
+            source="recomputed, Lyapunov equation",
+            detail=UNCERTAIN if np.isnan(variance) else plant.units.get(fault, ""),
+        )
 
 
 def _gain_set_rows(
@@ -402,28 +410,6 @@ def _norm_rows(
     )
 
 
-def _noise_rows(plant: DescriptorSystem, errors: ErrorModel) -> Iterator[Check]:
-    if not plant.nw:
-        return
-    covariance = certain_noise_covariance(
-        errors.Az, errors.noise, -errors.fault_output[0], errors.fault_output[3], plant.dt
-    )
-    for name, variance in zip(plant.fault_names, np.diag(covariance), strict=True):
-        yield information(
-            f"noise in fhat[{name}]",
-            "standard deviation of the fault estimate under the stated noise",
-            float(np.sqrt(variance)),
-            source="recomputed, Lyapunov equation",
-            detail=UNCERTAIN if np.isnan(variance) else plant.units.get(name, ""),
-        )
-
-
-def _time_constant(radius: float, dt: float) -> str:
-    if not 0.0 < radius < 1.0:
-        return "no time constant"
-    return f"slowest time constant {-dt / np.log(radius):.3g} s"
-
-
 #: Letters that every gain set has; it may have R as well.
 NEEDED = ("T", "N", "L", "W", "Psi", "Upsilon")
 RESTRICTED, WEIGHT = "gains: T and N", "gains: W"
@@ -491,10 +477,16 @@ def gain_rows(
     }
     for name, (claim, source) in claims.items():
         yield equality(name, claim, identities[name].residual(allowances.get(name)), source)
+    psi, upsilon = equations.detectability_matrix(gains), gains["Upsilon"]
+    sizes = equations.absolute.detectability_matrix({"T": np.abs(gains["T"])})
+    detectability = [
+        Identity((gains["Psi"], -psi), ((sizes,),), entrywise=True),
+        Identity((upsilon, -work.C @ gains["Psi"]), ((work.C, sizes),), entrywise=True),
+    ]
     yield equality(
         "gains: Psi and Upsilon",
         "Psi holds the columns (TA)^(rho_i - 1) T f_i, and Upsilon = C Psi",
-        worst([identity.residual() for identity in _detectability_identities(work, gains, equations)]),
+        worst([identity.residual() for identity in detectability]),
         "Wang 2015, eq. (20)",
     )
     if "R" in gains:
@@ -511,17 +503,6 @@ def gain_rows(
         worst([identity.residual() for identity in _realisation_identities(gains, observer, tracking, equations)]),
         "Wang 2015, eq. (23); our state estimate",
     )
-
-
-def _detectability_identities(
-    work: DescriptorSystem, gains: Mapping[str, FloatArray], equations: Equations
-) -> list[Identity]:
-    psi, upsilon = equations.detectability_matrix(gains), gains["Upsilon"]
-    sizes = equations.absolute.detectability_matrix({"T": np.abs(gains["T"])})
-    return [
-        Identity((gains["Psi"], -psi), ((sizes,),), entrywise=True),
-        Identity((upsilon, -work.C @ gains["Psi"]), ((work.C, sizes),), entrywise=True),
-    ]
 
 
 def _free_part_identities(
@@ -581,7 +562,14 @@ def printed_allowances(
 
     def totals(letter: str = "", move: FloatArray | None = None) -> dict[str, FloatArray]:
         moved = dict(gains) if move is None else {**gains, letter: gains[letter] + move}
-        return _totals(plant, work, filter_of(observer, equations.realised(moved)), moved, equations, scaling)
+        built = LinearObserver(**{**observer.as_dict(), **equations.realised(moved)})
+        tracking = equations.tracking(moved["T"])
+        lag = tracking.shape[1] // plant.nx - 1
+        errors = ErrorModel(plant, built, tracking, lag=lag)
+        found = gain_identities(work, moved, equations, scaling)
+        for name, steps in fault_identities(errors, built.fault_delays).items():
+            found |= {step_key(name, step): identity for step, identity in enumerate(steps)}
+        return {**tracking_totals(errors), **{name: identity.total for name, identity in found.items()}}
 
     centre = totals()
     found = {name: np.zeros_like(total) for name, total in centre.items()}
@@ -593,20 +581,3 @@ def printed_allowances(
             for name, middle in centre.items():
                 found[name] += np.maximum(np.abs(more[name] - middle), np.abs(less[name] - middle))
     return found
-
-
-def _totals(
-    plant: DescriptorSystem,
-    work: DescriptorSystem,
-    observer: LinearObserver,
-    gains: Mapping[str, FloatArray],
-    equations: Equations,
-    scaling: Scaling,
-) -> dict[str, FloatArray]:
-    tracking = equations.tracking(gains["T"])
-    lag = tracking.shape[1] // plant.nx - 1
-    errors = ErrorModel(plant, observer, tracking, lag=lag)
-    found = gain_identities(work, gains, equations, scaling)
-    for name, steps in fault_identities(errors, observer.fault_delays).items():
-        found |= {step_key(name, step): identity for step, identity in enumerate(steps)}
-    return {**tracking_totals(errors), **{name: identity.total for name, identity in found.items()}}

@@ -57,7 +57,9 @@ def index_doubt(judge: Evaluator, detectability: FaultDetectability) -> Unclear 
     if not detectability.finite or not _is_in_doubt(judge, detectability):
         return None
     plant, units, best = judge.plant, judge.units, None
-    direction = _null_direction(detectability)
+    lengths = np.linalg.norm(detectability.Upsilon, axis=0)
+    direction = np.linalg.svd(detectability.Upsilon / lengths)[2][-1] / lengths
+    direction = direction / direction[int(np.argmax(np.abs(direction)))]
     for digits in WITNESS_DIGITS:
         found = _changed(plant, units, detectability.indexes, np.round(direction, digits))
         if found is not None and (best is None or found.size < best.size):
@@ -102,12 +104,6 @@ def _moved(a: fmpq_mat, faults: fmpq_mat, fault: int, index: int | None) -> fmpq
     for _ in range(int(index or 1) - 1):
         vector = a * vector
     return vector
-
-
-def _null_direction(detectability: FaultDetectability) -> np.ndarray:
-    lengths = np.linalg.norm(detectability.Upsilon, axis=0)
-    direction = np.linalg.svd(detectability.Upsilon / lengths)[2][-1] / lengths
-    return np.asarray(direction / direction[int(np.argmax(np.abs(direction)))])
 
 
 def _changed(

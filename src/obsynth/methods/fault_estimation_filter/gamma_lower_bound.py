@@ -208,19 +208,14 @@ def _bound_in(normalised: NormalisedProblem, solver: str) -> float:
     if work.disturbances == 0:
         return 0.0
     if work.order == 0:
-        return normalised.gain * _direct_bound(work) * (1.0 - BOUND_MARGIN)
+        direct = work.Zd @ null_space(work.D) if work.weight_is_free else work.Zd
+        return normalised.gain * largest_singular_value(direct) * (1.0 - BOUND_MARGIN)
     try:
         dual = _DualProblem.of(work)
         point = _best_dual_point(dual, solver=solver)
     except (SolverError, np.linalg.LinAlgError):
         return 0.0
     return normalised.gain * _checked_bound(dual, *point)
-
-
-def _direct_bound(work: GainProblem) -> float:
-    """Return the gain of what no measurement sees and no state keeps: the disturbance in xi at once."""
-    direct = work.Zd @ null_space(work.D) if work.weight_is_free else work.Zd
-    return largest_singular_value(direct)
 
 
 @dataclass(frozen=True, eq=False)

@@ -88,7 +88,7 @@ def bounded_real_certificate(
             p = bounded_real_matrix(moved_a, moved_b, moved_c, d, 1.0, slack=slack * weight)
             if p is None:
                 continue
-            best = _triangular(np.asarray(np.linalg.cholesky(p)).T @ inverse)
+            best = np.asarray(np.triu(np.linalg.qr(np.asarray(np.linalg.cholesky(p)).T @ inverse, mode="r")))
             proof = prove_bounded_real(plant, observer, tracking, best, gain)
             if proof.in_double_precision:
                 return best, True
@@ -174,11 +174,6 @@ def _coordinates(
             return None
         change = change @ normalising_change(p)
     return change
-
-
-def _triangular(factor: FloatArray) -> FloatArray:
-    """Return the upper triangular factor of the same Gram matrix."""
-    return np.asarray(np.triu(np.linalg.qr(factor, mode="r")))
 
 
 def realise_filter(

@@ -521,16 +521,19 @@ def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progres
         zeros = np.zeros(((asked.mean - 1) * plant.nf, tracking.shape[1]))
         witnesses["tracking"] = np.vstack([tracking, zeros])
         observer = averaged(observer, asked.mean)
+    told = []
+    if plant.nd and asked.gamma is not None and level < asked.gamma:
+        told.append(
+            f"gamma = {asked.gamma:.6g} was asked for, and {level:.6g} is proved: a larger gamma would only make the "
+            "gains worse conditioned."
+        )
     return Synthesis(
         resolved,
         gains,
         observer,
         Certificate(witnesses, claims),
-        {"engine": _engine_of(records), "runs": records},
-        (
-            *_gamma_notes(asked.gamma, level if plant.nd else np.inf),
-            *notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
-        ),
+        {"engine": "lmi" if any("settings" in record for record in records) else "riccati", "runs": records},
+        (*told, *notes(plant, prepared.detectability, observer, largest_zero=held[-1].value)),
     )
 
 
@@ -643,21 +646,6 @@ def _left_inverse(upsilon: FloatArray) -> FloatArray:
     """Return the left inverse of least norm of a matrix of full column rank, whatever the units of the faults."""
     units = np.exp2(np.round(np.log2(np.linalg.norm(upsilon, axis=0))))
     return np.asarray(np.linalg.pinv(upsilon / units) / units[:, None])
-
-
-def _engine_of(records: list[dict[str, Any]]) -> str:
-    """Return which engine ran: the inequality comes in only where it may and where there is something to find."""
-    return "lmi" if any("settings" in record for record in records) else "riccati"
-
-
-def _gamma_notes(asked: float | None, shipped: float) -> tuple[str, ...]:
-    """Return a note where less is shipped than was asked for."""
-    if asked is None or shipped >= asked:
-        return ()
-    return (
-        f"gamma = {asked:.6g} was asked for, and {shipped:.6g} is proved: a larger gamma would only make the gains "
-        "worse conditioned.",
-    )
 
 
 def _gains(prepared: PreparedPlant, parts: _Parts, chosen: Injection) -> dict[str, FloatArray]:

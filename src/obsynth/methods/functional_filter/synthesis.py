@@ -229,7 +229,9 @@ def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Ca
     names = _residual_names(plant, models, parts, asked)
     observer, t, t0 = assembled(plant, parts, names)
     estimated = [plant.fault_names.index(name) for name in observer.fault_names]
-    walks = _walks(model, models, rates)
+    walks = np.zeros(model.order)
+    for part, walk in zip(models, rates, strict=True):
+        walks[model_states(model, part.faults)] = walk
     matrices = {
         "T": t,
         "T0": t0,
@@ -376,14 +378,6 @@ def _residual_names(
         label = "" if alone else f"{' '.join(plant.fault_names[i] for i in seen)}: "
         names += [f"{label}r{i + 1}" for i in range(len(part.residuals.C))]
     return names if len(set(names)) == len(names) else [f"{i + 1}: {name}" for i, name in enumerate(names)]
-
-
-def _walks(model: Exosystem, models: Sequence[FilterModel], rates: Sequence[FloatArray]) -> FloatArray:
-    """Return the walk of every state of the whole exosystem."""
-    walks = np.zeros(model.order)
-    for part, walk in zip(models, rates, strict=True):
-        walks[model_states(model, part.faults)] = walk
-    return walks
 
 
 def _resolved(

@@ -147,13 +147,9 @@ def _what_does_not_fit(
         order, steps = (len(shipped.get(name, ())) for name in ("state_tracking", "record"))
         known = max(steps, windows[0].question.samples) * (plant.nu + plant.ny)
         sizes = {"state_tracking": order * nx, "state_rows": nx**2, "record": known}
-        wrong += [name for name, size in sizes.items() if not _is_finite(shipped.get(name), size)]
+        found = ((name, size, shipped.get(name)) for name, size in sizes.items())
+        wrong += [name for name, size, m in found if m is None or m.size != size or not np.isfinite(m).all()]
     return wrong if len(names) in (0, nx) else [*wrong, "states"]
-
-
-def _is_finite(matrix: FloatArray | None, size: int) -> bool:
-    """Whether a matrix is there, of so many finite numbers."""
-    return matrix is not None and matrix.size == size and bool(np.isfinite(matrix).all())
 
 
 def excess(found: Repaired | None, radius: FloatArray) -> float:

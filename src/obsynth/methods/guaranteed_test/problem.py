@@ -188,16 +188,6 @@ def samples_given(asked: Asked) -> Any:
     return asked.before + asked.after if asked.after is not None else asked.samples
 
 
-def _key_of(window: Window) -> bytes:
-    """Return what windows have in common that have one programme and one test."""
-    digest = hashlib.blake2b(digest_size=32)
-    for part in (window.i, window.j, window.value, window.times, window.bar, np.array([window.rows])):
-        digest.update(np.ascontiguousarray(part).tobytes() + b"|")
-    for _, _, inputs in window.model.equations:
-        digest.update(np.ascontiguousarray(inputs).tobytes())
-    return digest.digest()
-
-
 @dataclass(frozen=True, eq=False)
 class Programmes:
     """The different windows of all rows, the first row of each, and which window each row has ``(rows,)``."""
@@ -215,7 +205,12 @@ class Programmes:
         of_row = []
         for row in problem.rows(samples):
             window = problem.window(samples, row=row)
-            key = _key_of(window) + bytes([problem.continues(window, row)])
+            digest = hashlib.blake2b(digest_size=32)
+            for part in (window.i, window.j, window.value, window.times, window.bar, np.array([window.rows])):
+                digest.update(np.ascontiguousarray(part).tobytes() + b"|")
+            for _, _, inputs in window.model.equations:
+                digest.update(np.ascontiguousarray(inputs).tobytes())
+            key = digest.digest() + bytes([problem.continues(window, row)])
             if key not in numbers:
                 numbers[key] = len(windows)
                 windows.append(window)

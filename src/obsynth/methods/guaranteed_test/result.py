@@ -178,7 +178,14 @@ class GuaranteedTest(ObserverDesign):
             number = names.index(names[0] if fault is None else fault)
             return hidden_by(self, GuaranteedTestMethod.of, number)
         if isinstance(self.observer, WindowObserver):
-            return self._hidden_at_worst()
+            shipped = self.certificate.matrices
+            leasts = shipped["leasts"].ravel()
+            if np.isnan(self.least) or self.least == 0.0:
+                return {}
+            problem = problem_as_designed(self._varying_plant, GuaranteedTestMethod.of(self.options))
+            place = int(np.flatnonzero(leasts == self.least)[0])
+            window = Programmes.of(problem, self.samples).windows[place]
+            return courses_of(window, shipped["witness"][place][: len(window.bar)])
         point = self.certificate.matrices.get("witness")
         if point is None:
             return {}
@@ -289,17 +296,6 @@ class GuaranteedTest(ObserverDesign):
             found = programmes.interval(outputs[rows], inputs[rows])
             low[k], high[k] = max(low[k], found[0]), min(high[k], found[1])
         return low, high
-
-    def _hidden_at_worst(self) -> dict[str, FloatArray]:
-        """Return the witness of the row with the largest of the least thresholds."""
-        shipped = self.certificate.matrices
-        leasts = shipped["leasts"].ravel()
-        if np.isnan(self.least) or self.least == 0.0:
-            return {}
-        problem = problem_as_designed(self._varying_plant, GuaranteedTestMethod.of(self.options))
-        place = int(np.flatnonzero(leasts == self.least)[0])
-        window = Programmes.of(problem, self.samples).windows[place]
-        return courses_of(window, shipped["witness"][place][: len(window.bar)])
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Plot the least threshold against the samples of the window.

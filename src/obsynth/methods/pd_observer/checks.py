@@ -240,7 +240,18 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     errors = PdErrorSystem.of(augmented, observer, plant.nx)
     yield _gains_row(design, augmented, tolerance)
     yield from _spectra(design, errors)
-    yield _pencil_row(design, augmented)
+    gain_j, gain_l = stacked_gains(design)
+    # E* = [I 0; 0 0], A* = [0 I; A - J C, -(I + L C)]: impulse-free where the lower right block is nonsingular.
+    moved, shown = augmented.A - gain_j @ augmented.C, np.eye(augmented.nx) + gain_l @ augmented.C
+    impulse_free = rounding_rank(_balanced(shown)) == augmented.nx
+    slowest = abscissa(_balanced(solved(shown, moved)), 0.0) if impulse_free else float("nan")
+    yield _negative(
+        "descriptor pair",
+        "(E*, A*) of the listed gains is admissible: regular, impulse-free, stable",
+        slowest,
+        source="Filasova et al., eqs. (38), (39), Definition 1",
+        detail=f"{augmented.nx} finite modes of {2 * augmented.nx}" if impulse_free else "I + L C is singular",
+    )
     yield from proof_rows(design)
     yield from norm_rows(design, errors, noisy)
 
@@ -374,22 +385,6 @@ def spectrum_text(values: ComplexArray) -> str:
     ordered = sorted((complex(value) for value in values), key=lambda v: (-v.real, v.imag))
     shown = [pole_text(value, pair=True) for value in ordered if value.imag >= 0.0]
     return listed(shown, most=LISTED_EIGENVALUES)
-
-
-def _pencil_row(design: ObserverDesign, augmented: DescriptorSystem) -> Check:
-    """Check the descriptor pair of the error from the listed gains: regular, impulse-free and stable."""
-    gain_j, gain_l = stacked_gains(design)
-    # E* = [I 0; 0 0], A* = [0 I; A - J C, -(I + L C)]: impulse-free where the lower right block is nonsingular.
-    moved, shown = augmented.A - gain_j @ augmented.C, np.eye(augmented.nx) + gain_l @ augmented.C
-    impulse_free = rounding_rank(_balanced(shown)) == augmented.nx
-    slowest = abscissa(_balanced(solved(shown, moved)), 0.0) if impulse_free else float("nan")
-    return _negative(
-        "descriptor pair",
-        "(E*, A*) of the listed gains is admissible: regular, impulse-free, stable",
-        slowest,
-        source="Filasova et al., eqs. (38), (39), Definition 1",
-        detail=f"{augmented.nx} finite modes of {2 * augmented.nx}" if impulse_free else "I + L C is singular",
-    )
 
 
 #: Norms of ``[J L]`` above this many times the norm of A are out of proportion to the plant, and worth a warning.

@@ -169,7 +169,12 @@ def _detectable(facts: SystemFacts) -> Condition:
 
 def _hidden_mode(plant: DescriptorSystem, hidden: Sequence[complex]) -> Condition:
     mode = max(hidden, key=lambda value: value.real)
-    signals = leading_names(_hidden_direction(plant, mode), plant.state_names, most=MOST_NAMES)
+    still = np.vstack([plant.E, np.zeros_like(plant.C)])
+    pencil = equilibrated_at(still, np.vstack([plant.A, plant.C]), mode, nx=plant.nx)
+    point = mode if mode.imag else mode.real
+    # The direction that [A - s I; C] shows least at the mode.
+    direction = np.abs(pencil.columns * np.linalg.svd(pencil.A - point * pencil.E)[2][-1])
+    signals = leading_names(direction, plant.state_names, most=MOST_NAMES)
     value = pole_text(mode, 6)
     detail = (
         f"the mode s = {value} (states {', '.join(map(repr, signals))}) is undetectable: no output responds to it, "
@@ -178,14 +183,6 @@ def _hidden_mode(plant: DescriptorSystem, hidden: Sequence[complex]) -> Conditio
     return Condition(
         "detectability", _CLAIM, False, float(len(hidden)), 0.0, _NEEDED_FOR, detail, mode=mode, signals=signals
     )
-
-
-def _hidden_direction(plant: DescriptorSystem, mode: complex) -> FloatArray:
-    """Return the sizes ``(nx,)`` of the states in the direction that ``[A - s I; C]`` shows least at a mode."""
-    still = np.vstack([plant.E, np.zeros_like(plant.C)])
-    pencil = equilibrated_at(still, np.vstack([plant.A, plant.C]), mode, nx=plant.nx)
-    point = mode if mode.imag else mode.real
-    return np.asarray(np.abs(pencil.columns * np.linalg.svd(pencil.A - point * pencil.E)[2][-1]))
 
 
 def _null_vector(matrix: FloatArray) -> FloatArray:

@@ -50,7 +50,14 @@ def explicit_certificate(
     balanced, units = balanced_matrix(moving)
     try:
         p = _gram(balanced)
-        delta = _good_delta(balanced)
+        # A delta for which -1 / delta is far from the eigenvalues.
+        one = np.eye(len(balanced))
+        middle = 1.0 / float(np.exp(np.mean(np.log(np.abs(np.linalg.eigvals(balanced))))))
+        steps = sorted(range(-DELTA_TRIES // 2, DELTA_TRIES // 2), key=abs)
+        candidates = [middle * DELTA_STEP**step for step in steps]
+        conditions = [float(np.linalg.cond(one + delta * balanced)) for delta in candidates]
+        good = [i for i, condition in enumerate(conditions) if condition <= GOOD_CONDITION]
+        delta = candidates[good[0] if good else int(np.argmin(conditions))]
         x = _coupling(balanced, p, delta)
         inverse = np.linalg.inv(estimate)
     except np.linalg.LinAlgError:
@@ -120,17 +127,6 @@ def _gram(a: FloatArray) -> FloatArray:
         # "An eigenvalue pair whose sum is very close to zero": what comes of it is proved or thrown away.
         p = continuous_lyapunov(a.T, -np.linalg.norm(a) * np.eye(len(a)))
     return np.asarray(0.5 * (p + p.T))
-
-
-def _good_delta(a: FloatArray) -> float:
-    """Return a delta for which ``-1 / delta`` is far from the eigenvalues of a stable ``a``."""
-    one = np.eye(len(a))
-    middle = 1.0 / float(np.exp(np.mean(np.log(np.abs(np.linalg.eigvals(a))))))
-    steps = sorted(range(-DELTA_TRIES // 2, DELTA_TRIES // 2), key=abs)
-    candidates = [middle * DELTA_STEP**step for step in steps]
-    conditions = [float(np.linalg.cond(one + delta * a)) for delta in candidates]
-    good = [i for i, condition in enumerate(conditions) if condition <= GOOD_CONDITION]
-    return candidates[good[0] if good else int(np.argmin(conditions))]
 
 
 def _coupling(a: FloatArray, p: FloatArray, delta: float) -> FloatArray:

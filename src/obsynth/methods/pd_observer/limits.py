@@ -65,7 +65,20 @@ def require_possible(plant: DescriptorSystem, asked: PdObserver, *, delta: float
             necessary=True,
         )
     if asked.disk_numbers is not None:
-        _require_disk(asked.disk_numbers, hidden, delta)
+        centre, radius = asked.disk_numbers
+        outside = [mode for mode in hidden if abs(mode + centre) >= radius]
+        if outside:
+            raise InfeasibleError(
+                f"No observer has all its eigenvalues within {radius:.6g} of {-centre:.6g}: the mode {outside[0]:.6g} "
+                "is unobservable, so that no gain moves it.",
+                necessary=True,
+            )
+        if abs(-1.0 / delta + centre) >= radius:
+            raise InfeasibleError(
+                f"The inequality for the disk has no solution with delta = {delta:.6g} s: -1/delta must lie inside the "
+                f"disk. Leave delta out, or take {1.0 / centre if centre > 0.0 else 2.0 / (centre + radius):.6g} s.",
+                necessary=False,
+            )
     limit = theorem_2_limit(plant, decay) if asked.theorem == 2 else math.inf
     if delta >= limit:
         raise InfeasibleError(
@@ -83,23 +96,6 @@ def require_possible(plant: DescriptorSystem, asked: PdObserver, *, delta: float
                 necessary=True,
                 lower_bound=least,
             )
-
-
-def _require_disk(disk: tuple[float, float], hidden: tuple[complex, ...], delta: float) -> None:
-    centre, radius = disk
-    outside = [mode for mode in hidden if abs(mode + centre) >= radius]
-    if outside:
-        raise InfeasibleError(
-            f"No observer has all its eigenvalues within {radius:.6g} of {-centre:.6g}: the mode {outside[0]:.6g} "
-            "is unobservable, so that no gain moves it.",
-            necessary=True,
-        )
-    if abs(-1.0 / delta + centre) >= radius:
-        raise InfeasibleError(
-            f"The inequality for the disk has no solution with delta = {delta:.6g} s: -1/delta must lie inside the "
-            f"disk. Leave delta out, or take {1.0 / centre if centre > 0.0 else 2.0 / (centre + radius):.6g} s.",
-            necessary=False,
-        )
 
 
 def least_noise_gain(plant: DescriptorSystem) -> float:

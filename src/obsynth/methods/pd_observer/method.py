@@ -176,17 +176,6 @@ class PdObserver(Method):
                 f"engine {self.engine!r} gives stability and a decay rate alone: take engine 'lmi', or leave out "
                 f"{', '.join(self.further)}."
             )
-        yield from self._broken_lists()
-        if self.objective is not None and not callable(self.objective):
-            yield f"objective is {shown(self.objective)}: give a function of the variables."
-        beside = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain", "adaptation_range")
-        yield from own_term_conflicts(self, beside=beside, engines=("riccati",))
-        others = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain")
-        clash = [name for name in others if getattr(self, name) is not None]
-        if self.adaptation_range is not None and clash:
-            yield f"adaptation_range cannot be combined with {', '.join(clash)}."
-
-    def _broken_lists(self) -> Iterator[str]:
         found = {name: _pair(getattr(self, name)) for name in ("disk", "adaptation_range")}
         for name, numbers in found.items():
             if getattr(self, name) is not None and numbers is None:
@@ -196,6 +185,14 @@ class PdObserver(Method):
             yield f"disk is {disk}: give [c, r] for |s + c| < r, with r > 0 and part of the disk left of the axis."
         if low_high is not None and not 0.0 < low_high[0] < low_high[1]:
             yield f"adaptation_range is {low_high}: give [low, high] with 0 < low < high."
+        if self.objective is not None and not callable(self.objective):
+            yield f"objective is {shown(self.objective)}: give a function of the variables."
+        beside = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain", "adaptation_range")
+        yield from own_term_conflicts(self, beside=beside, engines=("riccati",))
+        others = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain")
+        clash = [name for name in others if getattr(self, name) is not None]
+        if self.adaptation_range is not None and clash:
+            yield f"adaptation_range cannot be combined with {', '.join(clash)}."
 
     @property
     def further(self) -> tuple[str, ...]:

@@ -328,11 +328,24 @@ def synthesise(plant: DescriptorSystem, asked: PdObserver, *, progress: Callable
     gains, records = design_gains(work, asked)
     shipped = asked.range_numbers and min(max(1.0, asked.range_numbers[0]), asked.range_numbers[1])
     loop = shipped * np.eye(work.nf) if shipped else g
+    claims = {"theorem": float(gains.theorem), "delta": gains.delta, "decay": gains.decay}
+    bounds: dict[str, float | None] = {
+        "gain_bound": asked.gain_bound,
+        "fault_rate_gain": asked.fault_rate_gain,
+        "noise_gain": asked.noise_gain,
+    }
+    claims |= {name: float(bound) for name, bound in bounds.items() if bound is not None}
+    matrices = {"P1": gains.P1, "P3": gains.P3, **gains.gain_certificates}
+    if asked.disk_numbers is not None:
+        claims |= {"disk_centre": asked.disk_numbers[0], "disk_radius": asked.disk_numbers[1]}
+    if asked.range_numbers is not None:
+        claims |= {"adaptation_low": asked.range_numbers[0], "adaptation_high": asked.range_numbers[1]}
+        matrices |= {"P1_low": gains.ends[0], "P1_high": gains.ends[1]}
     return Synthesis(
         _resolved(asked, gains, g),
         listed_gains(work, gains.J, gains.L, loop),
         gains.observer,
-        _certificate(asked, gains),
+        Certificate(matrices, claims),
         {"engine": gains.engine, "runs": records},
         notes(work, asked, gains),
         transformation=form,
@@ -359,23 +372,6 @@ def listed_gains(plant: DescriptorSystem, J: FloatArray, L: FloatArray, g: Float
     return gains if g is None else {**gains, "G": g}
 
 
-def _certificate(asked: PdObserver, gains: PdGains) -> Certificate:
-    claims = {"theorem": float(gains.theorem), "delta": gains.delta, "decay": gains.decay}
-    bounds: dict[str, float | None] = {
-        "gain_bound": asked.gain_bound,
-        "fault_rate_gain": asked.fault_rate_gain,
-        "noise_gain": asked.noise_gain,
-    }
-    claims |= {name: float(bound) for name, bound in bounds.items() if bound is not None}
-    matrices = {"P1": gains.P1, "P3": gains.P3, **gains.gain_certificates}
-    if asked.disk_numbers is not None:
-        claims |= {"disk_centre": asked.disk_numbers[0], "disk_radius": asked.disk_numbers[1]}
-    if asked.range_numbers is not None:
-        claims |= {"adaptation_low": asked.range_numbers[0], "adaptation_high": asked.range_numbers[1]}
-        matrices |= {"P1_low": gains.ends[0], "P1_high": gains.ends[1]}
-    return Certificate(matrices, claims)
-
-
 def notes(plant: DescriptorSystem, asked: PdObserver, gains: PdGains) -> tuple[str, ...]:
     """Return what a user should know: how delta and the decay rate were chosen, slow or noisy estimates."""
     found = []
@@ -390,7 +386,16 @@ def notes(plant: DescriptorSystem, asked: PdObserver, gains: PdGains) -> tuple[s
             "gains."
         )
     found += _engine_notes(asked, gains, plant.nx + plant.nf)
-    return (*found, *_noise_notes(plant, gains))
+    direct = gains.observer.Dy[gains.observer.fault_rows]
+    return (
+        *found,
+        *[
+            f"The estimate of {name!r} amplifies high-frequency errors of the measurements by up to "
+            f"{np.linalg.norm(row):.3g}."
+            for name, row in zip(plant.fault_names, direct, strict=True)
+            if np.linalg.norm(row) > WARN_AMPLIFICATION
+        ],
+    )
 
 
 _CLOSED_FORM = "a Riccati equation (engine 'riccati'), with L = 0 and N = 0."
@@ -406,16 +411,6 @@ def _engine_notes(asked: PdObserver, gains: PdGains, states: int) -> list[str]:
     if asked.engine == "auto" and wanted != "lmi":
         return [f"With {states} unknown states the gains come from {_CLOSED_FORM} Engine 'lmi' may find smaller ones."]
     return []
-
-
-def _noise_notes(plant: DescriptorSystem, gains: PdGains) -> list[str]:
-    direct = gains.observer.Dy[gains.observer.fault_rows]
-    return [
-        f"The estimate of {name!r} amplifies high-frequency errors of the measurements by up to "
-        f"{np.linalg.norm(row):.3g}."
-        for name, row in zip(plant.fault_names, direct, strict=True)
-        if np.linalg.norm(row) > WARN_AMPLIFICATION
-    ]
 
 
 @dataclass(frozen=True, eq=False)

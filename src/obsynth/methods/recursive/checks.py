@@ -51,7 +51,7 @@ from obsynth.observers.recursive.gain_schedule import (
 from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options
 from obsynth.observers.recursive.step_model import StepMatrices
 from obsynth.observers.running import plain_recursion
-from obsynth.plants.descriptor import MatrixSequence, TimeVaryingDescriptorSystem, listed
+from obsynth.plants.descriptor import MatrixSequence, listed
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction, proved_rate
 from obsynth.proofs.definiteness import prove_positive_definite
@@ -103,7 +103,13 @@ def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
         before = innovation
         if position in (0, count // 2, count - 1):
             joint = np.hstack([x + theta @ gains.Upsilon.T if nq else x, theta])
-            scores[k + 1] = normalised(joint, _joint_root(gains), _gain_terms(gains, factor))
+            # Factorisations round relative to the whole noise: a covariance that tends to zero ends there.
+            terms = state_terms(gains.step, data_deviations(gains.step, factor))
+            parameters = np.linalg.norm(gains.spread, axis=1)
+            parameters = parameters + np.abs(gains.learn) @ data_deviations(gains.step, factor)
+            scores[k + 1] = normalised(
+                joint, _joint_root(gains), np.concatenate([terms + np.abs(gains.Upsilon) @ parameters, parameters])
+            )
         factor = gains.factor
     yield from _error_rows(scores)
     squares = np.concatenate([np.zeros(0), *(found.ravel() for found in nis)]) ** 2
@@ -126,15 +132,6 @@ def _joint_root(gains: GainStep) -> FloatArray:
     nq = gains.spread.shape[0]
     top = np.hstack([gains.factor, gains.Upsilon @ gains.spread])
     return np.asarray(np.vstack([top, np.hstack([np.zeros((nq, gains.factor.shape[1])), gains.spread])]))
-
-
-def _gain_terms(gains: GainStep, factor: FloatArray) -> FloatArray:
-    """Return the deviations that those of states and parameters are computed from, ``(nx + nq,)``."""
-    # Factorisations round relative to the whole noise: a covariance that tends to zero ends there.
-    terms = state_terms(gains.step, data_deviations(gains.step, factor))
-    parameters = np.linalg.norm(gains.spread, axis=1)
-    parameters = parameters + np.abs(gains.learn) @ data_deviations(gains.step, factor)
-    return np.concatenate([terms + np.abs(gains.Upsilon) @ parameters, parameters])
 
 
 def data_deviations(step: StepMatrices, factor: FloatArray) -> FloatArray:
@@ -712,12 +709,6 @@ def misfit(design: ObserverDesign) -> str:
         for field in fields:
             if not np.array_equal(getattr(ours, field), getattr(theirs, field)):
                 return field
-    return _different_matrix(plant, observer, stated)
-
-
-def _different_matrix(
-    plant: TimeVaryingDescriptorSystem, observer: RecursiveObserver, stated: RecursiveObserver
-) -> str:
     pairs: dict[str, tuple[MatrixSequence, MatrixSequence]] = {
         name: (matrix, observer.plant.matrices[name]) for name, matrix in plant.matrices.items()
     }

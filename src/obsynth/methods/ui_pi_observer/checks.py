@@ -614,14 +614,9 @@ def stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArray
     )
     if "decay" in claims:
         yield decay_row(observer, claims["decay"])
-    yield from _digits_rows(observer.Az, dt, claimed, claims)
-
-
-def _digits_rows(ahat: FloatArray, dt: float, poles: list[complex], claims: Mapping[str, float]) -> Iterator[Check]:
-    """Yield in how many digits Ahat has to be kept: as many as are commonly printed, or more where that is claimed."""
     wanted = claims.get("digits", PRINTED_DIGITS)
     digits = int(wanted) if 1 <= wanted <= DOUBLE_DIGITS else 1
-    rounded = as_printed(ahat, digits)
+    rounded = as_printed(observer.Az, digits)
     values, bound = eigenvalues(rounded), 1.0 if dt > 0.0 else 0.0
     found = abscissa_of(values, dt)
     yield Check(
@@ -636,9 +631,9 @@ def _digits_rows(ahat: FloatArray, dt: float, poles: list[complex], claims: Mapp
     yield information(
         "digits needed",
         "significant digits of Ahat with which every mode stays stable",
-        float(digits_needed(ahat, dt)),
+        float(digits_needed(observer.Az, dt)),
         source="recomputed eigenvalues",
-        detail=f"with {digits} digits poles move by {mean_miss(values, poles, dt):.1e} of their size",
+        detail=f"with {digits} digits poles move by {mean_miss(values, claimed, dt):.1e} of their size",
     )
 
 

@@ -451,41 +451,9 @@ def _key(model: Exosystem, *, exactly: bool) -> tuple[bool, *tuple[bytes, ...]]:
 
 
 def _decided(judge: Evaluator, model: Exosystem) -> Existence:
-    enough = _enough_outputs(judge)
-    if not enough.holds:
-        return Existence((enough,), judge.plant, None, np.zeros(0, dtype=np.complex128))
-    transformation, before, after = decoupling_data(judge)
-
-    def decide(judge: Evaluator) -> Existence:
-        # (D1) and the others fail independently: a user wants to know both.
-        first = [enough, _decoupling_condition(judge, before, after)]
-        return _decided_without_algebraic_states(judge, model, first, transformation)
-
-    if transformation is None:
-        return decide(judge)
-    return reconsidered(Evaluator(transformation.plant, judge.exactly), decide, lambda found: found.conditions)
-
-
-def _decided_without_algebraic_states(
-    judge: Evaluator, model: Exosystem, found: list[Condition], transformation: Transformation | None
-) -> Existence:
-    """Decide about a plant of which the first conditions were found."""
-    working, fixed, whole = judge.plant, np.zeros(0, dtype=np.complex128), replace(judge, model=model)
-    found.append(_zero_condition(judge, whole.natural, whole.units))
-    if found[-1].holds:
-        found += model_conditions(whole, model)
-    if all(condition.holds for condition in found):
-        found += order_conditions(whole, model)
-        if found[-1].holds:
-            fixed, condition = _fixed_modes(whole, model)
-            found.append(condition)
-    return Existence(tuple(found), working, transformation, fixed)
-
-
-def _enough_outputs(judge: Evaluator) -> Condition:
     plant, rank = judge.plant, disturbance_rank(judge)
     holds = rank <= plant.ny
-    return Condition(
+    enough = Condition(
         "nd <= ny",
         "no more independent unknown inputs than outputs",
         holds,
@@ -496,6 +464,27 @@ def _enough_outputs(judge: Evaluator) -> Condition:
         + ("" if holds else ". Measure more, or leave an unknown input out."),
         signals=() if holds else plant.disturbance_names,
     )
+    if not enough.holds:
+        return Existence((enough,), judge.plant, None, np.zeros(0, dtype=np.complex128))
+    transformation, before, after = decoupling_data(judge)
+
+    def decide(judge: Evaluator) -> Existence:
+        # (D1) and the others fail independently: a user wants to know both.
+        found = [enough, _decoupling_condition(judge, before, after)]
+        working, fixed, whole = judge.plant, np.zeros(0, dtype=np.complex128), replace(judge, model=model)
+        found.append(_zero_condition(judge, whole.natural, whole.units))
+        if found[-1].holds:
+            found += model_conditions(whole, model)
+        if all(condition.holds for condition in found):
+            found += order_conditions(whole, model)
+            if found[-1].holds:
+                fixed, condition = _fixed_modes(whole, model)
+                found.append(condition)
+        return Existence(tuple(found), working, transformation, fixed)
+
+    if transformation is None:
+        return decide(judge)
+    return reconsidered(Evaluator(transformation.plant, judge.exactly), decide, lambda found: found.conditions)
 
 
 _D2 = "rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd] on and outside the boundary of stability"

@@ -96,7 +96,16 @@ def synthesise(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callab
     progress("decoupling the unknown inputs")
     problem = placement_problem(working, model, found.fixed_modes, joint=asked.joint, given=asked.given_decoupling())
     if asked.G is not None:
-        _require_stable(problem)
+        # On the boundary within rounding is not stable either: an equation that is lost leaves a mode at zero.
+        modes = zip(problem.split.fixed_modes, problem.fixed_modes, strict=True)
+        unstable = [complex(own) for scaled, own in modes if is_outside(complex(scaled), problem.plant.dt)]
+        if unstable:
+            raise PreconditionError(
+                f"With these E_sharp, C_sharp and G the mode {number(unstable[0])} is fixed and not stable: U has lost "
+                "rank, and equations of the plant are lost with it. Leave E_sharp, C_sharp and G out.",
+                condition="fixed modes",
+                mode=unstable[0],
+            )
     progress("choosing the gains")
     gain, wanted, claims, runs = _chosen(asked, problem, region, weights, plant.dt)
     progress("building the realisation and its certificate")
@@ -195,17 +204,3 @@ def _in_region(
             # What was asked may be possible all the same.
             pass
     return region_gain(kalman, region, solver=asked.solver)
-
-
-def _require_stable(problem: PlacementProblem) -> None:
-    """Raise when a mode that no gain moves is not stable: only a given ``E#`` or ``G`` can bring one in."""
-    # On the boundary within rounding is not stable either: an equation that is lost leaves a mode at zero.
-    modes = zip(problem.split.fixed_modes, problem.fixed_modes, strict=True)
-    unstable = [complex(own) for scaled, own in modes if is_outside(complex(scaled), problem.plant.dt)]
-    if unstable:
-        raise PreconditionError(
-            f"With these E_sharp, C_sharp and G the mode {number(unstable[0])} is fixed and not stable: U has lost "
-            "rank, and equations of the plant are lost with it. Leave E_sharp, C_sharp and G out.",
-            condition="fixed modes",
-            mode=unstable[0],
-        )
