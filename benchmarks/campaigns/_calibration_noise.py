@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.calibration.calibrating import calibrate
-from obsynth.calibration.reporting import Calibration
+from obsynth.calibration.calibrating import Calibration, calibrate
 from obsynth.plants.descriptor import DescriptorSystem
 
 ROWS = 300

@@ -9,7 +9,7 @@ _TYPE_NAMES = {
     "analysis.diagnosis.diagnosing": "Diagnosis FaultDiagnosis StructuredResidual",
     "analysis.dae_structure": "Identifiability",
     "calibration.diagnostics": "Validation",
-    "calibration.reporting": "Calibration",
+    "calibration.calibrating": "Calibration",
     "calibration.validity": "Validity",
     "comparison.comparing": "ComparedMethod FaultComparison",
     "comparison.sensor_sets": "SensorSet SensorSets",

@@ -3,8 +3,8 @@ from obsynth.analysis.diagnosis.diagnosing import Diagnosis as Diagnosis
 from obsynth.analysis.diagnosis.diagnosing import FaultDiagnosis as FaultDiagnosis
 from obsynth.analysis.diagnosis.diagnosing import StructuredResidual as StructuredResidual
 from obsynth.analysis.diagnosis.fault_columns import DecoupledPlant as DecoupledPlant
+from obsynth.calibration.calibrating import Calibration as Calibration
 from obsynth.calibration.diagnostics import Validation as Validation
-from obsynth.calibration.reporting import Calibration as Calibration
 from obsynth.calibration.validity import Validity as Validity
 from obsynth.comparison.comparing import ComparedMethod as ComparedMethod
 from obsynth.comparison.comparing import FaultComparison as FaultComparison

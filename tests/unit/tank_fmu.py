@@ -73,7 +73,7 @@ def stubs(version: str, text: str) -> str:
 
 def tank(folder: Path, version: str, *, derivatives: bool = True) -> Path:
     """Build the FMU; skips where there is no compiler."""
-    from obsynth.observers.dae.c_code import compiler
+    from obsynth.observers.dae.observer import compiler
 
     command = compiler()
     if command is None:

@@ -19,7 +19,7 @@ from obsynth import (
     simulate_dae,
     validate,
 )
-from obsynth.calibration.reporting import integration_error
+from obsynth.calibration.calibrating import integration_error
 
 TRUE = {"C": 1e-3, "Rs": 100.0}
 WIDE = {"C": (1e-4, 1e-2), "Rs": (10.0, 1000.0)}

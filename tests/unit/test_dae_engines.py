@@ -14,7 +14,7 @@ from obsynth import DAEModel, DAEObserver, SolverError, SpecError, run_batch, si
 from obsynth.numerics.newton import SMALL, solved
 from obsynth.observers import batches as dae_batch
 from obsynth.observers import progress
-from obsynth.observers.dae import c_code as dae_library
+from obsynth.observers.dae import observer as dae_library
 from obsynth.observers.dae import observer as dae_records
 from obsynth.plants.dae import Compiled, DAEFunctions, ImplicitStep
 

@@ -16,7 +16,7 @@ import pytest
 
 import obsynth
 from obsynth.data.run import LogRun
-from obsynth.observers.dae.c_code import compiler
+from obsynth.observers.dae.observer import compiler
 
 METHODS = ("functional-filter", "ui-pi-observer", "fault-estimation-filter")
 DT, ROWS, BLANK = 0.1, 80, 50
@@ -291,7 +291,7 @@ def test_shipped_designs_are_compared(name: str) -> None:
 def test_all_that_casadi_writes_is_static(tmp_path: Path) -> None:
     import casadi as ca
 
-    from obsynth.observers.dae.c_code import _generated
+    from obsynth.observers.dae.observer import _generated
 
     x = ca.SX.sym("x", 2)
     code = _generated(

@@ -12,7 +12,7 @@ import pytest
 import obsynth
 from obsynth import SpecError
 from obsynth.exporting.fmu import archive
-from obsynth.observers.dae import c_code
+from obsynth.observers.dae import observer as dae_library
 
 fmpy = pytest.importorskip("fmpy", reason="fmpy is not installed (obsynth[fmu])")
 # Its parts are modules of their own.
@@ -43,7 +43,7 @@ def _compiled_in_less_time():
 
 @pytest.fixture
 def compiler() -> list[str]:
-    command = c_code.compiler()
+    command = dae_library.compiler()
     if command is None:
         pytest.skip("no C compiler")
     return command

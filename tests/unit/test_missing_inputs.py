@@ -14,7 +14,7 @@ from test_flaws_of_logs import designed, log
 
 import obsynth
 from obsynth.data.run import LogRun
-from obsynth.observers.dae.c_code import FLAGS, compiler, shared_library
+from obsynth.observers.dae.observer import FLAGS, compiler, shared_library
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
 DT, RATE, GAIN = 0.1, 2.0, 3.0

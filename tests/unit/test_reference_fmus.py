@@ -79,7 +79,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """Return a function that builds a model once: name, version of FMI, and whether it tells derivatives."""
     from tank_fmu import stubs
 
-    from obsynth.observers.dae.c_code import compiler
+    from obsynth.observers.dae.observer import compiler
 
     command, folder, made = compiler(), tmp_path_factory.mktemp("fmus"), dict[tuple[str, str, bool], Path]()
     if command is None:

@@ -64,7 +64,7 @@ def test_the_numbers_of_a_frame_are_there_once(sampled):
     import tracemalloc
 
     from obsynth.data.run import FrameSink
-    from obsynth.data.signals import Stamps
+    from obsynth.data.sources import Stamps
 
     rows = 20_000
     table = np.arange(3.0 * rows).reshape(3, rows)

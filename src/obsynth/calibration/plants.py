@@ -31,7 +31,7 @@ from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import SMALLEST, FloatArray
 from obsynth.numerics.newton import largest_entries
 from obsynth.numerics.ranks import rounding_rank
-from obsynth.observers.dae.c_code import compiler, shared_library
+from obsynth.observers.dae.observer import compiler, shared_library
 from obsynth.plants.dae import BUTCHER, DAEFunctions, DAEModel, symbolic_value, symbols_of
 from obsynth.plants.descriptor import (
     INDEX_NAME,

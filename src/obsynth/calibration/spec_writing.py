@@ -14,7 +14,7 @@ from obsynth.plants.noise_model import offset_state
 from obsynth.spec.loader import read_yaml
 
 if TYPE_CHECKING:
-    from obsynth.calibration.reporting import Calibration
+    from obsynth.calibration.calibrating import Calibration
 
 #: What ``calibrate --write-spec`` writes, and may write over.
 CALIBRATED_SPEC = FileKind("a spec that obsynth has calibrated", rb"\A# Calibrated by obsynth", suffix=".yaml")

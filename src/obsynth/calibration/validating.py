@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations.noise import with_noise
+from obsynth.calibration.calibrating import IntegrationError, integration_error
 from obsynth.calibration.diagnostics import (
     SIGNIFICANT,
     Consistency,
@@ -33,7 +34,6 @@ from obsynth.calibration.fits import Fit, Objective, greatest_likelihood
 from obsynth.calibration.logs import Log, LogData, quantum, read_log
 from obsynth.calibration.plants import NonlinearPlant, sample_graphs
 from obsynth.calibration.problem import Problem
-from obsynth.calibration.reporting import IntegrationError, integration_error
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.numerics.arguments import FloatArray, arguments_checked, read_only
 from obsynth.observers.dae.estimates import GatheredRows

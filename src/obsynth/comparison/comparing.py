@@ -19,8 +19,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.data.run import faults_on_rows
-from obsynth.data.signals import TIME_HEADER
-from obsynth.data.sources import log_table
+from obsynth.data.sources import TIME_HEADER, log_table
 from obsynth.data.stuck_sensors import stuck_rows, stuck_texts
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.assumptions import Log

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from obsynth.data.log_estimator import DECIDING, STALE, Row
 from obsynth.data.log_observers import SteppingLogObserver
 from obsynth.data.run import LogRun
-from obsynth.data.signals import TIME_HEADER, Signals, Stamps
-from obsynth.data.sources import CHUNK_ROWS, Data, chunks, parsed_rows
+from obsynth.data.sources import CHUNK_ROWS, TIME_HEADER, Data, Signals, Stamps, chunks, parsed_rows
 from obsynth.data.stuck_sensors import stuck_rows, stuck_texts
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions

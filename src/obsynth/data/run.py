@@ -30,8 +30,7 @@ from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.data.alarm_events import NO_DECISION, AlarmEvent, AlarmLog
 from obsynth.data.log_estimator import DECIDING, GAP, RECOVERING, STALE, Clock, LogObserver, Row
 from obsynth.data.log_observers import SteppingLogObserver, log_observer
-from obsynth.data.signals import TIME_HEADER, Signals, Stamps
-from obsynth.data.sources import CHUNK_ROWS, Data, check_suffix, chunks, samples
+from obsynth.data.sources import CHUNK_ROWS, TIME_HEADER, Data, Signals, Stamps, check_suffix, chunks, samples
 from obsynth.data.stuck_sensors import RepeatedValues, stuck_texts
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.guaranteed import is_guaranteed

@@ -5,8 +5,8 @@ Alarms of an exported observer: levels of its outputs, and a monitor that was le
 A sampled observer as C99: one header, one source, no allocation, no library; thresholds over tolerances beside it.
 
 Observers of nonlinear DAEs are templates filled with sizes and tables: CasADi writes the equations, and the loop of
-Newton around them, its damping and its homotopy are those of `obsynth.observers.dae.c_code`. What the header of one in
-single precision says of its error is measured, as steps are solved and no bound follows from the design alone: the C
+Newton around them, its damping and its homotopy are those of `obsynth.observers.dae.observer`. What the header of one
+in single precision says of its error is measured, as steps are solved and no bound follows from the design alone: the C
 runs beside the observer in double precision over records that are simulated from the design, with missing samples.
 """
 
@@ -43,8 +43,15 @@ from obsynth.experiments.monitors.learned_levels import (
 from obsynth.files.outputs import write_together
 from obsynth.numerics.arguments import SMALLEST, FloatArray, real_number, require_mapping
 from obsynth.numerics.continuous import first_order_hold
-from obsynth.observers.dae.c_code import FLAGS, compiler, in_lines, observer_code, observer_struct, shared_library
-from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.dae.observer import (
+    FLAGS,
+    DAEObserver,
+    compiler,
+    in_lines,
+    observer_code,
+    observer_struct,
+    shared_library,
+)
 from obsynth.observers.linear.observer import LinearObserver, checked_warm_up, sample_observer, transient
 from obsynth.observers.recursive.gain_schedule import steady_observer
 from obsynth.observers.recursive.observer import RecursiveObserver

@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arguments import FloatArray, arguments_worded, read_only
-from obsynth.observers.dae.c_code import BATCH_PARTS, compiler
 from obsynth.observers.dae.estimates import DAERow
-from obsynth.observers.dae.observer import DAEObserver, advanced
+from obsynth.observers.dae.observer import BATCH_PARTS, DAEObserver, advanced, compiler
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.progress import shown_progress
 from obsynth.observers.records import batch_record

@@ -22,8 +22,7 @@ from obsynth.numerics.arguments import FloatArray, read_only, whole_number
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.numerics.square_root_estimation import Gaussian, SmootherGain, joint_step, nothing_later, stepped_back
 from obsynth.observers.dae.estimates import DAERow, GatheredRows
-from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.dae.steps import DAEState, Steps
+from obsynth.observers.dae.observer import DAEObserver, DAEState, Steps
 from obsynth.observers.outliers import projected
 from obsynth.observers.records import measured_record, taken_inputs, whole_record
 from obsynth.observers.recursive.observer import (
@@ -31,10 +30,12 @@ from obsynth.observers.recursive.observer import (
     Recursion,
     RecursiveObserver,
     RecursiveState,
+    StepMatrices,
     deviations_in,
     recursive_estimates,
+    right_side,
+    stacked_noise,
 )
-from obsynth.observers.recursive.step_model import StepMatrices, right_side, stacked_noise
 from obsynth.observers.running import Estimates
 from obsynth.plants.dae import checked_inputs
 

@@ -38,8 +38,7 @@ from obsynth.exporting.c_source import (
     verification_words,
 )
 from obsynth.files.outputs import write_atomically
-from obsynth.observers.dae.c_code import FLAGS, compiler, shared_library
-from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.dae.observer import FLAGS, DAEObserver, compiler, shared_library
 from obsynth.results.design import ObserverDesign, unverified_mark
 
 

@@ -48,8 +48,7 @@ from obsynth.observers.recursive.gain_schedule import (
     gains_once,
     looked_at,
 )
-from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options
-from obsynth.observers.recursive.step_model import StepMatrices
+from obsynth.observers.recursive.observer import RecursiveObserver, StepMatrices, observer_from_options
 from obsynth.observers.running import plain_recursion
 from obsynth.plants.descriptor import MatrixSequence, listed
 from obsynth.proofs.balls import Ball, rounded_up

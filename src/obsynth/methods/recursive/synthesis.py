@@ -57,8 +57,7 @@ from obsynth.observers.recursive.gain_schedule import (
     GainScheduleSummary,
     gain_schedule_summary,
 )
-from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options, plain_options
-from obsynth.observers.recursive.step_model import stacked_noise
+from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options, plain_options, stacked_noise
 from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.results.design import Certificate
 

@@ -22,8 +22,15 @@ from obsynth.numerics.spectra import abscissa
 from obsynth.numerics.square_root_estimation import least_squares_step, rank_revealing_step, update
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import batch_record, require_horizon
-from obsynth.observers.recursive.observer import RecursiveObserver, deviations_in, excitation_levels, posterior_residual
-from obsynth.observers.recursive.step_model import PreparedStep, StepMatrices, spreads
+from obsynth.observers.recursive.observer import (
+    PreparedStep,
+    RecursiveObserver,
+    StepMatrices,
+    deviations_in,
+    excitation_levels,
+    posterior_residual,
+    spreads,
+)
 from obsynth.observers.running import Estimates, named_estimates, require_plain
 
 
