@@ -56,11 +56,11 @@ def test_faults_are_proved_and_certificates_hold(design, found, tmp_path) -> Non
 @pytest.mark.parametrize("make", [wang, drive])
 def test_healthy_windows_are_never_proved_faulty(make) -> None:
     design = obsynth.fault_estimation_filter(make())
-    name = design.plant.disturbance_names[0]
+    name, noise_bound = design.plant.disturbance_names[0], 1.0 if design.plant.nw else None
     for seed in range(4):
         u, y = record(design, seed, fault=0.0)
         found = proved_alarm(
-            design, u[:40], y[:40], window=12, disturbance_bounds={name: 0.1}, noise_bound=1.0,
+            design, u[:40], y[:40], window=12, disturbance_bounds={name: 0.1}, noise_bound=noise_bound,
             initial_set=start_set(design),
         )  # fmt: skip
         assert not found.proved
@@ -214,3 +214,9 @@ def test_a_record_with_a_gap_proves_nothing(design) -> None:
     for row, words in ((1, "at least 2"), (51, "have 50 rows")):
         with pytest.raises(obsynth.SpecError, match=words):
             obsynth.prove_alarm(design, whole, row, **options(design))
+
+
+def test_deviations_of_noise_that_nobody_states_are_refused(design) -> None:
+    u, y = record(design, 1, fault=0.2)
+    with pytest.raises(obsynth.SpecError, match="no noise is stated"):
+        proved_alarm(design, u[:34], y[:34], **options(design), noise_bound=3.0)

@@ -90,6 +90,16 @@ def test_options_of_a_spec_reach_the_design(tmp_path: Path) -> None:
     assert main(["verify", str(target)]) == 0
 
 
+def test_deviations_of_noise_that_nobody_states_are_refused() -> None:
+    quiet = plant().replace(Bw=None, Dw=None, noise_names=None)
+    with pytest.raises(obsynth.SpecError, match="states no noise of which this is a number of deviations"):
+        obsynth.guaranteed_test(quiet, **GOOD)
+    bounded = obsynth.guaranteed_test(quiet, **{**GOOD, "noise_bound": {"level": 0.3}})
+    assert bounded.threshold == pytest.approx(obsynth.guaranteed_test(plant(), **GOOD).threshold, rel=1e-9)
+    assert "noise within its stated bounds" in str(bounded)
+    assert "no sensor noise stated" in str(obsynth.guaranteed_test(quiet, **{**GOOD, "noise_bound": None}))
+
+
 def test_a_log_shorter_than_the_window_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
     test = obsynth.guaranteed_test(plant(), **GOOD)
     log = pd.DataFrame({"time": np.arange(4.0), "pump": np.zeros(4), "level": np.zeros(4)})

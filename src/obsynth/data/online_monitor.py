@@ -88,6 +88,7 @@ from obsynth.observers.outliers import checked_limit
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import changed
 from obsynth.plants.constants import shown
+from obsynth.plants.noise_model import require_noise
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.simulation.scenario import Scenario
 
@@ -582,7 +583,7 @@ def online_monitor(
     design, adaptive = tolerances_of(design, constants, initial_set, initial_error)
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
-    _require_noise(model, noise_bound)
+    require_noise(noise_bound, noisy=model.noisy)
     bounds = bounds_of(design, model, disturbance_bounds)
     if scenario is None:
         # Only those that are given are known.
@@ -646,17 +647,6 @@ def _require_linear_kind(kind: str, nominal: Mapping[str, float] | None) -> None
         )
     if nominal:
         raise SpecError("nominal is for recursive designs, which estimate parameters.", path="nominal")
-
-
-def _require_noise(model: ResidualModel, noise_bound: float | None) -> None:
-    """Refuse a bound of noise in measured data where no noise is stated: zero deviations, however many, stay zero."""
-    if noise_bound and not model.noisy:
-        raise SpecError(
-            "noise_bound is a number of standard deviations, but no noise is stated that reaches the monitored "
-            "signals, so there is nothing to multiply: state the noise of the sensors (sensor_noise of the plant, or "
-            "Bw and Dw), or leave noise_bound out.",
-            path="noise_bound",
-        )
 
 
 def _require_above_rounding(limit: float, model: ResidualModel, bounds: FloatArray) -> None:

@@ -45,6 +45,7 @@ from obsynth.methods.verifying import tracking_of, verify
 from obsynth.numerics.arguments import FloatArray, real_number, require_no_overflow, whole_number
 from obsynth.plants.constants import MOST_LISTED, shown
 from obsynth.plants.descriptor import index_of
+from obsynth.plants.noise_model import require_noise
 from obsynth.proofs.balls import gamma
 from obsynth.results.certificate_files import SHOWN_DIGITS, sealed
 from obsynth.results.design import ObserverDesign, design_as_dict, plain
@@ -639,6 +640,7 @@ def assumptions_of(
         raise SpecError(
             "Noise has no bound: give noise_bound (--noise-bound), in standard deviations.", path="noise_bound"
         )
+    require_noise(noise_bound, noisy=bool(plant.Bw.any() or plant.Dw.any()))
     if initial_set is None and state_bounds is None:
         raise SpecError("Nothing bounds the state: give initial_set (--initial), or state_bounds.", path="initial_set")
     require_no_overflow(noise_bound or 0.0, "noise_bound", "noise_bound")

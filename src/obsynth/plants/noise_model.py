@@ -18,6 +18,17 @@ from obsynth.plants.descriptor import index_of
 UNKNOWN_NUMBER = "unknown"
 
 
+def require_noise(noise_bound: float | None, *, noisy: bool) -> None:
+    """Refuse a bound of noise in deviations where no noise is stated: zero deviations, however many, stay zero."""
+    if noise_bound and not noisy:
+        raise SpecError(
+            "noise_bound is a number of standard deviations, but no noise is stated that reaches the monitored "
+            "signals, so there is nothing to multiply: state the noise of the sensors (sensor_noise of the plant, or "
+            "Bw and Dw), or leave noise_bound out.",
+            path="noise_bound",
+        )
+
+
 def noise_state(output: str) -> str:
     """Return the name of the state of an output's coloured noise."""
     return re.sub(r"\W", "_", f"noise_{output}")

@@ -30,6 +30,7 @@ from obsynth.analysis.diagnosis.fault_columns import dc_point, others, question
 from obsynth.analysis.structure import Structure, questions
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.errors import ObsynthError, PreconditionError
+from obsynth.experiments.monitors.guaranteed import is_guaranteed
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.monte_carlo import Evaluation, Interval
 from obsynth.experiments.simulation import Simulation
@@ -538,7 +539,9 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
     model = design.options.get("fault_model")
     if isinstance(model, str):
         yield f"faults that follow the model '{model}'"
-    if isinstance(design.plant, DescriptorSystem):
+    if is_guaranteed(design) and isinstance(design.plant, DescriptorSystem) and design.options.get("noise_bound"):
+        yield "noise within its stated bounds"
+    elif isinstance(design.plant, DescriptorSystem):
         noisy = sum(bool(row.any()) for row in design.plant.Dw)
         yield f"white noise on {noisy} of {design.plant.ny} sensors" if noisy else "no sensor noise stated"
 

@@ -283,7 +283,13 @@ def missing_bounds(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked:
         lacking = [name for name, does in zip(names, acting, strict=True) if does and name not in (known or {})]
         if lacking:
             yield f"disturbance_bounds: the largest absolute value of {', '.join(lacking)} is missing."
-    if asked.noise_bound is None and np.any(np.hstack([plant.Bw.ravel(), plant.Dw.ravel()])):
+    noisy = bool(plant.Bw.any() or plant.Dw.any())
+    if asked.noise_bound and not isinstance(asked.noise_bound, Mapping) and not noisy:
+        yield (
+            "noise_bound: the plant states no noise of which this is a number of deviations; give sensor_noise, or the "
+            "bound of each output by name."
+        )
+    if asked.noise_bound is None and noisy:
         yield (
             "noise_bound: a standard deviation is no bound; state how many of them the noise never exceeds, or the "
             "bound of each output by name."
