@@ -133,3 +133,37 @@ def test_an_offset_of_a_linear_plant_is_part_of_its_operating_point(tmp_path: Pa
     assert table is not None
     # From the first row on.
     assert np.abs(table["xhat[offset_ya]"]).max() <= 0.01
+
+
+@pytest.mark.parametrize("method", ["descriptor-kalman", "dae-adaptive-observer"])
+def test_a_start_that_is_stated_has_room_for_states_that_a_calibration_adds(method: str, tmp_path: Path) -> None:
+    """The written spec kept a start and covariances without the state of the offset, and no design took them."""
+    if method == "descriptor-kalman":
+        document = json.loads(json.dumps(LINEAR))
+        document["method"]["options"] = {
+            "Q": [[1e-6, 0.0], [0.0, 1e-6]], "R": [[1e-4, 0.0], [0.0, 1e-4]], "initial_state": [0.1, 0.2],
+            "initial_covariance": [[0.01, 0.001], [0.001, 0.01]],
+        }  # fmt: skip
+        data, start = of_two_states(1, 0.5), [0.1, 0.2, 0.0]
+    else:
+        document = json.loads(json.dumps(SPEC))
+        del document["plant"]["offset"]
+        document["plant"]["sensor_noise"] = {"y": {"deviation": "unknown", "correlation": "unknown"}}
+        document["method"]["options"]["initial_state"] = [1.1]
+        data, start = log(1), {"x": 1.1}
+    data.to_csv(tmp_path / "normal.csv", index=False)
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
+    asked = ["calibrate", "--system", str(tmp_path / "spec.yaml"), "--data", str(tmp_path / "normal.csv")]
+    assert main([*asked, "--write-spec", str(tmp_path / "found.yaml"), "--quiet"]) == 0
+    options = yaml.safe_load((tmp_path / "found.yaml").read_text())["method"]["options"]
+    assert options["initial_state"] == start
+    spec = obsynth.load_spec(tmp_path / "found.yaml")
+    design = obsynth.design(spec.plant, spec.method, **dict(spec.options))
+    if method == "descriptor-kalman":
+        deviation = yaml.safe_load((tmp_path / "found.yaml").read_text())["plant"]["offset"]["ya"]
+        wanted = np.diag([0.01, 0.01, deviation**2])
+        wanted[0, 1] = wanted[1, 0] = 0.001
+        np.testing.assert_allclose(design.observer.initial_covariance, wanted, rtol=1e-12)
+        # Of the noise that was found, and not of that which was stated.
+        np.testing.assert_allclose(design.observer.R.at(0), spec.plant.Dw @ spec.plant.Dw.T, rtol=1e-12)
+    assert obsynth.run_on_data(design, data).table is not None

@@ -154,6 +154,18 @@ def test_a_stuck_sensor_is_told_by_the_command_and_kept_in_the_file(tmp_path: Pa
     assert obsynth.load_thresholds(file).notes == tuple(notes)
 
 
+def test_what_a_stuck_sensor_repeats_is_not_learned_from() -> None:
+    """Levels were those of a sensor that is stuck: they are those of a log that is blank there."""
+    data = log(1)
+    data.loc[EVENT.start : EVENT.stop - 1, "yb"] = data.loc[EVENT.start, "yb"]
+    blank = data.copy()
+    blank.loc[EVENT.start + 1 : EVENT.stop - 1, "yb"] = np.nan
+    found, wanted = learned(data), learned(blank)
+    assert found.levels.tolist() == wanted.levels.tolist()
+    assert found.rows == wanted.rows
+    assert (len(found.notes), len(wanted.notes)) == (1, 0)
+
+
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("memory", [0.0, 0.9, 0.98])
 @pytest.mark.parametrize("step", [0.0, 0.3, 1.0, 3.0])

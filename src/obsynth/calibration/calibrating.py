@@ -1068,6 +1068,7 @@ def calibrate(
         dt=_sample_time(model, dt, substeps),
     )
     digest = whole.digest
+    whole = whole.unstuck()
     whole = whole.without(wrong_samples(whole.y))
     whole = whole.shifted(input_delay) if isinstance(input_delay, int) else whole
     plant = NonlinearPlant(model) if isinstance(model, DAEModel) else LinearPlant(model, whole)

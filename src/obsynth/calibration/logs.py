@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from obsynth.data.log_estimator import MOST_STALE
 from obsynth.data.sources import log_table, parsed_rows
-from obsynth.data.stuck_sensors import stuck_rows, stuck_texts
+from obsynth.data.stuck_sensors import stuck_rows, stuck_texts, without_repeats
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import FloatArray, read_only
 
@@ -122,6 +122,13 @@ class Log:
                     f"{len(rows)} value(s) of {name} are far from all others and count as not measured ({told})."
                 )
         return replace(self, y=read_only(np.where(wrong, np.nan, self.y)), notes=tuple(notes))
+
+    def unstuck(self) -> Log:
+        """Return the log without what sensors repeated while they were stuck, which no noise of theirs moved."""
+        y = without_repeats(self.y)
+        if np.array_equal(y, self.y, equal_nan=True):
+            return self
+        return replace(self, y=read_only(y), notes=(*self.notes, "What a stuck sensor repeats counts as not measured."))
 
 
 def told_rows(rows: Sequence[Any] | NDArray[np.int64]) -> str:

@@ -71,10 +71,12 @@ def calibrated_spec(path: Path, found: Calibration, *, calibration: Path | None 
         if not linear:
             method["id"] = _DAE if method["id"] == "auto" else method["id"]
             options |= _nonlinear_options(found)
-            if found.found_offsets:
+            if found.found_offsets or options.get("initial_state") is not None:
                 options["initial_state"] = _started(plant, options.get("initial_state"), found)
         elif plant.get("kind") != "dae":
             _set_offsets(plant, found)
+        if linear and method["id"] in _RECURSIVE:
+            options = _recursive_options(options, found)
     told = {"unknown": {}, **(document.get("calibrate") or {}), "digest": found.box.digest}
     told |= {"input_delay": int(found.input_delay)}
     whole = {**document, "plant": plant, "method": {**method, "options": options}, "calibrate": told}
@@ -173,3 +175,25 @@ def _nonlinear_options(found: Calibration) -> dict[str, Any]:
         "initial_covariance": {name: float(value) for name, value in found.initial_covariance.items()} | known,
         **({"outliers": "gate", "outlier_sizes": dict(found.outlier_sizes)} if found.outlier_sizes else {}),
     }
+
+
+def _recursive_options(stated: Mapping[str, Any], found: Calibration) -> dict[str, Any]:
+    """Return the options of a recursive filter of a linear plant, which has its noise from the plant now, and may have
+    states more than it had: their start and its variances come after those that were stated."""
+    options = {name: value for name, value in stated.items() if name not in ("Q", "R")}
+    offsets = {name: deviation for name, (_, deviation) in found.found_offsets.items()}
+    more = [
+        *(noise["deviation"] ** 2 for noise in found.sensor_noise.values()),
+        *(offsets.get(name, size) ** 2 for name, size in found.offset.items()),
+        *(found.initial_covariance[name] for name in found.walks),
+    ]
+    if options.get("initial_state") is not None:
+        options["initial_state"] = [*options["initial_state"], *np.zeros(len(more)).tolist()]
+    if isinstance(options.get("initial_covariance"), list):
+        own = np.array(options["initial_covariance"], dtype=np.float64)
+        whole = np.diag(np.concatenate([np.zeros(len(own)), more]))
+        whole[: len(own), : len(own)] = own
+        options["initial_covariance"] = whole.tolist()
+    if found.outlier_sizes:
+        options |= {"outliers": "gate", "outlier_sizes": dict(found.outlier_sizes)}
+    return options

@@ -27,7 +27,7 @@ from obsynth.data.log_estimator import DECIDING, STALE, Row
 from obsynth.data.log_observers import SteppingLogObserver
 from obsynth.data.run import LogRun
 from obsynth.data.sources import CHUNK_ROWS, TIME_HEADER, Data, Signals, Stamps, chunks, parsed_rows
-from obsynth.data.stuck_sensors import stuck_rows, stuck_texts
+from obsynth.data.stuck_sensors import stuck_rows, stuck_texts, without_repeats
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions
 from obsynth.experiments.monitors.adaptive import NO_TOLERANCE, noisy_design, over_box, tolerances_of
@@ -122,10 +122,10 @@ def notes_of_normal_rows(
                 "was not, blank its outputs in these rows, or give another log."
             )
         stuck = {
-            name: [(rows.start + first, rows.start + last) for first, last in stuck_rows(log[rows, i])]
+            name: [run for run in stuck_rows(log[:, i]) if run.last >= rows.start and run.first < rows.stop]
             for i, name in enumerate(signals.names[signals.inputs :], 1 + signals.inputs)
         }
-        yield from stuck_texts(stuck, shown, "; if it was, blank it in these rows, or give another log")
+        yield from stuck_texts(stuck, shown, ": what it repeats there counts as not measured")
 
     return tuple(found())
 
@@ -292,6 +292,8 @@ def learn_thresholds(
     )
     if len(log) < LEAST_NORMAL:
         raise SpecError(f"The log has {len(log)} rows: give {LEAST_NORMAL} and more.", path="normal")
+    before = 1 + first_run.signals.inputs
+    given_log, log = log, np.hstack([log[:, :before], without_repeats(log[:, before:])])
     said, sizes = _sized(design, started, log)
     dt = design.observer.dt or float(np.median(np.diff(said.times)))
     every = rows_per_alarm(false_alarms, dt)
@@ -312,7 +314,7 @@ def learn_thresholds(
         **given,
     )
     raised = raised_levels(design, found, watched, scores, **given)
-    notes = notes_of_normal_rows(raised, said.numbers[chosen], log, slice(first, last), first_run.signals, stamps)
+    notes = notes_of_normal_rows(raised, said.numbers[chosen], given_log, slice(first, last), first_run.signals, stamps)
     white = found.statistics.model.whitened(watched_rows(design, found, watched))
     inputs = log[said.numbers[chosen], 1 : 1 + first_run.signals.inputs]
     divided = notes_of_starts(divided_at_starts(design.observer, scores if found.statistics.estimates else None))

@@ -216,6 +216,15 @@ def stuck_rows(values: FloatArray) -> list[StuckRun]:
     return gathered.stuck()[0]
 
 
+def without_repeats(values: FloatArray) -> FloatArray:
+    """Return outputs ``(n, ny)`` with NaN for what each repeats while it is stuck: no noise of its sensor is there."""
+    found = np.array(values)
+    for i, column in enumerate(values.T):
+        for first, last in stuck_rows(column):
+            found[first + 1 : last + 1, i] = np.nan
+    return found
+
+
 def _rows(first: int, last: int) -> str:
     return f"rows {first} to {last}"
 
