@@ -13,6 +13,7 @@ import obsynth
 from obsynth.methods.pd_observer import synthesis
 from obsynth.methods.pd_observer.checks import prove_gains
 from obsynth.methods.pd_observer.inequalities import PdTask
+from obsynth.methods.pd_observer.limits import fastest_mode
 from obsynth.methods.pd_observer.method import MOST_STATES_FOR_LMI, PdObserver
 from obsynth.methods.pd_observer.realisation import with_faults_as_states
 from obsynth.methods.pd_observer.synthesis import closed_form
@@ -127,3 +128,10 @@ class TestChoice:
         design = obsynth.pd_observer(PLANT, engine="lmi")
         assert design.solver["engine"] == "riccati"
         assert any("'lmi' failed" in note and "Riccati" in note for note in design.notes)
+
+
+@pytest.mark.parametrize("rest", [7e-17, -7e-17, 0.0])
+def test_an_integrator_sets_no_pace_on_either_side_of_zero(rest: float) -> None:
+    # As a damped mode it was the slowest: delta was 1.4e16 s, and no engine found gains.
+    assert fastest_mode(np.diag([rest, -1.875, -2.0])) == 2.0
+    assert fastest_mode(np.array([[rest, 0.0, 0.0], [0.0, -1.0, 3.0], [0.0, -3.0, -1.0]])) == pytest.approx(10.0**0.5)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +22,7 @@ from obsynth.methods.detection_filter.conditions import unknown_inputs
 from obsynth.methods.detection_filter.method import DetectionFilterMethod
 from obsynth.methods.method import Synthesis
 from obsynth.numerics.arguments import FloatArray, largest_singular_value
-from obsynth.numerics.matrix_equations import continuous_solution
+from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_solution
 from obsynth.numerics.norms import response
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.spectra import abscissa
@@ -32,10 +32,13 @@ from obsynth.results.design import Certificate
 
 #: The grid of frequencies begins at this share of its end, where the band begins at zero.
 LEAST_FREQUENCY = 1e-6
-#: The proved gain is this much above one, and the proved sensitivity one of these below what a grid finds.
-PROOF_MARGIN, SENSITIVITY_MARGINS = 1e-6, (1e-4, 1e-3, 1e-2, 0.1, 0.5)
-#: Strictness of the equation that proves a gain, relative to what drives it.
-STRICTNESS = 1e-9
+#: The proved gain is the first of these above one, and the proved sensitivity the first below what a grid finds, with
+#: which the proof is above the rounding of its numbers.
+GAIN_MARGINS, SENSITIVITY_MARGINS = (1e-6, 1e-4, 1e-2), (1e-4, 1e-3, 1e-2, 0.1, 0.5)
+#: Share of the room that a bound leaves which strictness of the inequality takes: the other half is for rounding.
+STRICTNESS = 0.5
+#: A state with less than this share of the largest variance is none that noise reaches, up to rounding.
+UNREACHED = 1e-12
 #: Frequencies of the grid, and how often the least value is refined between its neighbours.
 GRID_FREQUENCIES, GRID_REFINEMENTS = 400, 40
 
@@ -66,17 +69,19 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
         fault_delays=(),
     )
     felt = error_transfer(smooth, observer, *unknown_inputs(smooth))
-    witness = _gain_witness(felt, 1.0 + PROOF_MARGIN, units)
-    if witness is None or not gain_is_proved(felt, 1.0 + PROOF_MARGIN, witness):
+    bound, witness = _proved_gain(felt, units)
+    if witness is None:
         raise SolverError(
-            "The Riccati equation of the detection filter has no solution for which a gain can be proved: the slowest "
-            f"pole is at {abscissa(observer.Az, 0.0):.3g} 1/s, next to a zero from the unknown inputs to the outputs "
-            "on the imaginary axis. State noise of the states (Bw)."
+            "The Riccati equation of the detection filter has no solution for which a gain can be proved in double "
+            f"precision (the slowest pole is at {abscissa(observer.Az, 0.0):.3g} 1/s, the largest gain is "
+            f"{np.max(np.abs(gain), initial=0.0):.3g}): the result is inconclusive. Zeros from the unknown inputs to "
+            "the outputs near the imaginary axis do that, and noise that hardly reaches some states: state noise of "
+            "the states (Bw)."
         )
     low, high = (float(value) for value in asked.band)
     least, where = _sensitivity(smooth, observer, low, high)
     claims = {
-        "disturbance_gain": 1.0 + PROOF_MARGIN,
+        "disturbance_gain": bound,
         "fault_sensitivity": _provable(smooth, observer, least, low, high),
         "band_from": low,
         "band_to": high,
@@ -125,22 +130,39 @@ class _OwnUnits:
         return self.states[:, None] * gain * self.outputs / self.rate, weight * self.outputs
 
 
-def _gain_witness(transfer: Transfer, bound: float, units: _OwnUnits) -> FloatArray | None:
-    """Return the matrix ``(n, n)`` that proves a gain, from a bounded real equation."""
+def _proved_gain(transfer: Transfer, units: _OwnUnits) -> tuple[float, FloatArray | None]:
+    """Return the least bound of the gain that is proved, and the matrix ``(n, n)`` that does."""
+    for bound in (1.0 + margin for margin in GAIN_MARGINS):
+        for witness in _gain_witnesses(transfer, bound, units):
+            if gain_is_proved(transfer, bound, witness):
+                return bound, witness
+    return np.inf, None
+
+
+def _gain_witnesses(transfer: Transfer, bound: float, units: _OwnUnits) -> Iterator[FloatArray]:
+    """Yield matrices ``(n, n)`` that may prove a gain above one of a co-inner transfer.
+
+    The covariance X of its states for unit noise solves the bounded real inequality at one, with equality: its other
+    blocks vanish.  A larger bound has room for ``X + eps S``, ``a S + S a' = -Q``, which makes it strict.  Q is as
+    large as the rounding of X: by the states' own variances, where noise reaches them.
+    """
     parts = transfer.dynamics, transfer.B, transfer.C, transfer.D
     a, b, c, d = (part.midpoint for part in parts)
     if not len(a):
-        return a
+        yield a
+        return
     (a, b), c = units.moved(a, b), c * units.states
-    gap = bound**2 * np.eye(len(c)) - d @ d.T
-    # Where nothing drives the errors, the strictness is relative to what the bound leaves room for.
-    room = largest_singular_value(a) ** 2 * float(np.linalg.eigvalsh(gap)[0])
-    room /= max(largest_singular_value(c) ** 2, np.finfo(np.float64).tiny)
-    slack = STRICTNESS * max(largest_singular_value(b @ b.T), room, np.finfo(np.float64).tiny)
-    found = continuous_solution(a, c, b @ b.T + slack * np.eye(len(a)), -gap, b @ d.T)
-    if found is None or not np.all(np.isfinite(found)):
-        return None
-    return np.asarray(0.5 * (found + found.T) * (units.states[:, None] * units.states / units.rate))
+    gap = bound**2 - largest_singular_value(d) ** 2
+    try:
+        variances = np.diag(continuous_lyapunov(a, -b @ b.T))
+        for least in (1.0, max(UNREACHED * np.max(variances), np.finfo(np.float64).tiny)):
+            weight = np.maximum(variances, least)
+            shown = largest_singular_value(c @ continuous_lyapunov(a, -np.diag(weight)) / np.sqrt(weight))
+            room = gap / max(shown**2, gap)
+            found = continuous_lyapunov(a, -b @ b.T - STRICTNESS * room * np.diag(weight))
+            yield 0.5 * (found + found.T) * (units.states[:, None] * units.states / units.rate)
+    except (np.linalg.LinAlgError, ValueError):
+        return
 
 
 def _notes(plant: DescriptorSystem, observer: LinearObserver, claims: Mapping[str, float]) -> tuple[str, ...]:

@@ -28,11 +28,11 @@ def fastest_mode(a: FloatArray) -> float:
     sizes = np.abs(modes)
     if not np.max(sizes) > NEGLIGIBLE_MODE * largest_singular_value(balanced):
         return 1.0
-    damped = modes.real < -WELL_DAMPED * sizes
-    # What is not damped sets the pace; where all is damped or at rest, the slowest mode does.
-    pace = float(np.max(sizes[~damped], initial=0.0))
-    if pace <= NEGLIGIBLE_MODE * float(np.max(sizes)):
-        pace = float(np.min(sizes[damped]))
+    # An integrator is at rest, on whichever side of zero rounding has put it.
+    moving = sizes > NEGLIGIBLE_MODE * float(np.max(sizes))
+    damped = moving & (modes.real < -WELL_DAMPED * sizes)
+    # What is not damped sets the pace; where all is damped or at rest, the slowest mode that moves does.
+    pace = float(np.max(sizes[moving & ~damped], initial=0.0)) or float(np.min(sizes[moving]))
     return float(np.max(sizes[(sizes <= FAR_BEYOND * pace) | ~damped]))
 
 
