@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
@@ -538,13 +539,11 @@ def from_andes(
 
 
 def _written_pencil(folder: Path) -> tuple[FloatArray, FloatArray, list[str]]:
-    from scipy.io import mmread
-
     missing = [name for name in _PENCIL if not (folder / name).is_file()]
     if missing:
         raise SpecError(f"{folder} has no {missing[0]}: a pencil of ANDES is {', '.join(_PENCIL)}.", path=str(folder))
     try:
-        e, a = (np.asarray(_dense(mmread(folder / name)), dtype=np.float64) for name in _PENCIL[:2])
+        e, a = (np.asarray(_dense(scipy.io.mmread(folder / name)), dtype=np.float64) for name in _PENCIL[:2])
         names = json.loads((folder / _PENCIL[2]).read_text(encoding="utf-8"))
         listed = [*names["differential"], *names["algebraic"]]
     except (OSError, ValueError, TypeError, KeyError) as error:
@@ -688,14 +687,11 @@ def from_matlab(
 
 def mat_arrays(source: Path) -> dict[str, Any]:
     """Return what a ``.mat`` file holds by name; raise `ValueError` for other versions and damaged files."""
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
     try:
-        content = loadmat(source)
+        content = scipy.io.loadmat(source)
     except NotImplementedError as error:
         raise ValueError("MATLAB 7.3 files are not supported, save it with '-v7'") from error
-    except MatReadError as error:
+    except scipy.io.matlab.MatReadError as error:
         raise ValueError(str(error)) from error
     return {name: value for name, value in content.items() if not name.startswith("__")}
 

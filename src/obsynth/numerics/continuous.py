@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import scipy
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import FloatArray, largest_singular_value, reachable
@@ -86,8 +87,6 @@ MOST_LENGTHS = 60
 
 def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     """Return an upper bound on the integral of the Euclidean norm of the response to each input."""
-    from scipy.linalg import expm
-
     if not a.size or not b.shape[1]:
         return np.zeros(b.shape[1])
     if not abscissa(a, 0.0) < 0.0:
@@ -95,7 +94,7 @@ def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     a, b, c = _in_lyapunov_norm(a, b, c)
     second = a @ a
     step = FIRST_LENGTH / largest_singular_value(a)
-    transition = np.asarray(expm(a * step))
+    transition = np.asarray(scipy.linalg.expm(a * step))
     # Columns of b at the start of the interval, and the whole state transition, for what is left in the end.
     columns = np.hstack([b, np.eye(len(a))])
     total = np.zeros(columns.shape[1])
@@ -161,9 +160,7 @@ def first_order_hold(a: FloatArray, inputs: FloatArray, step: float) -> tuple[Fl
 
 def _exponential(block: FloatArray, step: float) -> FloatArray:
     """Return ``exp(A h)`` without what rounding leaves where no power of A has an entry."""
-    from scipy.linalg import expm
-
-    return np.where(reachable(block), np.asarray(expm(block * step), dtype=np.float64), 0.0)
+    return np.where(reachable(block), np.asarray(scipy.linalg.expm(block * step), dtype=np.float64), 0.0)
 
 
 def _in_like_sizes(a: FloatArray, inputs: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import scipy
 
 from obsynth.numerics.arguments import FloatArray, largest_singular_value
 from obsynth.numerics.doubling import REFUTED, doubled_riccati_solution, is_clearly_negative, is_positive
@@ -20,30 +21,22 @@ from obsynth.numerics.norms import spectral_radius
 
 def continuous_lyapunov(a: FloatArray, weight: FloatArray) -> FloatArray:
     """Return X with ``a X + X a' = weight``."""
-    from scipy.linalg import solve_continuous_lyapunov
-
-    return _by_rows(solve_continuous_lyapunov, a, weight)
+    return _by_rows(scipy.linalg.solve_continuous_lyapunov, a, weight)
 
 
 def discrete_lyapunov(a: FloatArray, weight: FloatArray) -> FloatArray:
     """Return X with ``X = a X a' + weight``."""
-    from scipy.linalg import solve_discrete_lyapunov
-
-    return _by_rows(solve_discrete_lyapunov, a, weight)
+    return _by_rows(scipy.linalg.solve_discrete_lyapunov, a, weight)
 
 
 def continuous_riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: FloatArray, **others: Any) -> FloatArray:
     """Return SciPy's solution of ``a' X + X a - X b r^-1 b' X + q = 0``, with its ``e`` and ``s``."""
-    from scipy.linalg import solve_continuous_are
-
-    return _by_rows(solve_continuous_are, a, b, q, r, **others)
+    return _by_rows(scipy.linalg.solve_continuous_are, a, b, q, r, **others)
 
 
 def discrete_riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: FloatArray, **others: Any) -> FloatArray:
     """Return SciPy's solution of ``a' X a - X - a' X b (r + b' X b)^-1 b' X a + q = 0``, with its ``e`` and ``s``."""
-    from scipy.linalg import solve_discrete_are
-
-    return _by_rows(solve_discrete_are, a, b, q, r, **others)
+    return _by_rows(scipy.linalg.solve_discrete_are, a, b, q, r, **others)
 
 
 def _by_rows(solve: Callable[..., Any], *matrices: FloatArray, **others: FloatArray | None) -> FloatArray:

@@ -16,6 +16,7 @@ from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from obsynth.numerics.arguments import ComplexArray, FloatArray, largest_singular_value, read_only
@@ -40,15 +41,11 @@ def smallest_singular(matrix: NDArray[Any], count: int = 1) -> Smallest:
         _, values, right = np.linalg.svd(matrix)
         order = slice(None, -count - 1, -1)
         return values[order], right[order].conj().T, float(values[0])
-    from scipy.linalg import qr
-
-    return iterated(np.asarray(qr(matrix, mode="r", check_finite=False)[0][: matrix.shape[1]]), count)
+    return iterated(np.asarray(scipy.linalg.qr(matrix, mode="r", check_finite=False)[0][: matrix.shape[1]]), count)
 
 
 def iterated(triangle: NDArray[Any], count: int) -> Smallest:
     """Return the smallest singular values of an upper triangular matrix by inverse iteration."""
-    from scipy.linalg import solve_triangular
-
     size = triangle.shape[0]
     norm = float(np.sqrt(np.linalg.norm(triangle, 1) * np.linalg.norm(triangle, np.inf)))
     if norm == 0.0:
@@ -61,9 +58,9 @@ def iterated(triangle: NDArray[Any], count: int) -> Smallest:
     basis = np.random.default_rng(0).normal(size=(size, count)).astype(work.dtype)
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(NULL_DIRECTION_STEPS):
-            inner = solve_triangular(work, basis, trans="C", check_finite=False)
+            inner = scipy.linalg.solve_triangular(work, basis, trans="C", check_finite=False)
             inner /= np.max(np.abs(inner), axis=0, initial=0.0) + np.finfo(float).tiny
-            basis = np.linalg.qr(solve_triangular(work, inner, check_finite=False))[0]
+            basis = np.linalg.qr(scipy.linalg.solve_triangular(work, inner, check_finite=False))[0]
     _, values, turned = np.linalg.svd(triangle @ basis, full_matrices=False)
     return values[::-1], basis @ turned[::-1].conj().T, norm
 
@@ -137,15 +134,13 @@ class PencilPoints:
     @cached_property
     def _schur(self) -> tuple[ComplexArray, ComplexArray, ComplexArray, float] | None:
         """Return T, the basis, the rows below, and the condition of E; ``None`` where that is too large."""
-        from scipy.linalg import rsf2csf, schur
-
         columns = self.E.shape[1]
         basis, square = np.linalg.qr(self.E, mode="complete")
         turned, top = basis.T @ self.A, square[:columns]
         sizes = np.linalg.svd(top, compute_uv=False)
         if not sizes[-1] * SAFE_BASIS_CONDITION > sizes[0]:
             return None
-        t, u = rsf2csf(*schur(np.linalg.solve(top, turned[:columns]), check_finite=False))
+        t, u = scipy.linalg.rsf2csf(*scipy.linalg.schur(np.linalg.solve(top, turned[:columns]), check_finite=False))
         # The leading part is divided by E; the rows below are brought to its size.
         return t, u, np.asarray(turned[columns:] @ u / sizes[0]), float(sizes[0] / sizes[-1] / sizes[-1])
 

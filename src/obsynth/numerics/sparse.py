@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any, TypeGuard
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
@@ -63,17 +64,13 @@ def same_matrix(first: Any, second: Any) -> bool:
 
 def csr(matrix: Any) -> Any:
     """Return a sparse or dense matrix as a new ``scipy.sparse.csr_array``."""
-    from scipy.sparse import csr_array
-
-    return csr_array(matrix)
+    return scipy.sparse.csr_array(matrix)
 
 
 def selection(rows: Any, count: int) -> Any:
     """Return the sparse matrix ``(len(rows), count)`` with a one in each row."""
-    from scipy.sparse import csr_array
-
     places = np.asarray(rows, dtype=np.int64)
-    return csr_array((np.ones(len(places)), (np.arange(len(places)), places)), shape=(len(places), count))
+    return scipy.sparse.csr_array((np.ones(len(places)), (np.arange(len(places)), places)), shape=(len(places), count))
 
 
 Indices = NDArray[np.int64]
@@ -121,17 +118,16 @@ def _maximum_matching(matrix: Any) -> Indices:
     Every row may have an entry of its own beside the matrix, at a price: the cheapest full matching uses as few as
     possible.  scipy's matching without weights took minutes with rows and columns in some orders.
     """
-    from scipy.sparse import csr_array, eye_array, hstack
-    from scipy.sparse.csgraph import min_weight_full_bipartite_matching
-
     found = np.full(matrix.shape[1], -1, dtype=np.int64)
     if not matrix.nnz:
         return found
     # Most rows of E are empty.
     own_rows, own_columns = np.flatnonzero(np.diff(matrix.indptr)), np.unique(matrix.indices)
     part = csr(matrix[own_rows][:, own_columns])
-    cheap = csr_array((np.ones(part.nnz), part.indices, part.indptr), shape=part.shape)
-    row, column = min_weight_full_bipartite_matching(csr(hstack([cheap, OWN_ENTRY * eye_array(len(own_rows))])))
+    cheap = scipy.sparse.csr_array((np.ones(part.nnz), part.indices, part.indptr), shape=part.shape)
+    row, column = scipy.sparse.csgraph.min_weight_full_bipartite_matching(
+        csr(scipy.sparse.hstack([cheap, OWN_ENTRY * scipy.sparse.eye_array(len(own_rows))]))
+    )
     inside = column < len(own_columns)
     found[own_columns[column[inside]]] = own_rows[row[inside]]
     return found
@@ -183,21 +179,18 @@ def _alternating(matrix: Any, start: Indices, back: Indices) -> tuple[Indices, I
 
 def blocks_of(pattern: Any, row_of_column: Indices) -> tuple[int, Indices]:
     """Return the number of diagonal blocks of the block triangular form, and the block of each column."""
-    from scipy.sparse.csgraph import connected_components
-
-    count, labels = connected_components(csr(pattern)[row_of_column], directed=True, connection="strong")
+    count, labels = scipy.sparse.csgraph.connected_components(
+        csr(pattern)[row_of_column], directed=True, connection="strong"
+    )
     return int(count), np.asarray(labels, dtype=np.int64)
 
 
 def components_of(pattern: Any) -> tuple[Indices, Indices]:
     """Return the connected component of each row and each column; two that share an entry are in the same."""
-    from scipy.sparse import block_array
-    from scipy.sparse.csgraph import connected_components
-
     matrix = csr(pattern)
     rows = matrix.shape[0]
-    both = block_array([[None, abs(matrix)], [abs(matrix).T, None]], format="csr")
-    _, labels = connected_components(both, directed=False)
+    both = scipy.sparse.block_array([[None, abs(matrix)], [abs(matrix).T, None]], format="csr")
+    _, labels = scipy.sparse.csgraph.connected_components(both, directed=False)
     return np.asarray(labels[:rows], dtype=np.int64), np.asarray(labels[rows:], dtype=np.int64)
 
 
@@ -235,9 +228,6 @@ class SparseFactor:
     """
 
     def __init__(self, matrix: Any, *, by_all: bool = False) -> None:
-        from scipy.sparse import csc_array, diags_array, eye_array
-        from scipy.sparse.linalg import splu
-
         given = csr(matrix)
         self.rows: FloatArray = np.ones(given.shape[0])
         self.columns: FloatArray = np.ones(given.shape[1])
@@ -249,13 +239,13 @@ class SparseFactor:
         self.matrix = _scaled(given, self.rows, self.columns)
         self.size = given.shape[0]
         try:
-            self._lu = splu(csc_array(self.matrix))
+            self._lu = scipy.sparse.linalg.splu(scipy.sparse.csc_array(self.matrix))
             self.exactly_singular = False
         except RuntimeError:
             # SuperLU met a zero pivot: a perturbed matrix shows by its null vectors where.
             noise = np.random.default_rng(0).uniform(1.0, 2.0, self.size)
-            ridge = diags_array(PERTURBATION * noise) if self.size else eye_array(0)
-            self._lu = splu(csc_array(self.matrix + ridge))
+            ridge = scipy.sparse.diags_array(PERTURBATION * noise) if self.size else scipy.sparse.eye_array(0)
+            self._lu = scipy.sparse.linalg.splu(scipy.sparse.csc_array(self.matrix + ridge))
             self.exactly_singular = True
 
     def null_vectors(self) -> tuple[float, FloatArray, FloatArray]:
@@ -286,11 +276,9 @@ class SparseFactor:
     @cached_property
     def condition(self) -> float:
         """An estimate of the 1-norm condition number of the scaled matrix."""
-        from scipy.sparse.linalg import LinearOperator, onenormest
-
         if not self.size:
             return 1.0
-        inverse = LinearOperator(
+        inverse = scipy.sparse.linalg.LinearOperator(
             (self.size, self.size),
             matvec=self._lu.solve,
             rmatvec=lambda x: self._lu.solve(x, trans="T"),
@@ -298,7 +286,7 @@ class SparseFactor:
             dtype=np.float64,
         )
         peak = float(np.max(np.asarray(abs(self.matrix).sum(axis=0)), initial=0.0))
-        return peak * float(onenormest(inverse))
+        return peak * float(scipy.sparse.linalg.onenormest(inverse))
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return ``matrix^-1 right`` for dense columns, refined once with residuals of twice the digits."""
@@ -362,14 +350,11 @@ def scales_by_all_entries(matrix: Any) -> tuple[FloatArray, FloatArray]:
 
     Source: A. R. Curtis, J. K. Reid, J. Inst. Maths Applics 10, 1972.
     """
-    from scipy.sparse import block_array, coo_array, diags_array
-    from scipy.sparse.linalg import cg
-
     count = matrix.shape[0]
-    entries = coo_array(matrix)
+    entries = scipy.sparse.coo_array(matrix)
     entries.eliminate_zeros()
     sizes = np.log2(np.abs(entries.data))
-    pattern = coo_array((np.ones(len(sizes)), (entries.row, entries.col)), shape=matrix.shape)
+    pattern = scipy.sparse.coo_array((np.ones(len(sizes)), (entries.row, entries.col)), shape=matrix.shape)
     sums = np.concatenate(
         [
             np.bincount(entries.row, weights=sizes, minlength=count),
@@ -377,9 +362,13 @@ def scales_by_all_entries(matrix: Any) -> tuple[FloatArray, FloatArray]:
         ]
     )
     numbers = np.asarray(pattern.sum(axis=1)).ravel(), np.asarray(pattern.sum(axis=0)).ravel()
-    system = csr(block_array([[diags_array(numbers[0]), pattern], [pattern.T, diags_array(numbers[1])]]))
-    weights = diags_array(1.0 / np.maximum(np.concatenate(numbers), 1.0))
-    found, _ = cg(system, -sums, rtol=SCALING_ACCURACY, maxiter=SCALING_STEPS, M=weights)
+    system = csr(
+        scipy.sparse.block_array(
+            [[scipy.sparse.diags_array(numbers[0]), pattern], [pattern.T, scipy.sparse.diags_array(numbers[1])]]
+        )
+    )
+    weights = scipy.sparse.diags_array(1.0 / np.maximum(np.concatenate(numbers), 1.0))
+    found, _ = scipy.sparse.linalg.cg(system, -sums, rtol=SCALING_ACCURACY, maxiter=SCALING_STEPS, M=weights)
     scales = np.exp2(np.round(found))
     return scales[:count], scales[count:]
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import (
@@ -38,9 +39,9 @@ def stated_eigenvalues(phi: FloatArray) -> ComplexArray:
     if not (phi - np.diag(np.diag(phi))).any():
         # Blocks of one, such as steps: in order, each value once.
         return np.array(list(dict.fromkeys(np.diag(phi).tolist())), dtype=np.complex128)
-    from scipy.sparse.csgraph import connected_components
-
-    count, parts = connected_components(phi != 0.0, directed=False) if len(phi) else (0, np.zeros(0))
+    count, parts = (
+        scipy.sparse.csgraph.connected_components(phi != 0.0, directed=False) if len(phi) else (0, np.zeros(0))
+    )
     values: list[complex] = []
     for part in range(count):
         block = phi[np.ix_(parts == part, parts == part)]
@@ -124,9 +125,7 @@ class FaultModel:
         """
         if dt == 0.0 or self.sampled:
             return self.Phi
-        from scipy.linalg import expm
-
-        return np.asarray(expm(self.Phi * dt))
+        return np.asarray(scipy.linalg.expm(self.Phi * dt))
 
     def eigenvalues(self, dt: float) -> ComplexArray:
         """Return each eigenvalue of `transition` once; a multiple one, which rounding scatters, as a mean.
@@ -177,14 +176,12 @@ def from_matrices(Phi: Any, Cw: Any) -> FaultModel:
 
 def summed(models: Sequence[FaultModel]) -> FaultModel:
     """Return the model of a fault that is the sum of several signals, such as a step and a sinusoid."""
-    from scipy.linalg import block_diag
-
     if not models or len({model.sampled for model in models}) > 1:
         raise _refused(
             "A sum of fault models needs at least one part, and either built-in parts or given matrices, not both."
         )
     description = " plus ".join(model.description for model in models)
-    phi, row = block_diag(*(model.Phi for model in models)), np.hstack([model.Cw for model in models])
+    phi, row = scipy.linalg.block_diag(*(model.Phi for model in models)), np.hstack([model.Cw for model in models])
     return _observable(FaultModel(phi, row, description, models[0].sampled))
 
 

@@ -21,6 +21,7 @@ from typing import Any, NoReturn
 
 import flint
 import numpy as np
+import scipy
 from flint import fmpq, fmpq_mat
 
 from obsynth.analysis.plant_units import PlantUnits
@@ -378,11 +379,9 @@ def _surplus_equations(plant: DescriptorSystem, coarse: CoarseStructure, e: Any,
     combinations, scale = _left_null_space(csr(a - GENERIC_POINTS[0] * e)[rows][:, coarse.over_columns])
     if not _say_nothing(plant, rows, scale, combinations):
         return None
-    from scipy.linalg import qr
-
     # By convention the equation of a variable has its number, and goes with it.
     weights = np.where(np.isin(rows, coarse.under_columns), 1.0, OTHERS_WEIGHT)
-    _, _, order = qr((weights[:, None] * combinations).T, mode="economic", pivoting=True)
+    _, _, order = scipy.linalg.qr((weights[:, None] * combinations).T, mode="economic", pivoting=True)
     # Where more equations are repeated than variables are in too few, those that the pattern can do without.
     left_out = unmatched_instead(csr(abs(e) + abs(a)), coarse, rows[order[: combinations.shape[1]]])
     return None if left_out is None else np.union1d(coarse.under_rows, left_out)
@@ -390,10 +389,8 @@ def _surplus_equations(plant: DescriptorSystem, coarse: CoarseStructure, e: Any,
 
 def _say_nothing(plant: DescriptorSystem, rows: Indices, scale: FloatArray, combinations: FloatArray) -> bool:
     """Whether combinations of scaled equations are ``0 = 0``, with known inputs, faults and noise as well."""
-    from scipy.sparse import diags_array, hstack
-
     everything = [csr(getattr(plant, name))[rows] for name in ("E", "A", "B", "Bf", "Bd", "Bw")]
-    scaled = csr(diags_array(scale) @ hstack(everything))
+    scaled = csr(scipy.sparse.diags_array(scale) @ scipy.sparse.hstack(everything))
     peaks = np.zeros(scaled.shape[1])
     np.maximum.at(peaks, scaled.indices, np.abs(scaled.data))
     left = np.abs(scaled.T @ combinations)
@@ -418,15 +415,15 @@ def _solvable(plant: DescriptorSystem, rows: Indices, columns: Indices) -> bool:
 def _left_null_space(tall: Any) -> tuple[FloatArray, FloatArray]:
     """Return an orthonormal left null basis of a matrix with scaled rows, and the scales: one solution, bordered.
     With random G and H ``[M G; H 0]`` is nonsingular; its left solutions for the columns of G hold the null space."""
-    from scipy.sparse import block_array, diags_array
-
     (count, width), rng, more = tall.shape, np.random.default_rng(2), 0
     rows, columns = scales_by_all_entries(tall)
-    scaled = csr(diags_array(rows) @ tall @ diags_array(columns))
+    scaled = csr(scipy.sparse.diags_array(rows) @ tall @ scipy.sparse.diags_array(columns))
     while True:
         wanted = count - width + more
         border, below = rng.normal(size=(count, wanted)), rng.normal(size=(more, width))
-        factor = SparseFactor(block_array([[scaled, csr(border)], [csr(below), None]] if more else [[scaled, border]]))
+        factor = SparseFactor(
+            scipy.sparse.block_array([[scaled, csr(border)], [csr(below), None]] if more else [[scaled, border]])
+        )
         right = np.vstack([np.zeros((width, wanted)), np.eye(wanted)])
         basis = np.linalg.qr(factor.solve_transposed(right)[:count])[0]
         _, values, turned = np.linalg.svd(np.linalg.qr(scaled.T @ basis)[1])
@@ -928,23 +925,20 @@ class _Pieces:
         return *rows, csr(self._matrix(self.dynamic).T), csr(self._matrix(self.algebraic).T)
 
     def _matrix(self, pieces: list[tuple[int, Any, FloatArray]]) -> Any:
-        from scipy.sparse import csr_array
-
         ordered = sorted(pieces, key=lambda piece: piece[0])
         if all(len(piece[1]) == 1 for piece in ordered):
             return selection([piece[0] for piece in ordered], self.count)
         starts = np.concatenate([[0], np.cumsum([len(piece[1]) for piece in ordered])])
         indices = np.concatenate([piece[1] for piece in ordered])
         values = np.concatenate([piece[2] for piece in ordered])
-        return csr_array((values, indices, starts), shape=(len(ordered), self.count))
+        return scipy.sparse.csr_array((values, indices, starts), shape=(len(ordered), self.count))
 
 
 def _scales(e: Any, a: Any) -> tuple[FloatArray, FloatArray]:
     """Return the powers of two that bring the rows, then the columns, of ``[E A]`` near one."""
-    from scipy.sparse import csc_array
 
     def peaks(matrix: Any) -> FloatArray:
-        found = np.asarray(csc_array(abs(matrix)).max(axis=0).toarray()).ravel()
+        found = np.asarray(scipy.sparse.csc_array(abs(matrix)).max(axis=0).toarray()).ravel()
         return np.asarray(found, dtype=np.float64)
 
     rows = 1.0 / power_of_two_below(np.maximum(peaks(e.T), peaks(a.T)))
@@ -1010,9 +1004,7 @@ def _named(shares: FloatArray) -> Any:
 
 
 def _side_by_side(*blocks: Any) -> Any:
-    from scipy.sparse import hstack
-
-    return csr(hstack([csr(block) for block in blocks]))
+    return csr(scipy.sparse.hstack([csr(block) for block in blocks]))
 
 
 #: With so many states and signals, whose exponential takes 10 ms, each entry is rounded once: another machine finds it
@@ -1138,8 +1130,6 @@ def sampling_zero_warnings(plant: DescriptorSystem) -> tuple[str, ...]:
 
 def _noise_factor(A: FloatArray, noise: FloatArray, step: float) -> FloatArray:
     """Return a factor of the covariance that unit white noise through ``noise`` gathers in ``step``."""
-    from scipy.linalg import expm
-
     nx = A.shape[0]
     if not noise.any():
         return np.zeros((nx, 0))
@@ -1148,7 +1138,7 @@ def _noise_factor(A: FloatArray, noise: FloatArray, step: float) -> FloatArray:
     # Van Loan's block grows like exp(-A h): integrate a short step, then double it.
     doublings = math.ceil(math.log2(max(float(np.linalg.norm(balanced, 1)) * step, 1.0)))
     block = np.block([[-balanced, scaled @ scaled.T], [np.zeros((nx, nx)), balanced.T]])
-    result = expm(block * (step / 2.0**doublings))
+    result = scipy.linalg.expm(block * (step / 2.0**doublings))
     transition = result[nx:, nx:].T
     covariance = transition @ result[:nx, nx:]
     for _ in range(doublings):
