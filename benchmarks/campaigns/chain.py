@@ -26,8 +26,7 @@ from benchmarks.campaigns.frame import Outcome
 import obsynth
 from obsynth.data.alarm_proof import verify_alarm
 from obsynth.experiments.alarm_proof import proved_alarm
-from obsynth.results.certificate_files import calibration_text, verify_calibration
-from obsynth.results.design import design_as_dict, digest_of, loaded, restored
+from obsynth.results.design import calibration_text, design_as_dict, digest_of, loaded, restored, verify_calibration
 
 CASES = 3000
 LIMIT = 120.0

@@ -34,7 +34,7 @@ _PUBLIC_NAMES = {
     "analysis.diagnosis.diagnosing": "diagnose",
     "analysis.dae_structure": "identifiability",
     "analysis.structure": "analyse_structure",
-    "analysis.transformations.elimination": "eliminate_algebraic_states discretise",
+    "analysis.transformations.linear_plants": "eliminate_algebraic_states discretise",
     "analysis.transformations.linearisation": "linearise",
     "analysis.transformations.noise": "with_noise",
     "calibration.calibrating": "calibrate",

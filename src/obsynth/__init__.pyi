@@ -5,8 +5,8 @@ from obsynth.analysis.dae_structure import identifiability as identifiability
 from obsynth.analysis.diagnosis.diagnosing import diagnose as diagnose
 from obsynth.analysis.diagnosis.fault_columns import decouple as decouple
 from obsynth.analysis.structure import analyse_structure as analyse_structure
-from obsynth.analysis.transformations.elimination import discretise as discretise
-from obsynth.analysis.transformations.elimination import eliminate_algebraic_states as eliminate_algebraic_states
+from obsynth.analysis.transformations.linear_plants import discretise as discretise
+from obsynth.analysis.transformations.linear_plants import eliminate_algebraic_states as eliminate_algebraic_states
 from obsynth.analysis.transformations.linearisation import linearise as linearise
 from obsynth.analysis.transformations.noise import with_noise as with_noise
 from obsynth.calibration.calibrating import calibrate as calibrate

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from obsynth import ObserverDesign
-from obsynth.cli import data_commands, output
+from obsynth.cli import commands, output
 from obsynth.report import page, tables
 from obsynth.results.design import gain_set_digest
 
@@ -34,7 +34,7 @@ def verified_again() -> Callable[[Path], Any]:
 @pytest.fixture(autouse=True)
 def _verified_once(verified_again: Callable[[Path], Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """The verbs that hand a gain set on remember; ``verify`` does not."""
-    for module in (output, data_commands):
+    for module in (output, commands):
         monkeypatch.setattr(module, "verified_again", verified_again)
 
 

@@ -11,8 +11,7 @@ import pytest
 import obsynth
 from obsynth.cli.main import main
 from obsynth.plants.constants import constants_box
-from obsynth.results.certificate_files import box_row, calibration_text, read_calibration, verify_calibration
-from obsynth.results.design import digest_of
+from obsynth.results.design import box_row, calibration_text, digest_of, read_calibration, verify_calibration
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 SPEC, LOG = DESIGNS / "threetank" / "spec.yaml", DESIGNS / "threetank" / "log.csv"

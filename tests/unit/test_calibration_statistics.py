@@ -22,7 +22,7 @@ from obsynth.calibration.diagnostics import (
 )
 from obsynth.calibration.fits import Maximum, covariance_of, information, profile_box, quantile
 from obsynth.calibration.plants import NoiseStates, PlantWithNoise
-from obsynth.results.certificate_files import box_row, calibration_text, read_calibration, verify_calibration
+from obsynth.results.design import box_row, calibration_text, read_calibration, verify_calibration
 
 
 def test_a_quantile_is_shared_by_all_constants() -> None:

@@ -34,7 +34,7 @@ from obsynth import (
     fault_estimation_filter,
     verify,
 )
-from obsynth.analysis.transformations.recovery import StateRecovery
+from obsynth.analysis.transformations.linear_plants import StateRecovery
 from obsynth.methods.fault_estimation_filter.least_gain_proof import LEAST_GAIN_WITNESSES
 from obsynth.plants.constants import matrices_of
 from obsynth.spec.loader import load_spec

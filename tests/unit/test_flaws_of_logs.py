@@ -363,7 +363,7 @@ def test_a_log_without_stamps_takes_those_that_are_told(tmp_path: Path) -> None:
 
 
 def test_the_summary_lists_alarms_and_rows_that_could_not_alarm() -> None:
-    from obsynth.cli.data_commands import summary_of_run
+    from obsynth.cli.commands import summary_of_run
 
     data = log(rows=160)
     data.loc[60:80, "a"] += 1.0

@@ -12,8 +12,8 @@ import pytest
 
 import obsynth
 from obsynth import verify
-from obsynth.analysis.transformations import elimination
-from obsynth.analysis.transformations.recovery import StateRecovery
+from obsynth.analysis.transformations import linear_plants
+from obsynth.analysis.transformations.linear_plants import StateRecovery
 from obsynth.results.design import PlantSource, source_of
 from obsynth.spec import load_spec
 
@@ -80,7 +80,7 @@ def test_exact_numbers_behind_a_plant_of_many_states_are_known_to_rounding(smib,
 
     rounding = Fraction(1, 2**52)
     assert "plant as written" in {check.name for check in verify(moved(smib, rounding)).failures}
-    monkeypatch.setattr(elimination, "exact_elimination", lambda plant: None)
+    monkeypatch.setattr(linear_plants, "exact_elimination", lambda plant: None)
     spec = load_spec(DESIGNS / "smib" / "spec.yaml")
     recovery = spec.transformation.recovery
     many = obsynth.design(spec.plant, spec.method, name="smib", recovery=recovery, **dict(spec.options))

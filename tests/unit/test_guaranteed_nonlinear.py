@@ -14,7 +14,7 @@ from ruamel.yaml import YAML
 from scipy.integrate import solve_ivp
 
 import obsynth
-from obsynth.analysis.transformations.remainders import bounded_model
+from obsynth.analysis.transformations.linearisation import bounded_model
 from obsynth.cli.main import main
 
 AREA, C, H, V = 2.0, 0.5, 0.5, 0.002

@@ -15,7 +15,7 @@ import pytest
 from scipy.signal import lfilter
 
 import obsynth
-from obsynth.cli.data_commands import summary_of_run
+from obsynth.cli.commands import summary_of_run
 from obsynth.data.alarm_events import NOT_DISTINGUISHED_YET, alarm_rows
 from obsynth.data.online_monitor import learned_sizes
 from obsynth.experiments.monitors.learned_levels import (

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.analysis.transformations.elimination import dynamic_coordinates
+from obsynth.analysis.transformations.linear_plants import dynamic_coordinates
 from obsynth.methods.ui_pi_observer.placement_problem import KNOWN_POLES
 from obsynth.numerics import scaling
 from obsynth.numerics.scaling import LogBalance

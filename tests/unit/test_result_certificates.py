@@ -14,8 +14,7 @@ import pytest
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.results.certificate_files import differences
-from obsynth.results.design import digest_of
+from obsynth.results.design import differences, digest_of
 from obsynth.tolerances.robustness import robustness_statement
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from obsynth.analysis.transformations.elimination import discretise, eliminate_algebraic_states
+from obsynth.analysis.transformations.linear_plants import discretise, eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 from obsynth.simulation import Trajectory, simulate_plant

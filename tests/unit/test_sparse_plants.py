@@ -14,8 +14,7 @@ from scipy.sparse.csgraph import structural_rank
 
 import obsynth
 from obsynth.analysis.diagnosis.fault_columns import decouple
-from obsynth.analysis.transformations.elimination import eliminated_by_sparsity
-from obsynth.analysis.transformations.recovery import without_rounding
+from obsynth.analysis.transformations.linear_plants import eliminated_by_sparsity, without_rounding
 from obsynth.methods.designing import check
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 from obsynth.methods.ui_pi_observer.conditions import existence_conditions

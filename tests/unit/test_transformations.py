@@ -12,8 +12,12 @@ from scipy.signal import cont2discrete
 
 import obsynth
 from obsynth.analysis.structure import analyse_structure
-from obsynth.analysis.transformations.elimination import discretise, eliminate_algebraic_states, sampling_zero_warnings
-from obsynth.analysis.transformations.recovery import augment_faults
+from obsynth.analysis.transformations.linear_plants import (
+    augment_faults,
+    discretise,
+    eliminate_algebraic_states,
+    sampling_zero_warnings,
+)
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.plants.descriptor import DescriptorSystem

@@ -16,7 +16,7 @@ import obsynth
 from obsynth import DAEModel, PreconditionError, SpecError, linearise
 from obsynth.plants.constants import matrices_of
 from obsynth.plants.dae import local_equations
-from obsynth.results.certificate_files import calibration_text
+from obsynth.results.design import calibration_text
 from obsynth.spec import load_spec
 
 POINT = {"leak": 0.03, "h1": 0.7, "h3": 0.65}

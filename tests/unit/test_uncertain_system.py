@@ -7,7 +7,7 @@ import pytest
 from uncertain_plants import drive, wang
 
 import obsynth
-from obsynth.analysis.transformations.recovery import augment_faults
+from obsynth.analysis.transformations.linear_plants import augment_faults
 from obsynth.analysis.transformations.uncertain_plant import affine_plant
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.expressions import parse_expression

@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from obsynth.analysis.existence.statements import Evaluator
-from obsynth.analysis.transformations.recovery import Transformation, linear_plant
+from obsynth.analysis.transformations.linear_plants import Transformation, linear_plant
 from obsynth.analysis.zeros import structure_of, unstable_poles
 from obsynth.numerics.arguments import ComplexArray, arguments_checked
 from obsynth.numerics.libraries import on_one_thread_if_small

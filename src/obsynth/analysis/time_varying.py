@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.transformations.recovery import Transformation
+from obsynth.analysis.transformations.linear_plants import Transformation
 from obsynth.numerics.arguments import FloatArray, remembered, require_kind
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem

@@ -119,7 +119,7 @@ _EXPECTED_SCENARIO = option(
 
 VERBS = {
     "design": Verb(
-        "commands:run_design",
+        "run_design",
         "Design an observer from a spec, verify it, print a report and write the gain set.",
         (
             SYSTEM,
@@ -136,7 +136,7 @@ VERBS = {
         ),
     ),
     "check": Verb(
-        "commands:run_check",
+        "run_check",
         "Analyse the plant of a spec, and check for every method whether a design can exist.",
         (
             SYSTEM,
@@ -146,7 +146,7 @@ VERBS = {
         ),
     ),
     "sensors": Verb(
-        "commands:run_sensors",
+        "run_sensors",
         "Find the cheapest sensors to add, so that faults can be detected, isolated or estimated.",
         (
             SYSTEM,
@@ -176,7 +176,7 @@ VERBS = {
         ),
     ),
     "verify": Verb(
-        "commands:run_verify",
+        "run_verify",
         "Verify a saved gain set, or a certificate of any kind with all files that it refers to, again.",
         (
             Group(
@@ -222,7 +222,7 @@ VERBS = {
         ),
     ),
     "simulate": Verb(
-        "data_commands:run_simulate",
+        "run_simulate",
         "Design an observer from a spec, and simulate it on the spec's scenario.",
         (
             SYSTEM,
@@ -235,7 +235,7 @@ VERBS = {
         ),
     ),
     "compare": Verb(
-        "data_commands:run_compare",
+        "run_compare",
         "Design by every method that exists for a spec's plant, and compare them on its scenario.",
         (
             SYSTEM,
@@ -267,7 +267,7 @@ VERBS = {
         ),
     ),
     "evaluate": Verb(
-        "data_commands:run_evaluate",
+        "run_evaluate",
         "Design an observer from a spec, run the spec's scenario many times, and count alarms, delays and errors.",
         (
             SYSTEM,
@@ -306,7 +306,7 @@ VERBS = {
         ),
     ),
     "sweep": Verb(
-        "data_commands:run_sweep",
+        "run_sweep",
         "Design and verify for every combination of specs and values; a design that fails is a row of the table.",
         (
             option("--system", "FILE", "a spec (YAML), or several", type=Path, required=True, nargs="+"),
@@ -328,7 +328,7 @@ VERBS = {
         _SWEEP_DETAILS,
     ),
     "run": Verb(
-        "data_commands:run_run",
+        "run_run",
         "Run a design on measured data: a log, or a stream on standard input, with a row of estimates for each row.",
         (
             GAINS,
@@ -389,7 +389,7 @@ VERBS = {
         _RUN_DETAILS,
     ),
     "thresholds": Verb(
-        "data_commands:run_thresholds",
+        "run_thresholds",
         "Find thresholds of a design from a log without faults, for a rate of false alarms.",
         (
             GAINS,
@@ -421,7 +421,7 @@ VERBS = {
         ),
     ),
     "export": Verb(
-        "data_commands:run_export",
+        "run_export",
         "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h), or as a functional mock-up unit for "
         "co-simulation (.fmu). A recursive design for a time-invariant plant is written as its steady state.",
         (
@@ -469,7 +469,7 @@ VERBS = {
         ),
     ),
     "plot": Verb(
-        "data_commands:run_plot",
+        "run_plot",
         "Run a design on measured data and draw it: outputs, estimates, residuals, thresholds and alarms.",
         (
             GAINS,
@@ -494,7 +494,7 @@ VERBS = {
         ),
     ),
     "report": Verb(
-        "data_commands:run_report",
+        "run_report",
         "Verify a gain set again and write one self-contained HTML page about it.",
         (
             GAINS,
@@ -518,7 +518,7 @@ VERBS = {
         ),
     ),
     "linearise": Verb(
-        "calibration:run_linearise",
+        "run_linearise",
         "Linearise the nonlinear plant of a spec: exact matrices at an equilibrium (by default that of the spec's "
         "transform), or the reason why there is none.",
         (
@@ -567,7 +567,7 @@ VERBS = {
         ),
     ),
     "calibrate": Verb(
-        "calibration:run_calibrate",
+        "run_calibrate",
         "Fit constants and noise of a plant to a log without faults, with confidence intervals.",
         (
             SYSTEM,
@@ -597,7 +597,7 @@ VERBS = {
         ),
     ),
     "validate": Verb(
-        "calibration:run_validate",
+        "run_validate",
         "Test whether a log without faults agrees with a design.",
         (
             GAINS,
@@ -610,7 +610,7 @@ VERBS = {
         ),
     ),
     "prove-alarm": Verb(
-        "data_commands:run_prove_alarm",
+        "run_prove_alarm",
         "Prove that no plant within its tolerances explains the data up to a row without a fault.",
         (
             GAINS,
@@ -817,8 +817,9 @@ def _outcome(options: argparse.Namespace) -> int:
         is_written = options.verb == "design" or any(getattr(options, name, None) not in (None, "-") for name in named)
         if getattr(options, "force", False) and not is_written:
             raise SpecError("--force replaces a file, and none is written here: give --out.", path="--force")
-        module, _, function = VERBS[options.verb].run.partition(":")
-        run: Callable[[argparse.Namespace], int] = getattr(import_module(f"obsynth.cli.{module}"), function)
+        run: Callable[[argparse.Namespace], int] = getattr(
+            import_module("obsynth.cli.commands"), VERBS[options.verb].run
+        )
         return run(options)
     except ObsynthError as error:
         told = error

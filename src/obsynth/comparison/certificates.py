@@ -16,20 +16,22 @@ from obsynth.experiments.assumptions import Log, file_digest
 from obsynth.experiments.tolerance_study import study_statement, tolerance_study
 from obsynth.files.outputs import path_of, read_json
 from obsynth.numerics.arguments import arguments_checked
-from obsynth.results.certificate_files import (
+from obsynth.results.checks import Check, information, nothing_wrong
+from obsynth.results.design import (
     CALIBRATION_KIND,
     COMPARISON,
     RESULT_VERSION,
     RESULTS,
     ROBUSTNESS,
     STUDY,
+    ObserverDesign,
+    VerificationReport,
     body_of,
     differences,
+    loaded,
     opened,
     verify_calibration,
 )
-from obsynth.results.checks import Check, information, nothing_wrong
-from obsynth.results.design import ObserverDesign, VerificationReport, loaded
 from obsynth.simulation.scenario import scenario_from
 from obsynth.tolerances.robustness import robustness, robustness_statement
 

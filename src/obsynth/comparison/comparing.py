@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.recovery import Transformation, linear_plant
+from obsynth.analysis.transformations.linear_plants import Transformation, linear_plant
 from obsynth.data.run import faults_on_rows
 from obsynth.data.sources import TIME_HEADER, log_table
 from obsynth.data.stuck_sensors import stuck_rows, stuck_texts
@@ -59,8 +59,7 @@ from obsynth.plotting.panels import (
     with_unit,
     written,
 )
-from obsynth.results.certificate_files import COMPARISON, SHOWN_DIGITS, result_text
-from obsynth.results.design import ObserverDesign, design_as_dict
+from obsynth.results.design import COMPARISON, SHOWN_DIGITS, ObserverDesign, design_as_dict, result_text
 from obsynth.simulation.scenario import Scenario, Sine, Step, resolve, scenario_from
 from obsynth.tolerances.robustness import plant_at
 

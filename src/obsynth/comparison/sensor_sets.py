@@ -18,8 +18,7 @@ from annotated_types import Ge
 
 from obsynth.analysis.diagnosis.diagnosing import SensorSearch, Task, reached
 from obsynth.analysis.diagnosis.fault_columns import Questions, Sensor, fault_numbers, state_sensors, with_sensors
-from obsynth.analysis.transformations.elimination import discretise
-from obsynth.analysis.transformations.recovery import Transformation, linear_plant
+from obsynth.analysis.transformations.linear_plants import Transformation, discretise, linear_plant
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.files.tables import html_table, text_table
 from obsynth.methods.functions import functional_filter

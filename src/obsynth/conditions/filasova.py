@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.recovery import Transformation, linear_plant
+from obsynth.analysis.transformations.linear_plants import Transformation, linear_plant
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import SpecError
 from obsynth.methods.conic import lazy_cvxpy as cp

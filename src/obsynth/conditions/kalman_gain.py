@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.time_varying import as_time_varying
-from obsynth.analysis.transformations.recovery import Transformation, linear_plant
+from obsynth.analysis.transformations.linear_plants import Transformation, linear_plant
 from obsynth.conditions import atoms
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import ObsynthError, VerificationError

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.transformations.recovery import Transformation, linear_plant
+from obsynth.analysis.transformations.linear_plants import Transformation, linear_plant
 from obsynth.conditions import atoms
 from obsynth.conditions.atoms import MARGIN
 from obsynth.conditions.problem import Conditions, Values, require_data

@@ -36,9 +36,8 @@ from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import FloatArray, arguments_checked, is_whole, whole_number
 from obsynth.observers.linear.observer import WindowObserver
-from obsynth.results.certificate_files import SHOWN_DIGITS, opened
 from obsynth.results.checks import Check, information
-from obsynth.results.design import ObserverDesign, VerificationReport, loaded, restored
+from obsynth.results.design import SHOWN_DIGITS, ObserverDesign, VerificationReport, loaded, opened, restored
 
 
 @arguments_checked

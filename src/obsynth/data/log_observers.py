@@ -97,7 +97,7 @@ class GapModel:
         """Return the model of a plant; ``None`` where the plant cannot be propagated (index 2 or more)."""
         if np.array_equal(plant.E, np.eye(plant.nx)):
             return cls(plant, np.eye(plant.nx))
-        from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+        from obsynth.analysis.transformations.linear_plants import eliminate_algebraic_states
 
         try:
             done = eliminate_algebraic_states(plant)

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, TextIO, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.transformations.recovery import StateRecovery
+from obsynth.analysis.transformations.linear_plants import StateRecovery
 from obsynth.data.alarm_events import NO_DECISION, AlarmEvent, AlarmLog
 from obsynth.data.log_estimator import DECIDING, GAP, RECOVERING, STALE, Clock, LogObserver, Row
 from obsynth.data.log_observers import SteppingLogObserver, log_observer
@@ -74,8 +74,7 @@ from obsynth.observers.smoothing import (
     smoothed_record,
 )
 from obsynth.plants.descriptor import DescriptorSystem, index_of
-from obsynth.results.certificate_files import sealed
-from obsynth.results.design import ObserverDesign, digest_of, gain_set_digest, plain, restored
+from obsynth.results.design import ObserverDesign, digest_of, gain_set_digest, plain, restored, sealed
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -47,8 +47,7 @@ from obsynth.plants.constants import MOST_LISTED, shown
 from obsynth.plants.descriptor import index_of
 from obsynth.plants.noise_model import require_noise
 from obsynth.proofs.balls import gamma
-from obsynth.results.certificate_files import SHOWN_DIGITS, sealed
-from obsynth.results.design import ObserverDesign, design_as_dict, plain
+from obsynth.results.design import SHOWN_DIGITS, ObserverDesign, design_as_dict, plain, sealed
 from obsynth.tolerances.robustness import structure_of
 from obsynth.verification.adaptive_bound import adaptive_bound, thresholds_of_records
 

@@ -15,7 +15,7 @@ from typing import Any, cast, overload
 
 import numpy as np
 
-from obsynth.analysis.transformations.recovery import Transformation, plant_and_recovery
+from obsynth.analysis.transformations.linear_plants import Transformation, plant_and_recovery
 from obsynth.errors import SpecError
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.files.tables import table_writer

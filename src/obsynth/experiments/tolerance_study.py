@@ -19,8 +19,7 @@ from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import FloatArray, arguments_checked, freeze, whole_number
 from obsynth.plants.constants import deviations_told, shown, tolerance_share
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.certificate_files import SHOWN_DIGITS, STUDY, result_text
-from obsynth.results.design import ObserverDesign, design_as_dict, require_verified
+from obsynth.results.design import SHOWN_DIGITS, STUDY, ObserverDesign, design_as_dict, require_verified, result_text
 from obsynth.simulation.scenario import Scenario, Step
 
 #: Tolerances that are tried, by default.

@@ -12,8 +12,13 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
-from obsynth.analysis.transformations.recovery import StateRecovery, Transformation, plant_and_recovery
+from obsynth.analysis.transformations.linear_plants import (
+    MANY_VARIABLES,
+    StateRecovery,
+    Transformation,
+    eliminate_algebraic_states,
+    plant_and_recovery,
+)
 from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.methods.method import Method, Synthesis, silent
 from obsynth.methods.refusals import require_above_rounding, with_advice

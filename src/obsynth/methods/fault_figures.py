@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.transformations.elimination import discretise, eliminate_algebraic_states
+from obsynth.analysis.transformations.linear_plants import discretise, eliminate_algebraic_states
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arguments import FloatArray
 from obsynth.observers.linear.observer import LinearObserver

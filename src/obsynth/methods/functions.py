@@ -7,7 +7,7 @@ from dataclasses import fields
 from inspect import Parameter, Signature, getdoc
 from typing import Any, TypeVar
 
-from obsynth.analysis.transformations.recovery import Transformation
+from obsynth.analysis.transformations.linear_plants import Transformation
 from obsynth.errors import SpecError
 from obsynth.methods.designing import design
 from obsynth.methods.method import Method

@@ -2,7 +2,7 @@
 from collections.abc import Callable
 from typing import Any, Literal, TypeVar
 
-from obsynth.analysis.transformations.recovery import Transformation
+from obsynth.analysis.transformations.linear_plants import Transformation
 from obsynth.methods.method import Method
 from obsynth.methods.registry import Plant
 from obsynth.results.design import ObserverDesign

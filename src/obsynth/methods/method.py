@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeA
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.transformations.recovery import Transformation
+from obsynth.analysis.transformations.linear_plants import Transformation
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import FloatArray, WrittenAs, field_types, problem_with, shown
 from obsynth.numerics.regions import LMIRegion

@@ -24,7 +24,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.linear_plants import eliminate_algebraic_states
 from obsynth.calibration.diagnostics import Validation, draw_validation
 from obsynth.calibration.validating import states_innovations, validate
 from obsynth.data.alarm_events import NO_ALARM, alarm_notes, alarm_rows, silence

@@ -28,7 +28,7 @@ from rich.text import Text
 from obsynth.analysis.diagnosis.diagnosing import Diagnosis
 from obsynth.analysis.diagnosis.fault_columns import dc_point, others, question
 from obsynth.analysis.structure import Structure, questions
-from obsynth.analysis.transformations.recovery import StateRecovery
+from obsynth.analysis.transformations.linear_plants import StateRecovery
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.experiments.monitors.guaranteed import is_guaranteed
 from obsynth.experiments.monitors.monitor import Monitor

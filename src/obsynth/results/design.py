@@ -2,6 +2,8 @@
 
 A gain set is one JSON document with a schema version and a digest, floats bit for bit.  Large ones are a zip of the
 document and its arrays as ``.npz``, uncompressed and with a fixed date: the same design gives the same bytes.
+
+Certificates and calibrations on disk: one JSON document, its kind, version and digest, and what it says.
 """
 
 from __future__ import annotations
@@ -23,16 +25,24 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from obsynth.analysis.transformations.recovery import RecoveryOperator, StateRecovery, Transformation
+from obsynth.analysis.transformations.linear_plants import RecoveryOperator, StateRecovery, Transformation
 from obsynth.errors import SpecError, VerificationError
 from obsynth.extensions import extension
 from obsynth.files.outputs import FileKind, input_file, json_data, path_of, read_json, write_atomically
-from obsynth.numerics.arguments import FloatArray, arguments_checked, freeze, is_number, read_only, require_kind
+from obsynth.numerics.arguments import (
+    FloatArray,
+    arguments_checked,
+    freeze,
+    is_finite_number,
+    is_number,
+    read_only,
+    require_kind,
+)
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.running import LONGEST_DELAY
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem, listed
-from obsynth.results.checks import Check, all_hold
+from obsynth.results.checks import Check, all_hold, information, nothing_wrong
 
 if TYPE_CHECKING:
     import control
@@ -327,7 +337,7 @@ class PlantSource:
     @cached_property
     def derived(self) -> Transformation:
         """The elimination, and the sampling where there was one, done again; once for all checks."""
-        from obsynth.analysis.transformations.elimination import discretise, eliminate_algebraic_states
+        from obsynth.analysis.transformations.linear_plants import discretise, eliminate_algebraic_states
 
         if self.sample_time is None:
             return eliminate_algebraic_states(self.plant)
@@ -336,7 +346,7 @@ class PlantSource:
     @cached_property
     def smooth(self) -> DescriptorSystem:
         """The plant without its algebraic states, before it is sampled; made once for all checks."""
-        from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+        from obsynth.analysis.transformations.linear_plants import eliminate_algebraic_states
 
         return eliminate_algebraic_states(self.plant).plant
 
@@ -889,3 +899,274 @@ def _is_recovery(value: Any) -> bool:
     if not isinstance(value, dict) or not _is_texts(value.get("names")):
         return False
     return all(_is_array(item) and item.ndim == 2 for key, item in value.items() if key.startswith(("from_", "noise_")))
+
+
+#: Kinds of results that are certified with the gain sets that they rest on.
+ROBUSTNESS, STUDY, COMPARISON = "obsynth robustness", "obsynth tolerance study", "obsynth comparison"
+RESULTS = (ROBUSTNESS, STUDY, COMPARISON)
+RESULT_FILE = FileKind(
+    "a certificate of a result",
+    rb'\A\s*\{\s*"kind":\s*"obsynth (robustness|tolerance study|comparison)"',
+    suffix=".json",
+)
+RESULT_VERSION = 1
+#: Digits of a digest that a sentence shows.
+SHOWN_DIGITS = 12
+
+
+def sealed(kind: str, version: int, body: Any, *, under: str = "certificate") -> str:
+    """Return the text of a file that holds a body, plain data, with its digest."""
+    document = {"kind": kind, "schema_version": version, "sha256": digest_of(body), under: body}
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def opened(
+    path: Path,
+    kinds: tuple[str, ...],
+    version: int,
+    what: str,
+    again: str,
+    *,
+    under: str = "certificate",
+    is_protected: bool = True,
+) -> tuple[str, dict[str, Any], bool]:
+    """Return kind and body of what `sealed` wrote, and whether its digest is right; ``again`` says how to make one."""
+    document = read_json(path, is_protected=is_protected)
+    if not isinstance(document, dict) or document.get("kind") not in kinds:
+        raise SpecError(f"{path} is no {what}.", path=str(path))
+    body = document.get(under)
+    if document.get("schema_version") != version or not isinstance(body, dict):
+        raise SpecError(
+            f"{path} has the schema version {document.get('schema_version')!r}, and this obsynth reads {version}: "
+            f"{again}.",
+            path=str(path),
+        )
+    try:
+        return document["kind"], body, document.get("sha256") == digest_of(body)
+    except RecursionError as error:
+        raise SpecError(f"{path} is nested too deeply to be a {what}: {again}.", path=str(path)) from error
+
+
+def result_text(
+    kind: str,
+    designs: Mapping[str, ObserverDesign],
+    asked: Mapping[str, Any],
+    result: Mapping[str, Any],
+    statement: str,
+    log: Mapping[str, Any] | None = None,
+) -> str:
+    """Return the certificate of a result: what was asked, the figures, the sentence, and every gain set inside."""
+    told = plain({"statement": statement, "asked": asked, "result": result, "log": log})
+    inside = {name: design_as_dict(design) for name, design in designs.items()}
+    return sealed(kind, RESULT_VERSION, {**told, "gain_sets": inside})
+
+
+#: Figures that are found again agree to this share of themselves, or of the largest beside them for rounding.
+SAME_FIGURE, FIGURE_ROUNDING_SHARE = 1e-6, 1e-9
+
+
+def differences(stored: Any, found: Any, where: str = "") -> list[str]:
+    """Return the places at which two results differ, numbers by more than rounding."""
+    if isinstance(found, Mapping):
+        if not isinstance(stored, Mapping) or stored.keys() != found.keys():
+            return [where or "names"]
+        items = [(str(name), stored[name], found[name]) for name in found]
+    elif isinstance(found, (list, tuple)):
+        if not isinstance(stored, (list, tuple)) or len(stored) != len(found):
+            return [where]
+        items = [(str(i + 1), one, other) for i, (one, other) in enumerate(zip(stored, found, strict=True))]
+    else:
+        return [] if _same_figure(stored, found, 0.0) else [where]
+    numbers = [abs(float(other)) for _, _, other in items if _is_figure(other)]
+    rounding = FIGURE_ROUNDING_SHARE * max((size for size in numbers if size < float("inf")), default=0.0)
+    wrong = []
+    for name, one, other in items:
+        place = f"{where}, {name}" if where else name
+        if not _is_figure(other):
+            wrong += differences(one, other, place)
+        elif not _same_figure(one, other, rounding):
+            wrong.append(place)
+    return wrong
+
+
+def _is_figure(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _same_figure(one: Any, other: Any, rounding: float) -> bool:
+    if not (_is_figure(one) and _is_figure(other)):
+        return bool(type(one) is type(other) and one == other)
+    if one == other or (one != one and other != other):
+        return True
+    if not (np.isfinite(one) and np.isfinite(other)):
+        return False
+    return bool(abs(one - other) <= max(SAME_FIGURE * abs(other), rounding))
+
+
+def body_of(body: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a certificate of a result holds beside its gain sets, as it was before it was written."""
+    found: dict[str, Any] = restored({name: value for name, value in body.items() if name != "gain_sets"})
+    return found
+
+
+CALIBRATION_KIND = "obsynth calibration"
+CALIBRATION_VERSION = 1
+_SOURCE = "the calibration file"
+
+
+def calibration_text(data: Mapping[str, Any]) -> str:
+    """Return what a calibration file holds: the data and their digest."""
+    body = plain({"kind": CALIBRATION_KIND, "schema_version": CALIBRATION_VERSION, **data})
+    return json.dumps({"kind": CALIBRATION_KIND, "sha256": digest_of(body), **body}, indent=1, allow_nan=False) + "\n"
+
+
+def _calibration_in(path: Path, where: str = "") -> dict[str, Any]:
+    """Return the content of a calibration file of this version, whatever its digest; `SpecError` for any other."""
+    found, name = read_json(path, where=where or None), path.name
+    if not isinstance(found, dict) or found.get("kind") != CALIBRATION_KIND:
+        raise SpecError(f"{name} is no calibration: write one by obsynth calibrate --out {name}.", path=where or name)
+    version = found.get("schema_version")
+    if version != CALIBRATION_VERSION:
+        raise SpecError(
+            f"{name} has the schema version {version!r}, and this obsynth reads {CALIBRATION_VERSION}: calibrate again "
+            f"(obsynth calibrate --out {name}).",
+            path=where or name,
+        )
+    return found
+
+
+def read_calibration(path: Path, *, where: str = "") -> dict[str, Any]:
+    """Return the content of a calibration file whose digest is right; raise `SpecError` for any other."""
+    found, name = _calibration_in(path, where), path.name
+    if "sha256" not in found:
+        raise SpecError(f"{name} holds no digest of itself, as files of older versions: calibrate again (obsynth "
+                        f"calibrate --out {name}).", path=where or name)  # fmt: skip
+    if not _intact(found):
+        raise SpecError(f"{name} was changed after it was written: its digest does not match.", path=where or name)
+    wrong = _misfits(found)
+    if wrong:
+        raise SpecError(f"{name} is damaged: {', '.join(wrong)}. Calibrate again.", path=where or name)
+    return found
+
+
+def _intact(found: Mapping[str, Any]) -> bool:
+    return bool(found.get("sha256") == digest_of({key: value for key, value in found.items() if key != "sha256"}))
+
+
+def verify_calibration(path: str | Path, again: Mapping[str, Any] | None = None) -> VerificationReport:
+    """Check a calibration file, against the same calibration done ``again`` where plant and log are given.
+
+    Parameters
+    ----------
+    path : str or Path
+        What ``obsynth calibrate --out`` wrote.
+    again : mapping, optional
+        `Calibration.to_dict` of the same plant and log.
+
+    Returns
+    -------
+    VerificationReport
+        Without ``again`` the ranges are assumed to be what the log says.
+
+    Raises
+    ------
+    SpecError
+        The file is no calibration.
+    """
+    found = _calibration_in(Path(path))
+    rows = [
+        nothing_wrong("digest", "the file is as it was written", [] if _intact(found) else ["sha256"], source=_SOURCE)
+    ]
+    rows.append(
+        nothing_wrong(
+            "box",
+            "ranges are finite, hold their nominal values, and the level is a probability, of a log that is named",
+            _misfits(found),
+            source=_SOURCE,
+        )
+    )
+    log = found.get("log") if isinstance(found.get("log"), dict) else {}
+    cited = str(log.get("digest", "")) if isinstance(log, dict) else ""
+    if again is None:
+        rows.append(information(
+            "log", f"the ranges follow from the log with digest {cited}: assumed, as plant and log were not "
+            "given (--system, --data)", float("nan"), source=_SOURCE, status="assumed",
+        ))  # fmt: skip
+    else:
+        rows.append(
+            nothing_wrong(
+                "log",
+                "the log that is given has the digest that the file cites",
+                [] if again["log"]["digest"] == cited else ["digest"],
+                source=_SOURCE,
+            )
+        )
+        rows.append(
+            nothing_wrong(
+                "ranges",
+                "the same calibration gives the same constants, ranges and level",
+                _differences(found, again),
+                source=_SOURCE,
+            )
+        )
+    return VerificationReport.of(rows)
+
+
+#: Ranges found again on another machine may differ by this share of their width.
+SAME_WIDTH = 1e-2
+
+
+def _differences(found: Mapping[str, Any], again: Mapping[str, Any]) -> list[str]:
+    """Return what differs from the same calibration done again."""
+    one, two = found.get("constants"), again["constants"]
+    if not isinstance(one, dict) or one.keys() != two.keys():
+        return ["names"]
+    wrong = [] if found.get("level") == again["level"] else ["level"]
+    return wrong + [name for name, item in two.items() if not _same_range(one[name], item)]
+
+
+def _same_range(one: Any, item: Mapping[str, Any]) -> bool:
+    """Whether a constant of a file is that of the calibration done again; what is malformed is not."""
+    stated, (low, high) = _stated_range(one), item["range"]
+    if not stated or any(one.get(key) != item[key] for key in ("open", "unit")):
+        return False
+    slack = SAME_WIDTH * (high - low)
+    return all(abs(a - b) <= slack for a, b in zip(stated, (low, item["nominal"], high), strict=True))
+
+
+def _stated_range(item: Any) -> list[float]:
+    """Return low end, nominal value and high end of a constant of a file; nothing of what is malformed."""
+    ends = item.get("range") if isinstance(item, dict) else None
+    if not isinstance(ends, list) or len(ends) != 2 or not isinstance(item.get("open"), list):
+        return []
+    if not all(isinstance(text, str) for text in (item.get("unit"), *item["open"])):
+        return []
+    stated = [ends[0], item.get("nominal"), ends[1]]
+    return stated if all(map(is_finite_number, stated)) else []
+
+
+def _misfits(found: Mapping[str, Any]) -> list[str]:
+    level = found.get("level")
+    wrong = [] if is_finite_number(level) and 0.0 < float(level or 0.0) < 1.0 else ["level"]
+    log = found.get("log")
+    wrong += [] if isinstance(log, dict) and isinstance(log.get("digest"), str) else ["log"]
+    wrong += [] if isinstance(found.get("stands"), bool) else ["stands"]
+    constants = found.get("constants")
+    if not isinstance(constants, dict):
+        return [*wrong, "constants"]
+    stated = {str(name): _stated_range(item) for name, item in constants.items()}
+    return wrong + [name for name, values in stated.items() if not values or sorted(values) != values]
+
+
+def box_row(box: Any, path: Path) -> Check:
+    """Return the row that a calibrated box is that of a calibration file."""
+    found = read_calibration(path)
+    constants = found["constants"]
+    wrong = [] if box.calibration == found["sha256"] else ["digest of the calibration"]
+    wrong += [] if box.digest == found["log"]["digest"] and box.level == found["level"] else ["log or level"]
+    for name in box.calibrated or box.constants:
+        item, stated = box.constants.get(name), constants.get(name)
+        if item is None or stated is None or [item.low, item.high, item.nominal] != [*stated["range"],
+                                                                                     stated["nominal"]]:  # fmt: skip
+            wrong.append(name)
+    return nothing_wrong("calibration", f"the box is that of {path.name}", wrong, source=_SOURCE)

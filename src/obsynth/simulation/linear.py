@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.time_varying import algebraic_rows
-from obsynth.analysis.transformations.elimination import discretise, eliminate_algebraic_states
-from obsynth.analysis.transformations.recovery import StateRecovery
+from obsynth.analysis.transformations.linear_plants import StateRecovery, discretise, eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import FloatArray, arguments_checked, real_array, real_vector, whole_number
 from obsynth.numerics.continuous import driven, first_order_hold

@@ -25,8 +25,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from obsynth.analysis.transformations.elimination import discretise, eliminate_algebraic_states
-from obsynth.analysis.transformations.recovery import Transformation
+from obsynth.analysis.transformations.linear_plants import Transformation, discretise, eliminate_algebraic_states
 from obsynth.errors import SpecError, a_kind
 from obsynth.files.outputs import input_file, path_of, read_json, read_text
 from obsynth.numerics.arguments import FloatArray, arguments_checked, as_matrix, is_whole, read_only
@@ -43,8 +42,7 @@ from obsynth.plants.descriptor import (
     suggestion,
 )
 from obsynth.plants.uncertain_system import with_expressions
-from obsynth.results.certificate_files import read_calibration
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import ObserverDesign, read_calibration
 from obsynth.simulation.scenario import PROFILE_KINDS, Profile, Scenario, check_parameters
 
 if TYPE_CHECKING:

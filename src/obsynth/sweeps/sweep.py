@@ -34,8 +34,18 @@ from obsynth.numerics.arguments import FloatArray, arguments_checked, require_ki
 from obsynth.observers.progress import RunsProgress, as_they_come, progress_of_runs
 from obsynth.plants.descriptor import DescriptorSystem, index_of
 from obsynth.plotting.panels import tidy
-from obsynth.results.certificate_files import RESULT_VERSION, opened, sealed
-from obsynth.results.design import ObserverDesign, gain_set_bytes, load, loaded, plain, require_verified, restored
+from obsynth.results.design import (
+    RESULT_VERSION,
+    ObserverDesign,
+    gain_set_bytes,
+    load,
+    loaded,
+    opened,
+    plain,
+    require_verified,
+    restored,
+    sealed,
+)
 from obsynth.spec.loader import changed_document, design_of_spec, read_yaml, spec_of
 from obsynth.version import __version__
 

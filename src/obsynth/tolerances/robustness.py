@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from obsynth.analysis.transformations.elimination import discretise, eliminate_algebraic_states
+from obsynth.analysis.transformations.linear_plants import discretise, eliminate_algebraic_states
 from obsynth.analysis.transformations.uncertain_plant import (
     ROW_ROUNDING_SHARE,
     AffinePlant,
@@ -37,8 +37,14 @@ from obsynth.plants.constants import SAME_TOLERANCE, SAMPLED, UNCERTAIN_MATRICES
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse
-from obsynth.results.certificate_files import ROBUSTNESS, SHOWN_DIGITS, result_text
-from obsynth.results.design import ObserverDesign, design_as_dict, require_verified
+from obsynth.results.design import (
+    ROBUSTNESS,
+    SHOWN_DIGITS,
+    ObserverDesign,
+    design_as_dict,
+    require_verified,
+    result_text,
+)
 from obsynth.verification.error_structure import (
     ErrorStructure,
     Responses,

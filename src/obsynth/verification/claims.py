@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.recovery import StateRecovery
+from obsynth.analysis.transformations.linear_plants import StateRecovery
 from obsynth.numerics.arguments import FloatArray, is_number, remembered
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear.observer import unaveraged

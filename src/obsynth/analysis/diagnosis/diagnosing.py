@@ -36,7 +36,7 @@ from obsynth.analysis.diagnosis.fault_columns import (
     state_sensors,
     with_sensors,
 )
-from obsynth.analysis.transformations.recovery import Transformation, linear_plant
+from obsynth.analysis.transformations.linear_plants import Transformation, linear_plant
 from obsynth.analysis.zeros import structure_of
 from obsynth.errors import SpecError
 from obsynth.files.tables import html_table, text_table

@@ -32,7 +32,7 @@ import numpy as np
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 from numpy.typing import NDArray
 
-from obsynth.analysis.transformations.recovery import Transformation, linear_plant
+from obsynth.analysis.transformations.linear_plants import Transformation, linear_plant
 from obsynth.analysis.zeros import are_outside
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import ComplexArray, FloatArray, arguments_checked, largest_singular_value, read_only

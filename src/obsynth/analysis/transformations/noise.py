@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.recovery import Transformation, unchanged_states
+from obsynth.analysis.transformations.linear_plants import Transformation, unchanged_states
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import SMALLEST, FloatArray, arguments_checked, real_number, require_no_overflow
 from obsynth.plants.constants import Uncertainty

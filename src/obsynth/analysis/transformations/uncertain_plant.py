@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.analysis.transformations.elimination import algebraic_coordinates
+from obsynth.analysis.transformations.linear_plants import algebraic_coordinates
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.ranks import UNTOUCHED_SHARE

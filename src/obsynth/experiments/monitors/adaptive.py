@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.transformations.elimination import algebraic_coordinates, discretise, eliminate_algebraic_states
+from obsynth.analysis.transformations.linear_plants import algebraic_coordinates, discretise, eliminate_algebraic_states
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant, reduced_family
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.assumptions import Assumptions

@@ -46,8 +46,7 @@ from obsynth.observers.linear.observer import LinearObserver, WindowObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import changed
 from obsynth.plants.noise_model import offset_state
-from obsynth.results.certificate_files import opened, sealed
-from obsynth.results.design import ObserverDesign, digest_of, gain_set_digest, plain, restored
+from obsynth.results.design import ObserverDesign, digest_of, gain_set_digest, opened, plain, restored, sealed
 
 #: Parts of a log whose largest statistics are compared, the share of them that is taken as usual, and how many times
 #: that an event stands out at least: a fifth of the parts of a log may hold events.

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from obsynth.analysis.transformations.elimination import discretise, eliminate_algebraic_states
+from obsynth.analysis.transformations.linear_plants import discretise, eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.registry import error_model
 from obsynth.numerics.arguments import FloatArray, largest_singular_value

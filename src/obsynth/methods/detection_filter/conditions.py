@@ -6,7 +6,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
 from obsynth.analysis.existence.statements import Evaluator
-from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.linear_plants import eliminate_algebraic_states
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.ranks import decide_rank

@@ -9,7 +9,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import require_all
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.linear_plants import eliminate_algebraic_states
 from obsynth.errors import SolverError
 from obsynth.methods.detection_filter.checks import (
     Transfer,

@@ -23,7 +23,7 @@ from flint import fmpq_mat
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.statements import PlantNumbers, numbers_of, settled_rank
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.transformations.recovery import augment_faults
+from obsynth.analysis.transformations.linear_plants import augment_faults
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import FloatArray, largest_singular_value, require_shape
 from obsynth.numerics.ranks import (

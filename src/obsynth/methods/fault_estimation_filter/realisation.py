@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import require_all
-from obsynth.analysis.transformations.elimination import SLOW_ZERO_RADIUS, sampling_zero_warnings
+from obsynth.analysis.transformations.linear_plants import SLOW_ZERO_RADIUS, sampling_zero_warnings
 from obsynth.errors import SpecError
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.fault_estimation_filter.prepared_plant import (

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.remainders import bounded_model
+from obsynth.analysis.transformations.linearisation import bounded_model
 from obsynth.errors import ObsynthError
 from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.guaranteed_test.problem import (

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
-from obsynth.analysis.transformations.remainders import bounded_model, remainder_names
+from obsynth.analysis.transformations.linearisation import bounded_model, remainder_names
 from obsynth.analysis.transformations.uncertain_plant import affine_plant
 from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError
 from obsynth.methods.designing import design

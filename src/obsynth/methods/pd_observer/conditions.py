@@ -13,8 +13,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition, up_to_failure
 from obsynth.analysis.existence.statements import Evaluator, FullRank, NoZeroOutside, SystemFacts, reconsidered
-from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
-from obsynth.analysis.transformations.recovery import Transformation
+from obsynth.analysis.transformations.linear_plants import Transformation, eliminate_algebraic_states
 from obsynth.analysis.zeros import MOST_NAMES, equilibrated_at, leading_names, structure_of
 from obsynth.numerics.arguments import FloatArray, remembered
 from obsynth.numerics.ranks import equilibrate

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.analysis.plant_units import FAR_UNITS, PlantUnits
 from obsynth.analysis.time_varying import WARN_MARKOV_CONDITION, HorizonRanks, as_time_varying, horizon_ranks
-from obsynth.analysis.transformations.recovery import Transformation
+from obsynth.analysis.transformations.linear_plants import Transformation
 from obsynth.analysis.zeros import are_outside, leading_names
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.method import Method, Synthesis

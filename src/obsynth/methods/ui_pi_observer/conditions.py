@@ -42,12 +42,13 @@ from obsynth.analysis.existence.statements import (
     zero_verdict,
 )
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.transformations.elimination import (
+from obsynth.analysis.transformations.linear_plants import (
+    StateRecovery,
+    Transformation,
     dynamic_coordinates,
     eliminate_algebraic_states,
     eliminated_exactly,
 )
-from obsynth.analysis.transformations.recovery import StateRecovery, Transformation
 from obsynth.analysis.zeros import (
     MOST_NAMES,
     Zero,
