@@ -225,12 +225,14 @@ def plain_decades(panel: Axes, *, across: bool = False) -> None:
     """Give an axis, vertical or ``across``, a logarithmic scale, with plain numbers at 1, 2 and 5 where it is short."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-    (panel.set_xscale if across else panel.set_yscale)("log")
     lines = [np.asarray(line.get_ydata(), dtype=np.float64) for line in panel.get_lines()]
     # Across, a level that is drawn from one side to the other has no place.
     shown = np.array(panel.dataLim.intervalx) if across else np.concatenate([np.zeros(0), *lines])
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
-    if not shown.size or shown.max() > SHORT_SPREAD * shown.min():
+    if not shown.size:
+        return  # nothing has a place on it, and matplotlib gives an axis without data limits below zero
+    (panel.set_xscale if across else panel.set_yscale)("log")
+    if shown.max() > SHORT_SPREAD * shown.min():
         return
     axis = panel.xaxis if across else panel.yaxis
     if not across:
