@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 from dae_plants import exchanger, linear
 
-from obsynth import DAEModel, DAEObserver, SolverError, SpecError, dae_adaptive_observer, run_batch, simulate_dae
+from obsynth import (
+    DAEModel,
+    DAEObserver,
+    SolverError,
+    SpecError,
+    dae_adaptive_observer,
+    run_batch,
+    simulate_dae,
+    verify,
+)
 from obsynth.numerics.arguments import read_only
 from obsynth.plants.dae import DAEFunctions, ImplicitStep
 from obsynth.types import Estimates
@@ -366,3 +375,40 @@ def test_bad_simulations_are_named(arguments, words) -> None:
     given = {"u": np.tile(exchanger().nominal_input, (5, 1)), "dt": 1.0, **arguments}
     with pytest.raises(SpecError, match=words):
         simulate_dae(exchanger(), given.pop("u"), **given)
+
+
+def levitated() -> DAEModel:
+    """Return a ball below a magnet, which falls or sticks at any constant voltage."""
+    return DAEModel(
+        {"place": "der(z) = v", "force": "m * (1 + load) * der(v) = m * (1 + load) * 9.81 - 5e-4 * i * i / (z * z)",
+         "coil": "0.05 * der(i) = volt - 2 * i"},
+        {"Z": "z", "I": "i"}, states={"z": 0.01, "v": 0.0, "i": 0.99}, inputs={"volt": 1.98}, parameters={"load": 0.0},
+        constants={"m": 0.5},
+    )  # fmt: skip
+
+
+def filled() -> DAEModel:
+    """Return a tank whose level a controller keeps: at constant flows it is empty after eight seconds."""
+    return DAEModel(
+        {"tank": "der(h) = feed * (1 - loss) - out - 0.02 * sqrt(h)"}, {"L": "h"}, states={"h": 1.0},
+        inputs={"feed": 0.1, "out": 0.22}, parameters={"loss": 0.0},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("model", "dt", "fewer"), [(levitated(), 0.002, False), (filled(), 1.0, True)])
+def test_a_plant_that_only_a_controller_keeps_at_its_nominal_point_has_a_design(
+    model: DAEModel, dt: float, fewer: bool
+) -> None:
+    """It was refused: at constant nominal inputs it comes to where its equations have no solution."""
+    design = dae_adaptive_observer(
+        model, dt=dt, Q={name: 1e-8 for name in model.equation_names}, R=np.diag([1e-8, 1e-4][: model.ny]),
+        form="augmented-kalman", random_walk=[[1e-6]], initial_parameter_covariance=[[1e-3]],
+        initial_covariance=np.diag([1e-6, 1e-2, 1e-2][: model.nx]),
+    )  # fmt: skip
+    steps = design.certificate.claims["steps"]
+    told = [note for note in design.notes if f"over {steps:.0f} steps in place of 100" in note]
+    assert (steps < 10.0, len(told)) == (fewer, int(fewer))
+    assert verify(design).passed
+    for name in ("NEES", "NIS"):
+        (row,) = [check for check in design.report.checks if check.name == name]
+        assert "runs of 40 steps" not in row.detail

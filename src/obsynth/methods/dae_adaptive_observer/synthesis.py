@@ -36,7 +36,7 @@ def synthesise(plant: DAEModel, asked: DaeAdaptiveObserver, *, progress: Callabl
         "index": float(facts.index),
         "condition": facts.condition,
         "contraction": facts.contraction,
-        "steps": float(NOMINAL_STEPS),
+        "steps": float(facts.steps),
     }
     return Synthesis(
         resolved_options(observer),
@@ -56,6 +56,12 @@ def _notes(observer: DAEObserver, facts: DAEFacts) -> Iterator[str]:
             if abs(move) > size
         ]
         yield f"The initial state does not meet the algebraic equations; it is moved onto them: {', '.join(moved)}."
+    if facts.steps < NOMINAL_STEPS:
+        yield (
+            "At constant nominal inputs the plant leaves its nominal state for where its equations have no solution: "
+            f"the checks are made over {facts.steps} steps in place of {NOMINAL_STEPS}. State inputs and states at "
+            "which the plant rests to have them over more."
+        )
     turn = largest_turn(observer.model, observer.dt)
     if observer.integration == "backward-euler" and turn > LARGEST_TURN:
         yield (

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.dae_structure import Identifiability, identifiability, index_report
-from obsynth.errors import SpecError
+from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arguments import FloatArray, read_only
 from obsynth.numerics.lapack import pencil_eigenvalues
 from obsynth.observers.dae.estimates import DAERow, GatheredRows
@@ -131,8 +131,9 @@ def _default_parameter_variances(model: DAEModel, given: Any) -> FloatArray:
     return np.asarray((DEFAULT_PARAMETER_SHARE * sizes) ** 2)
 
 
-#: Steps of the nominal run.
-NOMINAL_STEPS = 100
+#: Steps of the nominal run; where a plant leaves its nominal point for where its equations have no solution, so small a
+#: share of the steps to there, and the fewest that say anything.
+NOMINAL_STEPS, SHARE_OF_SOLVED, FEWEST_STEPS = 100, 0.5, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +156,11 @@ class DAEFacts:
     parameter_covariance: FloatArray  # ``(nq, nq)`` at the end
 
     @property
+    def steps(self) -> int:
+        """Steps of the run."""
+        return len(self.kept)
+
+    @property
     def decay_time(self) -> float:
         """Steps in which an error of the state filter falls to 1/e; infinite where it does not."""
         if not 0.0 < self.contraction < 1.0:
@@ -166,26 +172,21 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
     """Run an observer on its own model at nominal inputs and parameters."""
     model = observer.model
     u = np.array(model.nominal_input)
-    # The outputs of the model from the observer's initial state, without noise.
-    step, outputs = observer.steps.implicit, []
-    x, theta = np.array(observer.initial_state), np.array(observer.initial_parameters)
-    for k in range(NOMINAL_STEPS + 1):
-        x = step.solve(x, u, theta, k=k).x
-        outputs.append(step.functions.outputs(x, theta)[0])
+    outputs = _nominal_outputs(observer, u)
     gathered, kept = GatheredRows(observer), []
 
     def add(rows: DAERow) -> None:
         gathered.add(rows)
         kept.append(np.array(rows.several.part("kept")))
 
-    end = advanced(observer.steps, np.array(outputs), np.tile(u, (len(outputs), 1)), add)
+    end = advanced(observer.steps, outputs, np.tile(u, (len(outputs), 1)), add)
     found = gathered.estimates()
     covariance = found.parameter_covariances[-1]
     deviations = np.sqrt(np.diag(covariance))
     safe = np.where(deviations > 0.0, deviations, 1.0)
     identifiable = identifiability(
         model,
-        np.tile(u, (NOMINAL_STEPS + 1, 1)),
+        np.tile(u, (len(outputs), 1)),
         dt=observer.dt,
         R=observer.R,
         method=observer.integration,
@@ -208,3 +209,23 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
         read_only(np.concatenate(kept)[1:]),
         read_only(covariance),
     )
+
+
+def _nominal_outputs(observer: DAEObserver, u: FloatArray) -> FloatArray:
+    """Return the outputs of the model from the observer's initial state, without noise.
+
+    Inputs that a controller moves are constant here: an unstable plant, or a tank whose flows are not in balance, goes
+    to where its equations have no solution, and what is near to that is no nominal run.
+    """
+    step, outputs = observer.steps.implicit, list[FloatArray]()
+    x, theta = np.array(observer.initial_state), np.array(observer.initial_parameters)
+    for k in range(NOMINAL_STEPS + 1):
+        try:
+            x = step.solve(x, u, theta, k=k).x
+        except SolverError:
+            kept = int(SHARE_OF_SOLVED * len(outputs))
+            if kept <= FEWEST_STEPS:  # the first is none
+                raise
+            return np.array(outputs[:kept])
+        outputs.append(step.functions.outputs(x, theta)[0])
+    return np.array(outputs)
