@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from obsynth.calibration.fits import Objective, Profile, guarded_maximum, quantile, simulation_fits
+from obsynth.calibration.fits import Objective, guarded_maximum, profile_root, quantile, simulation_fits
 from obsynth.calibration.logs import Log
 from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem, calibration_problem
@@ -75,7 +75,7 @@ def root_at_truth(rows: int, seed: int, quantum: float = 0.0) -> float:
     fits = simulation_fits(problem, 1, 0, lambda text: None)
     objective = Objective(problem, fits[0])
     maximum, _ = guarded_maximum(objective, fits, lambda text: None)
-    return max(Profile(objective, maximum, i).root(TRUTH[name] / float(objective.problem.widths[i]))
+    return max(profile_root(objective, maximum, i)[0](TRUTH[name] / float(objective.problem.widths[i]))
                for i, name in enumerate(BOUNDS))  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from scipy import sparse
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.data.sources import Dialect
+from obsynth.data.sources import number_in_cell
 from obsynth.errors import SpecError
 from obsynth.spec.loader import read_yaml
 
@@ -67,7 +67,7 @@ def test_damaged_fmus_end_in_one_error_and_leave_the_process_where_it_was(
 @pytest.mark.parametrize("text", ["1_000", "1_0.5", "1e1_0"])
 def test_underscores_are_no_part_of_a_number(text: str) -> None:
     with pytest.raises(obsynth.SpecError, match="Row 7"):
-        Dialect(",").number(text, 7, "y1")
+        number_in_cell(text, 7, "y1")
 
 
 @pytest.mark.parametrize(

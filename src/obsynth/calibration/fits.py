@@ -756,57 +756,54 @@ def upper_limit(objective: Objective, maximum: Maximum, i: int) -> float:
     return side.value
 
 
-class Profile:
-    """The least value of the objective as a function of one variable, the others led along."""
+def profile_root(objective: Objective, maximum: Maximum, i: int) -> tuple[Callable[[float], float], float]:
+    """Return the root of the deviance at a value of one variable, the others led along, and the variable's deviation:
+    deviance is twice what the least value of the objective is above its minimum."""
+    others = [j for j in range(len(maximum.z)) if j != i]
+    values, vectors = np.linalg.eigh(maximum.hessian)
+    values = np.maximum(values, LEAST_CURVATURE_SHARE * max(float(values.max()), SMALLEST))
+    covariance = (vectors / values) @ vectors.T
+    slope = covariance[others, i] / covariance[i, i]
+    values, vectors = np.linalg.eigh(maximum.hessian[np.ix_(others, others)])
+    values = np.maximum(values, LEAST_CURVATURE_SHARE * max(float(values.max(initial=0.0)), SMALLEST))
+    spread = np.sqrt(np.diag((vectors / values) @ vectors.T))
+    # Variables that the log does not determine move by no more than their search does.
+    scale = np.minimum(spread, np.where(np.arange(len(maximum.z))[others] < objective.nt, 1.0, 3.0))
+    low, high = objective.low[others], objective.high[others]
+    place, rest = float(maximum.z[i]), maximum.z[others].copy()
 
-    def __init__(self, objective: Objective, maximum: Maximum, i: int) -> None:
-        self.objective, self.maximum, self.i = objective, maximum, i
-        self.others = [j for j in range(len(maximum.z)) if j != i]
-        values, vectors = np.linalg.eigh(maximum.hessian)
-        values = np.maximum(values, LEAST_CURVATURE_SHARE * max(float(values.max()), SMALLEST))
-        self.covariance = (vectors / values) @ vectors.T
-        inner = maximum.hessian[np.ix_(self.others, self.others)]
-        values, vectors = np.linalg.eigh(inner)
-        values = np.maximum(values, LEAST_CURVATURE_SHARE * max(float(values.max(initial=0.0)), SMALLEST))
-        spread = np.sqrt(np.diag((vectors / values) @ vectors.T))
-        # Variables that the log does not determine move by no more than their search does.
-        self.scale = np.minimum(spread, np.where(np.arange(len(maximum.z))[self.others] < objective.nt, 1.0, 3.0))
-        self.place, self.rest = float(maximum.z[i]), maximum.z[self.others].copy()
-
-    def root(self, value: float) -> float:
-        """Return the root of the deviance at a value of the variable."""
-        o, i, others = self.objective, self.i, self.others
-        slope = self.covariance[others, i] / self.covariance[i, i]
-        low, high = o.low[others], o.high[others]
-        guess = np.clip(self.rest + slope * (value - self.place), low, high)
+    def root(value: float) -> float:
+        nonlocal place, rest
 
         def both(w: FloatArray) -> tuple[float, FloatArray]:
             z = np.empty(len(others) + 1)
             z[others], z[i] = w, value
-            found, gradient = o(z)
+            found, gradient = objective(z)
             return found, gradient[others]
 
         if others:
-            least, self.rest = descent(
-                both, guess, low, high, self.scale, tolerance=PROFILE_SEARCH_TOLERANCE, most=MOST_PROFILE_SEARCHES
+            guess = np.clip(rest + slope * (value - place), low, high)
+            least, rest = descent(
+                both, guess, low, high, scale, tolerance=PROFILE_SEARCH_TOLERANCE, most=MOST_PROFILE_SEARCHES
             )
         else:
-            least = both(self.rest)[0]
-        self.place = value
-        return math.sqrt(max(2.0 * (least - self.maximum.value), 0.0))
+            least = both(rest)[0]
+        place = value
+        return math.sqrt(max(2.0 * (least - maximum.value), 0.0))
+
+    return root, math.sqrt(max(covariance[i, i], LEAST_DEVIATION**2))
 
 
 def _side(objective: Objective, maximum: Maximum, i: int, sign: float, target: float) -> Side:
     """Return where the root of the profile's deviance reaches a target; open where a bound comes first."""
-    profile, begin = Profile(objective, maximum, i), float(maximum.z[i])
+    (root, deviation), begin = profile_root(objective, maximum, i), float(maximum.z[i])
     end = float(objective.low[i] if sign < 0 else objective.high[i])
     if abs(end - begin) < AT_BOUND:
         return Side(end, True)
-    deviation = math.sqrt(max(profile.covariance[i, i], LEAST_DEVIATION**2))
     inner, reached_inner = begin, 0.0
     outer, reached = begin + sign * min(target * deviation, abs(end - begin)), 0.0
     for _ in range(MOST_PROFILE_STEPS):
-        reached = profile.root(outer)
+        reached = root(outer)
         if reached >= target or outer == end:
             break
         inner, reached_inner = outer, reached
@@ -821,7 +818,7 @@ def _side(objective: Objective, maximum: Maximum, i: int, sign: float, target: f
             break
         share = min(max((target - reached_inner) / (reached - reached_inner), LEAST_CUT), 1.0 - LEAST_CUT)
         middle = inner + share * (outer - inner)
-        found = profile.root(middle)
+        found = root(middle)
         if found >= target:
             outer, reached = middle, found
         else:

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,12 +178,8 @@ NEARER, LEAST_WRONG = 1e-3, 4
 MOST_OF_RATE = 0.5
 
 
-class Pair(NamedTuple):
-    """Samples of one output: the first and the last of their rows, and which output."""
-
-    first: int
-    second: int
-    output: int
+#: Samples of one output: the first and the last of their rows, and which output.
+Pair: TypeAlias = tuple[int, int, int]
 
 
 def believed_pairs(refused: Sequence[FloatArray], y: FloatArray) -> list[Pair]:
@@ -194,15 +190,15 @@ def believed_pairs(refused: Sequence[FloatArray], y: FloatArray) -> list[Pair]:
         before = refused[k - 1] if k else np.zeros_like(memory)
         begun[seen & (np.abs(memory[0]) == 1.0)] = k
         believed = seen & (np.abs(memory[0]) >= 2.0) & (memory[3] != 0.0) & (before[3] == 0.0)
-        found += [Pair(int(begun[i]), k, int(i)) for i in np.flatnonzero(believed)]
+        found += [(int(begun[i]), k, int(i)) for i in np.flatnonzero(believed)]
     return found
 
 
 def without(y: FloatArray, pairs: Sequence[Pair]) -> FloatArray:
     """Return what was measured ``(n, ny)`` without these pairs."""
     left = y.copy()
-    for pair in pairs:
-        left[pair.first : pair.second + 1, pair.output] = np.nan
+    for first, last, output in pairs:
+        left[first : last + 1, output] = np.nan
     return left
 
 
@@ -211,10 +207,10 @@ def taken_back(pairs: Sequence[Pair], refused: Sequence[FloatArray], y: FloatArr
     shown."""
     far = np.array([memory[0] != 0.0 for memory in refused])
     found = []
-    for pair in pairs:
-        later = np.flatnonzero(np.isfinite(y[pair.second + 1 :, pair.output]))
-        if later.size and not far[pair.second + 1 + later[0], pair.output]:
-            found.append(pair)
+    for first, last, output in pairs:
+        later = np.flatnonzero(np.isfinite(y[last + 1 :, output]))
+        if later.size and not far[last + 1 + later[0], output]:
+            found.append((first, last, output))
     return found
 
 
@@ -464,7 +460,7 @@ def _without_pairs(
     wrong = taken_back(pairs, hidden.refused, y)
     seen = np.isfinite(y).sum(axis=0)
     # All of a pair are wrong samples: those that were believed too.
-    refused = hidden.refused[-1][1] + 2.0 * np.bincount([p.output for p in wrong], minlength=len(seen))
+    refused = hidden.refused[-1][1] + 2.0 * np.bincount([output for _, _, output in wrong], minlength=len(seen))
     # A second comes with the same probability as the first, and in half of the cases on the same side.
     chance = float(0.5 * np.sum((refused / np.maximum(seen, 1)) ** 2))
     # So many pairs are what single wrong samples make at this rate, and leave most of the alarms to others.

@@ -524,53 +524,43 @@ _GROUPED = re.compile(
 _ONE_GROUP = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
 
 
-@dataclass(frozen=True)
-class Dialect:
-    """How a log is written: what separates its columns, and whether numbers may have a decimal comma."""
-
-    separator: str
-
-    @property
-    def comma(self) -> bool:
-        """Whether a comma in a number stands for its point."""
-        return self.separator != ","
-
-    def number(self, text: str | None, row: int, column: str, stamps: Stamps | None = None) -> float:
-        """Return the number in a cell, NaN where it is missing; a cell that is none is named with its row.
-        A word is what loggers write for a bad sample: ``stamps`` counts these, and which columns show numbers."""
-        cell = "" if text is None else text.strip()
-        if cell.lower() in MISSING_TEXTS:
-            return float("nan")
-        try:
-            found = number_in_text(cell.replace(",", ".") if self.comma and "." not in cell else cell)
-            if self.comma and stamps is not None and ("," in cell or "." in cell):
-                mark = "." if "." in cell else ","
-                if stamps.decimals.get(column) != mark:
-                    stamps.take_mark(column, row, cell, mark, may_group=bool(_ONE_GROUP.fullmatch(cell)))
-        except ValueError:
-            grouped = _GROUPED.fullmatch(cell)
-            if grouped is not None and stamps is not None:
-                whole, mark, decimals = grouped[1], grouped[3] or "", grouped[4] or ""
-                if mark:
-                    stamps.take_mark(column, row, cell, mark, may_group=False)
-                stamps.numeric.add(column)
-                return float(re.sub(r"[^\d+-]", "", whole) + "." + decimals)
-            if stamps is not None and ("#" in cell or not any(letter.isdigit() for letter in cell)):
-                stamps.take_word(column, row, cell)
-                return float("nan")
-            advice = ""
-            if "," in cell:
-                advice = (
-                    " Separate the columns by semicolons where numbers have a decimal comma."
-                    if not self.comma
-                    else " Leave out what groups thousands."
-                )
-            raise SpecError(
-                f"Row {row}, column {column!r}: {text!r} is no number.{advice}", path=f"row {row}"
-            ) from None
-        if stamps is not None:
+def number_in_cell(
+    text: str | None, row: int, column: str, stamps: Stamps | None = None, *, comma: bool = False
+) -> float:
+    """Return the number in a cell, NaN where it is missing; a cell that is none is named with its row.
+    A word is what loggers write for a bad sample: ``stamps`` counts these, and which columns show numbers; ``comma``:
+    whether a comma in a number stands for its point."""
+    cell = "" if text is None else text.strip()
+    if cell.lower() in MISSING_TEXTS:
+        return float("nan")
+    try:
+        found = number_in_text(cell.replace(",", ".") if comma and "." not in cell else cell)
+        if comma and stamps is not None and ("," in cell or "." in cell):
+            mark = "." if "." in cell else ","
+            if stamps.decimals.get(column) != mark:
+                stamps.take_mark(column, row, cell, mark, may_group=bool(_ONE_GROUP.fullmatch(cell)))
+    except ValueError:
+        grouped = _GROUPED.fullmatch(cell)
+        if grouped is not None and stamps is not None:
+            whole, mark, decimals = grouped[1], grouped[3] or "", grouped[4] or ""
+            if mark:
+                stamps.take_mark(column, row, cell, mark, may_group=False)
             stamps.numeric.add(column)
-        return found
+            return float(re.sub(r"[^\d+-]", "", whole) + "." + decimals)
+        if stamps is not None and ("#" in cell or not any(letter.isdigit() for letter in cell)):
+            stamps.take_word(column, row, cell)
+            return float("nan")
+        advice = ""
+        if "," in cell:
+            advice = (
+                " Separate the columns by semicolons where numbers have a decimal comma."
+                if not comma
+                else " Leave out what groups thousands."
+            )
+        raise SpecError(f"Row {row}, column {column!r}: {text!r} is no number.{advice}", path=f"row {row}") from None
+    if stamps is not None:
+        stamps.numeric.add(column)
+    return found
 
 
 def _as_windows(error: UnicodeError) -> tuple[str, int]:
@@ -624,7 +614,7 @@ def text_chunks(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iter
 
 def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[FloatArray]:
     """Yield one row at a time, ``(1, 1 + nu + ny)``, as soon as its line is there."""
-    header, dialect, table = _opened(stream, signals.columns)
+    header, comma, table = _opened(stream, signals.columns)
     if not header:
         raise SpecError("The data are empty: their first line is the names of the columns.", path="data")
     places = signals.positions(header)
@@ -643,8 +633,8 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
             )
         cells = [*cells[: len(header)], *[""] * (len(header) - len(cells))]
         stamp = cells[places[0]] if date is None else with_date(cells[date], cells[places[0]])
-        time = stamps.read(stamp, row, header[places[0]], comma=dialect.comma)
-        values = [dialect.number(cells[place], row, header[place], stamps) for place in places[1:]]
+        time = stamps.read(stamp, row, header[places[0]], comma=comma)
+        values = [number_in_cell(cells[place], row, header[place], stamps, comma=comma) for place in places[1:]]
         for i, place in enumerate(states):
             if place is not None and is_bad(cells[place]):
                 stamps.take_bad(header[places[i]], row, cells[place].strip(), header[place])
@@ -665,10 +655,10 @@ def header_of(path: Path, wanted: Sequence[str]) -> list[str]:
         raise SpecError(f"{path} cannot be read: {error.strerror or error}.", path=str(path)) from error
 
 
-def _opened(stream: TextIO, wanted: Sequence[str]) -> tuple[tuple[str, ...], Dialect, Iterator[list[str]]]:
-    """Return the names of the columns, how the log is written, and the cells of the lines below the header.  What a
-    logger remarks before the header, in blank lines and in lines that begin with ``#`` and name no column that is read,
-    is passed over."""
+def _opened(stream: TextIO, wanted: Sequence[str]) -> tuple[tuple[str, ...], bool, Iterator[list[str]]]:
+    """Return the names of the columns, whether numbers may have a decimal comma, and the cells of the lines below the
+    header.  What a logger remarks before the header, in blank lines and in lines that begin with ``#`` and name no
+    column that is read, is passed over."""
     lines = _text_lines(stream)
     head = next(lines, "")
     while (head and not head.strip()) or (
@@ -678,10 +668,10 @@ def _opened(stream: TextIO, wanted: Sequence[str]) -> tuple[tuple[str, ...], Dia
         head = next(lines, "")
     told = _SEPARATOR_LINE.fullmatch(head)
     head = next(lines, "") if told else head
-    dialect = Dialect(told.group(1)) if told else _dialect_of(head, wanted)
+    separator = told.group(1) if told else _separator_of(head, wanted)
     # A name in quotes may go on in the next line.
-    table = _cells(itertools.chain([head], lines), dialect)
-    return tuple(unquoted(name.strip()) for name in next(table, [])), dialect, table
+    table = _cells(itertools.chain([head], lines), separator)
+    return tuple(unquoted(name.strip()) for name in next(table, [])), separator != ",", table
 
 
 def _together(rows: Iterator[FloatArray], count: int) -> Iterator[FloatArray]:
@@ -689,11 +679,11 @@ def _together(rows: Iterator[FloatArray], count: int) -> Iterator[FloatArray]:
         yield np.concatenate(block)
 
 
-def _dialect_of(head: str, wanted: Sequence[str]) -> Dialect:
-    """Return how a log is written: by the separator that finds the columns that are read, or that finds most."""
+def _separator_of(head: str, wanted: Sequence[str]) -> str:
+    """Return what separates the columns of a log: what finds the columns that are read, or finds most."""
     found = {separator: _names(head, separator) for separator in SEPARATORS}
     whole = next((s for s, names in found.items() if all(column_of(names, name) for name in wanted)), None)
-    return Dialect(whole or max(SEPARATORS, key=lambda s: len(found[s])))
+    return whole or max(SEPARATORS, key=lambda s: len(found[s]))
 
 
 def _names(head: str, separator: str) -> Sequence[str]:
@@ -703,9 +693,9 @@ def _names(head: str, separator: str) -> Sequence[str]:
         return []
 
 
-def _cells(lines: Iterator[str], dialect: Dialect) -> Iterator[list[str]]:
+def _cells(lines: Iterator[str], separator: str) -> Iterator[list[str]]:
     """Yield the cells of each line; what is no text, or no table, is a `SpecError`."""
-    table = csv.reader(lines, delimiter=dialect.separator)
+    table = csv.reader(lines, delimiter=separator)
     for row in itertools.count():
         try:
             cells = next(table, None)
@@ -1245,8 +1235,7 @@ def _numbers(column: pd.Series, done: int, stamps: Stamps | None = None) -> Floa
             stamps.numeric.add(str(column.name))
         return found
     texts = [None if pd.isna(cell) else str(cell) for cell in column]
-    plain = Dialect(",")
-    return np.array([plain.number(text, done + i + 1, str(column.name), stamps) for i, text in enumerate(texts)])
+    return np.array([number_in_cell(text, done + i + 1, str(column.name), stamps) for i, text in enumerate(texts)])
 
 
 #: Decimals of seconds that dates are told to.

@@ -35,13 +35,6 @@ MOST_RUNS_TOLD = 3
 _WAITING_ROWS = 1024
 
 
-class StuckRun(NamedTuple):
-    """Rows in which an output repeats one value, the first and the last of them."""
-
-    first: int
-    last: int
-
-
 class _Repeats(NamedTuple):
     """A run of equal samples, and the changes before it."""
 
@@ -120,8 +113,8 @@ class _Output:
     def _longest(runs: Sequence[_Repeats]) -> list[_Repeats]:
         return sorted(runs, key=lambda run: (-run.length, run.first))[:MOST_STUCK_RUNS]
 
-    def stuck(self) -> list[StuckRun]:
-        """Return the runs that are improbable beside the others, in order.
+    def stuck(self) -> list[tuple[int, int]]:
+        """Return first and last rows of the runs that are improbable beside the others, in order.
 
         Lengths of the longest tenth of the others are taken as geometric beyond the shortest of these: so a sensor of
         coarse steps, which repeats its value often, has to repeat it for longer.  Where a few runs alone are long,
@@ -139,7 +132,7 @@ class _Output:
             chance = size * (above / (1.0 + above)) ** (shortest - least)
             if shortest >= TIMES_USUAL * longest and chance < EXPECTED_RUNS:
                 found = [run for run in runs[:count] if not self._rests(run)]
-                return [StuckRun(run.first, run.last) for run in sorted(found, key=lambda run: run.first)]
+                return [(run.first, run.last) for run in sorted(found, key=lambda run: run.first)]
         return []
 
     def _rests(self, run: _Repeats) -> bool:
@@ -203,13 +196,13 @@ class RepeatedValues:
             with np.errstate(over="ignore", invalid="ignore"):
                 output.take(numbers[seen], column[seen])
 
-    def stuck(self) -> list[list[StuckRun]]:
+    def stuck(self) -> list[list[tuple[int, int]]]:
         """Return by output the rows in which it is stuck."""
         self._look()
         return [output.stuck() for output in self._outputs]
 
 
-def stuck_rows(values: FloatArray) -> list[StuckRun]:
+def stuck_rows(values: FloatArray) -> list[tuple[int, int]]:
     """Return the rows in which an output ``(n,)``, NaN where it was not measured, is stuck."""
     gathered = RepeatedValues(1)
     gathered.take(values[:, None])

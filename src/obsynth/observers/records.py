@@ -70,9 +70,7 @@ def measured_record(value: ArrayLike, columns: int) -> FloatArray:
 def _numbers(value: Any, name: str) -> FloatArray:
     """Return an array of finite real numbers of one or two dimensions; raise `SpecError` naming it."""
     raw = as_given(value, name, f"{name} is ragged: give the same number of signals at each sample.")
-    if raw.ndim <= 1:
-        return np.asarray(as_matrix(raw.reshape(1, -1), name)[0])
-    return as_matrix(raw, name)
+    return np.asarray(as_matrix(raw.reshape(1, -1), name)[0]) if raw.ndim <= 1 else as_matrix(raw, name)
 
 
 def checked_record(value: Any, columns: int, name: str) -> FloatArray:

@@ -80,11 +80,10 @@ def simulate_dae(
     rng = np.random.default_rng(seed)
     pushed = _noise(Q, model.nx, "Q", rng, len(inputs))
     measurement_noise = _noise(R, model.ny, "R", rng, len(inputs))
-    run = _Run(ImplicitStep(DAEFunctions(model, integration), length), inputs, theta, pushed)
-    run.start(_consistent(model, x, inputs, theta, length))
-    take_samples(len(inputs), run.together, run.alone)
+    step, start = ImplicitStep(DAEFunctions(model, integration), length), _consistent(model, x, inputs, theta, length)
+    states, outputs, residuals = _recorded(step, inputs, theta, pushed, start)
     time = length * np.arange(len(inputs), dtype=np.float64)
-    return Trajectory(run.states, run.outputs + measurement_noise, inputs, theta, time=time, residuals=run.residuals)
+    return Trajectory(states, outputs + measurement_noise, inputs, theta, time=time, residuals=residuals)
 
 
 def _consistent(model: DAEModel, x: FloatArray, inputs: FloatArray, theta: FloatArray, dt: float) -> FloatArray:
@@ -111,49 +110,47 @@ def _parameters(model: DAEModel, value: ArrayLike | None, samples: int) -> Float
     return theta
 
 
-class _Run:
-    """A record while it is being filled."""
+def _recorded(
+    step: ImplicitStep, inputs: FloatArray, theta: FloatArray, pushed: FloatArray, start: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return states, outputs and residuals of a record from a start."""
+    functions, samples = step.functions, len(inputs)
+    states, outputs = np.zeros((samples, functions.model.nx)), np.zeros((samples, functions.model.ny))
+    residuals, calls = np.zeros(samples), dict[int, Compiled]()
 
-    def __init__(self, step: ImplicitStep, inputs: FloatArray, theta: FloatArray, pushed: FloatArray) -> None:
-        self.step, self.inputs, self.theta, self.pushed = step, inputs, theta, pushed
-        model, samples = step.functions.model, len(inputs)
-        self.states, self.outputs = np.zeros((samples, model.nx)), np.zeros((samples, model.ny))
-        self.residuals, self.calls = np.zeros(samples), dict[int, Compiled]()
+    def note(kept: slice, found: FloatArray, left: FloatArray | float = 0.0) -> None:
+        states[kept], residuals[kept] = found, left
+        for k in range(kept.start, kept.stop):
+            outputs[k] = functions.outputs(states[k], theta[k])[0]
 
-    def start(self, x: FloatArray) -> None:
-        """Begin at a state."""
-        if len(self.inputs):
-            self._note(slice(0, 1), x[None])
-
-    def together(self, k: int, length: int) -> int:
+    def together(k: int, length: int) -> int:
         """Take several steps in one call; return how many of them were solved."""
-        if length not in self.calls:
-            functions = self.step.functions
-            graphs, key = functions.model.graphs, ("simulated", functions.method, self.step.dt, length)
+        if length not in calls:
+            graphs, key = functions.model.graphs, ("simulated", functions.method, step.dt, length)
             if key not in graphs:
-                graphs[key] = _simulated(self.step).mapaccum(length)
-            self.calls[length] = Compiled(graphs[key])
+                graphs[key] = _simulated(step).mapaccum(length)
+            calls[length] = Compiled(graphs[key])
         kept = slice(k, k + length)
-        arriving = np.hstack([self.inputs[kept], self.theta[kept], self.pushed[kept]])
-        after, said = (found.T for found in self.calls[length](self.states[k - 1], arriving.ravel()))
+        arriving = np.hstack([inputs[kept], theta[kept], pushed[kept]])
+        after, said = (found.T for found in calls[length](states[k - 1], arriving.ravel()))
         good = (said[:, 1] == 1.0) & np.isfinite(after).all(axis=1)
         taken = length if good.all() else int(np.argmin(good))
-        self._note(slice(k, k + taken), after[:taken], said[:taken, 0])
+        note(slice(k, k + taken), after[:taken], said[:taken, 0])
         return taken
 
-    def alone(self, k: int) -> None:
+    def alone(k: int) -> None:
         """Take one step that needs care."""
-        x, u, theta = self.states[k - 1], self.inputs[k], self.theta[k]
-        solution = self.step.solve(x, u, theta, before=self.inputs[k - 1], k=k)
+        x, u = states[k - 1], inputs[k]
+        solution = step.solve(x, u, theta[k], before=inputs[k - 1], k=k)
         moved = solution.x
-        if self.pushed[k].any():
-            moved = moved + self.step.sensitivities(solution, x, u, theta)[2] @ self.pushed[k]
-        self._note(slice(k, k + 1), moved[None], solution.residual)
+        if pushed[k].any():
+            moved = moved + step.sensitivities(solution, x, u, theta[k])[2] @ pushed[k]
+        note(slice(k, k + 1), moved[None], solution.residual)
 
-    def _note(self, kept: slice, states: FloatArray, residuals: FloatArray | float = 0.0) -> None:
-        self.states[kept], self.residuals[kept] = states, residuals
-        for k in range(kept.start, kept.stop):
-            self.outputs[k] = self.step.functions.outputs(self.states[k], self.theta[k])[0]
+    if samples:
+        note(slice(0, 1), start[None])
+    take_samples(samples, together, alone)
+    return states, outputs, residuals
 
 
 def _simulated(step: ImplicitStep) -> Any:

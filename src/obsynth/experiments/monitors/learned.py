@@ -496,9 +496,7 @@ def watched_values(residuals: FloatArray, evidence: Any) -> FloatArray | None:
     """Return fault estimates and residuals of a row, in the order of `watched_names`; `None` where there are none."""
     if isinstance(evidence, Evidence):
         return np.concatenate([evidence.theta, residuals])
-    if isinstance(evidence, LinearSample):
-        return evidence.faults_and_residuals
-    return None
+    return evidence.faults_and_residuals if isinstance(evidence, LinearSample) else None
 
 
 def thresholds_from_rows(
@@ -555,17 +553,17 @@ def thresholds_from_rows(
         centres = scores.chosen(slice(len(rows) // 2 if conformal else None)).centre()
     found = signatures(design, kept, np.sqrt(np.nanvar(x, axis=0))) if like is None else like.statistics.directions
     statistics = Statistics(model, *found, estimates=() if scores is None else names[:faults])
-    lasting = 0.0
+    lasting, extrapolated = 0.0, False
     if conformal:
         statistics, levels = conformal_levels(x, others, statistics, scores)
     else:
         lasting = lasting_sizes(model.whitened(x)) if like is None else like.lasting
         rarer = RARER_WHERE_SIZES_LAST if lasting else 1.0
-        statistics, levels = learned_levels(x, others * rarer, statistics, seed, scores)
+        statistics, levels, extrapolated = learned_levels(x, others * rarer, statistics, seed, scores)
     return LearnedThresholds(
         told,
         statistics,
-        read_only(levels.own * levels.factor),
+        read_only(levels),
         every,
         count,
         rows_needed(statistics.model, every, scores),
@@ -573,7 +571,7 @@ def thresholds_from_rows(
         read_only(centres),
         read_only(np.where(scales > 0.0, scales, 1.0)),
         gain_set_digest(design),
-        levels.extrapolated,
+        extrapolated,
         tuple(name for i, name in enumerate(names) if i not in kept and name not in statistics.estimates),
         settling_rows(design),
         pairs,
@@ -833,9 +831,7 @@ class LearnedRule(Rule):
             return int(self._places[names.index(told)])
         if told in self._faults:
             return self._faults[told]
-        if not count:
-            return None
-        return int(np.argmax(np.abs(found[:count] - self.learned.centres) / self.learned.scales))
+        return None if not count else int(np.argmax(np.abs(found[:count] - self.learned.centres) / self.learned.scales))
 
     def _predicted(self, state: LearnedState) -> FloatArray:
         """Return what the autoregression says of the next row."""

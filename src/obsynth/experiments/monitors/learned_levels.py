@@ -472,14 +472,6 @@ def drawn_rows(e: FloatArray, places: NDArray[np.int64], rng: np.random.Generato
     return np.asarray(found)
 
 
-class Levels(NamedTuple):
-    """Levels of each statistic ``(k,)``, the factor on all of them that holds, and whether it was extrapolated."""
-
-    own: FloatArray
-    factor: float
-    extrapolated: bool
-
-
 def is_conformal(rows: int, every: float) -> bool:
     """Whether so many rows show the rate themselves, so that no bootstrap has to."""
     return rows >= CONFORMAL * every
@@ -487,9 +479,9 @@ def is_conformal(rows: int, every: float) -> bool:
 
 def conformal_levels(
     x: FloatArray, every: float, statistics: Statistics, scores: Scores | None = None
-) -> tuple[Statistics, Levels]:
-    """Return statistics fitted to the first half of rows ``(n, m)``, and their levels from the second; ``scores``:
-    what these rows say of faults, which are where the first half has them.
+) -> tuple[Statistics, FloatArray]:
+    """Return statistics fitted to the first half of rows ``(n, m)``, and their levels ``(k,)`` from the second;
+    ``scores``: what these rows say of faults, which are where the first half has them.
 
     Alarms in the second half are as exchangeable with later ones as blocks of rows are (split conformal: Papadopoulos
     et al. 2002).
@@ -507,7 +499,7 @@ def conformal_levels(
     own, _ = _union(first, every, half - SETTLING)
     union = (second / own[None, :, None]).max(axis=1)
     rows = int(np.asarray(np.isfinite(x[half + SETTLING :]).all(axis=1)).sum())
-    return found, Levels(_of_deviations(own, usual), exchangeable_level(union, rows, every), extrapolated=False)
+    return found, _of_deviations(own, usual) * exchangeable_level(union, rows, every)
 
 
 def _of_faults(scores: Scores, centre: FloatArray, sizes: FloatArray) -> FloatArray:
@@ -525,9 +517,9 @@ def _usual(scores: Scores) -> tuple[FloatArray, FloatArray]:
 
 def learned_levels(
     x: FloatArray, every: float, statistics: Statistics, seed: int = 0, scores: Scores | None = None
-) -> tuple[Statistics, Levels]:
-    """Return statistics with levels by age, and the levels for one alarm per ``every`` rows from rows ``(n, m)``
-    without faults; ``scores``: what these rows say of faults."""
+) -> tuple[Statistics, FloatArray, bool]:
+    """Return statistics with levels by age, the levels ``(k,)`` for one alarm per ``every`` rows from rows ``(n, m)``
+    without faults, and whether they are extrapolated; ``scores``: what these rows say of faults."""
     rng = np.random.default_rng(seed)
     model, n = statistics.model, len(x)
     rows = int(np.clip(ROWS_PER_ALARM * every, LEAST_STREAM_ROWS, MOST_STREAM_ROWS))
@@ -579,7 +571,7 @@ def learned_levels(
     usual = None if scores is None else _usual(scores)
     itself = (normal_statistics(x, statistics, scores, usual) / own[:, None]).max(axis=0)[None]
     shown_there = exchangeable_level(itself, itself[:, SETTLING:].size, every)
-    return statistics, Levels(_of_deviations(own, usual), max(level * sure, shown_there), every > seen_rate)
+    return statistics, _of_deviations(own, usual) * max(level * sure, shown_there), every > seen_rate
 
 
 def exchangeable_level(values: FloatArray, rows: int, every: float) -> float:

@@ -22,7 +22,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -737,11 +737,8 @@ LEFT_AFTER_TABLE = 1e-3
 LONGEST_TABLE, MOST_NUMBERS = 16_384, 20_000_000
 
 
-class UnlimitedHorizonBound(NamedTuple):
-    """A bound by the number of samples since the start: a table, and a limit for every later one."""
-
-    table: FloatArray
-    limit: float
+#: A bound by the number of samples since the start: a table, and a limit for every later one.
+UnlimitedHorizonBound: TypeAlias = tuple[FloatArray, float]
 
 
 def samples_of(transition: FloatArray, window: int) -> int:
@@ -774,7 +771,7 @@ def unlimited_bound(
     begins = initial_error + _columns(inputs.start)
     start = max(shown) * left * begins
     if kind == "pointwise":
-        return UnlimitedHorizonBound(_start_added(model, bare, initial_error) * OUTWARD, (pointwise + start) * OUTWARD)
+        return _start_added(model, bare, initial_error) * OUTWARD, (pointwise + start) * OUTWARD
     table = window_threshold(model, inputs, initial_error, window)
     # No window has more energy than its samples one by one; for a sampled plant its own bound may be smaller.
     # Such a window may begin in the table, where more is left of the start.
@@ -782,7 +779,7 @@ def unlimited_bound(
     limit = float(np.sqrt(window)) * (pointwise + start) * OUTWARD
     if model.continuous is None and model.sampled is None:
         limit = min(limit, _window_limit(model, inputs, (initial_error, left, last), window))
-    return UnlimitedHorizonBound(table, limit)
+    return table, limit
 
 
 def _window_limit(
@@ -808,7 +805,7 @@ def unlimited_paper(
 ) -> UnlimitedHorizonBound:
     """Return (66) of Wang et al. 2015 for records of any length."""
     table = paper_threshold(model, bounds, initial_error, gamma)
-    return UnlimitedHorizonBound(table, float(table[-1]))
+    return table, float(table[-1])
 
 
 def _start_added(model: ResidualModel, bare: FloatArray, initial_error: float) -> FloatArray:

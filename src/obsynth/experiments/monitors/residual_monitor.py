@@ -272,6 +272,4 @@ def _straight_lines(
             for residual, power in zip(residuals, model.powers(), strict=True)
         ]
     )
-    if kind == "pointwise":
-        return sizes
-    return norms_of_windows(sizes, window)
+    return sizes if kind == "pointwise" else norms_of_windows(sizes, window)

@@ -250,7 +250,7 @@ class NormRule(Rule):
     ) -> None:
         self.gaps: GapGrowth | None = None
         self.table, self.limit, self.irregular = table, limit, irregular
-        self._regular = UnlimitedHorizonBound(table, limit)
+        self._regular = table, limit
         self._window, self._dt, self._watched, self._driven = window, dt, watched, driven
 
     def over_gaps(self, gaps: GapGrowth) -> NormRule:

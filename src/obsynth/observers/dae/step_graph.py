@@ -149,9 +149,7 @@ class _Update:
     def later(self, found: Arrays) -> Arrays:
         """Update parameters and state."""
         innovation = self._innovation(found)
-        if self._is_joint:
-            return self._joint(innovation, learns=True)
-        return self._corrected(self._learnt(innovation))
+        return self._joint(innovation, learns=True) if self._is_joint else self._corrected(self._learnt(innovation))
 
     @property
     def _is_joint(self) -> bool:

@@ -479,9 +479,7 @@ def noise_variances(observer: LinearObserver, noise: FloatArray) -> FloatArray:
 
 def checked_warm_up(asked: float | None, default: float) -> float:
     """Return the warm-up in seconds."""
-    if asked is None:
-        return default
-    return real_number(asked, "warm_up", "seconds, 0 or more", least=0.0)
+    return default if asked is None else real_number(asked, "warm_up", "seconds, 0 or more", least=0.0)
 
 
 #: Frequencies of the grid, and how far it reaches beyond the slowest and the fastest pole of the observer.
@@ -600,9 +598,7 @@ class WindowObserver(Observer[WindowState, float]):
             Number of the row.
         """
         place = k - self.samples
-        if place < 0:
-            return -1
-        return int(self.programmes[min(place, len(self.programmes) - 1)])
+        return -1 if place < 0 else int(self.programmes[min(place, len(self.programmes) - 1)])
 
     def init(self) -> WindowState:
         """Return the state before the first sample, k = 0."""
@@ -638,9 +634,7 @@ class WindowObserver(Observer[WindowState, float]):
         require_horizon(self.horizon, state.k + 1, early=False)
         window = np.vstack([state.recent, np.concatenate([u, y])])
         which = self.programme_at(state.k)
-        value = np.nan
-        if which >= 0:
-            value = float(self.weights[which] @ window[::-1].ravel() + self.constants[which])
+        value = float(self.weights[which] @ window[::-1].ravel() + self.constants[which]) if which >= 0 else np.nan
         return WindowState(state.k + 1, window[1:]), value
 
     def step(self, state: WindowState, y: ArrayLike, u: ArrayLike = ()) -> tuple[WindowState, Estimates]:

@@ -756,9 +756,7 @@ class Recursion:
         if not rows.size or not settings.Q.is_constant:
             return None
         others = np.setdiff1d(np.arange(settings.plant.ne), rows)
-        if np.any(settings.Q.at(0)[np.ix_(others, rows)]):
-            return None
-        return steps_of(settings, rows)
+        return None if np.any(settings.Q.at(0)[np.ix_(others, rows)]) else steps_of(settings, rows)
 
     def plain(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
         """Take a sample as it is."""
@@ -1290,9 +1288,7 @@ class RecursiveObserver(StepObserver):
         row : RawEstimate
             What is known at a sample.
         """
-        if self.state_bounds is None:
-            return row
-        return row._replace(x=projected(row.x, row.factor, self.state_bounds))
+        return row if self.state_bounds is None else row._replace(x=projected(row.x, row.factor, self.state_bounds))
 
 
 def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> RecursiveObserver:
