@@ -94,7 +94,7 @@ __all__ = sorted(_PUBLIC_HOMES)
 
 provide(
     {
-        "conditions of a design": "obsynth.conditions.shipped:conditions_of",
+        "conditions of a design": "obsynth.conditions.own_terms:conditions_of",
         "design summary": "obsynth.report.tables:summary",
         "picture of a guaranteed test": "obsynth.plotting.estimates:plot_least_thresholds",
     }

@@ -21,7 +21,7 @@ _TYPE_NAMES = {
     "experiments.monte_carlo": "Evaluation Interval",
     "experiments.tolerance_study": "ToleranceStudy",
     "experiments.simulation": "Simulation",
-    "methods.fault_figures": "FaultFigures",
+    "methods.automatic": "FaultFigures",
     "methods.detection_filter.public": "DetectionFilter",
     "methods.recursive.synthesis": "SteadyState",
     "observers.decisions": "Alarm Decision",

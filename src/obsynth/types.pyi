@@ -20,8 +20,8 @@ from obsynth.experiments.monte_carlo import Evaluation as Evaluation
 from obsynth.experiments.monte_carlo import Interval as Interval
 from obsynth.experiments.simulation import Simulation as Simulation
 from obsynth.experiments.tolerance_study import ToleranceStudy as ToleranceStudy
+from obsynth.methods.automatic import FaultFigures as FaultFigures
 from obsynth.methods.detection_filter.public import DetectionFilter as DetectionFilter
-from obsynth.methods.fault_figures import FaultFigures as FaultFigures
 from obsynth.methods.recursive.synthesis import SteadyState as SteadyState
 from obsynth.observers.decisions import Alarm as Alarm
 from obsynth.observers.decisions import Decision as Decision

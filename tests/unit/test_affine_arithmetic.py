@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from obsynth.errors import PreconditionError
-from obsynth.proofs.affine import AffineMatrix, affine_block
-from obsynth.proofs.affine_numbers import AffineNumber
+from obsynth.proofs.affine import AffineMatrix, AffineNumber, affine_block
 
 Exact = np.ndarray  # of fractions
 

@@ -9,7 +9,7 @@ import pytest
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.methods.fault_figures import fault_figures, on_the_clock
+from obsynth.methods.automatic import fault_figures, on_the_clock
 from obsynth.spec.loader import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

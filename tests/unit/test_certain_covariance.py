@@ -7,8 +7,8 @@ import pytest
 from flint import fmpq, fmpq_mat
 
 from obsynth.numerics.spectra import noise_covariance
-from obsynth.proofs import covariances
-from obsynth.proofs.covariances import certain_noise_covariance
+from obsynth.proofs import products
+from obsynth.proofs.products import certain_noise_covariance
 
 
 def far_from_normal(steep: float) -> np.ndarray:
@@ -61,7 +61,7 @@ def test_a_variance_of_which_double_precision_knows_no_digit_is_that_of_the_stor
 
 
 def test_a_variance_of_rounding_is_not_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(covariances, "MOST_ENCLOSED_STATES", 5)
+    monkeypatch.setattr(products, "MOST_ENCLOSED_STATES", 5)
     a = far_from_normal(100.0)
     found = certain_noise_covariance(a, np.ones((6, 1)), np.ones((2, 6)), np.zeros((2, 1)), 0.1)
     assert np.all(np.isnan(found))

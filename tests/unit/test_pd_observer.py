@@ -21,14 +21,15 @@ from obsynth.methods.pd_observer.checks import (
     prove_shipped_stability,
 )
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
-from obsynth.methods.pd_observer.given_gains import (
+from obsynth.methods.pd_observer.limits import least_noise_gain
+from obsynth.methods.pd_observer.realisation import (
     coupled_certificate,
     explicit_certificate,
     gain_certificate,
     symmetric_certificate,
+    with_faults_as_states,
+    with_sensor_noise,
 )
-from obsynth.methods.pd_observer.limits import least_noise_gain
-from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
 from obsynth.numerics.continuous import ContinuousNorms
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec

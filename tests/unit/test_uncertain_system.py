@@ -12,8 +12,7 @@ from obsynth.analysis.transformations.uncertain_plant import affine_plant
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.expressions import parse_expression
 from obsynth.plants.constants import UNCERTAIN_MATRICES
-from obsynth.proofs.affine import AffineMatrix, affine_exponential, affine_inverse
-from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
+from obsynth.proofs.affine import AffineMatrix, AffineNumber, affine_exponential, affine_inverse, affine_translation
 from obsynth.tolerances.robustness import drawn_points, index_one_on_box, plant_at
 
 ONE = {"E": None, "A": [["1 - 0.1 * k / m"]], "C": [[1]], "dt": 0.1}

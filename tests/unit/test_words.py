@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from obsynth.methods.fault_figures import FaultFigures
+from obsynth.methods.automatic import FaultFigures
 
 ROOT = Path(__file__).parents[2]
 #: What is read: sources and templates, documentation, notebooks, and the notes of the designs.

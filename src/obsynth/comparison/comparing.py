@@ -26,9 +26,19 @@ from obsynth.experiments.assumptions import Log
 from obsynth.experiments.monitors.residual_model import largest_disturbances
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.files.tables import html_table, standing_page, text_table
-from obsynth.methods.automatic import SETTLING_TIMES, Candidate, Maker, candidate, linear_methods
+from obsynth.methods.automatic import (
+    DECOUPLED,
+    SETTLING_TIMES,
+    Candidate,
+    FaultFigures,
+    Maker,
+    candidate,
+    held,
+    linear_methods,
+    on_the_clock,
+    step_responses,
+)
 from obsynth.methods.designing import agree, design
-from obsynth.methods.fault_figures import DECOUPLED, FaultFigures, held, on_the_clock, step_responses
 from obsynth.methods.functional_filter.kalman_gain import settling_time
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import MOST_STATES, problem_of

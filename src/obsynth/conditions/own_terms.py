@@ -2,6 +2,8 @@
 
 The methods leave these to the problem as it stands in the paper: solved as it is here, gains taken from it, and the
 realisation and certificate of these gains made as for any others.  `verify` knows nothing of how they were found.
+
+The paper's conditions of a finished design, with the matrices of its certificate put in.
 """
 
 from __future__ import annotations
@@ -15,10 +17,11 @@ import numpy as np
 from obsynth.analysis.conditions import require_all
 from obsynth.conditions import atoms
 from obsynth.conditions.filasova import filasova_theorem1, filasova_theorem2
+from obsynth.conditions.kalman_gain import steady_gain
 from obsynth.conditions.problem import Conditions, named_constraints
-from obsynth.conditions.share_pasand import sharepasand
+from obsynth.conditions.share_pasand import augmented_problem, sharepasand
 from obsynth.conditions.wang import error_norm, h2_terms, noise_paths, wang2015
-from obsynth.errors import PreconditionError, SolverError
+from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.conic.lmi import SOLVER_SETTINGS, USABLE_STATUSES, semidefinite_solvers
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
@@ -27,19 +30,23 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import with_sensor_f
 from obsynth.methods.fault_estimation_filter.realisation import synthesis_from_gains as filter_from_gains
 from obsynth.methods.method import Synthesis
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
-from obsynth.methods.pd_observer.given_gains import synthesis_from_gains as pd_from_gains
 from obsynth.methods.pd_observer.limits import default_delta
 from obsynth.methods.pd_observer.method import PdObserver
+from obsynth.methods.pd_observer.realisation import synthesis_from_gains as pd_from_gains
+from obsynth.methods.recursive.conditions import recursive_conditions
+from obsynth.methods.recursive.synthesis import steady_state_filter
 from obsynth.methods.refusals import require_all_told
-from obsynth.methods.ui_pi_observer.conditions import existence
+from obsynth.methods.ui_pi_observer.augmented_plant import direct_part, shipped_model
+from obsynth.methods.ui_pi_observer.conditions import existence, existence_conditions
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
 from obsynth.methods.ui_pi_observer.placement_problem import synthesis_from_gains as ui_pi_from_gains
 from obsynth.numerics.arguments import FloatArray
+from obsynth.numerics.matrix_equations import discrete_lyapunov
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane, sector
 from obsynth.observers.linear.observer import LinearObserver, averaged
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import exosystem
-from obsynth.results.design import Certificate
+from obsynth.results.design import Certificate, ObserverDesign
 
 #: What is tried by default: an interior-point method, and one of first order that says infeasible where that stalls.
 AUTOMATIC = ("CLARABEL", "SCS")
@@ -240,3 +247,86 @@ def _told(
     imposed = f", and every eigenvalue in {where}" if where is not None else ""
     note = f"The inequality was solved as it stands in the paper, with {', '.join(found.constraints)}{imposed}."
     return replace(made, options=options, solver={"engine": "lmi", "runs": runs}, notes=(note, *made.notes))
+
+
+def conditions_of(design: ObserverDesign) -> Conditions:
+    """Return the conditions of a design's paper, every variable with the value that the certificate gives it."""
+    makers = {
+        "fault-estimation-filter": _wang,
+        "pd-observer": _filasova,
+        "ui-pi-observer": _share_pasand,
+        "descriptor-kalman": _kalman,
+    }
+    if design.method not in makers:
+        raise SpecError(
+            f"Method {design.method!r} is not made of matrix inequalities; those that are: {', '.join(makers)}.",
+            path="method",
+        )
+    return makers[design.method](design)
+
+
+def _put(found: Conditions, **values: Any) -> Conditions:
+    """Give variables their values, symmetric ones exactly so."""
+    for name, value in values.items():
+        variable, number = found.variables[name], np.asarray(value, dtype=np.float64)
+        variable.value = 0.5 * (number + number.T) if variable.attributes["symmetric"] else number
+    return found
+
+
+def _kept(design: ObserverDesign) -> Any:
+    """The design of gains that are shipped already is that design."""
+    return lambda gains, name: design.replace(name=name)
+
+
+def _wang(design: ObserverDesign) -> Conditions:
+    plant, _ = design.linear
+    gains, factor = design.gains, design.certificate.matrices["P_factor"]
+    gamma = design.certificate.claims.get("gamma")
+    found = wang2015(plant, gamma=gamma, T=gains["T"], N=gains["N"], W=gains["W"], margin=0.0)
+    P = factor.T @ factor
+    # L = L0 + P^-1 Y (I - Upsilon W): of all Y, the one that has no part along Upsilon.
+    values = {"P": P, "Y": P @ (gains["L"] - found.data["L0"])}
+    return _put(found, **values, **({} if gamma is not None else {"gamma_squared": 0.0}))
+
+
+def _filasova(design: ObserverDesign) -> Conditions:
+    plant, _ = design.linear
+    claims, matrices, gains = design.certificate.claims, design.certificate.matrices, design.gains
+    theorem = filasova_theorem2 if claims["theorem"] == 2.0 else filasova_theorem1
+    decay = claims["decay"]
+    found = theorem(plant, delta=claims["delta"], decay=decay, reading="printed", margin=0.0)
+    loop = gains.get("G", np.eye(plant.nf))
+    J = np.vstack([gains["J"], loop @ gains["M"]])
+    L = np.vstack([gains["L"], loop @ gains["N"]])
+    P3 = matrices["P3"]
+    return _put(found, P1=matrices["P1"], P3=P3, Y=P3.T @ (J - decay * L), Z=P3.T @ L)
+
+
+def _share_pasand(design: ObserverDesign) -> Conditions:
+    plant, _ = design.linear
+    gains, matrices = design.gains, design.certificate.matrices
+    U_a, K_a = gains["U_a"], gains["K_a"]
+    X = np.asarray(np.linalg.inv(matrices["stability"]))
+    model = shipped_model(matrices, plant.nf)
+    held = existence_conditions(plant, model)
+    found = augmented_problem(plant, model, (U_a, gains["D_a"]), X=X, margin=0.0, held=held, design=_kept(design))
+    seen, injection, _ = direct_part(plant)
+    injected = np.vstack([injection, np.zeros((model.order, plant.ny))])
+    gain = (K_a - U_a @ injected) @ seen.T
+    return _put(found, P=np.eye(len(X)), Y=np.linalg.solve(X, gain))
+
+
+def _kalman(design: ObserverDesign) -> Conditions:
+    plant, observer = design.recursive
+    if not plant.is_time_invariant:
+        raise SpecError("The plant changes with k: its filter has no steady gain.", path="plant")
+    process, sensor = observer.Q.at(0), observer.R.at(0)
+    held = tuple(recursive_conditions(plant, parameters=False))
+    steady = steady_state_filter(plant, Q=process, R=sensor)
+    found = steady_gain(plant, process, sensor, margin=0.0, held=held, design=_kept(design))
+    data = found.data
+    S = np.hstack([steady.L - data["L0"], steady.K - data["K0"]]) @ np.hstack([data["N1"], data["N2"]]).T
+    X = data["X"]
+    P = X.T @ discrete_lyapunov((steady.L @ data["A"]).T, np.eye(len(X))) @ X
+    driven = np.linalg.solve(X, np.hstack([steady.L @ data["W"], -steady.K @ data["V"]]))
+    return _put(found, P=P, Y=P @ np.linalg.solve(X, S), Z=driven.T @ P @ driven)

@@ -37,7 +37,7 @@ from obsynth.exporting.c_source import (
     write_dae_c,
 )
 from obsynth.files.outputs import FileKind, write_atomically, write_together
-from obsynth.methods.guaranteed_test.bank import groups_of, is_bank
+from obsynth.methods.guaranteed_test.checks import groups_of, is_bank
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.numerics.arguments import FloatArray, arguments_checked

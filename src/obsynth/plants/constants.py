@@ -634,8 +634,7 @@ class Uncertainty:
         PreconditionError
             An expression is not bounded on the box.
         """
-        from obsynth.proofs.affine import AffineMatrix
-        from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
+        from obsynth.proofs.affine import AffineMatrix, AffineNumber, affine_translation
 
         count, translation = len(box.names), affine_translation(len(box.names))
         zero, numbers = AffineNumber(0.0, np.zeros(count), 0.0), dict[str, AffineNumber]()

@@ -31,9 +31,8 @@ from obsynth.numerics.doubling import symmetric_product
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, Enclosed, arb_matrix, block, gamma, rounded_up
-from obsynth.proofs.covariances import enclosed_sum
 from obsynth.proofs.definiteness import prove_positive_definite
-from obsynth.proofs.products import exponential
+from obsynth.proofs.products import enclosed_sum, exponential
 
 #: Where between the spectral radius (0) and one (1) the rate is tried, in turn.
 TRIED_RATES = (0.5, 0.2, 0.8, 0.95)

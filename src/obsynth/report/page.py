@@ -36,7 +36,7 @@ from obsynth.experiments.monitors.residual_monitor import monitor
 from obsynth.experiments.simulation import Simulation, simulate
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.files.tables import standing_page
-from obsynth.methods.fault_figures import HELD_GROWTH
+from obsynth.methods.automatic import HELD_GROWTH
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.registry import REGISTRY, method_class

@@ -36,7 +36,7 @@ from obsynth.experiments.monte_carlo import Evaluation, Interval
 from obsynth.experiments.simulation import Simulation
 from obsynth.files.outputs import yaml_text
 from obsynth.files.tables import html_table
-from obsynth.methods.fault_figures import SETTLING_SAMPLES, FaultFigures, fault_figures, on_the_clock
+from obsynth.methods.automatic import SETTLING_SAMPLES, FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.kalman_gain import DelayCurve, delay_curve, settling_time
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.decisions import ParameterMonitor

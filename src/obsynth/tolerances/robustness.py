@@ -385,7 +385,15 @@ def index_one_on_box(plant: DescriptorSystem) -> BoxVerdict:
     numbers = as_written(plant, written)
     affine = written.affine(numbers, written.box)
     dynamic, algebraic = compressed_rows(affine["E"].at(written.box.offsets))
-    require_algebraic(affine["E"], algebraic)
+    changed, size = affine["E"].after(algebraic), np.abs(algebraic) @ affine["E"].magnitude
+    moving = np.abs(changed.parts).sum(axis=0) > VANISHING_SHARE * size
+    if moving.any():
+        rows = np.flatnonzero(np.abs(algebraic[moving.any(axis=1)]).sum(axis=0))
+        raise PreconditionError(
+            f"A tolerance puts a derivative into an algebraic equation (rows {', '.join(str(i + 1) for i in rows)}): "
+            "the plant's order changes inside the box. Give these rows of E no tolerance of their own.",
+            condition="algebraic rows",
+        )
 
     def build(lower: FloatArray, upper: FloatArray) -> AffineMatrix:
         found = written.affine(numbers, written.box.part(lower, upper))
@@ -407,19 +415,6 @@ def compressed_rows(e: FloatArray) -> tuple[FloatArray, FloatArray]:
     chosen = pivot_columns(exact)
     null = nearest_doubles(null_basis(exact)) if len(chosen) < n else np.zeros((n, 0))
     return np.eye(n)[chosen], np.asarray(null.T)
-
-
-def require_algebraic(e: AffineMatrix, algebraic: FloatArray) -> None:
-    """Refuse a box that makes an algebraic row dynamic."""
-    found, size = e.after(algebraic), np.abs(algebraic) @ e.magnitude
-    moving = np.abs(found.parts).sum(axis=0) > VANISHING_SHARE * size
-    if moving.any():
-        rows = np.flatnonzero(np.abs(algebraic[moving.any(axis=1)]).sum(axis=0))
-        raise PreconditionError(
-            f"A tolerance puts a derivative into an algebraic equation (rows {', '.join(str(i + 1) for i in rows)}): "
-            "the plant's order changes inside the box. Give these rows of E no tolerance of their own.",
-            condition="algebraic rows",
-        )
 
 
 #: A design without tolerances says this.

@@ -22,7 +22,7 @@ from obsynth.numerics.arguments import FloatArray, is_number, remembered
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear.observer import unaveraged
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.covariances import certain_noise_covariance
+from obsynth.proofs.products import certain_noise_covariance
 from obsynth.results.checks import Check, information, nothing_wrong, upper_bound_check
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.verification.error_system import ErrorModel, natural_scaling

@@ -35,8 +35,14 @@ from obsynth.plants.constants import Constant, ConstantsBox, Entry, Uncertainty,
 from obsynth.plants.dae import DAEModel, LocalEquations, equation_of, local_equations, symbolic_equations, symbols_of
 from obsynth.plants.descriptor import DescriptorSystem, index_of
 from obsynth.plants.uncertain_system import filled_plant, stated_box
-from obsynth.proofs.affine import AffineMatrix, affine_block, affine_exponential, affine_zero_order_hold
-from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
+from obsynth.proofs.affine import (
+    AffineMatrix,
+    AffineNumber,
+    affine_block,
+    affine_exponential,
+    affine_translation,
+    affine_zero_order_hold,
+)
 from obsynth.proofs.balls import UNIT_ROUNDOFF, gamma, rounded_up
 
 #: Largest scaled residual of what counts as a root.

@@ -13,8 +13,7 @@ from obsynth.experiments.monitors.adaptive import over_box
 from obsynth.experiments.monitors.monitor import Judged, LinearSample, Monitor, Rule, Sample
 from obsynth.experiments.monitors.rules import NormRule
 from obsynth.experiments.simulation import make_bench
-from obsynth.methods.guaranteed_test.bank import is_bank
-from obsynth.methods.guaranteed_test.checks import while_inside
+from obsynth.methods.guaranteed_test.checks import is_bank, while_inside
 from obsynth.methods.guaranteed_test.exact import Programmes
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed

@@ -80,9 +80,11 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
         )
     low, high = (float(value) for value in asked.band)
     least, where = _sensitivity(smooth, observer, low, high)
+    reached = error_transfer(smooth, observer, smooth.Bf, smooth.Df)
+    shares = (least * (1.0 - margin) for margin in SENSITIVITY_MARGINS)
     claims = {
         "disturbance_gain": bound,
-        "fault_sensitivity": _provable(smooth, observer, least, low, high),
+        "fault_sensitivity": next((level for level in shares if sensitivity_is_proved(reached, level, low, high)), 0.0),
         "band_from": low,
         "band_to": high,
         "frequency": where,
@@ -178,13 +180,6 @@ def _notes(plant: DescriptorSystem, observer: LinearObserver, claims: Mapping[st
         "The plant is not stable: both norms are those of the error's own equations, and what rounding of the stored "
         "numbers adds has no finite gain. It matters for disturbances that last very long.",
     )
-
-
-def _provable(plant: DescriptorSystem, observer: LinearObserver, least: float, low: float, high: float) -> float:
-    """Return the largest share of the sensitivity found that is proved; zero, which says nothing, where none is."""
-    felt = error_transfer(plant, observer, plant.Bf, plant.Df)
-    shares = (least * (1.0 - margin) for margin in SENSITIVITY_MARGINS)
-    return next((level for level in shares if sensitivity_is_proved(felt, level, low, high)), 0.0)
 
 
 def _gains(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:

@@ -31,7 +31,7 @@ from obsynth.numerics.norms import highest_gain_found, hinf_norm
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver, modes_of
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.covariances import certain_noise_covariance
+from obsynth.proofs.products import certain_noise_covariance
 from obsynth.results.checks import Check, fitting_check, information, nothing_wrong, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import prove_bounded_real
@@ -497,10 +497,17 @@ def gain_rows(
             worst([identity.residual() for identity in _free_part_identities(work, gains, scaling, fixed_weight)]),
             "Wang 2015, eq. (60)",
         )
+    formed = equations.realised(gains)
+    terms = equations.absolute.realised({letter: np.abs(gains[letter]) for letter in "TNLW"}, minus=1.0)
+    realised = [
+        Identity((getattr(observer, name), -formed[name]), ((terms[name],),), entrywise=True)
+        for name in OBSERVER_MATRICES
+    ]
+    realised.append(Identity((tracking, -equations.tracking(gains["T"])), entrywise=True))
     yield equality(
         "gains: realisation",
         "the realisation is that of T, N, L and W, and the certificate tracks T x",
-        worst([identity.residual() for identity in _realisation_identities(gains, observer, tracking, equations)]),
+        worst([identity.residual() for identity in realised]),
         "Wang 2015, eq. (23); our state estimate",
     )
 
@@ -530,18 +537,6 @@ def _free_part_identities(
         Identity((fixed, -span @ (shares @ fixed)), ((mixed,),), outputs),
     ]
     return [*found, Identity((fixed, -moved @ gains["W"]), ((mixed,),), outputs)] if fixed_weight else found
-
-
-def _realisation_identities(
-    gains: Mapping[str, FloatArray], observer: LinearObserver, tracking: FloatArray, equations: Equations
-) -> list[Identity]:
-    formed = equations.realised(gains)
-    sizes = equations.absolute.realised({letter: np.abs(gains[letter]) for letter in "TNLW"}, minus=1.0)
-    found = [
-        Identity((getattr(observer, name), -formed[name]), ((sizes[name],),), entrywise=True)
-        for name in OBSERVER_MATRICES
-    ]
-    return [*found, Identity((tracking, -equations.tracking(gains["T"])), entrywise=True)]
 
 
 #: The gains that are printed; Psi, Upsilon and R follow from them.

@@ -23,7 +23,6 @@ from flint import fmpq_mat
 from obsynth.numerics.arguments import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import arb_matrix, undecided_pivot
-from obsynth.proofs.covariances import squared_norm
 from obsynth.proofs.exact_arithmetic import (
     blocks,
     null_basis,
@@ -35,6 +34,7 @@ from obsynth.proofs.exact_arithmetic import (
     whole_null_basis,
     zeros_matrix,
 )
+from obsynth.proofs.products import squared_norm
 from obsynth.results.checks import Check, information
 
 #: Filters of more states are not examined: exact null spaces of that many doubles take seconds.

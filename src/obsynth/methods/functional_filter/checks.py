@@ -18,8 +18,7 @@ from obsynth.numerics.arguments import FloatArray, reachable
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import arb_matrix
-from obsynth.proofs.covariances import certain_noise_covariance
-from obsynth.proofs.products import EXPONENTIAL_BITS, as_ball
+from obsynth.proofs.products import EXPONENTIAL_BITS, as_ball, certain_noise_covariance
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import decay_row, stability_row

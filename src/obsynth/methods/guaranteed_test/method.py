@@ -218,8 +218,7 @@ class GuaranteedTestMethod(Asked, Method):
     @classmethod
     def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
         """Yield a row for each claim, from the plant and the shipped numbers alone."""
-        from obsynth.methods.guaranteed_test.bank import bank_checks, is_bank
-        from obsynth.methods.guaranteed_test.checks import checks
+        from obsynth.methods.guaranteed_test.checks import bank_checks, checks, is_bank
 
         del printed_digits
         bank = is_bank(design) and isinstance(design.plant, DescriptorSystem)
@@ -235,7 +234,7 @@ class GuaranteedTestMethod(Asked, Method):
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel | None:
         """Return what the registers follow: the multipliers of one equation each; without a fault the row is zero."""
-        from obsynth.methods.guaranteed_test.bank import is_bank, tests_of
+        from obsynth.methods.guaranteed_test.checks import is_bank, tests_of
         from obsynth.methods.guaranteed_test.problem import window_as_designed
         from obsynth.methods.guaranteed_test.windows import tracked
 

@@ -58,7 +58,7 @@ class GuaranteedTest(ObserverDesign):
     @property
     def tests(self) -> tuple[GuaranteedTest, ...]:
         """The tests of a bank (``isolate``), one for each fault, each as a design of its own; or this one alone."""
-        from obsynth.methods.guaranteed_test.bank import is_bank, tests_of
+        from obsynth.methods.guaranteed_test.checks import is_bank, tests_of
 
         if not is_bank(self):
             return (self,)
@@ -71,7 +71,7 @@ class GuaranteedTest(ObserverDesign):
         Of a test that is blind to nothing (``free`` none) these are all faults, and one that is blind to all others
         isolates.
         """
-        from obsynth.methods.guaranteed_test.bank import groups_of, is_bank
+        from obsynth.methods.guaranteed_test.checks import groups_of, is_bank
 
         names = self.fault_names
         if is_bank(self):
@@ -171,7 +171,7 @@ class GuaranteedTest(ObserverDesign):
         fault : str, optional
             Of a bank: which one; the first by default.
         """
-        from obsynth.methods.guaranteed_test.bank import hidden_by, is_bank
+        from obsynth.methods.guaranteed_test.checks import hidden_by, is_bank
 
         if is_bank(self):
             names = self.linear[0].fault_names

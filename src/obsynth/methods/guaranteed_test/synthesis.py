@@ -20,7 +20,7 @@ from obsynth.analysis.transformations.linearisation import bounded_model, remain
 from obsynth.analysis.transformations.uncertain_plant import affine_plant
 from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError
 from obsynth.methods.designing import design
-from obsynth.methods.guaranteed_test.bank import (
+from obsynth.methods.guaranteed_test.checks import (
     BANK_GROUPS,
     BANK_PAIRS,
     BY_TEST,

@@ -222,7 +222,7 @@ class PdObserver(Method):
 
     def gain_matrix(self, nf: int) -> FloatArray | None:
         """Return G ``(nf, nf)``, nonsingular; ``None`` when none is asked for."""
-        from obsynth.methods.pd_observer.given_gains import checked_adaptation_gain
+        from obsynth.methods.pd_observer.realisation import checked_adaptation_gain
 
         return None if self.adaptation_gain is None else checked_adaptation_gain(self.adaptation_gain, nf)
 
@@ -237,7 +237,7 @@ class PdObserver(Method):
         cls, plant: DescriptorSystem, *, J: Any, L: Any, M: Any, N: Any, adaptation_gain: Any = None, decay: float = 0.0
     ) -> Synthesis:
         """Return realisation and certificate of the gains of eqs. (4), (6); see `obsynth.design_from_gains`."""
-        from obsynth.methods.pd_observer.given_gains import synthesis_from_gains
+        from obsynth.methods.pd_observer.realisation import synthesis_from_gains
 
         gains = {"J": J, "L": L, "M": M, "N": N}
         return synthesis_from_gains(plant, gains=gains, adaptation_gain=adaptation_gain, decay=decay)

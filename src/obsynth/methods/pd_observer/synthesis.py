@@ -31,16 +31,18 @@ from obsynth.methods.pd_observer.checks import (
     prove_shipped_stability,
 )
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
-from obsynth.methods.pd_observer.given_gains import (
-    coupled_certificate,
-    explicit_certificate,
-    gain_certificate,
-    symmetric_certificate,
-)
 from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve
 from obsynth.methods.pd_observer.limits import default_delta, fastest_mode, require_possible
 from obsynth.methods.pd_observer.method import PdObserver
-from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states, with_sensor_noise
+from obsynth.methods.pd_observer.realisation import (
+    coupled_certificate,
+    explicit_certificate,
+    gain_certificate,
+    realise_pd_observer,
+    symmetric_certificate,
+    with_faults_as_states,
+    with_sensor_noise,
+)
 from obsynth.numerics.arguments import FloatArray, largest_singular_value
 from obsynth.numerics.doubling import EQUATION_TOLERANCE, continuous_riccati_solution, symmetric
 from obsynth.numerics.matrix_equations import continuous_solution

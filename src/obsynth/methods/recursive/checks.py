@@ -106,9 +106,11 @@ def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
             terms = state_terms(gains.step, data_deviations(gains.step, factor))
             parameters = np.linalg.norm(gains.spread, axis=1)
             parameters = parameters + np.abs(gains.learn) @ data_deviations(gains.step, factor)
-            scores[k + 1] = normalised(
-                joint, _joint_root(gains), np.concatenate([terms + np.abs(gains.Upsilon) @ parameters, parameters])
-            )
+            # Of states and parameters together: its square is their covariance after the step.
+            top = np.hstack([gains.factor, gains.Upsilon @ gains.spread])
+            root = np.vstack([top, np.hstack([np.zeros((len(gains.spread), gains.factor.shape[1])), gains.spread])])
+            terms = np.concatenate([terms + np.abs(gains.Upsilon) @ parameters, parameters])
+            scores[k + 1] = normalised(joint, root, terms)
         factor = gains.factor
     yield from _error_rows(scores)
     squares = np.concatenate([np.zeros(0), *(found.ravel() for found in nis)]) ** 2
@@ -124,13 +126,6 @@ def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
                 BAND_DEVIATIONS / float(np.sqrt(products.size)),
                 f"{products.size} products",
             )
-
-
-def _joint_root(gains: GainStep) -> FloatArray:
-    """Return the square root of the covariance of states and parameters after a step."""
-    nq = gains.spread.shape[0]
-    top = np.hstack([gains.factor, gains.Upsilon @ gains.spread])
-    return np.asarray(np.vstack([top, np.hstack([np.zeros((nq, gains.factor.shape[1])), gains.spread])]))
 
 
 def data_deviations(step: StepMatrices, factor: FloatArray) -> FloatArray:

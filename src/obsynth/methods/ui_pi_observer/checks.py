@@ -50,7 +50,7 @@ from obsynth.observers.linear.observer import LinearObserver, frequency_grid, is
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, balanced_transition
 from obsynth.proofs.balls import enclosed_eigenvalues, middle_of
-from obsynth.proofs.covariances import certain_noise_covariance
+from obsynth.proofs.products import certain_noise_covariance
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import decay_row, stability_row

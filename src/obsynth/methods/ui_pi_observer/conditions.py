@@ -156,7 +156,10 @@ def _model_condition(
         direction = columns * np.linalg.svd(scaled)[2][-1].conj()
         faults = leading_names(np.abs(courses @ direction[plant.nx : plant.nx + width]), plant.fault_names)
         shares = in_disturbances(plant, *independent_disturbances(plant), direction[plant.nx + width :])
-        disturbances = _masking(scaled, plant, width, shares)
+        # Where states alone already hide the fault, no disturbance does.
+        without = scaled[:, : plant.nx + width]
+        hides = decide_rank(without, expected=plant.nx + width, equilibrated=False)
+        disturbances = leading_names(shares, plant.disturbance_names, most=MOST_NAMES) if hides.full else ()
         signals = (*faults, *disturbances)
         masked = f" is masked by the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
         alone = len(faults) == 1
@@ -255,13 +258,6 @@ def lost_in_rounding(judge: Evaluator, model: Exosystem, mode: complex) -> Condi
         signals=judge.plant.fault_names,
     )
     return found.in_doubt(_order_doubt(judge, model, mode), judge.plant)
-
-
-def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: FloatArray) -> tuple[str, ...]:
-    """Return the disturbances of a null vector; none where states alone already hide the fault."""
-    without = scaled[:, : plant.nx + width]
-    alone = decide_rank(without, expected=plant.nx + width, equilibrated=False)
-    return leading_names(shares, plant.disturbance_names, most=MOST_NAMES) if alone.full else ()
 
 
 #: A direct effect on an output, relative to the effect on the states (both in scaled units), that elimination may

@@ -53,7 +53,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.proofs.balls import enclosed_eigenvalues, middle_of
-from obsynth.proofs.covariances import certain_noise_covariance
+from obsynth.proofs.products import certain_noise_covariance
 from obsynth.results.design import Certificate
 from obsynth.verification.certificates import slowest_decay, stability_factor
 
@@ -281,7 +281,12 @@ def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray, *,
     units = _balancing(f, c)
     work_f, work_c, basis = f * units / units[:, None], c * units, np.eye(n)
     size = max(largest_singular_value(work_f), largest_singular_value(work_c)) if n else 1.0
-    waiting = _upper_half(fixed_modes)
+    waiting: list[complex] = []
+    for mode in map(complex, fixed_modes):
+        if 0.0 < abs(mode.imag) <= SAME_MODE * max(1.0, abs(mode)):
+            waiting.append(complex(mode.real, 0.0))
+        elif mode.imag >= 0.0:
+            waiting.append(mode)
     seen = n
     while waiting:
         value = waiting[0]
@@ -308,17 +313,6 @@ def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray, *,
             waiting.remove(other)
     hidden = eigenvalues(work_f[seen:, seen:])
     return ObservableSplit(basis, units, work_f[:seen, :seen], work_c[:, :seen], hidden)
-
-
-def _upper_half(modes: ComplexArray) -> list[complex]:
-    """Return one mode of each pair; a double real mode that rounding has split into a pair is real twice."""
-    found: list[complex] = []
-    for mode in map(complex, modes):
-        if 0.0 < abs(mode.imag) <= SAME_MODE * max(1.0, abs(mode)):
-            found.append(complex(mode.real, 0.0))
-        elif mode.imag >= 0.0:
-            found.append(mode)
-    return found
 
 
 def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float) -> FloatArray:
