@@ -92,7 +92,7 @@ lost = lost.changed(constraints=[cp.trace(lost.variables["P"]) <= 1e6])
 lost.problem.solve(solver="CLARABEL")
 print(lost.problem.status)
 for row in lost.existence.checks:
-    print(f"{row.name:34s} {'holds' if row.passed else 'FAILS'}  {row.detail[:150]}")
+    print(f"{row.name:34s} {'holds' if row.passed else 'FAILS'}  {row.detail}")
 
 # %% [markdown]
 # What decides is on the plant's own data: a rank (D1), the zeros from $d$ to $y$ (D2), and, exactly at each unstable
@@ -202,7 +202,7 @@ print(design.report["limit at 0.5"].detail)
 # %% [markdown]
 # ## 6. What the order of the model does
 #
-# A step model on a ramp ends with a constant error, which the report foretells; higher orders follow, and pay in noise.
+# A step model on a ramp ends with a constant error, which the report predicts; higher orders follow, and pay in noise.
 
 # %%
 fig, axes = plt.subplots(figsize=(7.5, 3.2))
@@ -214,7 +214,7 @@ for model, style in (("step", "b:"), ("ramp", "k--"), ("parabola", "r-.")):
     noise = each.certificate.claims["noise_amplification"]
     error = each.report["steady error[fault]"]
     print(f"{model:9s} error at 20 s {estimate[-1] - fault[-1]:9.5f}, noise amplification {noise:8.1f}")
-    print(f"{'':9s} foretold: {error.value:.5f} when {error.claim.split('when ')[1]}")
+    print(f"{'':9s} predicted: {error.value:.5f} when {error.claim.split('when ')[1]}")
     axes.plot(time, estimate, style, linewidth=1.2, label=f"{model} model")
 axes.set(xlabel="time (s)", ylabel="fault", ylim=(-16, 16))
 axes.legend()

@@ -57,7 +57,8 @@ for solver, settings in {"CLARABEL": {}, "SCS": {"eps_abs": 1e-6, "eps_rel": 1e-
 # ## What the thermometer is worth, and where it ends
 #
 # The deviations against the noise of the thermometer. Without it there is no gain at all: the solver says infeasible,
-# and `existence` names the mode. At the point of operation the pressure alone does not tell the two parameters apart.
+# and `existence` names the mode. At the point of operation the pressure alone does not
+# distinguish the two parameters.
 
 # %%
 noises, found = np.logspace(-1, 1, 5), []
@@ -105,10 +106,10 @@ for name in ("M1", "U1", "m2"):
 print({name: f"{value:g} {model.units[name]}" for name, value in model.inputs.items()})
 
 # %% [markdown]
-# ## 2. What can the sensors tell?
+# ## 2. What can the sensors distinguish?
 #
 # Before any tuning: which directions of initial state and parameters leave a trace in the outputs along a trajectory of
-# 1,000 s? With both sensors everything is told, without any excitation.
+# 1,000 s? With both sensors everything is identifiable, without any excitation.
 
 # %%
 u = np.tile(model.nominal_input, (1001, 1))
@@ -118,7 +119,7 @@ print("directions seen:", both.rank, "of", len(both.singular_values))
 print({name: float(f"{value:.2g}") for name, value in zip(both.names, both.deviations, strict=True)})
 
 # %% [markdown]
-# From the pressure alone one direction is not told from noise: a little of each parameter.
+# From the pressure alone one direction is at the level of the noise: a little of each parameter.
 
 # %%
 units = {name: unit for name, unit in model.units.items() if name != "temperature"}
@@ -171,7 +172,7 @@ for title, momentum in (
     if title == "as printed":
         moved[:, 0] *= 1.0 + 0.01 * rng.standard_normal(200)
     found = obsynth.identifiability(printed, moved, dt=1.0, R=[[1e4]], parameter_scales=scales)
-    print(f"{title}: cannot be told: {', '.join(found.unidentifiable)}")
+    print(f"{title}: not identifiable: {', '.join(found.unidentifiable)}")
 
 # %% [markdown]
 # ## 3. The observer

@@ -106,7 +106,7 @@ print(obsynth.prove_alarm(design, log, 150, window=12, initial_set=start, **boun
 # ## How wrong may the model be?
 #
 # The fixed bound of the exact model alarms without a fault; the adaptive threshold never does, and pays for that with
-# the least fault that it tells. Each point is 20 plants of the box, half of them vertices.
+# the least fault that it detects. Each point is 20 plants of the box, half of them vertices.
 
 # %%
 study = obsynth.tolerance_study(design, spec.scenario, tolerances=[0, "1 %", "2 %", "5 %", "10 %"], noise_bound=4.0)

@@ -15,7 +15,6 @@
 # %%
 import numpy as np
 import pandas as pd
-from IPython.display import display
 
 import obsynth
 
@@ -74,4 +73,4 @@ compared = obsynth.compare(better, scenario=scenario, options=options, within=0.
 compared
 
 # %%
-display(compared.plot())
+figure = compared.plot()

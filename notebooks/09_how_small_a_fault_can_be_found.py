@@ -28,10 +28,10 @@ plant = spec.plant
 bounds = {"disturbance_bounds": {"load torque": 1.0}, "noise_bound": 3}
 step = obsynth.guaranteed_test(plant, "loss of torque", course="step", before=10, **bounds)
 print(f"threshold {step.threshold:.6g} N m, no test has one below {step.least:.6g} N m")
-print(f"a step of {step.surely_found:.4g} N m is surely found within {step.delay:.2g} s")
+print(f"a step of {step.surely_found:.4g} N m is certain to be detected within {step.delay:.2g} s")
 
 # %% [markdown]
-# Delay against size: more samples after the step tell a smaller one, up to a point.
+# Delay against size: more samples after the step detect a smaller one, up to a point.
 
 # %%
 step.plot()
@@ -46,7 +46,8 @@ obsynth.plotting.plot_hidden_course(step)
 plt.show()
 
 # %% [markdown]
-# What the fault may do decides most. After healthy samples the twist of the shaft is known, and a small step shows.
+# What the fault may do decides most. After healthy samples the twist of the shaft is known, and a small
+# step is detectable.
 
 # %%
 rows = []

@@ -33,6 +33,24 @@ def test_one_recommendation_with_its_reason(bicycle: obsynth.Comparison) -> None
     assert ranked == sorted(ranked)
 
 
+def test_an_interpreter_shows_results_as_their_text(bicycle: obsynth.Comparison) -> None:
+    """Not every number of every design, as which four thousand lines stood in a notebook."""
+    assert repr(bicycle) == str(bicycle)
+    assert repr(bicycle).endswith(bicycle.advice)
+    assert repr(obsynth.diagnose(load_spec(DESIGNS / "bicycle" / "spec.yaml").plant)).startswith("What can be diagnosed")
+
+
+def test_a_notebook_shows_the_picture(bicycle: obsynth.Comparison) -> None:
+    """It shows the figures that pyplot knows; a page leaves none open."""
+    import matplotlib.pyplot as plt
+
+    figure = bicycle.plot()
+    assert plt.gcf() is figure
+    plt.close(figure)
+    bicycle.page()
+    assert not plt.get_fignums()
+
+
 def test_refused_methods_say_why_in_one_line(bicycle: obsynth.Comparison) -> None:
     assert bicycle["pd-observer"].refused.startswith("the condition 'continuous time' fails")
     assert bicycle["descriptor-kalman"].refused == "estimates the state, but no fault"

@@ -202,6 +202,7 @@ def test_both_faults_are_identifiable_from_pressure_and_temperature() -> None:
     assert found.unseen == ()
     assert found.deviations[4] == pytest.approx(2e-4, rel=0.1)
     assert found.deviations[5] == pytest.approx(5.4, rel=0.01)
+    assert str(found).splitlines()[-1] == "psi: deviation 5.41 at least"
 
 
 def test_pressure_alone_needs_excitation() -> None:
@@ -212,6 +213,7 @@ def test_pressure_alone_needs_excitation() -> None:
     still = identifiability(model, excited(model), initial_state=steady(model), **known)
     assert still.rank == 4
     assert {"phi", "psi"} <= set(still.unidentifiable)
+    assert "phi: not identifiable\npsi: not identifiable\nno effect on the outputs (in units of scales): " in str(still)
     moved = identifiability(model, excited(model, share=0.05), **known)
     assert moved.rank == 5
     assert 70.0 < moved.deviations[5] < 140.0

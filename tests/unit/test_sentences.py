@@ -135,6 +135,8 @@ def test_every_assumption_has_its_part_in_the_digest_and_in_the_words() -> None:
     assert len({one.phrase(), *(other.phrase() for other in others)}) == 5
     driven = plant.replace(Bw=np.ones((2, 1)))
     assert "noise within 3 standard deviations" in Assumptions(driven, **asked).parts()
+    root = Assumptions(driven, **asked | {"noise_bound": 2.0 / 3.0 + 1.0}).parts()
+    assert "noise within 1.66666 standard deviations" in root
     assert "at y1" not in Assumptions(driven, **asked).phrase()
     assert shown(5.0) == "5"
     assert shown(0.25, "m") == "0.25 m"

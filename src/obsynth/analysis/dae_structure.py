@@ -1,4 +1,4 @@
-"""Solvability and index of a DAE, and which of its states and parameters the outputs tell apart."""
+"""Solvability and index of a DAE, and which of its states and parameters the outputs distinguish."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Identifiability:
         ``(nx + nq,)``.
     deviations : FloatArray
         ``(nx + nq,)``: Cramer-Rao bounds of the standard deviations, in the signals' units; infinite where a signal
-        cannot be told.
+        is not identifiable.
     excitation : float
         Least eigenvalue of the information on the parameters alone (the initial state known), in units of `scales`.
     rank : int
@@ -61,6 +61,12 @@ class Identifiability:
         return tuple(
             self._shares(row) for value, row in zip(self.singular_values, self.directions, strict=True) if value < 1.0
         )
+
+    def __repr__(self) -> str:
+        known = zip(self.names, self.deviations, strict=True)
+        lines = [f"{n}: deviation {d:.3g} at least" if np.isfinite(d) else f"{n}: not identifiable" for n, d in known]
+        shares = [", ".join(f"{share:.3g} {name}" for name, share in one.items()) for one in self.unseen]
+        return "\n".join([*lines, *(f"no effect on the outputs (in units of scales): {text}" for text in shares)])
 
     def _shares(self, row: FloatArray) -> dict[str, float]:
         return {name: float(share) for name, share in zip(self.names, row, strict=True) if abs(share) > NAMED_SHARE}

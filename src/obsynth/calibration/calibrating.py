@@ -202,7 +202,7 @@ class Calibration:
         """Whether the rows look as if one model held in all of them."""
         return self.change is None
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         rows = f"rows {self.log['rows'][0]}:{self.log['rows'][1]}"
         what = "1 constant" if len(self.nominal) == 1 else f"{len(self.nominal)} constants"
         lines = [
@@ -974,7 +974,7 @@ def calibrate(
         the row of the log.
     log : path, pandas.DataFrame or mapping
         CSV or Parquet file, or columns by name: ``time`` in seconds, every input and every output; NaN where an output
-        is missing.  Single outputs a hundred times further off than the others count as missing, which is told.
+        is missing.  Single outputs a hundred times further off than the others count as missing, and are reported.
     unknown : mapping of str to (low, high)
         Constants and parameters that are to be found, with finite bounds around their nominal values; none (``{}``)
         to find the noise alone.
@@ -988,8 +988,8 @@ def calibrate(
         ``(nx,)``, or values by name; by default nominal values, of linear plants zero.
     initial_covariance : array_like or mapping, optional
         ``(nx, nx)``, one variance, or variances by name.  By default deviations are 10 % of the nominal
-        sizes, or as far as the log begins elsewhere (which is told); of linear plants, what alone would make outputs as
-        large as they are.
+        sizes, or as far as the log begins elsewhere (a note says so); of linear plants, what alone would make outputs
+        as large as they are.
     rows : str, slice or pair, optional
         ``"a:b"``: the rows that are free of faults, as Python counts; all by default.
     columns : mapping of str to str, optional
@@ -1019,7 +1019,7 @@ def calibrate(
     sensor_noise : mapping, optional
         ``{y: {"correlation": seconds or "unknown"}}``: outputs whose noise is coloured, as in `with_noise`; white
         noise is found beside it.  ``{}`` says that all noise is white.  By default coloured noise is taken where the
-        innovations ask for it and the likelihood says so, which is told.
+        innovations ask for it and the likelihood says so, and is reported.
     offset : mapping or list of str, optional
         Outputs with an offset that is not known; ``{}`` says that there is none.  By default as for ``sensor_noise``.
     walks : mapping or list of str, optional

@@ -236,7 +236,7 @@ class Validation:
     estimates: Mapping[str, FloatArray]
     log: Mapping[str, Any]
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         rows = f"rows {self.log['rows'][0]}:{self.log['rows'][1]}"
         state = "agrees" if self.passed else "DOES NOT AGREE"
         lines = [f"{self.log['source'] or 'The log'}, {rows}, {state} with the design {self.name!r}."]

@@ -63,7 +63,7 @@ class Validity:
     deviations: Mapping[str, float]
     time: FloatArray
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         told = ", ".join(f"{name} {value:.3g}" for name, value in self.by_sensor.items())
         return f"Nonlinear against linear: at most {self.largest:.3g} deviations of a sensor ({told})."
 

@@ -381,11 +381,14 @@ class Comparison:
 
         An estimate that is too noisy for the range of its panel lies faintly behind the others.
         """
-        from matplotlib.figure import Figure
+        import matplotlib.pyplot as plt
 
+        return self._drawn(plt.figure)
+
+    def _drawn(self, new_figure: Callable[..., Figure]) -> Figure:
         shown = [entry for entry in self.methods if entry.faults]
         count = len(self.fault_names)
-        figure = Figure(figsize=(11.0, 2.8 * count), layout="constrained")
+        figure = new_figure(figsize=(11.0, 2.8 * count), layout="constrained")
         axes = figure.subplots(count, 2, squeeze=False)
         for row, name in enumerate(self.fault_names):
             left, right = axes[row]
@@ -427,7 +430,7 @@ class Comparison:
         best = np.nanquantile(shown[0].estimates[:, 0], (1.0 - SHOWN_SAMPLES, SHOWN_SAMPLES))
         return min(low - room, 1.5 * float(best[0])), max(high + room, 1.5 * float(best[1]))
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         table = text_table(self.rows(), left=2)
         return "\n".join([self.setting, *self.notes, *table, self.meanings(), *self.refusals, self.advice])
 
@@ -443,7 +446,9 @@ class Comparison:
 
     def page(self) -> str:
         """Return a page of HTML that stands alone, with table, picture, refusals and recommendation."""
-        picture = data_url(written(self.plot()))
+        from matplotlib.figure import Figure
+
+        picture = data_url(written(self._drawn(Figure)))
         meanings = "".join(f"<li>{escape(f'{name}: {text}')}</li>" for name, text in _FIGURE_MEANINGS.items())
         refused = "".join(f"<li>{escape(text)}</li>" for text in self.refusals)
         head, *rows = self.rows()

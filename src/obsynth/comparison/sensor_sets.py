@@ -179,7 +179,7 @@ class SensorSets:
             "sets": [{**vars(found), "sensors": list(found.sensors)} for found in self.sets],
         }
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         lines = [line.rstrip() for line in text_table(self.rows())]
         return "\n".join([f"Sensors to {self.goal}:", *lines, *self.out_of_reach, *self.failures(), *self.notes])
 
@@ -246,7 +246,7 @@ def sensor_sets(
     copies : int, optional
         How often one candidate may be measured.
     may_fail : bool, optional
-        Every added sensor may fail: its fault must be told as well.
+        Every added sensor may fail: its fault must be distinguished as well.
     most : int, optional
         Sets returned at most.
     fault, below : str, float, optional

@@ -488,7 +488,7 @@ class AlarmProof:
             raise SpecError("There is no proof to write: the alarm cannot be proved.", path="certificate")
         return write_atomically(path, sealed(ALARM_KIND, ALARM_VERSION, self.certificate))
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return self.statement
 
 

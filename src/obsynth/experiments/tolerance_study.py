@@ -142,7 +142,7 @@ class ToleranceStudy:
         text = result_text(STUDY, {"design": self.design}, self.asked, self.as_dict(), self.statement)
         return write_atomically(path, text)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return "\n".join([*text_table(self.rows(), left=2), self.conclusion])
 
 

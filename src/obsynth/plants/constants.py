@@ -36,7 +36,7 @@ _KEYS = ("nominal", "tolerance", "range", "unit")
 MOST_LISTED = 6
 #: Whole numbers up to so many digits are shown without a point.
 WHOLE_DIGITS = 12
-#: Digits of the ends of a range in a text: a calibrated one has all of them.
+#: Digits of a bound in a text: a calibrated one has all of them.
 RANGE_DIGITS = 6
 #: Shares of tolerances that agree so well are one share: they were stated as per cent.
 SAME_TOLERANCE = 1e-9
@@ -52,14 +52,18 @@ def shown(value: float, unit: str = "") -> str:
 
 def _in_few_digits(item: Constant) -> tuple[float, float]:
     """Return a range inside that of a constant, so that what holds for the latter holds for what a text says."""
-    low = float(Context(RANGE_DIGITS, ROUND_CEILING).create_decimal(repr(item.low)))
-    high = float(Context(RANGE_DIGITS, ROUND_FLOOR).create_decimal(repr(item.high)))
+    low, high = _rounded(item.low, ROUND_CEILING), _rounded(item.high, ROUND_FLOOR)
     return (low, high) if low < high else (item.low, item.high)
 
 
+def _rounded(value: float, way: str) -> float:
+    """Return a number in the digits of a text."""
+    return float(Context(RANGE_DIGITS, way).create_decimal(repr(float(value))))
+
+
 def deviations_told(count: float) -> str:
-    """Return so many standard deviations in words."""
-    return f"{shown(count)} standard deviation{'' if count == 1 else 's'}"
+    """Return so many standard deviations in words, rounded down: what holds for a bound holds for a lower one."""
+    return f"{shown(_rounded(count, ROUND_FLOOR))} standard deviation{'' if count == 1 else 's'}"
 
 
 @dataclass(frozen=True)

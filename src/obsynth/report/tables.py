@@ -395,7 +395,7 @@ class Summary:
         if self.file:
             yield f"Gain set: {self.file}", ""
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         """Return the lines as plain text."""
         return "\n".join(text for text, _ in self.lines())
 

@@ -300,7 +300,7 @@ class VerificationReport:
             return self[FORMER_NAMES[name]]
         raise KeyError(f"no check named {name!r}; there are: {', '.join(c.name for c in self.checks)}")
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         """Return the table of the checks."""
         from obsynth.results.layout import report_text
 

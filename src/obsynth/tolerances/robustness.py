@@ -603,7 +603,7 @@ class Robustness:
             "not_covered": self.not_covered,
         }
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return "\n".join(f"{label}: {text}" for label, text in self.facts())
 
     def _repr_html_(self) -> str:

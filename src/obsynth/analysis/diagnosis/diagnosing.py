@@ -357,7 +357,7 @@ class FaultDiagnosis:
     detectable_at : dict of float to bool
         The same for sinusoids, by frequency in rad/s.
     estimable : bool
-        Whether its value can be told, whatever its time course and that of all other faults.
+        Whether its value can be estimated, whatever its time course and that of all other faults.
     step_estimable : bool
         Whether it can if it is a step (the other faults are arbitrary).
     model_estimable : bool
@@ -511,7 +511,7 @@ class Diagnosis:
         way = "decided exactly" if self.exact else "decided in floating point"
         return f"What can be diagnosed ({f'decoupled from {named}' if count else 'no unknown inputs'}; {way})"
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         if not self.faults:
             return "The plant has no faults to diagnose."
         more = ["", *text_table(self.isolability_rows())] if len(self.faults) > 1 else []

@@ -629,7 +629,7 @@ class Question:
 
     @property
     def estimable(self) -> bool:
-        """Whether the fault's value can be told whatever its course is."""
+        """Whether the fault's value can be estimated whatever its course is."""
         return self.visible and not self.blocking.size
 
     @cached_property

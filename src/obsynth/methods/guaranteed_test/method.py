@@ -48,11 +48,12 @@ class GuaranteedTestMethod(Asked, Method):
         tried; the numbers are in the design's certificate as ``trade_off``.
     course : {"step", "constant", "any", "ramp", "rate"}, optional
         What the fault does.  ``step``: nothing for ``before`` samples, then it is constant (residuals fade once it
-        fills the window: latch alarms).  ``constant``: over the whole window.  ``any``: whatever it likes; it is told
-        for one sample, ``lag`` samples back.  ``ramp``: a straight line.  ``rate``: ``fault_rate`` a sample at most.
+        fills the window: latch alarms).  ``constant``: over the whole window.  ``any``: whatever it likes; it is
+        estimated for one sample, ``lag`` samples back.  ``ramp``: a straight line.  ``rate``: at most ``fault_rate``
+        a sample.
     lag : int, optional, samples
-        Of which sample before the last the fault is told (``any``, ``ramp``, ``rate``); for ``any`` by default the
-        least for which there is a test, otherwise 0.
+        Of which sample before the last the fault is estimated (``any``, ``ramp``, ``rate``); for ``any`` by default
+        the least for which there is a test, otherwise 0.
     before, after : int, optional, samples
         Of a step: healthy samples before it, and samples from it on, which is another way to say ``samples``.
     disturbance_bounds : float or mapping of str to float or [low, high]
