@@ -413,7 +413,7 @@ def load_thresholds(path: str | Path) -> LearnedThresholds:
     except SpecError:
         raise
     except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
-        raise SpecError(f"{file} is damaged: {error}.", path=str(file)) from error
+        raise SpecError(f"{file} is damaged, its parts do not fit together: {again}.", path=str(file)) from error
 
 
 def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
