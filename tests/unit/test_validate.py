@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,7 +11,7 @@ from test_calibrate import BOUNDS, LOG
 from test_linearise import tanks
 
 import obsynth
-from obsynth import SpecError, dae_adaptive_observer, linearise, validate, validity
+from obsynth import SpecError, dae_adaptive_observer, linearise, load_spec, validate, validity
 
 CALIBRATED = {"a1": 0.0163, "a2": 0.0199, "b1": 0.0350, "b2": 0.0354}
 HELD = {"u1": "u1_held", "u3": "u3_held"}
@@ -92,6 +94,24 @@ def test_a_recursive_design_is_validated_too():
         found = validate(design, log)
         assert found.nis.holds == holds
         assert set(found.sensors) == set(plant.output_names)
+
+
+@pytest.mark.usefixtures("taken_as_verified")
+def test_a_sensor_that_the_model_never_predicts_is_told_and_drawn() -> None:
+    """An algebraic state that nothing tells before it is measured: the report of a shipped design ended in an error."""
+    spec = load_spec(Path(__file__).parents[2] / "designs/moussaali2013_ltv/spec.yaml")
+    design = obsynth.design(spec.plant, spec.method, **dict(spec.options))
+    run = obsynth.simulate(design, spec.scenario.replace(horizon=60))
+    columns = {"time": run.time, "u1": run.inputs[:, 0], "u2": run.inputs[:, 1], "y1": run.outputs[:, 0]}
+    found = validate(design, pd.DataFrame(columns))
+    assert not found.sensors["y1"].nis.samples
+    assert "y1  not predicted in any row" in str(found)
+    assert "nan" not in str(found)
+    figure = found.plot()
+    assert [text.get_text() for text in figure.axes[1].texts] == ["not predicted in any row"]
+    import matplotlib.pyplot as plt
+
+    plt.close(figure)
 
 
 def test_bad_requests_are_refused(right):

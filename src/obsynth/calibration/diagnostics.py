@@ -247,6 +247,8 @@ class Validation:
         for name, found in self.sensors.items():
             lines.append(
                 f"  {name:<{width}}  {found.nis.value:<11.3g}  {found.mean:<+17.2g}  {found.whiteness.probability:.2g}"
+                if found.nis.samples
+                else f"  {name:<{width}}  not predicted in any row"
             )
         return "\n".join([*lines, *(f"  - {sentence}" for sentence in self.verdict)])
 
@@ -290,9 +292,12 @@ def draw_validation(found: Validation, panels: Sequence[Axes]) -> None:
         band = BAND_WIDTH * found.deviations[:, i]
         said.fill_between(time, -band, band, **BAND_STYLE)
         said.plot(time, found.innovations[:, i], color="black", linewidth=0.8, marker=".", markersize=3)
-        # The band of an unknown start would leave the innovations a line.
-        reach = 1.1 * max(np.nanmax(np.abs(found.innovations[:, i]), initial=0.0), np.nanmedian(band))
-        said.set_ylim(-reach, reach)
+        if found.sensors[name].nis.samples:
+            # The band of an unknown start would leave the innovations a line.
+            reach = 1.1 * max(np.nanmax(np.abs(found.innovations[:, i]), initial=0.0), np.nanmedian(band))
+            said.set_ylim(-reach, reach)
+        else:
+            said.text(0.5, 0.5, "not predicted in any row", transform=said.transAxes, ha="center", va="center")
         said.set_ylabel(f"innovation\nof {name}")
     for panel, (name, columns) in zip(panels[2 * len(names) :], found.estimates.items(), strict=True):
         value, band = columns[:, 0], BAND_WIDTH * columns[:, 1]

@@ -497,13 +497,16 @@ def _sensors(design: ObserverDesign, found: Validation) -> Table:
     table = headed_table("sensor", "unit", "mean square", "expected", "mean (deviations)", "white (p)", "variance")
     for name, sensor in found.sensors.items():
         ratio = found.ratios.get(name)
-        table.add_row(
-            Text(name),
-            design.plant.units.get(name, ""),
+        told = (
             number(sensor.nis.value),
             f"{sensor.nis.low:.2f} to {sensor.nis.high:.2f}",
             f"{sensor.mean:+.2g}",
             f"{sensor.whiteness.probability:.2g}",
+        )
+        table.add_row(
+            Text(name),
+            design.plant.units.get(name, ""),
+            *(told if sensor.nis.samples else ("not predicted", "", "", "")),
             "as designed" if ratio is None else f"{ratio:.2g} times R",
         )
     return table
