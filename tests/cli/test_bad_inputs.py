@@ -228,6 +228,11 @@ SCHEMA = [
     ),
     Case("elimination as number", put("plant", "transform", "eliminate_algebraic_states", 1), "must be true or false"),
     Case("gamma negative", put("method", "options", "gamma", -1), "method.options.gamma: must be greater than 0"),
+    Case(
+        "delay too long",
+        put("method", {"id": "functional-filter", "options": {"delay": 10**9}}),
+        "method.options.delay: must be at most ",
+    ),
     Case("gamma zero", put("method", "options", "gamma", 0), "method.options.gamma: must be greater than 0"),
     Case("gamma as text", put("method", "options", "gamma", "2"), "method.options.gamma: must be a number"),
     Case("gamma NaN", put("method", "options", "gamma", math.nan), "method.options.gamma: must be a finite number"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,12 +15,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy import sparse
+from scipy.io import savemat
 
 import obsynth
 from obsynth.cli.main import main
 from obsynth.data.sources import number_in_cell
 from obsynth.errors import SpecError
-from obsynth.spec.loader import read_yaml
+from obsynth.spec.loader import read_matrix, read_yaml
 
 FMU = """<?xml version="1.0"?><fmiModelDescription fmiVersion="2.0" modelName="m" guid="{x}"><ModelExchange
 modelIdentifier="m" providesDirectionalDerivative="true"/><ModelVariables><ScalarVariable name="x" valueReference="1"
@@ -62,6 +64,79 @@ def test_damaged_fmus_end_in_one_error_and_leave_the_process_where_it_was(
         obsynth.from_fmu("m.fmu")
     assert Path(os.getcwd()) == tmp_path
     assert not (tmp_path.parent / "outside.txt").exists()
+
+
+def _fmu_of(text: str, change: Callable[[bytearray], None], file: Path) -> None:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("modelDescription.xml", text)
+    content = bytearray(file.read_bytes())
+    change(content)
+    file.write_bytes(content)
+
+
+def encrypted(content: bytearray) -> None:
+    content[6] |= 1
+    content[content.index(b"PK\x01\x02") + 8] |= 1
+
+
+def of_unknown_compression(content: bytearray) -> None:
+    content[8] = content[content.index(b"PK\x01\x02") + 10] = 99
+
+
+def garbled(content: bytearray) -> None:
+    for place in range(60, 90):
+        content[place] ^= 0x5A
+
+
+@pytest.mark.parametrize(
+    ("declared", "change"),
+    [
+        ('encoding="klingon"', lambda content: None),
+        ('encoding="big5"', lambda content: None),
+        ("", encrypted),
+        ("", of_unknown_compression),
+        ("", garbled),
+    ],
+)
+def test_descriptions_that_cannot_be_read_end_in_one_error(
+    declared: str, change: Callable[[bytearray], None], tmp_path: Path
+) -> None:
+    """They ended in LookupError, ValueError, RuntimeError, NotImplementedError and zlib.error."""
+    pytest.importorskip("fmpy")
+    _fmu_of(FMU.replace("?>", f" {declared}?>", 1), change, tmp_path / "m.fmu")
+    with pytest.raises(obsynth.SpecError, match=r"m\.fmu cannot be used as an FMU"):
+        obsynth.from_fmu(tmp_path / "m.fmu")
+
+
+def test_small_files_that_unpack_to_large_matrices_are_refused_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """3 MB of an .npz took 2.7 GB and longer than 40 s."""
+    matrix = np.zeros((1000, 1000))
+    np.savez_compressed(tmp_path / "A.npz", A=matrix)
+    savemat(tmp_path / "A.mat", {"A": matrix}, do_compression=True)
+    assert all(file.stat().st_size < matrix.nbytes / 100 for file in tmp_path.iterdir())
+    assert read_matrix(tmp_path / "A.mat", where="A").shape == read_matrix(tmp_path / "A.npz", where="A").shape
+    monkeypatch.setattr("obsynth.numerics.arguments.MAXIMUM_ENTRIES", matrix.size // 2)
+    monkeypatch.setattr("scipy.io.loadmat", lambda _: pytest.fail("it is read"))
+    with pytest.raises(obsynth.SpecError, match=r"it is too large \(1\.0e\+06 entries\)"):
+        read_matrix(tmp_path / "A.mat", where="A")
+    tracemalloc.start()
+    with pytest.raises(obsynth.SpecError, match=r"it is too large \(1\.0e\+06 entries\)"):
+        read_matrix(tmp_path / "A.npz", where="A")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < matrix.nbytes / 4
+
+
+def test_gain_sets_that_unpack_to_more_are_refused_before(tmp_path: Path) -> None:
+    """A few megabytes of blanks took the memory, and minutes."""
+    file = tmp_path / "g.json"
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("gain_set.json", b" " * 1_000_000)
+        archive.writestr("arrays.npz", b"")
+    with pytest.raises(obsynth.SpecError, match="it is compressed, as no gain set is"):
+        obsynth.load(file)
 
 
 @pytest.mark.parametrize("text", ["1_000", "1_0.5", "1e1_0"])

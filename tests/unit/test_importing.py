@@ -271,7 +271,7 @@ def test_what_is_no_such_fmu_is_refused(tmp_path):
     with pytest.raises(SpecError, match=r"finite"):
         obsynth.from_fmu(path, at={"level": float("nan")})
     (tmp_path / "text.fmu").write_text("no archive")
-    with pytest.raises(SpecError, match=r"no FMU"):
+    with pytest.raises(SpecError, match=r"text\.fmu cannot be used as an FMU: File is not a zip"):
         obsynth.from_fmu(tmp_path / "text.fmu")
     with pytest.raises(SpecError, match=r"does not exist"):
         obsynth.from_fmu(tmp_path / "none.fmu")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import os
-import shutil
+import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -300,17 +300,18 @@ def _instance(path: Path) -> Iterator[Instance]:
     fmpy = imported("fmpy", extra="fmu")
     differentiates = _differentiates(fmpy, path)
     description = _read(lambda: fmpy.read_model_description(str(path)), path)
-    # A library that cannot be loaded leaves the process in the folder of the FMU, which is then deleted.
-    before, folder = os.getcwd(), _read(lambda: fmpy.extract(str(path)), path)
-    try:
-        instance = _read(lambda: Instance(description, folder, differentiates=differentiates), path)
+    before = os.getcwd()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         try:
-            yield instance
+            _read(lambda: fmpy.extract(str(path), folder), path)
+            instance = _read(lambda: Instance(description, folder, differentiates=differentiates), path)
+            try:
+                yield instance
+            finally:
+                instance.end()
         finally:
-            instance.end()
-    finally:
-        os.chdir(before)
-        shutil.rmtree(folder, ignore_errors=True)
+            # A library that cannot be loaded leaves the process in the folder of the FMU, which is then deleted.
+            os.chdir(before)
 
 
 def _read(make: Callable[[], Any], path: Path) -> Any:
@@ -319,19 +320,22 @@ def _read(make: Callable[[], Any], path: Path) -> Any:
         return make()
     except MemoryError:
         raise
-    except Exception as error:  # fmpy raises bare ones, for a library that cannot be loaded and for an unsafe path
+    # Whatever readers of damaged zips and texts raise; fmpy raises bare ones for a library that cannot be loaded.
+    except Exception as error:
         raise SpecError(f"{path} cannot be used as an FMU: {error}", path=str(path)) from error
+
+
+def _description(path: Path) -> ElementTree.Element:
+    """Return the description of the model in an FMU."""
+    with zipfile.ZipFile(path) as archive, archive.open("modelDescription.xml") as stream:
+        return ElementTree.parse(stream).getroot()
 
 
 def _differentiates(fmpy: Any, path: Path) -> bool:
     """Return whether an FMU tells derivatives; raise `SpecError` unless it can be linearised on this machine."""
     if not path.is_file():
         raise SpecError(f"{path} does not exist.", path=str(path))
-    try:
-        with zipfile.ZipFile(path) as archive, archive.open("modelDescription.xml") as stream:
-            root = ElementTree.parse(stream).getroot()
-    except (OSError, KeyError, zipfile.BadZipFile, ElementTree.ParseError) as error:
-        raise SpecError(f"{path} is no FMU: {error}", path=str(path)) from error
+    root = _read(lambda: _description(path), path)
     version = root.get("fmiVersion", "")
     if version[:2] not in ("2.", "3."):
         raise SpecError(f"{path} is of FMI {version or '?'}: give an FMU of FMI 2 or 3.", path=str(path))

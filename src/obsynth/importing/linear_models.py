@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -32,6 +33,7 @@ from obsynth.numerics.arguments import (
     is_finite_number,
     number_in_text,
     require_kind,
+    require_readable,
     require_shape,
     shown,
 )
@@ -686,8 +688,10 @@ def from_matlab(
 
 
 def mat_arrays(source: Path) -> dict[str, Any]:
-    """Return what a ``.mat`` file holds by name; raise `ValueError` for other versions and damaged files."""
+    """Return what a ``.mat`` file holds by name; raise `ValueError` for other versions, damaged and too large files."""
     try:
+        # A small file may unpack to more than the memory holds.
+        require_readable(sum(math.prod(shape) for _, shape, kind in scipy.io.whosmat(source) if kind != "sparse"))
         content = scipy.io.loadmat(source)
     except NotImplementedError as error:
         raise ValueError("MATLAB 7.3 files are not supported, save it with '-v7'") from error

@@ -131,6 +131,16 @@ def as_given(value: Any, name: str, ragged: str) -> NDArray[Any]:
         raise SpecError(f"{name} is a {type(value).__name__} that is no array: {error}.", path=name) from error
 
 
+#: Larger matrices in files are refused; of sparse ones, the entries that are stored count.
+MAXIMUM_ENTRIES = 50_000_000
+
+
+def require_readable(entries: float) -> None:
+    """Raise `ValueError` for more entries of a file than are read."""
+    if entries > MAXIMUM_ENTRIES:
+        raise ValueError(f"it is too large ({entries:.1e} entries)")
+
+
 def as_matrix(value: Any, name: str) -> FloatArray:
     """Convert nested lists, an array or a scalar to a finite, read-only real matrix; raise `SpecError` naming it."""
     raw = as_given(value, name, f"{name} has rows of different lengths: give a full matrix.")

@@ -69,7 +69,7 @@ MANY_NUMBERS = 50_000
 DOCUMENT, ARRAYS = "gain_set.json", "arrays.npz"
 #: Arrays with fewer numbers stay in the document of a packed gain set, where they can be read.
 SMALL_ARRAY = 64
-#: Larger members are refused before they fill the memory.
+#: Larger files are refused before they fill the memory.
 MAXIMUM_BYTES = 4_000_000_000
 _DATE = (1980, 1, 1, 0, 0, 0)
 # What JSON does not have is marked by these sets of keys; a mapping that happens to have one of them is wrapped.
@@ -721,14 +721,19 @@ def is_packed(start: bytes) -> bool:
     return start.startswith(b"PK\x03\x04")
 
 
+def _require_stored(archive: zipfile.ZipFile) -> None:
+    """Raise `ValueError` for a zip that unpacks to more than it has, as no gain set does."""
+    if any(item.compress_type != zipfile.ZIP_STORED for item in archive.infolist()):
+        raise ValueError("it is compressed, as no gain set is")
+
+
 def unpacked(content: bytes) -> tuple[str, bytes]:
     """Return the text of the document and the arrays; raise `ValueError` for any other zip."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             if sorted(archive.namelist()) != sorted([DOCUMENT, ARRAYS]):
                 raise ValueError("it does not hold the two members of a gain set")
-            if sum(item.file_size for item in archive.infolist()) > MAXIMUM_BYTES:
-                raise ValueError("it is too large")
+            _require_stored(archive)
             return archive.read(DOCUMENT).decode("utf-8"), archive.read(ARRAYS)
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError) as error:
         raise ValueError(f"it is damaged ({error})") from error
@@ -752,6 +757,8 @@ def _read_members(source: Path) -> tuple[Any, bytes | None]:
     if not is_packed(start):
         return read_json(source, most=MOST_GAIN_SET_CHARACTERS), None
     try:
+        if file.stat().st_size > MAXIMUM_BYTES:
+            raise ValueError("it is too large")
         text, arrays = unpacked(file.read_bytes())
         return json_data(text), arrays
     except (ValueError, RecursionError) as error:
@@ -786,6 +793,7 @@ def _arrays_in(content: bytes) -> dict[str, FloatArray]:
     """Return arrays by name; raise `ValueError` where they are damaged."""
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            _require_stored(archive.zip)
             return {name: np.asarray(archive[name], dtype=np.float64) for name in archive.files}
     except (zipfile.BadZipFile, EOFError, OSError) as error:
         raise ValueError(f"its arrays are damaged ({error})") from error

@@ -28,7 +28,15 @@ import numpy as np
 from obsynth.analysis.transformations.linear_plants import Transformation, discretise, eliminate_algebraic_states
 from obsynth.errors import SpecError, a_kind
 from obsynth.files.outputs import input_file, path_of, read_json, read_text
-from obsynth.numerics.arguments import FloatArray, arguments_checked, as_matrix, is_whole, read_only
+from obsynth.numerics.arguments import (
+    MAXIMUM_ENTRIES,
+    FloatArray,
+    arguments_checked,
+    as_matrix,
+    is_whole,
+    read_only,
+    require_readable,
+)
 from obsynth.numerics.libraries import one_thread_if_small
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
 from obsynth.plants.constants import UNCERTAIN_MATRICES, Entry, constant_of, does_not_stand
@@ -385,7 +393,12 @@ def _wanted(kind: str, context: Mapping[str, Any]) -> str:
         return str(context["wanted"])
     if kind == "literal_error":
         return f"one of {context['expected']}"
-    limits = {"greater_than": "greater than", "greater_than_equal": "at least", "less_than": "less than"}
+    limits = {
+        "greater_than": "greater than",
+        "greater_than_equal": "at least",
+        "less_than": "less than",
+        "less_than_equal": "at most",
+    }
     if kind in limits:
         limit = next(iter(context.values()))
         return f"{limits[kind]} {limit:g}"
@@ -422,8 +435,6 @@ def _known_keys(location: Sequence[str | int]) -> list[str]:
     return list(section.model_fields) if section is not None else []
 
 
-#: Larger matrices are refused; of sparse ones, the entries that are stored count.
-MAXIMUM_ENTRIES = 50_000_000
 # What the readers of numpy and scipy raise for a damaged file.
 _READING_ERRORS = (
     OSError,
@@ -510,6 +521,8 @@ def _numpy_archive(path: Path) -> dict[str, Any]:
             raise ValueError("it is no .npz archive")
         stream.seek(0)
         with np.load(stream, allow_pickle=False) as archive:
+            # A small file may unpack to more than the memory holds.
+            require_readable(sum(item.file_size for item in archive.zip.infolist()) / np.float64().nbytes)
             return dict(archive)
 
 
@@ -532,9 +545,7 @@ def _selected(content: Mapping[str, Any], variable: str | None, path: Path, wher
 
 def _as_dense(raw: Any) -> Any:
     """Return an array for whatever a reader gave; a damaged sparse matrix must not reach scipy's loops."""
-    entries = math.prod(int(length) for length in getattr(raw, "shape", ()))
-    if entries > MAXIMUM_ENTRIES:
-        raise ValueError(f"it is too large ({entries:.1e} entries)")
+    require_readable(math.prod(int(length) for length in getattr(raw, "shape", ())))
     if not hasattr(raw, "toarray"):
         return raw
     if hasattr(raw, "check_format"):
