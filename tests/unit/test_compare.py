@@ -37,7 +37,9 @@ def test_an_interpreter_shows_results_as_their_text(bicycle: obsynth.Comparison)
     """Not every number of every design, as which four thousand lines stood in a notebook."""
     assert repr(bicycle) == str(bicycle)
     assert repr(bicycle).endswith(bicycle.advice)
-    assert repr(obsynth.diagnose(load_spec(DESIGNS / "bicycle" / "spec.yaml").plant)).startswith("What can be diagnosed")
+    assert repr(obsynth.diagnose(load_spec(DESIGNS / "bicycle" / "spec.yaml").plant)).startswith(
+        "What can be diagnosed"
+    )
 
 
 def test_a_notebook_shows_the_picture(bicycle: obsynth.Comparison) -> None:
