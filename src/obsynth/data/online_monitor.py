@@ -122,7 +122,7 @@ def notes_of_normal_rows(
                 "was not, blank its outputs in these rows, or give another log."
             )
         stuck = {
-            name: [run for run in stuck_rows(log[:, i]) if run.last >= rows.start and run.first < rows.stop]
+            name: [(begin, end) for begin, end in stuck_rows(log[:, i]) if end >= rows.start and begin < rows.stop]
             for i, name in enumerate(signals.names[signals.inputs :], 1 + signals.inputs)
         }
         yield from stuck_texts(stuck, shown, ": what it repeats there counts as not measured")

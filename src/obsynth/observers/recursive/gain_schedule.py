@@ -314,7 +314,7 @@ STEPS_TO_CONTRACT = 50
 #: With more states, and a plant and noise that stay the same, fewer steps are followed, as work goes with the cube of
 #: the states; where errors do not shrink over these, so many times as many, until all were followed.
 MANY_STATES = 100
-FEWEST_STEPS = 60
+FEWEST_FOLLOWED = 60
 FOLLOW_FURTHER = 3
 #: Spectral radius below which gains that are kept make errors decay, whatever rounding did to it.
 CLEARLY_STABLE = 1.0 - 1e-6
@@ -397,7 +397,7 @@ def _first_end(observer: RecursiveObserver, steps: int) -> int:
     alike = plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant
     if not alike or plant.horizon or observer.adaptation is not None or plant.nx <= MANY_STATES:
         return steps
-    return min(steps, max(FEWEST_STEPS, round(steps * (MANY_STATES / plant.nx) ** 3)))
+    return min(steps, max(FEWEST_FOLLOWED, round(steps * (MANY_STATES / plant.nx) ** 3)))
 
 
 class ErrorProduct:
