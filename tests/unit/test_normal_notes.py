@@ -196,7 +196,7 @@ def test_coarse_sensors_that_stick_are_told_in_noise(step: float, least: int) ->
         shown, first = step * np.round(course / step), int(rng.integers(200, 2500))
         assert stuck_rows(shown) == []
         shown[first : first + 200] = shown[first]
-        told += any(run.first <= first and run.last >= first + 199 for run in stuck_rows(shown))
+        told += any(begin <= first and end >= first + 199 for begin, end in stuck_rows(shown))
     assert told >= least
 
 
