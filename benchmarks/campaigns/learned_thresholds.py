@@ -14,7 +14,6 @@ from benchmarks.campaigns.frame import Outcome
 from scipy.signal import lfilter
 
 from obsynth.experiments.monitors.learned_levels import (
-    Levels,
     Statistics,
     conformal_levels,
     count_alarms,
@@ -92,20 +91,20 @@ def case(seed: int) -> Outcome:
     return Outcome(kind, found, wrong, factor)
 
 
-def learned(normal: np.ndarray, every: float, seed: int) -> tuple[Statistics, Levels]:
+def learned(normal: np.ndarray, every: float, seed: int) -> tuple[Statistics, np.ndarray]:
     """Return statistics and levels as `obsynth.learn_thresholds` takes them."""
     signatures = np.diag(normal.std(axis=0))
     told = tuple(f"signal {i}" for i in range(len(signatures)))
     statistics = Statistics(fitted_autoregression(normal), signatures, told)
     if is_conformal(len(normal), every):
         return conformal_levels(normal, every, statistics)
-    return learned_levels(normal, every, statistics, seed)
+    return learned_levels(normal, every, statistics, seed)[:2]
 
 
-def ratios(statistics: Statistics, levels: Levels, x: np.ndarray) -> np.ndarray:
+def ratios(statistics: Statistics, levels: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return the largest statistic of rows ``(n, m)`` in units of its level."""
     found = statistics.of_rows(statistics.model.whitened(x)[None])[:, 0]
-    return np.asarray((found / levels.own[:, None]).max(axis=0) / levels.factor)
+    return np.asarray((found / levels[:, None]).max(axis=0))
 
 
 def drawn(name: str, rows: int, rng: np.random.Generator) -> np.ndarray:

@@ -118,9 +118,9 @@ def test_the_stated_rate_is_kept_out_of_sample(m: int, memory: float, share: Cal
         rng = np.random.default_rng([seed, m])
         x, fresh = coloured(rng, 2_000, m, memory), coloured(rng, 50_000, m, memory)
         model = fitted_autoregression(x)
-        statistics, levels = learned_levels(x, every, Statistics(model, np.eye(m), tuple("abc"[:m])), seed)
-        largest = (statistics.of_rows(model.whitened(fresh)[None]) / levels.own[:, None, None]).max(axis=0)
-        rates.append(every * count_alarms(largest, levels.factor) / 50_000)
+        statistics, levels, _ = learned_levels(x, every, Statistics(model, np.eye(m), tuple("abc"[:m])), seed)
+        largest = (statistics.of_rows(model.whitened(fresh)[None]) / levels[:, None, None]).max(axis=0)
+        rates.append(every * count_alarms(largest, 1.0) / 50_000)
         assert rows_needed(model, every) <= 2_000
     # Of 400 alarms, or of 200: 5 or 7 %; the reference has .56 to .84 on average for 2,000 rows.
     assert 0.4 <= np.mean(rates) <= 1.0
@@ -133,11 +133,11 @@ def test_the_rows_learned_from_keep_the_rate_where_something_slow_is_in_them() -
     rng, every = np.random.default_rng(2), 1_100.0
     x = rng.standard_normal((3_000, 1)) + 0.5 * (np.sin(2.0 * np.pi * np.arange(3_000) / 1_500) > 0.95)[:, None]
     model = fitted_autoregression(x)
-    statistics, levels = learned_levels(x, every, Statistics(model, np.eye(1), ("y",)))
+    statistics, levels, _ = learned_levels(x, every, Statistics(model, np.eye(1), ("y",)))
     e = model.whitened(x[None])
     assert np.isfinite(e).all()
-    largest = (statistics.of_rows(e)[:, 0] / levels.own[:, None]).max(axis=0)
-    assert 1 <= count_alarms(largest[None], levels.factor) <= int((3_000 - SETTLING) / every - 1.0) + 1
+    largest = (statistics.of_rows(e)[:, 0] / levels[:, None]).max(axis=0)
+    assert 1 <= count_alarms(largest[None], 1.0) <= int((3_000 - SETTLING) / every - 1.0) + 1
 
 
 @pytest.mark.parametrize("tail", [0.0, 0.25, -1.0])
@@ -164,9 +164,9 @@ def test_a_small_fault_in_noise_with_heavy_tails_is_told_as_early_as_its_evidenc
         noise = rng.standard_t(5, (12_000, 1))
         x, fault = noise[:2_000] / noise.std(), noise[2_000:] / noise.std()
         fault = fault + np.tile(np.repeat([0.0, 1.0 / 3.0], 500), 10)[:, None]
-        statistics, levels = learned_levels(x, every, Statistics(fitted_autoregression(x), np.eye(1), ("y",)), seed)
-        found = statistics.of_rows(statistics.model.whitened(fault)[None])[:, 0] / levels.own[:, None]
-        above = (found.max(axis=0) > levels.factor).reshape(10, 2, 500)[:, 1]
+        statistics, levels, _ = learned_levels(x, every, Statistics(fitted_autoregression(x), np.eye(1), ("y",)), seed)
+        found = statistics.of_rows(statistics.model.whitened(fault)[None])[:, 0] / levels[:, None]
+        above = (found.max(axis=0) > 1.0).reshape(10, 2, 500)[:, 1]
         delays.extend(np.where(above.any(axis=1), above.argmax(axis=1), 500))
     assert np.mean(delays) < 200.0
 
@@ -179,8 +179,8 @@ def test_many_rows_show_their_rate_themselves() -> None:
         x[200:210] = np.nan
         assert is_conformal(len(x), every)
         statistics, levels = conformal_levels(x, every, Statistics(fitted_autoregression(x), np.eye(2), ("a", "b")))
-        largest = statistics.of_rows(statistics.model.whitened(fresh)[None])[:, 0] / levels.own[:, None]
-        rates.append(every * count_alarms(largest.max(axis=0), levels.factor) / 40_000)
+        largest = statistics.of_rows(statistics.model.whitened(fresh)[None])[:, 0] / levels[:, None]
+        rates.append(every * count_alarms(largest.max(axis=0), 1.0) / 40_000)
     # Of 29 alarms that the second half may have: a deviation of .19 each, .08 of their mean.
     assert 0.8 <= np.mean(rates) <= 1.1
     assert not is_conformal(3_000, every)
