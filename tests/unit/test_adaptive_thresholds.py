@@ -401,3 +401,29 @@ def test_designs_without_residuals_are_watched_by_their_estimates() -> None:
     assert (table["alarm"] == "").all()
     log["y1"] += np.where(np.arange(20) >= 10, 3.0, 0.0)
     assert (obsynth.run_on_data(design, log, monitor=monitor, warm_up=0.0).table["alarm"] != "").any()
+
+
+@pytest.mark.parametrize("p", [0.95, 1.0, 1.05])
+def test_residuals_that_are_zero_but_for_rounding_refuse_no_bound(p: float) -> None:
+    # An observer decoupled from d reads x3 = y2 as it is: that residual, and what the fault follows, are 1e-16.
+    a = [[0.26, -0.21, 0.2], ["-0.21*p", "-1.06*p", 0.0], [0.37, 0.31, -1.0]]
+    plant = obsynth.uncertain_system(
+        {"E": np.diag([0.88, 1.61, 0.0]).tolist(), "A": a, "B": [[0.95], [1.18], [1.52]], "Bf": [[0.32], [-0.79], [0]],
+         "Bd": [[1.16], [-0.17], [0.0]], "C": [[1, 0, 0], [0, 0, 1]], "dt": 1.0},
+        {"p": {"nominal": 1.0, "tolerance": "5 %"}},
+    )  # fmt: skip
+    design = obsynth.ui_pi_observer(plant)
+    states = dict.fromkeys(design.plant.state_names, 2.0)
+    monitor = obsynth.online_monitor(design, disturbance_bounds={"d1": 0.1}, initial_set=states)
+    rng, x, rows = np.random.default_rng(3), np.array([0.5, -0.7]), []
+    for k in range(40):
+        u, d = rng.choice([-1.0, 1.0]), 0.1 * rng.choice([-1.0, 1.0])
+        third = 0.37 * x[0] + 0.31 * x[1] + 1.52 * u
+        rows.append([float(k), u, x[0], third])
+        into = [0.26 * x[0] - 0.21 * x[1] + 0.2 * third, -0.21 * p * x[0] - 1.06 * p * x[1]]
+        x = (np.array(into) + np.array([0.95, 1.18]) * u + np.array([1.16, -0.17]) * d) / [0.88, 1.61]
+    table = obsynth.run_on_data(
+        design, pd.DataFrame(rows, columns=["time", "u1", "y1", "y2"]), monitor=monitor, warm_up=0.0
+    ).table
+    assert (table["fhat[f1]"].abs() <= table["threshold fhat[f1]"]).all()
+    assert (table["fhat[f1]"].abs() > 0.01 * table["threshold fhat[f1]"]).any()

@@ -66,6 +66,9 @@ LEAST_INFORMATION = 1e-10
 #: Deviations below this share of the terms they are computed from are zero: rounding is seven orders smaller, so that
 #: what is kept has seven digits.
 KNOWN_SHARE = 1e-9
+#: What is zero but for rounding beside other terms ends at the rounding of these: this share of them counts among its
+#: own terms, so that bounds of 1e-9 to 1e-7 of its terms are above some hundred roundings of the others.
+ROUNDED_BESIDE = 1e-4
 #: Size of a fault's column in a decoupled plant, relative to before the reduction, below which it left no trace.
 TRACE_TOLERANCE = 1e-9
 #: Parity directions whose noise is below this share of the terms it is made of are free of noise: a few roundings.

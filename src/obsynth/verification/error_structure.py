@@ -19,7 +19,7 @@ import numpy as np
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arguments import FloatArray
-from obsynth.numerics.ranks import EFFECT_RANK_SHARE
+from obsynth.numerics.ranks import EFFECT_RANK_SHARE, ROUNDED_BESIDE
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.affine import AffineMatrix, affine_block
 from obsynth.proofs.balls import gamma, rounded_up
@@ -168,8 +168,10 @@ def error_structure(
 def _sizes(observer: LinearObserver, affine: AffinePlant, t: FloatArray, c: FloatArray, dy: FloatArray) -> FloatArray:
     """Return the size of the terms of each row, ``(rows, 1)``."""
     absolute = np.abs
-    te = absolute(t) @ affine.E.magnitude
-    top = absolute(observer.Az) @ te + absolute(observer.By) @ affine.C.magnitude + absolute(t) @ affine.A.magnitude
+    own = absolute(observer.By) @ affine.C.magnitude + absolute(t) @ affine.A.magnitude
+    # A state z that reads algebraic equations alone follows no state, but for the rounding of its own terms.
+    te = absolute(t) @ affine.E.magnitude + ROUNDED_BESIDE * own
+    top = absolute(observer.Az) @ te + own
     low = absolute(c) @ te + absolute(dy) @ affine.C.magnitude
     return np.asarray(np.vstack([top, low]).max(axis=1, initial=np.finfo(np.float64).tiny)[:, None])
 

@@ -33,7 +33,7 @@ from obsynth.methods.recursive.conditions import SOURCE, recursive_conditions
 from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.matrix_equations import discrete_lyapunov
 from obsynth.numerics.norms import spectral_radius
-from obsynth.numerics.ranks import KNOWN_SHARE, RANK_TOLERANCE, numerical_rank
+from obsynth.numerics.ranks import KNOWN_SHARE, RANK_TOLERANCE, ROUNDED_BESIDE, numerical_rank
 from obsynth.numerics.scaling import LogBalance, balance_by_least_squares, power_of_two_below
 from obsynth.numerics.square_root_estimation import LeastSquaresStep, least_squares_step, rank_revealing_step
 from obsynth.observers.dae.observer import DAEObserver
@@ -66,9 +66,6 @@ CONSISTENCY_STEPS = 60
 CONSISTENCY_SEED = 20130703
 #: Bands are this many standard deviations of the statistic wide: a sound design fails one time in two million.
 BAND_DEVIATIONS = 5.0
-#: A state that tends to zero beside others ends at their rounding, in units in which equations and outputs are of one
-#: size: this share of them counts as its terms, of which bounds of 1e-9 are some hundred roundings.
-ROUNDED_BESIDE = 1e-4
 
 _SOURCE = "recomputed, Monte Carlo with a fixed seed"
 
