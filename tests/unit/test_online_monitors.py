@@ -479,3 +479,35 @@ def test_options_of_another_kind_are_refused_by_name(kind, wang):
             with pytest.raises(obsynth.SpecError, match=f"not for {kind}") as refused:
                 obsynth.monitor(design, scenario, kind, **{name: value})
             assert refused.value.path == name
+
+
+@pytest.mark.parametrize("kind", ["pointwise", "window"])
+def test_what_has_no_bound_at_any_stamps_has_none_and_no_nan(kind: str) -> None:
+    """Modes that last are bent by the disturbance: between stamps anywhere nothing is bounded, and inf - inf was."""
+    plant = obsynth.DescriptorSystem(
+        None, [[-1.0, -1.0], [1.0, 1.0]], np.zeros((2, 0)), [[1.0, 1.0], [0.0, 1.0]], Bf=[[0.0], [-1.0]],
+        Bd=[[1.0], [1.0]], Bw=np.zeros((2, 2)), Dw=0.01 * np.eye(2), dt=0.0,
+    )  # fmt: skip
+    design = obsynth.design(plant, "functional-filter")
+    given = {"disturbance_bounds": {plant.disturbance_names[0]: 0.1}, "noise_bound": 2.0, "sample_time": 0.05}
+    monitor = obsynth.online_monitor(design, kind, **given)
+    assert "while rows are not equally far apart there is no bound" in monitor.statement
+    table, limit = monitor.rule.irregular
+    assert np.isinf(limit)
+    assert np.isinf(table).all()
+    times = np.concatenate([0.05 * np.arange(200), 10.0 + 0.03 * np.arange(50)])
+    log = pd.DataFrame({"time": times, **dict.fromkeys(plant.output_names, 0.0)})
+    table = obsynth.run_on_data(design, log, monitor=monitor, warm_up=0.5).table
+    known = table[table["statistic"].notna()]
+    assert np.isfinite(known["threshold"][known["time"] < 9.9]).all()
+    assert np.isinf(known["threshold"][known["time"] > 10.02]).all()
+
+
+def test_the_bound_of_the_paper_asks_for_no_noise_bound_that_it_does_not_take() -> None:
+    plant = obsynth.DescriptorSystem(
+        None, [[0.8, 0.1], [0.0, 0.7]], C=np.eye(2), Bf=[[1.0], [0.0]], Bw=np.zeros((2, 2)), Dw=0.01 * np.eye(2), dt=0.1
+    )
+    design = obsynth.fault_estimation_filter(plant)
+    with pytest.raises(SpecError, match=r"\(66\) bounds nothing else: use pointwise") as caught:
+        obsynth.online_monitor(design, "paper")
+    assert "noise_bound" not in str(caught.value)

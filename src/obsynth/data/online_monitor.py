@@ -477,6 +477,7 @@ _GROWS = "; after missing outputs it is larger by the possible error of the plan
 _WAITS = "; until the effect of a gap has settled nothing is decided, as {reason}"
 _NOT_CLOSER = "; rows are no closer than {dt} s"
 _JITTERING = "; stamps that jitter by up to a fifth of the interval are taken as regular"
+_UNEVEN = "; while rows are not equally far apart there is no bound"
 _REGULAR = "; no row is further than {dt} s from the last"
 
 
@@ -608,10 +609,11 @@ def online_monitor(
             rule, told = over_box(noisy, norm, bounds, noise_bound, initial_error, initial_set, sample_time=dt)
             first = _AFTER_WARM_UP if initial_error is None else _AFTER_A_GAP
             return made(told + (first if initial_set is None else _FROM_THE_FIRST), rule)
-        _require_above_rounding(limit, model, bounds)
+        _require_above_rounding(kind, limit, model, bounds)
         gaps = gap_growth(model, bounds, noise_bound) if kind == "pointwise" else ""
         rule = norm.over_gaps(gaps) if isinstance(gaps, GapGrowth) else norm
         ending = (_AFTER_WARM_UP if initial_error is None else _AFTER_A_GAP) + _more_words(kind, model, limit, dt)
+        ending += _UNEVEN * bool(norm.irregular is not None and np.isinf(norm.irregular[1]))
         ending += _WAITS.format(reason=gaps) if isinstance(gaps, str) and gaps else _GROWS * bool(gaps)
     else:
         rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
@@ -647,7 +649,7 @@ def _require_linear_kind(kind: str, nominal: Mapping[str, float] | None) -> None
         raise SpecError("nominal is for recursive designs, which estimate parameters.", path="nominal")
 
 
-def _require_above_rounding(limit: float, model: ResidualModel, bounds: FloatArray) -> None:
+def _require_above_rounding(kind: str, limit: float, model: ResidualModel, bounds: FloatArray) -> None:
     """Refuse a bound that rounding of what it is made of would pass: of disturbances that cancel."""
     plant = model.errors.plant
     # They come by the states, of which a row may show others than those that they enter.
@@ -655,10 +657,13 @@ def _require_above_rounding(limit: float, model: ResidualModel, bounds: FloatArr
     size = float(np.linalg.norm(model.C, 2) * np.linalg.norm(entering))
     if not limit > RESIDUAL_ROUNDING_SHARE * size:
         raise SpecError(
-            "As stated, no disturbance and no noise reaches the residual: its bound would be zero but for rounding, "
-            "which exceeds it. State noise (noise_bound, sensor_noise of the plant), or give a threshold yourself "
-            "(thresholds).",
-            path="noise_bound",
+            "As stated, no disturbance reaches the residual, and (66) bounds nothing else: use pointwise, which bounds "
+            "noise too, or give a threshold yourself (thresholds)."
+            if kind == "paper"
+            else "As stated, no disturbance and no noise reaches the residual: its bound would be zero but for "
+            "rounding, which exceeds it. State noise (noise_bound, sensor_noise of the plant), or give a threshold "
+            "yourself (thresholds).",
+            path="kind" if kind == "paper" else "noise_bound",
         )
 
 

@@ -766,6 +766,9 @@ def unlimited_bound(
     shown = [largest_singular_value(model.C @ power) for power in powers]
     # Of k = m N + j samples, m N shrink by left^m: inputs of that age, and the start, add no more than this.
     aged = _columns(last @ inputs.B) * sum(shown) / (1.0 - left)
+    if not np.isfinite(inputs.limit):
+        # What outputs do between stamps that may be anywhere has no bound.
+        return np.full(model.steps, np.inf), np.inf
     bare = pointwise_threshold(model, inputs, 0.0)
     pointwise = float(bare[-1] - inputs.between[-1]) + inputs.limit + shown[-1] * _columns(inputs.B) + aged
     begins = initial_error + _columns(inputs.start)
