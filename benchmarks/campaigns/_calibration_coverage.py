@@ -17,8 +17,7 @@ import numpy as np
 
 from obsynth.calibration.fits import Objective, guarded_maximum, profile_root, quantile, simulation_fits
 from obsynth.calibration.logs import Log
-from obsynth.calibration.plants import NonlinearPlant
-from obsynth.calibration.problem import Problem, calibration_problem
+from obsynth.calibration.problem import NonlinearPlant, Problem, calibration_problem
 from obsynth.plants.dae import DAEModel
 from obsynth.simulation.dae import simulate_dae
 from obsynth.spec import load_spec

@@ -21,7 +21,7 @@ from obsynth.calibration.diagnostics import (
     wrong_samples,
 )
 from obsynth.calibration.fits import Maximum, covariance_of, information, profile_box, quantile
-from obsynth.calibration.plants import NoiseStates, PlantWithNoise
+from obsynth.calibration.problem import NoiseStates, PlantWithNoise
 from obsynth.results.design import box_row, calibration_text, read_calibration, verify_calibration
 
 

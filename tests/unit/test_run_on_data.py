@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import obsynth
 from obsynth import SpecError, run_on_data
-from obsynth.data.log_estimator import interval
+from obsynth.data.log_observers import interval
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
 

@@ -64,16 +64,20 @@ from obsynth.calibration.fits import (
     with_seen_start,
 )
 from obsynth.calibration.logs import EVEN, Log, LogData, read_log, told_rows
-from obsynth.calibration.plants import (
+from obsynth.calibration.problem import (
+    IMPOSSIBLE,
     CalibrationPlant,
+    Likelihood,
     LinearPlant,
     NoiseStates,
     NonlinearPlant,
     PlantWithNoise,
+    Problem,
     asked_states,
+    calibration_problem,
     correlation_name,
+    require_variation,
 )
-from obsynth.calibration.problem import IMPOSSIBLE, Likelihood, Problem, calibration_problem, require_variation
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.dae_adaptive_observer.conditions import NOMINAL_SAMPLES
 from obsynth.numerics.arguments import SMALLEST, FloatArray, Seed, arguments_checked, is_whole, read_only, whole_number

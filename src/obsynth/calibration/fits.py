@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.calibration.logs import refused, roughness
-from obsynth.calibration.plants import PlantWithNoise
-from obsynth.calibration.problem import IMPOSSIBLE, LARGEST_STEP_RESIDUAL, Likelihood, Problem
+from obsynth.calibration.problem import IMPOSSIBLE, LARGEST_STEP_RESIDUAL, Likelihood, PlantWithNoise, Problem
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import SMALLEST, FloatArray
 from obsynth.numerics.ranks import LEAST_INFORMATION

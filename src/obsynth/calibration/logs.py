@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.data.log_estimator import MOST_STALE
+from obsynth.data.log_observers import MOST_STALE
 from obsynth.data.sources import log_table, parsed_rows
 from obsynth.data.stuck_sensors import stuck_rows, stuck_texts, without_repeats
 from obsynth.errors import PreconditionError, SpecError

@@ -81,16 +81,12 @@ def calibrated_spec(path: Path, found: Calibration, *, calibration: Path | None 
     told |= {"input_delay": int(found.input_delay)}
     whole = {**document, "plant": plant, "method": {**method, "options": options}, "calibrate": told}
     if document.get("inputs") is not None:
-        whole["inputs"] = _timing(plant, found, linear=linear)
+        # When the inputs act is as the calibration has them, whatever the spec or the command line said before.
+        sampled = bool(plant.get("dt")) or bool((plant.get("transform") or {}).get("sample_time"))
+        hold = {"hold": "ends" if plant.get("kind") == "dae" else "begins"} if sampled or not linear else {}
+        whole["inputs"] = {**hold, "delay": int(found.input_delay)}
     heading = f"# Calibrated by obsynth from {path.name} and {found.log['source'] or 'a log'}.\n"
     return heading + yaml_text(whole)
-
-
-def _timing(plant: Mapping[str, Any], found: Calibration, *, linear: bool) -> dict[str, Any]:
-    """Return when the inputs act as the calibration has them, whatever the spec or the command line said before."""
-    sampled = bool(plant.get("dt")) or bool((plant.get("transform") or {}).get("sample_time"))
-    hold = {"hold": "ends" if plant.get("kind") == "dae" else "begins"} if sampled or not linear else {}
-    return {**hold, "delay": int(found.input_delay)}
 
 
 def _set_constants(plant: dict[str, Any], found: Calibration, calibration: Path | None, *, with_ranges: bool) -> None:

@@ -32,8 +32,7 @@ from obsynth.calibration.diagnostics import (
 )
 from obsynth.calibration.fits import Fit, Objective, greatest_likelihood
 from obsynth.calibration.logs import Log, LogData, quantum, read_log
-from obsynth.calibration.plants import NonlinearPlant, sample_graphs
-from obsynth.calibration.problem import Problem
+from obsynth.calibration.problem import NonlinearPlant, Problem, sample_graphs
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.numerics.arguments import FloatArray, arguments_checked, read_only
 from obsynth.observers.dae.estimates import GatheredRows

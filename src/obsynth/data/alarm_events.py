@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from obsynth.data.log_estimator import GAP, OUT_OF_ORDER, PARTIAL, RECOVERING, REPEATED_STAMP, WARM_UP
+from obsynth.data.log_observers import GAP, OUT_OF_ORDER, PARTIAL, RECOVERING, REPEATED_STAMP, WARM_UP
 from obsynth.experiments.monitors.learned_levels import HOLD
 from obsynth.observers.running import BAND_WIDTH
 

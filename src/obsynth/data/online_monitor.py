@@ -23,8 +23,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.data.log_estimator import DECIDING, STALE, Row
-from obsynth.data.log_observers import SteppingLogObserver
+from obsynth.data.log_observers import DECIDING, STALE, Row, SteppingLogObserver
 from obsynth.data.run import LogRun
 from obsynth.data.sources import CHUNK_ROWS, TIME_HEADER, Data, Signals, Stamps, chunks, parsed_rows
 from obsynth.data.stuck_sensors import stuck_rows, stuck_texts, without_repeats

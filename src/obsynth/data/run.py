@@ -28,8 +28,17 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.transformations.linear_plants import StateRecovery
 from obsynth.data.alarm_events import NO_DECISION, AlarmEvent, AlarmLog
-from obsynth.data.log_estimator import DECIDING, GAP, RECOVERING, STALE, Clock, LogObserver, Row
-from obsynth.data.log_observers import SteppingLogObserver, log_observer
+from obsynth.data.log_observers import (
+    DECIDING,
+    GAP,
+    RECOVERING,
+    STALE,
+    Clock,
+    LogObserver,
+    Row,
+    SteppingLogObserver,
+    log_observer,
+)
 from obsynth.data.sources import CHUNK_ROWS, TIME_HEADER, Data, Signals, Stamps, check_suffix, chunks, samples
 from obsynth.data.stuck_sensors import RepeatedValues, stuck_texts
 from obsynth.errors import ObsynthError, SpecError

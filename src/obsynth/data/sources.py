@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, TextIO, TypeAlias
 
 import numpy as np
 
-from obsynth.data.log_estimator import LogObserver
+from obsynth.data.log_observers import LogObserver
 from obsynth.errors import SpecError
 from obsynth.files.outputs import input_file, reason
 from obsynth.files.tables import unquoted
@@ -642,17 +642,6 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
         yield np.array([[time, *values]])
     if row == 0:
         raise SpecError("The data have no rows.", path="data")
-
-
-def header_of(path: Path, wanted: Sequence[str]) -> list[str]:
-    """Return the names of the columns of a file, of which some are wanted."""
-    try:
-        with path.open(encoding=encoding_of(path), errors=_WINDOWS, newline="") as stream:
-            return list(_opened(stream, wanted)[0])
-    except UnicodeDecodeError as error:
-        raise no_text(path, error) from error
-    except OSError as error:
-        raise SpecError(f"{path} cannot be read: {error.strerror or error}.", path=str(path)) from error
 
 
 def _opened(stream: TextIO, wanted: Sequence[str]) -> tuple[tuple[str, ...], bool, Iterator[list[str]]]:
@@ -1279,7 +1268,13 @@ def _header(data: Any, wanted: Sequence[str]) -> list[str]:
     check_suffix(path, (*TEXT_SUFFIXES, *NEEDED_PACKAGES))
     input_file(path)
     if path.suffix.lower() in TEXT_SUFFIXES:
-        return header_of(path, wanted)
+        try:
+            with path.open(encoding=encoding_of(path), errors=_WINDOWS, newline="") as stream:
+                return list(_opened(stream, wanted)[0])
+        except UnicodeDecodeError as error:
+            raise no_text(path, error) from error
+        except OSError as error:
+            raise SpecError(f"{path} cannot be read: {error.strerror or error}.", path=str(path)) from error
     with _readable(path), _read_by_package(path):
         _, names_of = _READERS[path.suffix.lower()]
         return names_of(path, wanted)

@@ -363,17 +363,7 @@ def statement_of(test: GuaranteedTest, group: tuple[str, ...], row: int, log: Lo
     source = "a record" if log is None else f"{log.name} (sha256 {log.sha256[:SHOWN_DIGITS]})"
     others = [plant.fault_names[k] for k in question.free]
     besides = f", whatever {' and '.join(others)} does" if others else ""
-    one = " or ".join(group)
-    return (
-        f"Proved: rows {row - rows_of_test(test) + 1} to {row} of {source} cannot occur without "
-        f"{one}{besides}{while_inside(test)}, with {_assumed(window)}: {one} is present, or the model is not exact. "
-        f"Gain set {gain_set[:SHOWN_DIGITS]}."
-    )
-
-
-def _assumed(window: Window) -> str:
-    """Return the bounds that a proof rests on, in words."""
-    plant, bounds = window.plant, window.bounds
+    one, bounds = " or ".join(group), window.bounds
     noise = np.abs(bounds.noise_output) @ bounds.noise
     d_middle = bounds.disturbance_middle
     v_middle = None if bounds.noise_middle is None else bounds.noise_output @ bounds.noise_middle
@@ -383,10 +373,14 @@ def _assumed(window: Window) -> str:
         "process noise within its bounds" if bounds.noise_state.any() else "",
         _listed(plant.state_names, bounds.state, plant.units, "within", "states"),
         _listed(plant.state_names, bounds.first, plant.units, "at first within", "states"),
-        "" if window.question.disturbance == "jump" else f"disturbances that are {window.question.disturbance}",
+        "" if question.disturbance == "jump" else f"disturbances that are {question.disturbance}",
     ]
-    told = [part for part in parts if part]
-    return ", ".join(told) if told else "any disturbances and noise"
+    assumed = ", ".join(part for part in parts if part) or "any disturbances and noise"
+    return (
+        f"Proved: rows {row - rows_of_test(test) + 1} to {row} of {source} cannot occur without "
+        f"{one}{besides}{while_inside(test)}, with {assumed}: {one} is present, or the model is not exact. "
+        f"Gain set {gain_set[:SHOWN_DIGITS]}."
+    )
 
 
 def _listed(

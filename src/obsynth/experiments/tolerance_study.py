@@ -18,7 +18,6 @@ from obsynth.files.tables import text_table
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import FloatArray, arguments_checked, freeze, whole_number
 from obsynth.plants.constants import deviations_told, shown, tolerance_share
-from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import SHOWN_DIGITS, STUDY, ObserverDesign, design_as_dict, require_verified, result_text
 from obsynth.simulation.scenario import Scenario, Step
 
@@ -213,7 +212,13 @@ def tolerance_study(
     """
     whole_number(runs, "runs")
     plant, observer = design.linear
-    known = _tolerance_of(plant)
+    box = None if plant.uncertainty is None else plant.uncertainty.box
+    if box is None or not box.names:
+        raise SpecError("The plant's constants have no tolerances: state constants.", path="design")
+    zero = [item.name for item in box.uncertain if item.nominal == 0.0]
+    if zero:
+        raise SpecError(f"The nominal value of {zero[0]!r} is zero, which has no per cent.", path="tolerances")
+    known = max(item.half / abs(item.nominal) for item in box.uncertain)
     names = observer.fault_names
     if not names or (fault is not None and fault not in names):
         raise SpecError(f"fault is {fault!r}: the design estimates {', '.join(names) or 'none'}.", path="fault")
@@ -242,17 +247,6 @@ def tolerance_study(
         "noise_bound": noise_bound,
     }
     return ToleranceStudy(np.array(shares), alarms, least, chosen, plant.units.get(chosen, ""), runs, design, asked)
-
-
-def _tolerance_of(plant: DescriptorSystem) -> float:
-    """Return the largest tolerance of a plant's constants, as a share."""
-    box = None if plant.uncertainty is None else plant.uncertainty.box
-    if box is None or not box.names:
-        raise SpecError("The plant's constants have no tolerances: state constants.", path="design")
-    zero = [item.name for item in box.uncertain if item.nominal == 0.0]
-    if zero:
-        raise SpecError(f"The nominal value of {zero[0]!r} is zero, which has no per cent.", path="tolerances")
-    return max(item.half / abs(item.nominal) for item in box.uncertain)
 
 
 def _scaled(design: ObserverDesign, factor: float) -> ObserverDesign:

@@ -27,8 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from obsynth.data.log_estimator import SETTLING_SLACK
-from obsynth.data.log_observers import GAP_LEFT_SHARE, LEAST_SHOWN, LinearLogObserver
+from obsynth.data.log_observers import GAP_LEFT_SHARE, LEAST_SHOWN, SETTLING_SLACK, LinearLogObserver
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.learned import LearnedThresholds, as_learned, watched_names
 from obsynth.experiments.monitors.learned_levels import (

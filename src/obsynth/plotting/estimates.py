@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.data.log_estimator import DECIDING
+from obsynth.data.log_observers import DECIDING
 from obsynth.data.run import DataRun
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.monitor import Detection

@@ -28,7 +28,7 @@ from obsynth.analysis.transformations.linear_plants import eliminate_algebraic_s
 from obsynth.calibration.diagnostics import Validation, draw_validation
 from obsynth.calibration.validating import states_innovations, validate
 from obsynth.data.alarm_events import NO_ALARM, alarm_notes, alarm_rows, silence
-from obsynth.data.log_estimator import DECIDING
+from obsynth.data.log_observers import DECIDING
 from obsynth.data.run import DataRun
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.monitor import Detection

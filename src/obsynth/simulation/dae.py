@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -80,21 +81,14 @@ def simulate_dae(
     rng = np.random.default_rng(seed)
     pushed = _noise(Q, model.nx, "Q", rng, len(inputs))
     measurement_noise = _noise(R, model.ny, "R", rng, len(inputs))
-    step, start = ImplicitStep(DAEFunctions(model, integration), length), _consistent(model, x, inputs, theta, length)
-    states, outputs, residuals = _recorded(step, inputs, theta, pushed, start)
+    if len(inputs):
+        # From a start that is not on the algebraic equations the first step, which is longer, may still find a way.
+        with suppress(SolverError):
+            x = onto_constraint(model, x, inputs[0], theta[0], length)
+    step = ImplicitStep(DAEFunctions(model, integration), length)
+    states, outputs, residuals = _recorded(step, inputs, theta, pushed, x)
     time = length * np.arange(len(inputs), dtype=np.float64)
     return Trajectory(states, outputs + measurement_noise, inputs, theta, time=time, residuals=residuals)
-
-
-def _consistent(model: DAEModel, x: FloatArray, inputs: FloatArray, theta: FloatArray, dt: float) -> FloatArray:
-    """Return a start on the algebraic equations, which is the given one where it is on them already."""
-    if not len(inputs):
-        return x
-    try:
-        return onto_constraint(model, x, inputs[0], theta[0], dt)
-    except SolverError:
-        # From there the first step, which is longer, may still find a way.
-        return x
 
 
 def _parameters(model: DAEModel, value: ArrayLike | None, samples: int) -> FloatArray:

@@ -367,15 +367,6 @@ def _varying(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _Firs
 FORGETTING_RINGS = 3
 
 
-def norm_beyond_nominal(plan: AdaptivePlan, found: Thresholds) -> float:
-    """Return what box, start and rounding add to the norm of the residual."""
-    rows = plan.residuals
-    parts = [found.shift[rows], found.rest[rows], plan.bound.more[rows], *found.first[:, rows]]
-    if plan.start_beyond_nominal:
-        parts.append(found.start[rows])
-    return math.fsum(math.hypot(*part) for part in parts)
-
-
 class AdaptiveRuleState(NamedTuple):
     """The state of `AdaptiveRule`."""
 
@@ -431,7 +422,11 @@ class AdaptiveRule(Rule):
         if dt is None and self.nominal is not None and state.nominal is not None:
             nominal, (statistic, threshold, *_) = self.nominal.step(state.nominal, sample)
             state = state._replace(nominal=nominal)
-            threshold = (threshold + norm_beyond_nominal(plan, found)) * THRESHOLD_ROUNDING
+            # What box, start and rounding add to the norm of the residual.
+            parts = [found.shift[at], found.rest[at], plan.bound.more[at], *found.first[:, at]]
+            if plan.start_beyond_nominal:
+                parts.append(found.start[at])
+            threshold = (threshold + math.fsum(math.hypot(*part) for part in parts)) * THRESHOLD_ROUNDING
         else:
             statistic, threshold = math.hypot(*values[at]), math.hypot(*found.total[at])
         nf = len(plan.fault_names)
@@ -643,7 +638,15 @@ def adaptive_plan(
 ) -> tuple[AdaptivePlan, AdaptivePlan]:
     """Return the plans from the first start on and after a later one, over the plant's box, if there is a bound."""
     plant, observer = design.linear
-    _require_regular(plant)
+    if plant.uncertainty is not None and plant.uncertainty.box.names:
+        found = index_one_on_box(plant)
+        if found.verdict == "refuted" and found.at is not None:
+            values = values_at(plant.uncertainty.box, found.at)
+            where = ", ".join(f"{name} = {value:.6g}" for name, value in values.items())
+            raise PreconditionError(
+                f"The plant is singular, or not of index 1, inside the box: at {where}. Give smaller tolerances.",
+                condition="regularity",
+            )
     if not plant.is_discrete:
         return _sampled_plan(design, bounds, noise_bound, initial_error, initial_set, observer_state, sample_time)
     affine = affine_plant(plant)
@@ -730,20 +733,6 @@ def _require_bounds(structure: ErrorStructure, bounds: FloatArray, plant: Descri
         names = ", ".join(plant.disturbance_names[i] for i in lacking)
         raise SpecError(
             f"No bound is given on {names}: give disturbance_bounds (--disturbance).", path="disturbance_bounds"
-        )
-
-
-def _require_regular(plant: DescriptorSystem) -> None:
-    """Refuse a box with a plant that is singular, or not of index 1."""
-    uncertain = plant.uncertainty
-    if uncertain is None or not uncertain.box.names:
-        return
-    found = index_one_on_box(plant)
-    if found.verdict == "refuted" and found.at is not None:
-        where = ", ".join(f"{name} = {value:.6g}" for name, value in values_at(uncertain.box, found.at).items())
-        raise PreconditionError(
-            f"The plant is singular, or not of index 1, inside the box: at {where}. Give smaller tolerances.",
-            condition="regularity",
         )
 
 

@@ -103,14 +103,6 @@ def _in_usual(values: FloatArray) -> FloatArray:
     return values / usual if usual > 0.0 else np.zeros_like(values)
 
 
-def without_events(rows: FloatArray, events: tuple[Event, ...]) -> FloatArray:
-    """Return rows ``(n, m)`` of which those of events are not known."""
-    left = rows.copy()
-    for event in events:
-        left[event.begun : event.ended + 1] = np.nan
-    return left
-
-
 def factors(
     statistics: Statistics, levels: FloatArray, others: Statistics, other_levels: FloatArray
 ) -> dict[str, float]:
@@ -623,7 +615,9 @@ def raised_levels(
     said = _usual_scores(scores, known) if found.statistics.estimates and scores is not None else None
     x = watched_rows(design, found, rows)
     events = events_of(x, found.columns, found.statistics, found.levels, said, found.centres)
-    left = without_events(rows, events)
+    left = rows.copy()
+    for event in events:
+        left[event.begun : event.ended + 1] = np.nan
     count = int(whole_rows(design, found, left).sum())
     others = found.pairs.others(found.every)
     if not events or count < LEAST_NORMAL or is_conformal(count, others) != is_conformal(found.rows, others):

@@ -393,7 +393,11 @@ class _Ordered:
     def __init__(self, values: FloatArray, every: float) -> None:
         self.streams = _apart(values)
         self.rows = int(np.atleast_2d(values)[:, SETTLING:].size)
-        self.order = _highest(self.streams, self._looked_at(every))
+        below, count = -self.streams, self._looked_at(every)
+        # The highest first; of equal ones the first comes first.  Only these need an order: the others are many.  What
+        # is no number is no less than any, and comes last.
+        places = np.flatnonzero(~(below > np.partition(below, count - 1)[count - 1]))
+        self.order = places[np.argsort(below[places], kind="stable")][:count]
 
     def _looked_at(self, every: float) -> int:
         return max(min(int(4 * HOLD * (self.rows / every)), self.rows), 1)
@@ -415,14 +419,6 @@ class _Ordered:
             middle = (low + high) // 2
             low, high = (middle, high) if alarms(middle) <= allowed else (low, middle)
         return float(self.streams[order[high - 1]])
-
-
-def _highest(values: FloatArray, count: int) -> NDArray[np.int64]:
-    """Return the places of so many highest values, the highest first; of equal ones the first comes first."""
-    below = -values
-    # Only these need an order: the others are many.  What is no number is no less than any, and comes last.
-    places = np.flatnonzero(~(below > np.partition(below, count - 1)[count - 1]))
-    return places[np.argsort(below[places], kind="stable")][:count]
 
 
 class Tail(NamedTuple):

@@ -175,11 +175,15 @@ class BetweenSamples:
             return np.zeros(steps), np.zeros(0)
         pieces = interval_pieces(plant.A, plant.Bd, self.into, self.dt)
         partial, whole = self._sums(pieces.columns, steps)
-        at = self._at_samples(plant.Dd, steps)
-        table = gathered(pieces, partial, count)[: max(steps - 1, 0)] + at[1][: max(steps - 1, 0)]
-        whole = rounded_up((gathered(pieces, whole, count) + at[2] + at[0]) * sizes, 6)
+        # What the values at the samples do: at once, by later samples, and by all.
+        above = np.zeros((len(plant.A), count))
+        now, later = np.vstack([above, self.first @ plant.Dd]), Ball.exact(np.vstack([above, self.second @ plant.Dd]))
+        at_once = column_norms(Ball.exact(self.direct) @ Ball.exact(plant.Dd) + Ball.exact(self.c) @ Ball.exact(now))
+        by_later, by_all = self._sums(self.M @ Ball.exact(now) + later, steps)
+        table = gathered(pieces, partial, count)[: max(steps - 1, 0)] + by_later[: max(steps - 1, 0)]
+        whole = rounded_up((gathered(pieces, whole, count) + by_all + at_once) * sizes, 6)
         earlier = np.vstack([np.zeros((1, count)), table])[:steps]
-        return np.asarray(rounded_up(np.sum((earlier + at[0]) * sizes, axis=1), count + 6)), np.asarray(whole)
+        return np.asarray(rounded_up(np.sum((earlier + at_once) * sizes, axis=1), count + 6)), np.asarray(whole)
 
     def of_process_noise(self, columns: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
         """Return the same for what is gathered in each sample, columns ``(n, m)`` of x of at most one each."""
@@ -188,13 +192,6 @@ class BetweenSamples:
         partial, whole = self._sums(self.into @ Ball.exact(columns), steps)
         earlier = np.vstack([np.zeros((1, columns.shape[1])), partial])[:steps]
         return np.asarray(np.sum(earlier, axis=1)), np.asarray(whole)
-
-    def _at_samples(self, dd: FloatArray, steps: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return what the values at the samples do: at once ``(nd,)``, by later samples, and by all."""
-        above = np.zeros((len(self.plant.A), dd.shape[1]))
-        now, later = np.vstack([above, self.first @ dd]), Ball.exact(np.vstack([above, self.second @ dd]))
-        at_once = column_norms(Ball.exact(self.direct) @ Ball.exact(dd) + Ball.exact(self.c) @ Ball.exact(now))
-        return at_once, *self._sums(self.M @ Ball.exact(now) + later, steps)
 
     def _sums(self, columns: Ball, steps: int) -> tuple[FloatArray, FloatArray]:
         if self.contraction is not None:
@@ -836,7 +833,16 @@ CORRELATION_LEFT, MOST_LAGS = 1e-9, 200_000
 
 def window_covariance(model: ResidualModel, window: int) -> FloatArray:
     """Return the covariance ``(window nr, window nr)`` of consecutive residuals in steady state, oldest first."""
-    reached = _felt(model)
+
+    def size(b: FloatArray, d: FloatArray) -> FloatArray:
+        return np.asarray(np.sqrt(np.abs(np.diag(output_covariance(model.A, b, model.C, d)))))
+
+    # By more than rounding: from most observers some are decoupled.
+    noise, sizes = size(model.Bw, model.Dw), np.where(np.isfinite(model.bounds), model.bounds, 1.0)
+    reached = [
+        bool(np.any(size(model.Bd[:, [j]] * largest, model.Dd[:, [j]] * largest) > NOTHING_FELT * noise))
+        for j, largest in enumerate(sizes)
+    ]
     if any(bool(hit) and not calm for hit, calm in zip(reached, model.steady, strict=True)):
         raise SpecError(
             "A disturbance that reaches the residual has a part that is not random or does not last: its covariance "
@@ -859,19 +865,6 @@ def _driving(model: ResidualModel) -> tuple[FloatArray, FloatArray, FloatArray]:
     b = np.hstack([model.Bd * model.deviations, model.Bw])
     d = np.hstack([model.Dd * model.deviations, model.Dw])
     return b, d, output_covariance(model.A, b, np.eye(len(model.A)), np.zeros((len(model.A), b.shape[1])))
-
-
-def _felt(model: ResidualModel) -> list[bool]:
-    """Return which disturbances reach the residual by more than rounding: from most observers some are decoupled."""
-
-    def size(b: FloatArray, d: FloatArray) -> FloatArray:
-        return np.asarray(np.sqrt(np.abs(np.diag(output_covariance(model.A, b, model.C, d)))))
-
-    noise, sizes = size(model.Bw, model.Dw), np.where(np.isfinite(model.bounds), model.bounds, 1.0)
-    return [
-        bool(np.any(size(model.Bd[:, [j]] * largest, model.Dd[:, [j]] * largest) > NOTHING_FELT * noise))
-        for j, largest in enumerate(sizes)
-    ]
 
 
 def whitener_of(covariance: FloatArray) -> FloatArray:

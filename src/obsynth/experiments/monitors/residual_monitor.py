@@ -180,6 +180,14 @@ def _whitened_rule(
     # A window that outlasts the scenario is refused before its covariance is factorised.
     first = settled(model, start, window)
     whitener, white = whitened(kind, model, window)
+    # Bonferroni's inequality over all looks (chi-square), or Ville's over all white sums.
+    table, looks, degrees = np.full(model.steps, np.inf), model.steps - first, len(whitener)
+    if kind == "chi-square":
+        table[first:] = chi_square_limit(degrees, false_alarms / looks)
+    else:
+        # Two signs for each component; a sum may start at every look.
+        sums = looks if white else looks * (looks + 1) / 2
+        table[first:] = math.log(2 * degrees * sums / false_alarms)
     return WhitenedRule(
         whitener,
         steady_mean(model),
@@ -188,7 +196,7 @@ def _whitened_rule(
         false_alarms=false_alarms,
         dt=dt,
         white=white,
-        table=_statistical(kind, model, len(whitener), first, false_alarms, white=white),
+        table=table,
     )
 
 
@@ -219,28 +227,6 @@ def bounds_of(design: ObserverDesign, model: ResidualModel, given: Mapping[str, 
             value, f"The bound of {name!r}", "a number, 0 or more", least=0.0, path="disturbance_bounds"
         )
     return bounds
-
-
-def _statistical(
-    kind: str,
-    model: ResidualModel,
-    degrees: int,
-    first: int,
-    false_alarms: float,
-    *,
-    white: bool,
-) -> FloatArray:
-    """Return thresholds by Bonferroni's inequality over all looks (chi-square), or Ville's over all white sums; they
-    are infinite before the ``first`` look."""
-    threshold = np.full(model.steps, np.inf)
-    looks = model.steps - first
-    if kind == "chi-square":
-        threshold[first:] = chi_square_limit(degrees, false_alarms / looks)
-    else:
-        # Two signs for each component; a sum may start at every look.
-        sums = looks if white else looks * (looks + 1) / 2
-        threshold[first:] = math.log(2 * degrees * sums / false_alarms)
-    return threshold
 
 
 def _floor(bench: Bench, plant: DescriptorSystem, scenario: Scenario, rows: slice) -> float:

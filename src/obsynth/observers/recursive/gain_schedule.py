@@ -184,20 +184,6 @@ class SteadyObserver(NamedTuple):
 def steady_observer(observer: RecursiveObserver) -> SteadyObserver:
     """Return the steady state of a recursive observer: its gains once the covariances have settled."""
     require_plain(observer, "A steady filter")
-    _require_constant(observer)
-    settled, steps = _settled(observer)
-    realisation, start = _realised(observer, settled)
-    radius = abscissa(realisation.Az, observer.dt)
-    if not radius < 1.0:
-        raise PreconditionError(
-            f"The steady filter is not stable (spectral radius {radius:.6g}): a mode is neither observable nor "
-            "damped, or the parameters are not excited in steady state. Run the recursion itself (obsynth run).",
-            condition="stable steady filter",
-        )
-    return SteadyObserver(realisation, read_only(start), steps)
-
-
-def _require_constant(observer: RecursiveObserver) -> None:
     sequences = {**observer.plant.matrices, "Q": observer.Q, "R": observer.R}
     moving = [name for name, sequence in sequences.items() if not sequence.is_constant]
     if moving:
@@ -212,6 +198,16 @@ def _require_constant(observer: RecursiveObserver) -> None:
             "use the recursion itself (obsynth run), or design without reset.",
             path="reset",
         )
+    settled, steps = _settled(observer)
+    realisation, start = _realised(observer, settled)
+    radius = abscissa(realisation.Az, observer.dt)
+    if not radius < 1.0:
+        raise PreconditionError(
+            f"The steady filter is not stable (spectral radius {radius:.6g}): a mode is neither observable nor "
+            "damped, or the parameters are not excited in steady state. Run the recursion itself (obsynth run).",
+            condition="stable steady filter",
+        )
+    return SteadyObserver(realisation, read_only(start), steps)
 
 
 def _settled(observer: RecursiveObserver) -> tuple[GainStep, int]:

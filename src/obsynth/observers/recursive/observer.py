@@ -124,30 +124,25 @@ def stacked_noise(first: FloatArray, second: FloatArray) -> FloatArray:
     return noise
 
 
-def require_in_range(S: FloatArray, factor: FloatArray, k: int, state_names: Sequence[str]) -> None:
-    """Raise `PreconditionError` when deviations outgrow double precision on the way to sample ``k``."""
-    if float(np.max(np.abs(S), initial=0.0)) < OUTGROWN:
-        return
-    sizes = np.max(np.abs(np.nan_to_num(factor[: len(state_names)])), axis=1, initial=0.0)
-    names = leading_names(sizes, state_names)
-    raise PreconditionError(
-        f"The errors outgrow double precision at k = {k}: they grow in states that the outputs do not observe, or not "
-        "often enough: "
-        f"{', '.join(map(repr, names))}. Measure more, shorten the horizon, or leave these states out.",
-        condition="bounded errors",
-        signals=names,
-    )
-
-
 def spreads(
     step: StepMatrices, factor: FloatArray, diffuse: FloatArray, k: int, state_names: Sequence[str]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a root ``(rows, any)`` of the covariance of a step's data, and what is unknown in them ``(rows, r)``."""
+    """Return a root ``(rows, any)`` of the covariance of a step's data on the way to sample ``k``, and what is unknown
+    in them ``(rows, r)``; raise `PreconditionError` where deviations outgrow double precision."""
     ne, rows, width = len(step.A), len(step.H), factor.shape[1]
     S = np.zeros((rows, max(width + step.noise.shape[1], rows)))
     S[:ne, :width] = step.A @ factor
     S[:, width : width + step.noise.shape[1]] = step.noise
-    require_in_range(S, factor, k, state_names)
+    if not float(np.max(np.abs(S), initial=0.0)) < OUTGROWN:
+        sizes = np.max(np.abs(np.nan_to_num(factor[: len(state_names)])), axis=1, initial=0.0)
+        names = leading_names(sizes, state_names)
+        raise PreconditionError(
+            f"The errors outgrow double precision at k = {k}: they grow in states that the outputs do not observe, or "
+            f"not often enough: {', '.join(map(repr, names))}. Measure more, shorten the horizon, or leave these "
+            "states out.",
+            condition="bounded errors",
+            signals=names,
+        )
     return S, np.vstack([step.A @ diffuse, np.zeros((rows - ne, diffuse.shape[1]))])
 
 
@@ -917,12 +912,6 @@ def _products(matrices: FloatArray, rows: FloatArray) -> FloatArray:
     return np.asarray(np.matmul(matrices, rows[:, :, None])[:, :, 0])
 
 
-def _triangles(noise: FloatArray) -> FloatArray:
-    """Return the triangular factors ``(., rows, rows)`` of rotated noise ``(., any, rows)``."""
-    found, rows = np.asarray(np.linalg.qr(noise, mode="r")), noise.shape[2]
-    return np.pad(found, ((0, 0), (0, rows - found.shape[1]), (0, 0)))
-
-
 def stacked_steps(
     step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
@@ -944,7 +933,9 @@ def stacked_steps(
     # The transpose of a rotation: parity first.
     turned = np.concatenate((orthogonal[:, :, n:], orthogonal[:, :, :n]), axis=2)
     moved = np.matmul(step.A.transpose(0, 2, 1), turned[:, :ne])
-    known = _triangles(np.matmul(step.noise.transpose(0, 2, 1), turned))
+    # The triangular factors of the rotated noise.
+    known = np.asarray(np.linalg.qr(np.matmul(step.noise.transpose(0, 2, 1), turned), mode="r"))
+    known = np.pad(known, ((0, 0), (0, rows - known.shape[1]), (0, 0)))
     right = np.concatenate((_products(step.B, before), y, _products(step.Dn, u)), axis=1)
     data = _products(turned.transpose(0, 2, 1), right)
     head, data = np.ascontiguousarray(triangle[:, :n]), np.ascontiguousarray(data[:count])
@@ -1003,7 +994,9 @@ def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> Estimate
         "innovations": np.full((samples, rows), np.nan),
         "nis_degrees": np.zeros(samples),
     }
-    stretches = _complete_stretches(y)
+    # For each sample, how many complete ones begin with it.
+    missing = np.flatnonzero(np.isnan(y).any(axis=1))
+    stretches = np.append(missing, samples)[np.searchsorted(missing, np.arange(samples))] - np.arange(samples)
     pause, patience = 1, 1
     k = 0
     while k < samples:
@@ -1046,13 +1039,6 @@ def _fill(record: dict[str, FloatArray], kept: slice, *parts: FloatArray) -> Non
         record[name][kept] = part
     record["innovations"][kept, : parts[4].shape[-1]] = parts[4]
     record["nis_degrees"][kept] = parts[4].shape[-1]
-
-
-def _complete_stretches(y: FloatArray) -> FloatArray:
-    """Return, for each sample, how many complete ones begin with it."""
-    missing = np.flatnonzero(np.isnan(y).any(axis=1))
-    after = np.append(missing, len(y))[np.searchsorted(missing, np.arange(len(y)))]
-    return np.asarray(after - np.arange(len(y)))
 
 
 def _kernel_steps(
