@@ -69,7 +69,11 @@ def test_a_threshold_that_begins_next_to_zero_does_not_stretch_the_picture(wang)
     found = obsynth.monitor(design, scenario).watch(simulation.estimates)
     limit = np.where(np.arange(len(found.threshold)) < 2, 5e-324, found.threshold)
     panel = plot_detection(replace(found, threshold=limit), dt=1.0)
-    assert panel.get_ylim()[0] == pytest.approx(np.median(limit) / 1000.0)
+    assert panel.get_ylim() == pytest.approx((np.median(limit) / 1000.0, 2.0 * found.values.max()))
+    # Without disturbances a threshold decays below what rounding leaves of the residual.
+    falling = np.maximum(10.0 ** -np.arange(len(limit), dtype=float), 5e-324)
+    panel = plot_detection(replace(found, threshold=falling), dt=1.0)
+    assert panel.get_ylim()[0] == np.finfo(float).eps * found.values.max()
 
 
 def test_the_papers_threshold_says_what_it_is_not(wang) -> None:

@@ -408,6 +408,8 @@ _BAND_LINE = {"color": "0.7", "linewidth": 0.6, "linestyle": "-", "zorder": 1.8}
 _TRUTH_ON_BAND = {"color": "black", "linewidth": 1.8, "zorder": 2.5}
 #: Decades that a logarithmic axis shows below the lowest threshold.
 DECADES_BELOW = 3
+#: Its axis ends at so many times the largest statistic, or the usual threshold.
+ROOM_ABOVE = 2.0
 
 
 @arguments_checked
@@ -504,8 +506,10 @@ def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None)
     if np.any(~np.isnan(shown)):
         panel.set_yscale("log")
         if deciding.any():
-            # An adaptive threshold may begin next to zero: its least value says nothing about the picture.
-            panel.set_ylim(bottom=float(np.median(detection.threshold[deciding])) * 10.0**-DECADES_BELOW)
+            # An adaptive threshold may begin next to zero, one without disturbances ends there: at rounding level.
+            usual, most = float(np.median(detection.threshold[deciding])), float(np.nanmax(shown))
+            least = max(usual * 10.0**-DECADES_BELOW, float(np.finfo(np.float64).eps) * most)
+            panel.set_ylim(least, ROOM_ABOVE * max(most, usual))
     if detection.k is not None:
         blamed = f": {detection.fault}" if detection.fault else ""
         mark(panel, time[detection.k], detection.values[detection.k], f"alarm at {detection.time:g} s{blamed}")
