@@ -59,23 +59,32 @@ from obsynth.files.outputs import (
     made_folder,
     protect,
     protect_stream,
+    read_json,
     require_distinct,
     write_atomically,
     write_together,
 )
 from obsynth.files.tables import text_table
+from obsynth.methods.registry import AUTO, REGISTRY, method_class
+from obsynth.numerics.libraries import failure_of
+from obsynth.plants.noise_model import offset_state
 from obsynth.results.design import (
     CALIBRATION_KIND,
     GAIN_SET,
     RESULT_FILE,
+    RESULTS,
     box_row,
+    calibration_text,
     design_as_dict,
     gain_set_bytes,
     place_of,
+    plain,
     restored,
+    unverified_mark,
     verify_calibration,
     written_for,
 )
+from obsynth.spec.loader import design_of_spec, load_model, load_plant, read_yaml
 
 if TYPE_CHECKING:
     from obsynth.analysis.structure import Structure
@@ -83,8 +92,6 @@ if TYPE_CHECKING:
 
 def run_design(options: argparse.Namespace) -> int:
     """Run ``design``: spec in, report and gain set out."""
-    from obsynth.spec.loader import design_of_spec
-
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
         spec = obsynth.load_spec(options.system)
@@ -141,8 +148,6 @@ def designed_or_loaded(
 ) -> obsynth.ObserverDesign:
     """Return the design that a spec asks for, or a saved one of the same plant, verified again."""
     if gains is None:
-        from obsynth.spec.loader import design_of_spec
-
         return design_of_spec(spec, progress=report_stage)
     design, _ = gains_to_hand_on(gains, unverified=unverified)
     require_same_signals(design, gains, spec)
@@ -182,8 +187,6 @@ def run_check(options: argparse.Namespace) -> int:
     """Run ``check``: structure, and the existence conditions of every method."""
     spec = obsynth.load_spec(options.system)
     _ask(spec)
-    from obsynth.methods.registry import AUTO
-    from obsynth.numerics.libraries import failure_of
     from obsynth.report.tables import check_report, diagnosis_report, is_unclear, print_methods
 
     if not isinstance(spec.plant, obsynth.DescriptorSystem):
@@ -257,8 +260,6 @@ def _structure_as_dict(structure: Structure) -> dict[str, Any]:
 
 def run_sensors(options: argparse.Namespace) -> int:
     """Run ``sensors``: spec in, least sets of sensors to add out; 3 where nothing reaches the goal."""
-    from obsynth.analysis.transformations.linear_plants import linear_plant
-
     with progress(quiet=options.quiet) as report_stage:
         spec = obsynth.load_spec(options.system)
         plant = linear_plant(spec.plant)
@@ -282,7 +283,6 @@ def run_verify(options: argparse.Namespace) -> int:
     """Run ``verify``: recheck any certificate, without a solver, to the end of what it rests on."""
     from obsynth.comparison.certificates import kind_of_file, verify_certificate
     from obsynth.experiments.alarm_proof import ALARM_KIND
-    from obsynth.results.design import RESULTS
 
     options.gains = options.gains or options.file
     # A pipe would keep us waiting; who reads a gain set says what is wrong with it.
@@ -331,9 +331,6 @@ def _require_fitting(options: argparse.Namespace, kind: str) -> None:
 
 def _calibrated_again(options: argparse.Namespace) -> dict[str, Any]:
     """Return what the same calibration of the given plant and log comes to."""
-    from obsynth.files.outputs import read_json
-    from obsynth.spec.loader import load_plant
-
     plant, _ = load_plant(options.system)
     asked = read_json(options.gains).get("asked")
     if not isinstance(asked, dict):
@@ -553,10 +550,10 @@ _LATER = (0.0, 0.1, 0.25, 0.5, 0.95)
 
 def certificate_target(options: argparse.Namespace) -> Path | None:
     """Return where ``run --prove`` writes its certificate; refuse what cannot be proved before any work is done."""
-    if options.prove is None:
-        return None
     from obsynth.experiments.alarm_proof import CERTIFICATE
 
+    if options.prove is None:
+        return None
     if options.monitor != "pointwise":
         raise SpecError("--prove is for alarms of --monitor pointwise.", path="--prove")
     if options.data == STREAM or options.state is not None:
@@ -783,7 +780,6 @@ def run_report(options: argparse.Namespace) -> int:
         own = ("gains", "unverified", "system", "out", "force", "json")
         refuse_given(options, [name for name in vars(options) if name not in own], "a log: give --data")
     from obsynth.report.page import PAGE, html_report
-    from obsynth.results.design import unverified_mark
 
     scenario = None if options.system is None else required_scenario(obsynth.load_spec(options.system))
     system = None if options.system is None else str(options.system)
@@ -959,7 +955,7 @@ def _run_tolerances(options: argparse.Namespace) -> int:
     if target is not None and _is_json(target):
         found.save(target)
     elif target is not None:
-        from obsynth.plotting.trade_off import plot_tolerances
+        from obsynth.plotting.estimates import plot_tolerances
 
         written_picture(target, 2, lambda axes: plot_tolerances(found, axes=axes))
     answer(
@@ -1121,9 +1117,6 @@ def _require_claim(options: argparse.Namespace, parameters: dict[str, list[Any]]
     """Refuse a claim that no method of a sweep can make before anything is designed."""
     if options.claim is None:
         return
-    from obsynth.methods.registry import REGISTRY, method_class
-    from obsynth.spec.loader import read_yaml
-
     methods = list(parameters.get("method.id", ()))
     for section in parameters.get("method", [read_yaml(Path(spec)).get("method") for spec in options.system]):
         methods.append(section.get("id") if isinstance(section, dict) else None)
@@ -1355,7 +1348,6 @@ def _log_arguments(options: argparse.Namespace) -> dict[str, Any]:
 def run_linearise(options: argparse.Namespace) -> int:
     """Run ``linearise``: spec or plant in, matrices and operating point out."""
     from obsynth.report.tables import linear_plant_text, plant_document
-    from obsynth.spec.loader import load_model
 
     model, spec = load_model(options.system)
     if options.data is None:
@@ -1409,8 +1401,6 @@ def run_linearise(options: argparse.Namespace) -> int:
 def run_calibrate(options: argparse.Namespace) -> int:
     """Run ``calibrate``: spec and log in, constants with their box and a verdict out."""
     from obsynth.calibration.spec_writing import CALIBRATED_SPEC, calibrated_spec
-    from obsynth.results.design import CALIBRATION_KIND, calibration_text, plain
-    from obsynth.spec.loader import load_plant
 
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
@@ -1478,8 +1468,6 @@ def _asked(spec: obsynth.Spec | None, options: argparse.Namespace) -> dict[str, 
 
 def _without_offsets(stated: Any, spec: obsynth.Spec) -> Any:
     """Return what is said of a start without the offsets that another log has shown: this log shows its own."""
-    from obsynth.plants.noise_model import offset_state
-
     offsets = {offset_state(name) for name in (spec.noise or {}).get("offset") or ()}
     if not (offsets and isinstance(stated, Mapping)):
         return stated

@@ -29,9 +29,9 @@ from obsynth.experiments.alarm_proof import (
     statement_of,
 )
 from obsynth.experiments.assumptions import Log, file_digest
-from obsynth.experiments.monitors.guaranteed import is_guaranteed
 from obsynth.experiments.monitors.options import WINDOW
 from obsynth.files.outputs import path_of
+from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import FloatArray, arguments_checked, is_whole, whole_number

@@ -30,7 +30,7 @@ from obsynth.data.stuck_sensors import stuck_rows, stuck_texts, without_repeats
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions
 from obsynth.experiments.monitors.adaptive import NO_TOLERANCE, noisy_design, over_box, tolerances_of
-from obsynth.experiments.monitors.guaranteed import data_monitor, is_guaranteed
+from obsynth.experiments.monitors.guaranteed import data_monitor
 from obsynth.experiments.monitors.learned import (
     LEAST_NORMAL,
     NO_PAIRS,
@@ -80,6 +80,7 @@ from obsynth.experiments.monitors.rules import (
     gap_growth,
     parameter_monitor,
 )
+from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.numerics.arguments import FloatArray, Seed, arguments_checked, is_finite_number
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver

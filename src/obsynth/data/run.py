@@ -42,7 +42,6 @@ from obsynth.data.log_observers import (
 from obsynth.data.sources import CHUNK_ROWS, TIME_HEADER, Data, Signals, Stamps, check_suffix, chunks, samples
 from obsynth.data.stuck_sensors import RepeatedValues, stuck_texts
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.experiments.monitors.guaranteed import is_guaranteed
 from obsynth.experiments.monitors.learned import LearnedRule, as_learned
 from obsynth.experiments.monitors.learned_levels import HOLD
 from obsynth.experiments.monitors.monitor import LinearSample, Monitor, Sample
@@ -58,6 +57,7 @@ from obsynth.files.outputs import (
     write_atomically,
 )
 from obsynth.files.tables import table_writer
+from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.windows import rows_before
 from obsynth.numerics.arguments import (

@@ -27,11 +27,12 @@ from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.experiments.assumptions import Assumptions, Log
 from obsynth.experiments.monitors.adaptive import start_of
-from obsynth.experiments.monitors.guaranteed import is_guaranteed, refuse_bounds
+from obsynth.experiments.monitors.guaranteed import refuse_bounds
 from obsynth.experiments.monitors.options import WINDOW
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.guaranteed_test.checks import while_inside
 from obsynth.methods.guaranteed_test.exact import Programmes
+from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.guaranteed_test.proofs import (
     columns_of_exact,
     down,

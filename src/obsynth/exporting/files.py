@@ -38,7 +38,7 @@ from obsynth.exporting.c_source import (
 )
 from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.methods.guaranteed_test.checks import groups_of, is_bank
-from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
+from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.numerics.arguments import FloatArray, arguments_checked
 from obsynth.observers.dae.observer import DAEObserver
@@ -118,7 +118,7 @@ def float_error(found: Realisation) -> str:
 
 def require_fixed(design: ObserverDesign, suffix: str) -> None:
     """Raise `SpecError` for tests that solve programmes at each row, which no export holds."""
-    if design.method != GuaranteedTestMethod.id:
+    if not is_guaranteed(design):
         return
     if isinstance(design.observer, WindowObserver):
         raise SpecError(
@@ -151,7 +151,7 @@ def _require_about_zero(design: ObserverDesign) -> None:
 
 def is_window(design: ObserverDesign) -> bool:
     """Whether a design is nothing but tests on windows, without an observer of the state beside."""
-    return design.method == GuaranteedTestMethod.id and not design.linear[1].state_names
+    return is_guaranteed(design) and not design.linear[1].state_names
 
 
 def window_c_texts(found: Realisation, prefix: str, header: str) -> tuple[str, str]:

@@ -200,36 +200,30 @@ def _parity(q2: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray, Floa
 
 def _pivoted(matrix: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
     """Return Q ``(rows, rows)``, R and the order of columns of ``matrix (rows, any)``: LAPACK's QR with pivoting."""
-    from obsynth.numerics.lapack import dgeqp3, dorgqr
-
     rows, columns = matrix.shape
     if not matrix.size:
         return np.eye(rows), np.empty_like(matrix), np.arange(columns)
-    packed, order, tau, _, _ = dgeqp3(_finite(matrix), lwork=WORK * (columns + 1))
+    packed, order, tau, _, _ = lapack.dgeqp3(_finite(matrix), lwork=WORK * (columns + 1))
     reflections = min(rows, columns)
     whole = np.empty((rows, rows), order="F")
     whole[:, :reflections] = packed[:, :reflections]
-    return dorgqr(whole, tau, lwork=WORK * rows, overwrite_a=1)[0], np.triu(packed), order - 1
+    return lapack.dorgqr(whole, tau, lwork=WORK * rows, overwrite_a=1)[0], np.triu(packed), order - 1
 
 
 def _triangle(matrix: FloatArray) -> FloatArray:
     """Return R of the QR factorisation of a matrix, with as many rows as that has."""
-    from obsynth.numerics.lapack import dgeqrf
-
-    return np.triu(dgeqrf(_finite(matrix), lwork=WORK * matrix.shape[1])[0])
+    return np.triu(lapack.dgeqrf(_finite(matrix), lwork=WORK * matrix.shape[1])[0])
 
 
 def _substituted(triangle: FloatArray, right: FloatArray, *, lower: bool = False) -> FloatArray:
     """Return ``triangle^-1 right`` of a triangle without zeros on its diagonal, upper or ``lower``."""
-    from obsynth.numerics.lapack import dtrtrs
-
     if not right.size:
         return np.zeros(right.shape)
     _finite(right)
     if triangle.flags.f_contiguous:
-        return np.asarray(dtrtrs(_finite(triangle), right, lower=lower)[0])
+        return np.asarray(lapack.dtrtrs(_finite(triangle), right, lower=lower)[0])
     # LAPACK reads rows as columns: the transposed triangle, transposed.
-    return np.asarray(dtrtrs(_finite(triangle).T, right, lower=not lower, trans=1)[0])
+    return np.asarray(lapack.dtrtrs(_finite(triangle).T, right, lower=not lower, trans=1)[0])
 
 
 def _finite(matrix: FloatArray) -> FloatArray:

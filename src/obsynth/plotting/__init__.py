@@ -19,8 +19,9 @@ if TYPE_CHECKING:
         plot_residuals,
         plot_simulation,
         plot_states,
+        plot_tolerances,
     )
-    from obsynth.plotting.trade_off import estimate_gains, plot_gains, plot_poles, plot_tolerances, plot_trade_off
+    from obsynth.plotting.trade_off import estimate_gains, plot_gains, plot_poles, plot_trade_off
 
 __all__ = [
     "estimate_gains",
@@ -46,9 +47,10 @@ _PICTURE_HOMES = {
     for module, names in {
         "estimates": (
             "plot_data plot_decision plot_detection plot_faults plot_hidden_course plot_intervals "
-            "plot_least_thresholds plot_parameters plot_residuals plot_simulation plot_states"
+            "plot_least_thresholds plot_parameters plot_residuals plot_simulation plot_states "
+            "plot_tolerances"
         ),
-        "trade_off": "estimate_gains plot_gains plot_poles plot_tolerances plot_trade_off",
+        "trade_off": "estimate_gains plot_gains plot_poles plot_trade_off",
     }.items()
     for name in names.split()
 }

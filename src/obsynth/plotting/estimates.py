@@ -22,6 +22,7 @@ from obsynth.data.run import DataRun
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.monitor import Detection
 from obsynth.experiments.simulation import Simulation
+from obsynth.experiments.tolerance_study import ADAPTIVE, FIXED, ToleranceStudy
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.numerics.arguments import FloatArray, arguments_checked, as_matrix, real_array
 from obsynth.observers.decisions import Decision
@@ -35,6 +36,7 @@ from obsynth.plotting.panels import (
     RESIDUAL_STYLE,
     THRESHOLD_STYLES,
     TRUE_STYLE,
+    WIDE_AXIS,
     WIDTH,
     finish,
     label_time,
@@ -923,3 +925,52 @@ def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes
         )
     panel.axhline(0.0, color="0.4", linewidth=0.8)
     return finish(panel, "relative to its largest value", below="time (s)")
+
+
+_MONITORS: tuple[dict[str, Any], ...] = (
+    {"label": FIXED, "color": "tab:red", "linestyle": "--", "marker": "x"},
+    {"label": ADAPTIVE, "color": "black", "linestyle": "-", "marker": "o"},
+)
+
+
+@arguments_checked
+def plot_tolerances(study: ToleranceStudy, *, axes: Iterable[Axes] | None = None) -> list[Axes]:
+    """Plot false alarms, and the least fault that is found in every run, against the tolerance.
+
+    Parameters
+    ----------
+    study : ToleranceStudy
+        From `obsynth.tolerance_study`.
+    axes : iterable of Axes, optional
+        Two; new ones, one above the other, by default.
+
+    Returns
+    -------
+    list of Axes
+        The fixed bound beside the adaptive threshold: false alarms above, least faults below; a monitor that tells no
+        fault at some tolerance has no point there.
+
+    Raises
+    ------
+    SpecError
+        The argument is something else, or there are too few or too many axes.
+    """
+    panels = new_panels(axes, 2, size=(WIDTH, 2.0 * PANEL_HEIGHT + 0.8))
+    unit = f" ({study.unit})" if study.unit else ""
+    labels = ("runs with a\nfalse alarm (%)", f"least {study.fault}\nfound in every run{unit}")
+    across = 100.0 * study.tolerances
+    least = np.where(np.isfinite(study.least_faults), study.least_faults, np.nan)
+    for panel, values, label in zip(panels, (100.0 * study.false_alarms, least), labels, strict=True):
+        for j, style in enumerate(_MONITORS):
+            panel.plot(across, values[:, j], linewidth=1.2, markersize=5.0, **style)
+        panel.set_ylabel(label)
+        legend_above(panel)
+        tidy(panel)
+    panels[0].set_ylim(-4.0, 104.0)
+    known = least[np.isfinite(least)]
+    if known.size and known.max() > WIDE_AXIS * known.min():
+        plain_decades(panels[1])
+    else:
+        panels[1].set_ylim(bottom=0.0)
+    panels[-1].set_xlabel("largest tolerance of a constant (%)")
+    return panels

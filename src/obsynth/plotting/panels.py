@@ -221,6 +221,10 @@ def with_unit(name: str, units: Mapping[str, str] | None) -> str:
     return f"{name} ({unit})" if unit and unit != "1" else name
 
 
+#: From this ratio of largest to smallest on, an axis is logarithmic.
+WIDE_AXIS = 10.0
+
+
 def plain_decades(panel: Axes, *, across: bool = False) -> None:
     """Give an axis, vertical or ``across``, a logarithmic scale, with plain numbers at 1, 2 and 5 where it is short."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator

@@ -25,19 +25,15 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from obsynth.analysis.diagnosis.diagnosing import Diagnosis
 from obsynth.analysis.diagnosis.fault_columns import dc_point, others, question
 from obsynth.analysis.structure import Structure, questions
 from obsynth.analysis.transformations.linear_plants import StateRecovery
 from obsynth.errors import ObsynthError, PreconditionError
-from obsynth.experiments.monitors.guaranteed import is_guaranteed
-from obsynth.experiments.monitors.monitor import Monitor
-from obsynth.experiments.monte_carlo import Evaluation, Interval
-from obsynth.experiments.simulation import Simulation
 from obsynth.files.outputs import yaml_text
 from obsynth.files.tables import html_table
 from obsynth.methods.automatic import SETTLING_SAMPLES, FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.kalman_gain import DelayCurve, delay_curve, settling_time
+from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.decisions import ParameterMonitor
 from obsynth.observers.linear.observer import SETTLED_TO, LinearObserver, WindowObserver, sample_observer, transient
@@ -60,7 +56,11 @@ from obsynth.results.layout import (
 from obsynth.verification.plant import PLANT_MATRICES
 
 if TYPE_CHECKING:
+    from obsynth.analysis.diagnosis.diagnosing import Diagnosis
     from obsynth.comparison.comparing import Comparison
+    from obsynth.experiments.monitors.monitor import Monitor
+    from obsynth.experiments.monte_carlo import Evaluation, Interval
+    from obsynth.experiments.simulation import Simulation
 
 
 def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
@@ -864,7 +864,7 @@ def _worst(title: str, rows: list[Any], size: Callable[[Any], float]) -> tuple[s
 
 def described(monitor: Monitor | ParameterMonitor) -> tuple[str, str]:
     """Return which monitor it is, and what its threshold means."""
-    if isinstance(monitor, Monitor):
+    if not isinstance(monitor, ParameterMonitor):
         return monitor.kind, monitor.statement
     return monitor.statistic, (
         "of a decision on parameters, passed in a run without a change with about the stated probability "
@@ -874,7 +874,7 @@ def described(monitor: Monitor | ParameterMonitor) -> tuple[str, str]:
 
 def final_threshold(monitor: Monitor | ParameterMonitor) -> float | None:
     """Return the threshold at the end of a run; ``None`` where it is not the same in each run, or decides nothing."""
-    if not isinstance(monitor, Monitor) or not monitor.threshold.size or not np.isfinite(monitor.threshold[-1]):
+    if isinstance(monitor, ParameterMonitor) or not monitor.threshold.size or not np.isfinite(monitor.threshold[-1]):
         return None
     return float(monitor.threshold[-1])
 

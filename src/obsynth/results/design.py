@@ -25,7 +25,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from obsynth.analysis.transformations.linear_plants import RecoveryOperator, StateRecovery, Transformation
+from obsynth.analysis.transformations.linear_plants import (
+    RecoveryOperator,
+    StateRecovery,
+    Transformation,
+    discretise,
+    eliminate_algebraic_states,
+)
 from obsynth.errors import SpecError, VerificationError
 from obsynth.extensions import extension
 from obsynth.files.outputs import FileKind, input_file, json_data, path_of, read_json, write_atomically
@@ -38,19 +44,16 @@ from obsynth.numerics.arguments import (
     read_only,
     require_kind,
 )
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.linear.observer import LinearObserver, WindowObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import LONGEST_DELAY
 from obsynth.plants.dae import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem, listed
+from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem, listed
 from obsynth.results.checks import Check, all_hold, information, nothing_wrong
 
 if TYPE_CHECKING:
     import control
-
-    from obsynth.observers.dae.observer import DAEObserver
-    from obsynth.observers.linear.observer import WindowObserver
-    from obsynth.observers.recursive.observer import RecursiveObserver
-    from obsynth.plants.descriptor import TimeVaryingDescriptorSystem
 
 
 GAIN_SET_VERSION = 2
@@ -141,22 +144,13 @@ def _body_of(design: Any) -> dict[str, Any]:
 
 
 def types_of(kind: str | None) -> tuple[Any, Any]:
-    """Return the types of plant and observer of a kind; only those asked for are loaded."""
-    if kind == "recursive":
-        from obsynth.observers.recursive.observer import RecursiveObserver
-        from obsynth.plants.descriptor import TimeVaryingDescriptorSystem
-
-        return TimeVaryingDescriptorSystem, RecursiveObserver
-    if kind == "window":
-        from obsynth.observers.linear.observer import WindowObserver
-        from obsynth.plants.descriptor import TimeVaryingDescriptorSystem
-
-        return TimeVaryingDescriptorSystem, WindowObserver
-    if kind == "dae":
-        from obsynth.observers.dae.observer import DAEObserver
-
-        return DAEModel, DAEObserver
-    return DescriptorSystem, LinearObserver
+    """Return the types of plant and observer of a kind."""
+    others: dict[str | None, tuple[Any, Any]] = {
+        "recursive": (TimeVaryingDescriptorSystem, RecursiveObserver),
+        "window": (TimeVaryingDescriptorSystem, WindowObserver),
+        "dae": (DAEModel, DAEObserver),
+    }
+    return others.get(kind, (DescriptorSystem, LinearObserver))
 
 
 def _tag(design: Any) -> dict[str, str]:
@@ -337,8 +331,6 @@ class PlantSource:
     @cached_property
     def derived(self) -> Transformation:
         """The elimination, and the sampling where there was one, done again; once for all checks."""
-        from obsynth.analysis.transformations.linear_plants import discretise, eliminate_algebraic_states
-
         if self.sample_time is None:
             return eliminate_algebraic_states(self.plant)
         return discretise(self.plant, self.sample_time)
@@ -346,8 +338,6 @@ class PlantSource:
     @cached_property
     def smooth(self) -> DescriptorSystem:
         """The plant without its algebraic states, before it is sampled; made once for all checks."""
-        from obsynth.analysis.transformations.linear_plants import eliminate_algebraic_states
-
         return eliminate_algebraic_states(self.plant).plant
 
     def as_dict(self) -> dict[str, Any]:
@@ -487,9 +477,6 @@ class ObserverDesign:
         SpecError
             The design is a linear time-invariant one.
         """
-        from obsynth.observers.recursive.observer import RecursiveObserver
-        from obsynth.plants.descriptor import TimeVaryingDescriptorSystem
-
         return self._parts(TimeVaryingDescriptorSystem, RecursiveObserver, "recursive observer")
 
     @property
@@ -501,8 +488,6 @@ class ObserverDesign:
         SpecError
             The design is for a linear plant.
         """
-        from obsynth.observers.dae.observer import DAEObserver
-
         return self._parts(DAEModel, DAEObserver, "observer of a nonlinear plant")
 
     def _parts(self, plant: type[OfPlant], observer: type[OfObserver], what: str) -> tuple[OfPlant, OfObserver]:
@@ -587,7 +572,6 @@ class ObserverDesign:
     def _constant_observer(self) -> LinearObserver:
         """Return the observer, of a recursive design its steady state."""
         from obsynth.observers.recursive.gain_schedule import steady_observer
-        from obsynth.observers.recursive.observer import RecursiveObserver
 
         if isinstance(self.observer, RecursiveObserver):
             return steady_observer(self.observer).observer

@@ -28,6 +28,7 @@ import numpy as np
 from obsynth.analysis.transformations.linear_plants import Transformation, discretise, eliminate_algebraic_states
 from obsynth.errors import SpecError, a_kind
 from obsynth.files.outputs import input_file, path_of, read_json, read_text
+from obsynth.methods.registry import AUTO, REGISTRY, method_class
 from obsynth.numerics.arguments import (
     MAXIMUM_ENTRIES,
     FloatArray,
@@ -188,7 +189,6 @@ class DocumentProblems:
 
 def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocument, dict[str, Any]]:
     """Check a whole spec, and the options of its method."""
-    from obsynth.methods.registry import AUTO, REGISTRY, method_class
     from obsynth.spec.schema import options_schema
 
     problems = DocumentProblems(source, what="spec")
@@ -239,7 +239,6 @@ def _checked_sections(document: Mapping[str, Any], problems: DocumentProblems) -
 
 def _options_of_any(given: dict[str, Any], source: Path) -> dict[str, Any]:
     """Return options as the first method reads them that has them all; `auto` decides between those that do."""
-    from obsynth.methods.registry import REGISTRY
     from obsynth.spec.schema import options_schema
 
     if not given:
@@ -419,13 +418,12 @@ def _wanted(kind: str, context: Mapping[str, Any]) -> str:
 def _known_keys(location: Sequence[str | int]) -> list[str]:
     """Return the keys that the section around the last part of ``location`` may have."""
     from obsynth.spec import schema
-    from obsynth.spec.schema import MatrixFile, TransformSection
 
     sections: dict[str, type[BaseModel]] = {
-        "<file>": MatrixFile,
+        "<file>": schema.MatrixFile,
         "<one>": schema.ProfileSection,
         "method": schema.MethodSection,
-        "transform": TransformSection,
+        "transform": schema.TransformSection,
     }
     if "<pick>" in location:
         return ["outputs" if {"C", "Df", "Dd"} & set(location) else "states", "file"]
@@ -1231,8 +1229,6 @@ def _noisy_model(
 
 def _with_options(options: Mapping[str, Any], more: Mapping[str, Any], method: str) -> dict[str, Any]:
     """Return options with others that the method has, where they are not given; of those by name, what is missing."""
-    from obsynth.methods.registry import REGISTRY, method_class
-
     known = {field.name for field in fields(method_class(method))} if method in REGISTRY else set()
     found = dict(options)
     for name, value in more.items():

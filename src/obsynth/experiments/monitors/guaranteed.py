@@ -29,11 +29,6 @@ from obsynth.tolerances.robustness import with_tolerances
 STATED_BY_DESIGN = ("disturbance_bounds", "noise_bound", "initial_error", "gamma")
 
 
-def is_guaranteed(design: ObserverDesign) -> bool:
-    """Whether a design brings its own threshold."""
-    return design.method == GuaranteedTestMethod.id
-
-
 def refuse_bounds(given: Mapping[str, Any]) -> None:
     """Raise `SpecError` where bounds are given for a guaranteed test: those of its design count."""
     # The command line gives a mapping without entries where nothing is stated.

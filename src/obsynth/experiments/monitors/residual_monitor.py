@@ -15,7 +15,7 @@ from obsynth.experiments.monitors.adaptive import (
     over_box,
     tolerances_of,
 )
-from obsynth.experiments.monitors.guaranteed import is_guaranteed, record_monitor
+from obsynth.experiments.monitors.guaranteed import record_monitor
 from obsynth.experiments.monitors.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
 from obsynth.experiments.monitors.options import LINEAR_OPTIONS, checked_options
 from obsynth.experiments.monitors.residual_model import (
@@ -33,6 +33,7 @@ from obsynth.experiments.monitors.residual_model import (
 )
 from obsynth.experiments.monitors.rules import NormRule, WhitenedRule
 from obsynth.experiments.simulation import Bench, make_bench
+from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.numerics.arguments import FloatArray, arguments_checked, chosen, real_number
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.outliers import chi_square_limit

@@ -254,3 +254,8 @@ class GuaranteedTestMethod(Asked, Method):
             return ErrorModel(plant, observer, *window.followed(shipped["multipliers"].ravel()))
         both = tracked(window, shipped["multipliers"].ravel(), shipped["state_tracking"], shipped["state_rows"])
         return ErrorModel(plant, observer, *both)
+
+
+def is_guaranteed(design: ObserverDesign) -> bool:
+    """Whether a design brings its own threshold."""
+    return design.method == GuaranteedTestMethod.id
