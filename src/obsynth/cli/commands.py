@@ -550,10 +550,10 @@ _LATER = (0.0, 0.1, 0.25, 0.5, 0.95)
 
 def certificate_target(options: argparse.Namespace) -> Path | None:
     """Return where ``run --prove`` writes its certificate; refuse what cannot be proved before any work is done."""
-    from obsynth.experiments.alarm_proof import CERTIFICATE
-
     if options.prove is None:
         return None
+    from obsynth.experiments.alarm_proof import CERTIFICATE
+
     if options.monitor != "pointwise":
         raise SpecError("--prove is for alarms of --monitor pointwise.", path="--prove")
     if options.data == STREAM or options.state is not None:
