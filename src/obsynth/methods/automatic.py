@@ -289,26 +289,19 @@ def automatic_design(plant: Any, options: Mapping[str, Any], maker: Maker, refus
             path="method.options",
         )
     if plant.nf == 0:
-        return _for_the_state(plant, options, possible, maker)
+        order: list[Purpose] = ["state despite unknown inputs", "state despite noise"]
+        if plant.nw and not plant.nd:
+            order.reverse()
+        refusals = []
+        for each in [name for purpose in order for name in _methods_with(purpose, possible)]:
+            try:
+                return _with_note(maker(plant, each, options), "there are no faults to estimate")
+            except ObsynthError as error:
+                refusals.append(error)
+        if refusals:
+            raise refusals[0]
+        raise SpecError("The plant has no faults, and the options are for methods that estimate some.", path="method")
     return _chosen(plant, options, possible, maker, refusing)
-
-
-def _for_the_state(
-    plant: DescriptorSystem, options: Mapping[str, Any], possible: list[str], maker: Maker
-) -> ObserverDesign:
-    """Return an observer of the state: there are no faults."""
-    order: list[Purpose] = ["state despite unknown inputs", "state despite noise"]
-    if plant.nw and not plant.nd:
-        order.reverse()
-    refusals = []
-    for method in [name for purpose in order for name in _methods_with(purpose, possible)]:
-        try:
-            return _with_note(maker(plant, method, options), "there are no faults to estimate")
-        except ObsynthError as error:
-            refusals.append(error)
-    if refusals:
-        raise refusals[0]
-    raise SpecError("The plant has no faults, and the options are for methods that estimate some.", path="method")
 
 
 def _chosen(

@@ -144,7 +144,14 @@ def _symmetric(ball: Ball) -> Ball:
 def _by_cholesky(ball: Ball, means: Means = "Cholesky") -> DefinitenessProof:
     size = ball.shape[0]
     forming = float(rounded_up(np.max(np.sum(ball.radius, axis=1)), size + 2))
-    error = forming + _factorisation_bound(ball.midpoint)
+    states = ball.midpoint.shape[0]
+    growth = gamma(2 * (states + 4))
+    trace = float(rounded_up(np.sum(np.abs(np.diag(ball.midpoint))), states))
+    largest = float(np.max(np.abs(np.diag(ball.midpoint))))
+    # The shift only lowers a diagonal that stays positive, so the unshifted trace bounds the shifted one.
+    bound = growth * (1.0 + 2.0 * growth) * trace + 2.0 * UNIT_ROUNDOFF * largest
+    underflow = 4.0 * states * (2.0 * states + largest) * UNDERFLOW
+    error = forming + float(rounded_up(np.asarray(bound + underflow), 8))
     shift = LEAST_SHIFT * error
     factor = _shifted_factor(ball.midpoint, shift)
     if factor is None:
@@ -216,18 +223,6 @@ def _in_more_digits(formula: Formula, exponents: NDArray[np.int64], first: Defin
     if bound is None:
         return replace(first, reason=f"{first.reason}; {told}")
     return DefinitenessProof(True, bound, first.error_bound, "ball arithmetic", told)
-
-
-def _factorisation_bound(symmetric: FloatArray) -> float:
-    """Bound on what a completed Cholesky factorisation of ``symmetric`` less a shift leaves open."""
-    size = symmetric.shape[0]
-    growth = gamma(2 * (size + 4))
-    trace = float(rounded_up(np.sum(np.abs(np.diag(symmetric))), size))
-    largest = float(np.max(np.abs(np.diag(symmetric))))
-    # The shift only lowers a diagonal that stays positive, so the unshifted trace bounds the shifted one.
-    bound = growth * (1.0 + 2.0 * growth) * trace + 2.0 * UNIT_ROUNDOFF * largest
-    underflow = 4.0 * size * (2.0 * size + largest) * UNDERFLOW
-    return float(rounded_up(np.asarray(bound + underflow), 8))
 
 
 def _shifted_factor(matrix: FloatArray, shift: float) -> FloatArray | None:

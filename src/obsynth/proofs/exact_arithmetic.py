@@ -132,23 +132,6 @@ def over_one_denominator(E: fmpq_mat, A: fmpq_mat) -> tuple[fmpz_mat, fmpz_mat]:
     return e * (common // int(own)), a * (common // int(other))
 
 
-def with_integer_entries(E: fmpq_mat, A: fmpq_mat) -> tuple[fmpz_mat, fmpz_mat]:
-    """Return two matrices ``(m, n)`` with common rows and columns multiplied by rationals, so that all are integers."""
-    rows, columns = int(A.nrows()), int(A.ncols())
-    # Over one denominator each row is a multiple of what it is over its own.
-    pairs = zip(*(part.tolist() for part in over_one_denominator(E, A)), strict=True)
-    table = [_coprime([int(value) for part in pair for value in part]) for pair in pairs]
-    for j in range(columns):
-        common = gcd(*(row[k] for row in table for k in (j, columns + j)))
-        if common > 1:
-            for row in table:
-                row[j], row[columns + j] = row[j] // common, row[columns + j] // common
-    table = [_coprime(row) for row in table]
-    parts = ([value for row in table for value in row[part]] for part in (slice(columns), slice(columns, None)))
-    e, a = (fmpz_mat(rows, columns, part) for part in parts)
-    return e, a
-
-
 def _coprime(values: list[int]) -> list[int]:
     common = gcd(*values)
     return [value // common for value in values] if common > 1 else values
@@ -480,7 +463,19 @@ class ExactPencil:
     @cached_property
     def _integers(self) -> tuple[fmpz_mat, fmpz_mat]:
         """E and A with rows and columns multiplied by rational numbers, so that all entries are small integers."""
-        return with_integer_entries(self.E, self.A)
+        rows, columns = int(self.A.nrows()), int(self.A.ncols())
+        # Over one denominator each row is a multiple of what it is over its own.
+        pairs = zip(*(part.tolist() for part in over_one_denominator(self.E, self.A)), strict=True)
+        table = [_coprime([int(value) for part in pair for value in part]) for pair in pairs]
+        for j in range(columns):
+            common = gcd(*(row[k] for row in table for k in (j, columns + j)))
+            if common > 1:
+                for row in table:
+                    row[j], row[columns + j] = row[j] // common, row[columns + j] // common
+        table = [_coprime(row) for row in table]
+        parts = ([value for row in table for value in row[part]] for part in (slice(columns), slice(columns, None)))
+        e, a = (fmpz_mat(rows, columns, part) for part in parts)
+        return e, a
 
     @cached_property
     def _degree(self) -> int:
@@ -719,7 +714,17 @@ class EnclosedPencil:
     def stable(self) -> bool:
         """Whether every finite zero is strictly inside the unit circle."""
         with flint.ctx.workprec(self.bits):
-            return inside_unit_circle(self.zero_coefficients)
+            # Yes for certain; no where a root is on the circle to so many digits.
+            p = _trimmed(self.zero_coefficients)
+            while len(p) > 1:
+                first, last = p[0], p[-1]
+                if not bool(abs(first) < abs(last)):
+                    return False
+                p = [last * p[i] - first * p[-1 - i] for i in range(1, len(p))]
+                # |last| > |first|: the new leading coefficient, last^2 - first^2, is not zero.
+                scale = abs(p[-1])
+                p = [value / scale for value in p]
+            return True
 
     def _determinant(self, seed: int) -> list[Any]:
         """Return the coefficients of the determinant of the pencil with its rows compressed at random."""
@@ -750,20 +755,6 @@ def greatest_common_divisor(first: Sequence[Any], second: Sequence[Any]) -> list
                 remainder[k + i] = remainder[k + i] - factor * value
         large, small = small, _normalised(remainder[: len(small) - 1])
     return large
-
-
-def inside_unit_circle(coefficients: Sequence[Any]) -> bool:
-    """Whether all roots are strictly inside the unit circle: yes for certain, no where a root is on it to digits."""
-    p = _trimmed(coefficients)
-    while len(p) > 1:
-        first, last = p[0], p[-1]
-        if not bool(abs(first) < abs(last)):
-            return False
-        p = [last * p[i] - first * p[-1 - i] for i in range(1, len(p))]
-        # |last| > |first|: the new leading coefficient, last^2 - first^2, is not zero.
-        scale = abs(p[-1])
-        p = [value / scale for value in p]
-    return True
 
 
 def _normalised(coefficients: Sequence[Any]) -> list[Any]:

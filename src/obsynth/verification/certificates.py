@@ -79,7 +79,27 @@ def _try_bounded_real(
         return unproved("the certificate cannot be inverted")
 
     def formula(kind: type[Enclosed]) -> Enclosed:
-        return _formed(kind, plant, observer, tracking, factor, inverse, gain)
+        exact = kind.exact
+        core, nd = factor.shape[0], plant.nd
+        q, s = exact(factor), exact(inverse)
+        b = exact(tracking[:core, : plant.nx]) @ exact(plant.Bd) - exact(observer.By[:core]) @ exact(plant.Dd)
+        qs, qms = q @ s, q @ (exact(observer.Az[:core, :core]) @ s)
+        cs = exact(observer.Cz[observer.fault_rows, :core]) @ s
+        d = exact(observer.Dy[observer.fault_rows]) @ exact(plant.Dd)
+        level = exact(np.eye(nd)).scaled(gain).scaled(gain)
+        qb, nf = q @ b, cs.shape[0]
+
+        def zero(rows: int, columns: int) -> Enclosed:
+            return exact(np.zeros((rows, columns)))
+
+        return block(
+            [
+                [qs.T @ qs, zero(core, nd), qms.T, cs.T],
+                [zero(nd, core), level, qb.T, -d.T],
+                [qms, qb, exact(np.eye(core)), zero(core, nf)],
+                [cs, -d, zero(nf, core), exact(np.eye(nf))],
+            ]
+        )
 
     return prove_positive_definite(formula)
 
@@ -91,39 +111,6 @@ def _is_triangular(factor: FloatArray) -> bool:
 
 def _is_invertible(inverse: FloatArray) -> bool:
     return bool(np.all(np.isfinite(inverse)) and np.all(np.diag(inverse) != 0.0))
-
-
-def _formed(
-    kind: type[Enclosed],
-    plant: DescriptorSystem,
-    observer: LinearObserver,
-    tracking: FloatArray,
-    factor: FloatArray,
-    inverse: FloatArray,
-    gain: float,
-) -> Enclosed:
-    """Return the matrix of the inequality with the bounds on the errors of forming it."""
-    exact = kind.exact
-    core, nd = factor.shape[0], plant.nd
-    q, s = exact(factor), exact(inverse)
-    b = exact(tracking[:core, : plant.nx]) @ exact(plant.Bd) - exact(observer.By[:core]) @ exact(plant.Dd)
-    qs, qms = q @ s, q @ (exact(observer.Az[:core, :core]) @ s)
-    cs = exact(observer.Cz[observer.fault_rows, :core]) @ s
-    d = exact(observer.Dy[observer.fault_rows]) @ exact(plant.Dd)
-    level = exact(np.eye(nd)).scaled(gain).scaled(gain)
-    qb, nf = q @ b, cs.shape[0]
-
-    def zero(rows: int, columns: int) -> Enclosed:
-        return exact(np.zeros((rows, columns)))
-
-    return block(
-        [
-            [qs.T @ qs, zero(core, nd), qms.T, cs.T],
-            [zero(nd, core), level, qb.T, -d.T],
-            [qms, qb, exact(np.eye(core)), zero(core, nf)],
-            [cs, -d, zero(nf, core), exact(np.eye(nf))],
-        ]
-    )
 
 
 def prove_symmetric_positive(matrix: FloatArray) -> DefinitenessProof:

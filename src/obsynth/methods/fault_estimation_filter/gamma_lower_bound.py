@@ -113,33 +113,20 @@ def output_nulling_part(problem: GainProblem) -> GainProblem:
 
 def strict_point(top: FloatArray, image: FloatArray) -> FloatArray:
     """Return ``Z1 > 0`` with ``image Z1 image' - top Z1 top' > 0``, from pairs of all kinds."""
-    point, reached = _pairs_from_rest(top, image)
+    n, size = top.shape
+    # Sequences from rest of every length, summed up: half of what is reached goes on unseen, the other half is slack.
+    point, reached = np.zeros((size, size)), np.zeros((n, 0))
+    for _ in range(n + 1):
+        unseen = null_space(np.hstack([top, -reached]))[:size]
+        point = point + 0.5 * unseen @ unseen.T
+        left, values, _ = np.linalg.svd(image @ unseen * np.sqrt(0.5), full_matrices=False)
+        rank = _rank(values)
+        reached = left[:, :rank] * values[:rank]
+    point, reached = 0.5 * (point + point.T), _range(reached)
     outside = null_space(reached.T) if reached.shape[1] else np.eye(top.shape[0])
     if outside.shape[1] == 0:
         return point
-    return _with_growing_pairs(point, top, image, reached, outside)
-
-
-def _pairs_from_rest(top: FloatArray, image: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return sequences from rest of every length, summed up, and a basis of the states they reach.
-
-    Step by step, half of what is reached goes on invisibly; the other half is slack.
-    """
-    n, size = top.shape
-    point, reached = np.zeros((size, size)), np.zeros((n, 0))
-    for _ in range(n + 1):
-        pairs = null_space(np.hstack([top, -reached]))[:size]
-        point = point + 0.5 * pairs @ pairs.T
-        left, values, _ = np.linalg.svd(image @ pairs * np.sqrt(0.5), full_matrices=False)
-        rank = _rank(values)
-        reached = left[:, :rank] * values[:rank]
-    return 0.5 * (point + point.T), _range(reached)
-
-
-def _with_growing_pairs(
-    point: FloatArray, top: FloatArray, image: FloatArray, reached: FloatArray, outside: FloatArray
-) -> FloatArray:
-    """Add pairs on the growing states, and as many from rest as make up for what those do to the reached states."""
+    # Pairs on the growing states, and as many from rest as make up for what those do to the reached states.
     pairs = np.linalg.pinv(outside.T @ top)
     back = np.linalg.inv(outside.T @ image @ pairs)
     grown = lyapunov_solution(back.T, back @ back.T)

@@ -229,7 +229,19 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     for name, claim, identity in _identities(plant, observer, matrices["T"], matrices["T0"]):
         yield equality(name, claim, identity.residual(), _SOURCE, bound=tolerance)
     yield stability_row(observer.Az, matrices["stability"], plant.dt, "Lyapunov")
-    yield from _claimed(design)
+    claims = design.certificate.claims
+    order = claims.get("order", float("nan"))
+    yield upper_bound_check(
+        "order",
+        "the filter has as many states as claimed: difference",
+        abs(observer.order - order),
+        0.0,
+        source="shipped realisation",
+        kind="equality",
+        detail=f"{observer.order} states",
+    )
+    if "decay" in claims:
+        yield decay_row(observer, claims["decay"])
     for name, claim, identity in _tracking(plant, observer, design):
         yield equality(
             name, claim, identity.residual(), "regulator equation, ours", bound=max(tolerance, TRACKING_TOLERANCE)
@@ -368,19 +380,3 @@ def _model_units(plant: DescriptorSystem, phi: FloatArray, cw: FloatArray) -> Fl
     made = (cw != 0.0).astype(np.float64) @ reachable(phi) > 0.0
     found = np.max(np.where(made, PlantUnits.of(plant).rounded().faults[:, None], 0.0), axis=0, initial=0.0)
     return np.where(found > 0.0, found, 1.0)
-
-
-def _claimed(design: ObserverDesign) -> Iterator[Check]:
-    (_, observer), claims = design.linear, design.certificate.claims
-    order = claims.get("order", float("nan"))
-    yield upper_bound_check(
-        "order",
-        "the filter has as many states as claimed: difference",
-        abs(observer.order - order),
-        0.0,
-        source="shipped realisation",
-        kind="equality",
-        detail=f"{observer.order} states",
-    )
-    if "decay" in claims:
-        yield decay_row(observer, claims["decay"])

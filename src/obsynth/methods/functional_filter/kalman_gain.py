@@ -17,7 +17,7 @@ from itertools import product
 
 import numpy as np
 
-from obsynth.analysis.diagnosis.fault_columns import DecoupledPlant, decoupled
+from obsynth.analysis.diagnosis.fault_columns import decoupled
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import structure_of
 from obsynth.errors import ObsynthError, PreconditionError, SolverError
@@ -63,21 +63,9 @@ def filter_model(
     plant: DescriptorSystem, model: Exosystem, *, removed: Sequence[int], faults: Sequence[int]
 ) -> FilterModel:
     """Return the model for some faults, free of the unknown inputs and of the faults removed."""
-    found = decoupled(plant, removed, faults)
-    used = model_states(model, faults)
-    return _with_fault_models(found, model.Phi[np.ix_(used, used)], model.Cw[np.ix_(list(faults), used)], tuple(faults))
-
-
-def model_states(model: Exosystem, faults: Sequence[int]) -> list[int]:
-    """Return the states of the exosystem that some faults are made of."""
-    reached = np.any(model.Cw[list(faults)] != 0.0, axis=0) if len(faults) else np.zeros(model.order, dtype=bool)
-    for _ in range(model.order):
-        reached = reached | np.any(model.Phi[reached] != 0.0, axis=0)
-    return [int(i) for i in np.flatnonzero(reached)]
-
-
-def _with_fault_models(found: DecoupledPlant, phi: FloatArray, cw: FloatArray, faults: tuple[int, ...]) -> FilterModel:
-    k, count, plant = found.order, len(phi), found.source
+    found, used = decoupled(plant, removed, faults), model_states(model, faults)
+    phi, cw = model.Phi[np.ix_(used, used)], model.Cw[np.ix_(list(faults), used)]
+    k, count = found.order, len(phi)
     inverse = np.linalg.inv(found.E) if k else np.zeros((0, 0))
     zeros = np.zeros((count, k))
     known = np.hstack([found.Bu, found.By])
@@ -93,11 +81,19 @@ def _with_fault_models(found: DecoupledPlant, phi: FloatArray, cw: FloatArray, f
         drive=np.vstack([np.zeros((k, count)), np.eye(count)]),
         T=np.vstack([inverse @ found.rows[:k, : plant.nx], np.zeros((count, plant.nx))]),
         T0=-rows @ found.rows[k:, : plant.nx],
-        faults=faults,
+        faults=tuple(faults),
         order=k,
         fault_sizes=found.fault_sizes,
         dt=plant.dt,
     )
+
+
+def model_states(model: Exosystem, faults: Sequence[int]) -> list[int]:
+    """Return the states of the exosystem that some faults are made of."""
+    reached = np.any(model.Cw[list(faults)] != 0.0, axis=0) if len(faults) else np.zeros(model.order, dtype=bool)
+    for _ in range(model.order):
+        reached = reached | np.any(model.Phi[reached] != 0.0, axis=0)
+    return [int(i) for i in np.flatnonzero(reached)]
 
 
 def _telling_rows(whole: FloatArray) -> FloatArray:

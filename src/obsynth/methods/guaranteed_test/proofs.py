@@ -421,16 +421,6 @@ class Square:
             return self.bounded_step(np.array([rounded_outward(abs(value)) for value in right]))
         if len(right) > MOST_ROWS_IN_BALLS or self.part.radius.any():
             return None
-        return self._in_balls(right)
-
-    def bounded_step(self, sizes: FloatArray) -> FloatArray:
-        """Return the same for a right side of at most these sizes, where the contraction is below one."""
-        magnitude = Ball.exact(np.abs(self.inverse)) @ Ball.exact(np.ldexp(sizes, self.rows)[:, None])
-        first = magnitude.magnitude.ravel()
-        rest = self.contraction / (1.0 - self.contraction) * float(np.max(first, initial=0.0))
-        return np.asarray(np.ldexp(rounded_up(first + rest, 8), self.columns))
-
-    def _in_balls(self, right: list[Fraction]) -> FloatArray | None:
         before = ctx.prec
         ctx.prec = INVERSE_BITS
         try:
@@ -446,6 +436,13 @@ class Square:
             ctx.prec = before
         doubles = np.array([float(value) for value in sizes])
         return np.asarray(np.ldexp(rounded_up(doubles, 4), self.columns))
+
+    def bounded_step(self, sizes: FloatArray) -> FloatArray:
+        """Return the same for a right side of at most these sizes, where the contraction is below one."""
+        magnitude = Ball.exact(np.abs(self.inverse)) @ Ball.exact(np.ldexp(sizes, self.rows)[:, None])
+        first = magnitude.magnitude.ravel()
+        rest = self.contraction / (1.0 - self.contraction) * float(np.max(first, initial=0.0))
+        return np.asarray(np.ldexp(rounded_up(first + rest, 8), self.columns))
 
 
 def _dense(window: Window, columns: np.ndarray) -> tuple[FloatArray, FloatArray]:

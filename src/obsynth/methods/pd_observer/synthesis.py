@@ -99,7 +99,16 @@ def design_gains(plant: DescriptorSystem, asked: PdObserver) -> tuple[PdGains, l
     if not free or plain.abscissa <= -target:
         return plain, records
     if plant.nx + plant.nf > MANY_UNKNOWN_STATES:
-        return _faster_at_little_cost(plant, asked, plain, target), records
+        # For many states as fast as the size of the gains allows: from the least rate upwards.
+        faster, most = plain, DECAY_PRICE * _given_units(plant).size(plain)
+        for share in sorted(DECAY_RETRIES):
+            if share * target <= -plain.abscissa:
+                continue
+            try:
+                faster = gains_for(plant, asked, decay=share * target, most=most)
+            except (SolverError, InfeasibleError):
+                break  # this rate was not asked for
+        return faster, records
     found = _faster(plant, asked, plain, target, records, own=own)
     if own and found.decay < target:
         try:
@@ -138,19 +147,6 @@ def _faster(
         if units.size(faster) <= most:
             return faster
     return plain
-
-
-def _faster_at_little_cost(plant: DescriptorSystem, asked: PdObserver, plain: PdGains, target: float) -> PdGains:
-    """Return gains that decay as fast as their size allows, for many states: from the least rate upwards."""
-    found = plain
-    for share in sorted(DECAY_RETRIES):
-        if share * target <= -plain.abscissa:
-            continue
-        try:
-            found = gains_for(plant, asked, decay=share * target, most=DECAY_PRICE * _given_units(plant).size(plain))
-        except (SolverError, InfeasibleError):
-            break  # this rate was not asked for
-    return found
 
 
 def gains_for(
