@@ -410,6 +410,26 @@ def before_the_mean(design: ObserverDesign) -> tuple[ObserverDesign, tuple[Check
     return replace(design, observer=base, certificate=Certificate(matrices, design.certificate.claims)), (row,)
 
 
+def fault_noise_rows(errors: ErrorModel) -> Iterator[Check]:
+    """Yield the deviation of each fault estimate under the noise that the plant states."""
+    plant = errors.plant
+    if not plant.nw:
+        return
+    shown, _, _, direct = errors.fault_output
+    # What noise does to an estimate at once has no finite variance in continuous time, and is left out.
+    seen = direct if plant.dt > 0.0 else 0.0 * direct
+    covariance = certain_noise_covariance(errors.Az, errors.noise, shown, seen, plant.dt)
+    for name, variance in zip(plant.fault_names, np.diag(covariance), strict=True):
+        yield information(
+            f"noise in fhat[{name}]",
+            "standard deviation of the fault estimate under the stated noise"
+            + ("" if plant.dt else ", for a sample time of 1 s (times its root for others)"),
+            float(np.sqrt(variance)),
+            source="recomputed, Lyapunov equation",
+            detail=UNCERTAIN if np.isnan(variance) else plant.units.get(name, ""),
+        )
+
+
 def mean_noise_rows(design: ObserverDesign) -> Iterator[Check]:
     """Yield the deviation of each averaged estimate under the stated noise."""
     plant, observer = design.linear

@@ -31,16 +31,15 @@ from obsynth.numerics.norms import highest_gain_found, hinf_norm
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver, modes_of
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.products import certain_noise_covariance
 from obsynth.results.checks import Check, fitting_check, information, nothing_wrong, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import prove_bounded_real
 from obsynth.verification.claims import (
-    UNCERTAIN,
     Identity,
     claim_rows,
     claimed,
     equality,
+    fault_noise_rows,
     recovery_rows,
     tracking_identities,
     tracking_totals,
@@ -283,19 +282,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         detail=f"eigenvalues computed; their proof is the row 'LMI'; {slowest}",
     )
     yield from _norm_rows(design, errors, modes, tracking, factor)
-    if not plant.nw:
-        return
-    covariance = certain_noise_covariance(
-        errors.Az, errors.noise, -errors.fault_output[0], errors.fault_output[3], plant.dt
-    )
-    for fault, variance in zip(plant.fault_names, np.diag(covariance), strict=True):
-        yield information(
-            f"noise in fhat[{fault}]",
-            "standard deviation of the fault estimate under the stated noise",
-            float(np.sqrt(variance)),
-            source="recomputed, Lyapunov equation",
-            detail=UNCERTAIN if np.isnan(variance) else plant.units.get(fault, ""),
-        )
+    yield from fault_noise_rows(errors)
 
 
 def _gain_set_rows(

@@ -54,7 +54,16 @@ from obsynth.proofs.products import certain_noise_covariance
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import decay_row, stability_row
-from obsynth.verification.claims import ALIKE, UNCERTAIN, Residual, equality, relative_tolerance, residual, worst
+from obsynth.verification.claims import (
+    ALIKE,
+    UNCERTAIN,
+    Residual,
+    equality,
+    fault_noise_rows,
+    relative_tolerance,
+    residual,
+    worst,
+)
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.plant import condition_rows, plant_information
 
@@ -668,20 +677,7 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
     elif np.any(np.isnan(unit)):
         text = "H2 norm from white noise on every output to a fault estimate"
         yield information("noise amplification", text, np.nan, source="recomputed, Lyapunov equation", detail=UNCERTAIN)
-    if not plant.nw:
-        return
-    tracking = design.certificate.matrices["tracking"][:, : plant.nx]
-    entering = tracking @ plant.Bw - observer.By @ plant.Dw
-    stated = certain_noise_covariance(observer.Az, entering, rows, discrete * (direct @ plant.Dw), plant.dt)
-    for name, variance in zip(plant.fault_names, np.diag(stated), strict=True):
-        yield information(
-            f"noise in fhat[{name}]",
-            "standard deviation of the fault estimate under the stated noise"
-            + ("" if plant.dt else ", for a sample time of 1 s (times its root for others)"),
-            float(np.sqrt(variance)),
-            source="recomputed, Lyapunov equation",
-            detail=UNCERTAIN if np.isnan(variance) else plant.units.get(name, ""),
-        )
+    yield from fault_noise_rows(ErrorModel(plant, observer, design.certificate.matrices["tracking"][:, : plant.nx]))
 
 
 def gain_rows(
