@@ -18,8 +18,7 @@ import numpy as np
 import obsynth
 from obsynth.methods.pd_observer.checks import prove_gains
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.proofs.balls import LARGEST_ORDER
-from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite
+from obsynth.proofs.balls import LARGEST_ORDER, DefinitenessProof, prove_positive_definite
 from obsynth.verification.certificates import prove_bounded_real, prove_stable
 
 SECONDS_PER_CELL = 1.0

@@ -23,10 +23,10 @@ import numpy as np
 
 import obsynth
 from obsynth.methods.fault_estimation_filter.central_filter import GainProblem
-from obsynth.methods.fault_estimation_filter.prepared_plant import prepare
+from obsynth.methods.fault_estimation_filter.conditions import prepare
 from obsynth.methods.fault_estimation_filter.synthesis import gain_problem, with_weight_limit
 from obsynth.numerics.norms import hinf_norm
-from obsynth.proofs.definiteness import prove_positive_definite
+from obsynth.proofs.balls import prove_positive_definite
 from obsynth.spec import load_spec
 
 ROOT = Path(__file__).parents[1]

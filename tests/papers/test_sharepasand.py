@@ -10,7 +10,7 @@ from exact_runs import ONE, RAMP, Together, ramp_and_sine, sine
 
 import obsynth
 from obsynth.analysis.zeros import zeros_of_system
-from obsynth.methods.placement.eigenstructure import place
+from obsynth.methods.placement.region import place
 from obsynth.methods.ui_pi_observer.augmented_plant import paper_decoupling
 from obsynth.numerics.spectra import spectrum_error
 from obsynth.simulation import simulate_plant

@@ -16,7 +16,7 @@ import obsynth
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import InfeasibleError
 from obsynth.methods.fault_estimation_filter.central_filter import search_least_gain
-from obsynth.methods.fault_estimation_filter.prepared_plant import prepare, restricted_equivalent_from
+from obsynth.methods.fault_estimation_filter.conditions import prepare, restricted_equivalent_from
 from obsynth.methods.fault_estimation_filter.synthesis import PrintedInequality, gain_problem
 from obsynth.numerics.norms import hinf_norm, spectral_radius
 from obsynth.simulation import simulate_plant

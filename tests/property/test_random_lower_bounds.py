@@ -5,9 +5,9 @@ import pytest
 
 import obsynth
 from obsynth.methods.fault_estimation_filter.central_filter import search_least_gain
+from obsynth.methods.fault_estimation_filter.conditions import prepare
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import _checked_bound, _DualProblem, proved_lower_bound
 from obsynth.methods.fault_estimation_filter.least_gain_proof import ALONE, LAST, LEAST_GAIN_PAIRS, InvisiblePairs
-from obsynth.methods.fault_estimation_filter.prepared_plant import prepare
 from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
 from obsynth.proofs.exact_arithmetic import stored_matrix
 

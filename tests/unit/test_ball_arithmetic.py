@@ -11,9 +11,16 @@ import pytest
 import obsynth
 from obsynth.methods.pd_observer.checks import prove_gains
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.proofs import definiteness
-from obsynth.proofs.balls import LARGEST_ORDER, Ball, Enclosed, ExtendedBall, block, prove_by_ball_arithmetic
-from obsynth.proofs.definiteness import prove_positive_definite
+from obsynth.proofs import balls
+from obsynth.proofs.balls import (
+    LARGEST_ORDER,
+    Ball,
+    Enclosed,
+    ExtendedBall,
+    block,
+    prove_by_ball_arithmetic,
+    prove_positive_definite,
+)
 from obsynth.verification.certificates import prove_bounded_real, prove_gain, prove_stable
 
 ULP = 2.0**-52
@@ -152,7 +159,7 @@ def test_a_larger_matrix_is_not_tried_and_the_reason_says_so() -> None:
 
 
 def test_what_is_far_from_definite_needs_no_digits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(definiteness, "LARGEST_ORDER", 0)
+    monkeypatch.setattr(balls, "LARGEST_ORDER", 0)
     found = prove_positive_definite(next_to_singular(np.random.default_rng(0), 5, np.inf))
     assert not found.proved
     assert "up to order 0" in found.reason
@@ -215,11 +222,11 @@ def test_the_report_says_which_proof_it_was(monkeypatch: pytest.MonkeyPatch) -> 
     plant = obsynth.DescriptorSystem(None, [[0.5, 1.0], [0.0, -1.0]], C=[[1.0, 0.0]], Bf=[[0.0], [1.0]])
     design = obsynth.pd_observer(plant)
     assert design.report["LMI"].detail.startswith("Cholesky")
-    monkeypatch.setattr(definiteness, "_by_cholesky", lambda *_: definiteness.DefinitenessProof(False, 0.0, 1.0))
+    monkeypatch.setattr(balls, "_by_cholesky", lambda *_: balls.DefinitenessProof(False, 0.0, 1.0))
     again = obsynth.verify(design)
     assert again.passed
     assert again["LMI"].detail.startswith("ball arithmetic with 128 bits")
-    monkeypatch.setattr(definiteness, "LARGEST_ORDER", 0)
+    monkeypatch.setattr(balls, "LARGEST_ORDER", 0)
     failed = obsynth.verify(design)["LMI"]
     assert not failed.passed
     assert "up to order 0" in failed.detail

@@ -5,9 +5,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from obsynth.proofs import definiteness
-from obsynth.proofs.balls import PANEL_ROWS, Ball
-from obsynth.proofs.definiteness import prove_positive_definite
+from obsynth.proofs import balls
+from obsynth.proofs.balls import PANEL_ROWS, Ball, prove_positive_definite
 
 
 def whole(matrix):
@@ -85,7 +84,7 @@ FAMILIES = (singular_gram, gram_off_by_one_ulp, known_inertia, shifted_to_the_ed
 
 @pytest.fixture
 def without_more_digits(monkeypatch):
-    monkeypatch.setattr(definiteness, "LARGEST_ORDER", 0)
+    monkeypatch.setattr(balls, "LARGEST_ORDER", 0)
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.__name__)
@@ -123,7 +122,7 @@ def test_no_false_proof_of_larger_singular_matrices(size, count, monkeypatch):
     rng = np.random.default_rng(size)
     for i in range(10 + count):
         if i == count:
-            monkeypatch.setattr(definiteness, "LARGEST_ORDER", 0)
+            monkeypatch.setattr(balls, "LARGEST_ORDER", 0)
         factor = rng.integers(-9, 10, (size, size - 1)).astype(float)
         assert not prove_positive_definite(factor @ factor.T).proved
 
@@ -256,7 +255,7 @@ def test_extreme_sizes_neither_warn_nor_raise(monkeypatch):
     factor[0, 0] = 1.0
     # Definite (the product is exact), with a smallest eigenvalue far below every double.
     assert prove_positive_definite(factor @ factor.T).means == "ball arithmetic"
-    monkeypatch.setattr(definiteness, "LARGEST_ORDER", 0)
+    monkeypatch.setattr(balls, "LARGEST_ORDER", 0)
     assert not prove_positive_definite(factor @ factor.T).proved
 
 
@@ -264,7 +263,7 @@ def test_a_ball_of_several_blocks_is_made_symmetric_entry_by_entry():
     rng = np.random.default_rng(9)
     n = 2 * PANEL_ROWS + 5
     ball = Ball(rng.standard_normal((n, n)), rng.random((n, n)))
-    found = definiteness._symmetric(ball)
+    found = balls._symmetric(ball)
     for part in (found.midpoint, found.radius):
         assert np.array_equal(part, part.T)
     # Every symmetric member of the ball is within: those are members of its transpose, too.
@@ -281,9 +280,9 @@ def test_a_shift_is_taken_from_the_diagonal_alone():
     matrix = rng.standard_normal((6, 6))
     matrix = matrix @ matrix.T + 2.0 * np.eye(6)
     kept = matrix.copy()
-    factor = definiteness._shifted_factor(matrix, 1.5)
+    factor = balls._shifted_factor(matrix, 1.5)
     assert np.array_equal(matrix, kept)
     assert np.array_equal(factor, np.tril(factor))
     assert np.allclose(factor @ factor.T, matrix - 1.5 * np.eye(6), rtol=0.0, atol=1e-14 * np.max(matrix))
-    assert definiteness._shifted_factor(matrix, 1e3) is None
-    assert definiteness._shifted_factor(np.full((2, 2), np.nan), 0.0) is None
+    assert balls._shifted_factor(matrix, 1e3) is None
+    assert balls._shifted_factor(np.full((2, 2), np.nan), 0.0) is None

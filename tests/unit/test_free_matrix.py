@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from obsynth import DescriptorSystem
-from obsynth.methods.fault_estimation_filter import prepared_plant
-from obsynth.methods.fault_estimation_filter.prepared_plant import restricted_equivalent_from
+from obsynth.methods.fault_estimation_filter import conditions
+from obsynth.methods.fault_estimation_filter.conditions import restricted_equivalent_from
 from obsynth.numerics.scaling import Scaling
 
 
@@ -26,11 +26,11 @@ def test_units_that_were_tried_are_not_tried_again(monkeypatch):
     plant = DescriptorSystem(np.diag([1.0, 1.0, 0.0]), 0.5 * np.eye(3), None, np.eye(3), Bf=np.ones((3, 1)), dt=0.1)
     one, other = Scaling(*np.ones((3, 3))), Scaling(np.ones(3), np.array([1.0, 1e9, 1.0]), np.ones(3))
     same = Scaling(*np.ones((3, 3)))
-    monkeypatch.setattr(prepared_plant, "_units", lambda _: iter([one, other, same]))
-    monkeypatch.setattr(prepared_plant, "MOST_CONDITION", 0.5)
-    plain, formed = prepared_plant.restricted_equivalent, []
-    monkeypatch.setattr(prepared_plant, "restricted_equivalent", lambda *given: formed.append(1) or plain(*given))
-    scaling, t, n = prepared_plant._equivalent(plant)
+    monkeypatch.setattr(conditions, "_units", lambda _: iter([one, other, same]))
+    monkeypatch.setattr(conditions, "MOST_CONDITION", 0.5)
+    plain, formed = conditions.restricted_equivalent, []
+    monkeypatch.setattr(conditions, "restricted_equivalent", lambda *given: formed.append(1) or plain(*given))
+    scaling, t, n = conditions._equivalent(plant)
     # Neither those that T cannot make up for, nor the same again.
     assert (scaling, len(formed)) == (one, 1)
     assert np.allclose(t @ plant.E + n @ plant.C, np.eye(3), rtol=0.0, atol=1e-14)

@@ -12,8 +12,7 @@ import scipy.linalg
 import obsynth
 from obsynth.methods.pd_observer import synthesis
 from obsynth.methods.pd_observer.checks import prove_gains
-from obsynth.methods.pd_observer.inequalities import PdTask
-from obsynth.methods.pd_observer.limits import fastest_mode
+from obsynth.methods.pd_observer.inequalities import PdTask, fastest_mode
 from obsynth.methods.pd_observer.method import MOST_STATES_FOR_LMI, PdObserver
 from obsynth.methods.pd_observer.realisation import with_faults_as_states
 from obsynth.methods.pd_observer.synthesis import closed_form

@@ -21,7 +21,7 @@ from obsynth.methods.pd_observer.checks import (
     prove_shipped_stability,
 )
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
-from obsynth.methods.pd_observer.limits import least_noise_gain
+from obsynth.methods.pd_observer.inequalities import least_noise_gain
 from obsynth.methods.pd_observer.realisation import (
     coupled_certificate,
     explicit_certificate,

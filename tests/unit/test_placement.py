@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 
 from obsynth import DescriptorSystem, PreconditionError, SolverError, SpecError, ui_pi_observer
-from obsynth.methods.placement.eigenstructure import jordan_form, place
-from obsynth.methods.placement.region import NOISE_PRICE, KalmanProblem, Region, compromise, region_gain
+from obsynth.methods.placement.region import (
+    NOISE_PRICE,
+    KalmanProblem,
+    Region,
+    compromise,
+    jordan_form,
+    place,
+    region_gain,
+)
 from obsynth.methods.ui_pi_observer.placement_problem import observable_split
 from obsynth.numerics.spectra import decay_rates, spectrum_error
 

@@ -24,13 +24,12 @@ from obsynth.conditions.wang import error_norm, h2_terms, noise_paths, wang2015
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.conic.lmi import SOLVER_SETTINGS, USABLE_STATUSES, semidefinite_solvers
-from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
+from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions, with_sensor_faults_as_states
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
-from obsynth.methods.fault_estimation_filter.prepared_plant import with_sensor_faults_as_states
 from obsynth.methods.fault_estimation_filter.realisation import synthesis_from_gains as filter_from_gains
 from obsynth.methods.method import Synthesis
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
-from obsynth.methods.pd_observer.limits import default_delta
+from obsynth.methods.pd_observer.inequalities import default_delta
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import synthesis_from_gains as pd_from_gains
 from obsynth.methods.recursive.conditions import recursive_conditions

@@ -31,7 +31,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.conic import lmi
 from obsynth.methods.designing import design_from_gains
-from obsynth.methods.placement.eigenstructure import checked_poles, place
+from obsynth.methods.placement.region import checked_poles, place
 from obsynth.methods.ui_pi_observer.augmented_plant import (
     AugmentedPlant,
     Decoupled,

@@ -29,15 +29,15 @@ from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.conic import lmi
 from obsynth.methods.designing import design_from_gains
 from obsynth.methods.fault_estimation_filter.central_filter import GainProblem, normalise, null_basis, search_least_gain
-from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
-from obsynth.methods.fault_estimation_filter.gamma_lower_bound import proved_lower_bound
-from obsynth.methods.fault_estimation_filter.prepared_plant import (
+from obsynth.methods.fault_estimation_filter.conditions import (
     exact_indexes,
+    examine_fault_filter,
     fault_detectability,
     prepare,
     restricted_equivalent_from,
     with_sensor_faults_as_states,
 )
+from obsynth.methods.fault_estimation_filter.gamma_lower_bound import proved_lower_bound
 from obsynth.numerics.arguments import (
     FloatArray,
     arguments_checked,

@@ -30,8 +30,17 @@ from obsynth.numerics.arguments import ComplexArray, FloatArray, largest_singula
 from obsynth.numerics.doubling import symmetric_product
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.numerics.scaling import balanced_matrix
-from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, Enclosed, arb_matrix, block, gamma, rounded_up
-from obsynth.proofs.definiteness import prove_positive_definite
+from obsynth.proofs.balls import (
+    UNDERFLOW,
+    UNIT_ROUNDOFF,
+    Ball,
+    Enclosed,
+    arb_matrix,
+    block,
+    gamma,
+    prove_positive_definite,
+    rounded_up,
+)
 from obsynth.proofs.products import enclosed_sum, exponential
 
 #: Where between the spectral radius (0) and one (1) the rate is tried, in turn.

@@ -21,9 +21,16 @@ from obsynth.numerics.arguments import FloatArray, remembered
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.observers.linear.observer import LinearObserver, poles_of
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import Ball, Enclosed, block, enclosed_eigenvalues
+from obsynth.proofs.balls import (
+    Ball,
+    DefinitenessProof,
+    Enclosed,
+    block,
+    enclosed_eigenvalues,
+    prove_positive_definite,
+    unproved,
+)
 from obsynth.proofs.contraction import prove_contraction
-from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
 from obsynth.results.checks import Check, CheckKind
 from obsynth.verification.error_system import contraction_of
 

@@ -26,9 +26,8 @@ from obsynth.observers.dae.building import (
 )
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.running import plain_recursion
-from obsynth.proofs.balls import Ball
+from obsynth.proofs.balls import Ball, prove_positive_definite
 from obsynth.proofs.contraction import proved_rate
-from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.proofs.products import logarithm_of_product
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign

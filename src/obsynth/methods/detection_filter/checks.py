@@ -26,9 +26,8 @@ from obsynth.numerics.scaling import balanced_matrix
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, rounded_up
+from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, prove_positive_definite, rounded_up
 from obsynth.proofs.contraction import prove_contraction
-from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.results.checks import Check, fitting_check, information
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import prove_gain

@@ -22,9 +22,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from obsynth.errors import PreconditionError
-from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
+from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions, with_sensor_faults_as_states
 from obsynth.methods.fault_estimation_filter.least_gain_proof import LEAST_GAIN_WITNESSES, least_gain_row
-from obsynth.methods.fault_estimation_filter.prepared_plant import with_sensor_faults_as_states
 from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import highest_gain_found, hinf_norm

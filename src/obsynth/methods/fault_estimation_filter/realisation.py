@@ -18,11 +18,11 @@ import numpy as np
 from obsynth.analysis.conditions import require_all
 from obsynth.analysis.transformations.linear_plants import SLOW_ZERO_RADIUS, sampling_zero_warnings
 from obsynth.errors import SpecError
-from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
-from obsynth.methods.fault_estimation_filter.prepared_plant import (
+from obsynth.methods.fault_estimation_filter.conditions import (
     WARN_DETECTABILITY_CONDITION,
     FaultDetectability,
     fault_detectability,
+    fault_filter_conditions,
     prepare,
     with_sensor_faults_as_states,
 )

@@ -53,18 +53,18 @@ from obsynth.methods.fault_estimation_filter.central_filter import (
     search_by_bisection,
     search_least_gain,
 )
-from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
+from obsynth.methods.fault_estimation_filter.conditions import (
+    PreparedPlant,
+    examine_fault_filter,
+    prepare,
+    with_sensor_faults_as_states,
+)
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import (
     BOUND_MARGIN,
     least_gain_certificate,
     proved_lower_bound,
 )
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
-from obsynth.methods.fault_estimation_filter.prepared_plant import (
-    PreparedPlant,
-    prepare,
-    with_sensor_faults_as_states,
-)
 from obsynth.methods.fault_estimation_filter.realisation import bounded_real_certificate, notes, realise_filter
 from obsynth.methods.method import Synthesis
 from obsynth.numerics.arguments import FloatArray, as_matrix, largest_singular_value

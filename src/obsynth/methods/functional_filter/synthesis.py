@@ -36,7 +36,7 @@ from obsynth.methods.functional_filter.kalman_gain import (
 )
 from obsynth.methods.functional_filter.method import FunctionalFilter
 from obsynth.methods.method import Synthesis
-from obsynth.methods.placement.eigenstructure import checked_poles, place
+from obsynth.methods.placement.region import checked_poles, place
 from obsynth.methods.refusals import require_all_told
 from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, product_but_rounding, rounding_rank

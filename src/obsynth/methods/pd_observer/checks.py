@@ -34,8 +34,7 @@ from obsynth.numerics.scaling import balanced_matrix
 from obsynth.numerics.spectra import abscissa, abscissa_of, eigenvalues, pole_text
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem, listed
-from obsynth.proofs.balls import Ball, Enclosed, block
-from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite
+from obsynth.proofs.balls import Ball, DefinitenessProof, Enclosed, block, prove_positive_definite
 from obsynth.results.checks import Check, fitting_check, information, lower_bound_check, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import proof_row, prove_gain, prove_symmetric_positive

@@ -31,8 +31,14 @@ from obsynth.methods.pd_observer.checks import (
     prove_shipped_stability,
 )
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
-from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve
-from obsynth.methods.pd_observer.limits import default_delta, fastest_mode, require_possible
+from obsynth.methods.pd_observer.inequalities import (
+    PdSolution,
+    PdTask,
+    default_delta,
+    fastest_mode,
+    require_possible,
+    solve,
+)
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import (
     coupled_certificate,

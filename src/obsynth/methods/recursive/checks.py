@@ -51,9 +51,8 @@ from obsynth.observers.recursive.gain_schedule import (
 from obsynth.observers.recursive.observer import RecursiveObserver, StepMatrices, observer_from_options
 from obsynth.observers.running import plain_recursion
 from obsynth.plants.descriptor import MatrixSequence, listed
-from obsynth.proofs.balls import Ball, rounded_up
+from obsynth.proofs.balls import Ball, prove_positive_definite, rounded_up
 from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction, proved_rate
-from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.proofs.products import AT_ONCE, logarithm_of_product, product_of_stack, stacked_product
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign

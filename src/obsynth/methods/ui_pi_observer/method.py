@@ -223,7 +223,7 @@ class UiPiObserver(Method):
 
     def slowest_asked(self, dt: float) -> float | None:
         """Return the least rate of decay that was asked for, in 1/s."""
-        from obsynth.methods.placement.eigenstructure import as_pole
+        from obsynth.methods.placement.region import as_pole
 
         if self.decay is not None:
             return self.decay
@@ -235,7 +235,7 @@ class UiPiObserver(Method):
 
     def resolved(self, model: Exosystem, fault_names: Sequence[str]) -> dict[str, Any]:
         """Return the options as plain data, for the gain set."""
-        from obsynth.methods.placement.eigenstructure import as_pole
+        from obsynth.methods.placement.region import as_pole
 
         listed = None if self.poles is None else [as_pole(pole) for pole in self.poles]
         return {

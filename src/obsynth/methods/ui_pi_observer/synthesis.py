@@ -18,8 +18,15 @@ from obsynth.analysis.zeros import is_outside
 from obsynth.errors import PreconditionError, SolverError
 from obsynth.methods.conic.lmi import chosen_solver
 from obsynth.methods.method import Synthesis, own_terms
-from obsynth.methods.placement.eigenstructure import checked_poles, place
-from obsynth.methods.placement.region import NOISE_PRICE, KalmanProblem, Region, compromise, region_gain
+from obsynth.methods.placement.region import (
+    NOISE_PRICE,
+    KalmanProblem,
+    Region,
+    checked_poles,
+    compromise,
+    place,
+    region_gain,
+)
 from obsynth.methods.refusals import require_all_told
 from obsynth.methods.ui_pi_observer.augmented_plant import number, numbers
 from obsynth.methods.ui_pi_observer.conditions import Existence, existence
