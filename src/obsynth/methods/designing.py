@@ -294,7 +294,16 @@ def verified(
             + "".join(f" {note}" for note in draft.notes),
             report=report,
         )
-    return draft.replace(report=report, notes=(*draft.notes, *notes, *_lost_tolerances(draft.plant)))
+    uncertain = draft.plant.uncertainty if isinstance(draft.plant, DescriptorSystem) else None
+    if uncertain is not None and uncertain.lost:
+        notes = (
+            *notes,
+            f"The tolerances of the constants ({', '.join(uncertain.box.names)}) are not carried over: "
+            f"{uncertain.lost}. The design is for the nominal plant, and thresholds and proofs over the box are "
+            "refused. Eliminate algebraic states first (transform: eliminate_algebraic_states, "
+            "obsynth.eliminate_algebraic_states).",
+        )
+    return draft.replace(report=report, notes=(*draft.notes, *notes))
 
 
 def failed_rows(report: VerificationReport) -> str:
@@ -396,18 +405,6 @@ def agree(one: DescriptorSystem, other: DescriptorSystem) -> bool:
     pairs = [(getattr(one, name), getattr(other, name)) for name in UNCERTAIN_MATRICES]
     return all(
         a.shape == b.shape and bool(np.all(np.abs(a - b) <= SAME_PLANT * np.abs(a).max(initial=0.0))) for a, b in pairs
-    )
-
-
-def _lost_tolerances(shipped: Plant) -> tuple[str, ...]:
-    """Return a note where a plant's tolerances are not carried over."""
-    uncertain = shipped.uncertainty if isinstance(shipped, DescriptorSystem) else None
-    if uncertain is None or not uncertain.lost:
-        return ()
-    return (
-        f"The tolerances of the constants ({', '.join(uncertain.box.names)}) are not carried over: {uncertain.lost}. "
-        "The design is for the nominal plant, and thresholds and proofs over the box are refused. Eliminate algebraic "
-        "states first (transform: eliminate_algebraic_states, obsynth.eliminate_algebraic_states).",
     )
 
 

@@ -308,24 +308,22 @@ class _Composite:
 
     def _gains_at(self, points: ComplexArray) -> FloatArray:
         # From the left, where the rows of fault errors are fewer than the disturbances.
-        left = self._through_observer(points)
+        modal = self._observer_solves
+        if modal is None:
+            left = np.concatenate([*resolved(None, self.observer.Az.T, self.shown.T, points)]).transpose(0, 2, 1)
+        else:
+            left = modal.rows(points, self.shown)
         ages = np.split(left @ self.K + self.J, self.lags, axis=2)
         seen = np.asarray(sum(part * points[:, None, None] ** -age for age, part in enumerate(ages)))
-        whole = self._through_plant(points, seen) @ self.plant.Bd + left @ self.driven + self.direct
+        modal = self._plant_solves
+        if modal is None:
+            pencils = pencils_at(self.plant.E.T, self.plant.A.T, points)
+            through = np.linalg.solve(pencils, seen.transpose(0, 2, 1)).transpose(0, 2, 1)
+        else:
+            through = modal.rows(points, seen)
+        whole = through @ self.plant.Bd + left @ self.driven + self.direct
         finite = np.all(np.isfinite(whole), axis=(1, 2))
         return np.where(finite, np.linalg.norm(np.where(finite[:, None, None], whole, 0.0), 2, axis=(1, 2)), 0.0)
-
-    def _through_observer(self, points: ComplexArray) -> ComplexArray:
-        if self._observer_solves is not None:
-            return self._observer_solves.rows(points, self.shown)
-        found = np.concatenate([*resolved(None, self.observer.Az.T, self.shown.T, points)])
-        return np.asarray(found.transpose(0, 2, 1))
-
-    def _through_plant(self, points: ComplexArray, rows: ComplexArray) -> ComplexArray:
-        if self._plant_solves is not None:
-            return self._plant_solves.rows(points, rows)
-        found = np.linalg.solve(pencils_at(self.plant.E.T, self.plant.A.T, points), rows.transpose(0, 2, 1))
-        return np.asarray(found.transpose(0, 2, 1))
 
     @cached_property
     def _observer_solves(self) -> ModalSolves | None:

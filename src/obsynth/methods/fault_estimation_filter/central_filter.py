@@ -449,7 +449,12 @@ class CentralEquation:
             possible=lambda y: self._is_possible(y, level),
             most_jumps=MOST_JUMPS,
         )
-        return None if s is None else self._in_all_states(s, level)
+        if s is None or self.lift is None:
+            return s
+        shown = self.h[self.problem.measured :]
+        through = s @ shown.T
+        k = s - through @ np.linalg.solve(shown @ through - level**2 * np.eye(len(shown)), through.T)
+        return np.asarray(self.lift @ k @ self.lift.T)
 
     def _sums(self, y: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:
         """Return ``k k' - diag(0, g^2 I) + h Y h'`` and ``A Y h' + B k'`` in all states; white measurements."""
@@ -461,14 +466,6 @@ class CentralEquation:
         lowered = weight.copy()
         lowered.reshape(-1)[self.problem.measured * (len(weight) + 1) :: len(weight) + 1] -= level**2
         return lowered
-
-    def _in_all_states(self, s: FloatArray, level: float) -> FloatArray:
-        if self.lift is None:
-            return s
-        shown = self.h[self.problem.measured :]
-        through = s @ shown.T
-        k = s - through @ np.linalg.solve(shown @ through - level**2 * np.eye(len(shown)), through.T)
-        return np.asarray(self.lift @ k @ self.lift.T)
 
     def _is_possible(self, y: FloatArray, level: float) -> bool:
         """Whether what xi shows over finitely many steps is still below the level, with the current measurement."""
@@ -654,10 +651,6 @@ class GammaIteration:
         gain = None if found is None else self._gain_within(found, level)
         return None if found is None or gain is None else (found, gain)
 
-    def least_seen(self) -> tuple[Injection, float] | None:
-        """Return the filter of the least true gain of those that were judged, if there is one."""
-        return min((item for item in self.seen if math.isfinite(item[1])), key=lambda item: item[1], default=None)
-
     def _gain_within(self, found: Injection, level: float) -> float | None:
         gain = self.equation.problem.achieved_gain(found)
         self.seen.append((found, gain))
@@ -760,8 +753,9 @@ def search_central_filter(
         if found is None and descent.reached and descent.reached[0].level < gain * (1.0 - NEXT_TO):
             descent = descent.judged_again(gain)
             found = descent.best()
-        # The level that is reached last may be made up by rounding, or noise may raise it.
-        found = min(filter(None, [found, descent.least_seen()]), key=lambda item: item[1], default=None)
+        # The level that is reached last may be made up by rounding, or noise may raise it: of all that were judged.
+        seen = [found, *(item for item in descent.seen if math.isfinite(item[1]))]
+        found = min(filter(None, seen), key=lambda item: item[1], default=None)
         if noise < most_noise < np.inf and (found is None or found[1] >= gain):
             least_noise = noise  # nor is less of it worth a try
         if found is None:

@@ -86,7 +86,10 @@ def identifiability_condition(
     still = all(matrix.is_constant for matrix in (plant.E, plant.A, plant.C, plant.Phi, plant.Psi))
     decision, (parameters, shares, states) = _steady(plant) if still else _along(plant, early=early)
     if still and constant is not None:
-        settled = _settled_traces(constant, decision)
+        settled, numbers = decision, constant.numbers
+        if numbers is not None:
+            traces = numbers.rank_at_root(numbers.matrices["Bf"], numbers.matrices["Df"], fmpz_poly([-1, 1]))
+            settled = settled_rank(decision, traces)
         if settled.rank < decision.rank:
             # What leaves no trace exactly does so nearly in floating point.
             parameters, shares, states = _steady_kernel(plant, settled.rank)
@@ -104,16 +107,6 @@ def identifiability_condition(
         return found
     doubt = constant.rank_doubt(NoZeroOutside("Bf").at_zero, decision, point=1 + 0j)
     return found.in_doubt(replace(doubt, parameters=True), constant.plant)
-
-
-def _settled_traces(judge: Evaluator, decision: RankDecision) -> RankDecision:
-    """Decide the rank of ``[A - E, Phi; C, Psi]``."""
-    numbers = judge.numbers
-    if numbers is None:
-        return decision
-    return settled_rank(
-        decision, numbers.rank_at_root(numbers.matrices["Bf"], numbers.matrices["Df"], fmpz_poly([-1, 1]))
-    )
 
 
 def _explained(
