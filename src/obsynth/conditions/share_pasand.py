@@ -35,7 +35,6 @@ from obsynth.methods.placement.region import checked_poles, place
 from obsynth.methods.ui_pi_observer.augmented_plant import (
     AugmentedPlant,
     Decoupled,
-    ObserverGains,
     combinations_seen,
     decouple,
     direct_part,
@@ -175,7 +174,7 @@ def augmented_problem(
     def gains(values: Values) -> dict[str, FloatArray]:
         free = K if poles is not None else X @ np.linalg.solve(values["P"], values["Y"])
         K_a = free @ seen + U_a @ injected
-        letters = realise(plant, model, ObserverGains(U_a, D_a, K_a), combinations_seen(plant))[1]
+        letters = realise(plant, model, (U_a, D_a, K_a), combinations_seen(plant))[1]
         nx = plant.nx
         return {**letters, "U": U_a[:nx, :nx], "D": D_a[:nx], "K": K_a[:nx], "F": K_a[nx:]}
 

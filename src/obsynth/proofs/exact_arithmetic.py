@@ -633,18 +633,14 @@ def exponential(matrix: fmpq_mat) -> Any:
     return arb_mat(matrix).exp()
 
 
-def holds_zero(value: Any) -> bool:
-    """Whether a number counts as zero: its enclosure holds it."""
-    return bool(value.contains(0))
-
-
 def rank_to_digits(rows: Rows) -> int:
     """Return the rank: at least this for certain, at most this to digits."""
     work = [list(row) for row in rows]
     rank, width = 0, len(work[0]) if work else 0
     free = list(range(width))
     while rank < len(work) and free:
-        places = [(i, j) for i in range(rank, len(work)) for j in free if not holds_zero(work[i][j])]
+        # A number whose enclosure holds zero counts as zero.
+        places = [(i, j) for i in range(rank, len(work)) for j in free if not work[i][j].contains(0)]
         if not places:
             break
         i, j = max(places, key=lambda place: float(work[place[0]][place[1]].abs_lower().log()))
@@ -767,7 +763,7 @@ def _normalised(coefficients: Sequence[Any]) -> list[Any]:
 
 def _trimmed(coefficients: Sequence[Any]) -> list[Any]:
     found = list(coefficients)
-    while found and holds_zero(found[-1]):
+    while found and found[-1].contains(0):
         found.pop()
     return found
 

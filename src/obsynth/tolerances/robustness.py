@@ -79,12 +79,7 @@ def plant_at(plant: DescriptorSystem, values: Mapping[str, float]) -> Descriptor
 def _written_at(plant: DescriptorSystem, uncertain: Uncertainty, values: Mapping[str, float]) -> DescriptorSystem:
     """Return the plant as it was written, for values of its constants."""
     matrices: dict[str, Any] = uncertain.filled(as_written(plant, uncertain), values)
-    return DescriptorSystem(**matrices, dt=0.0 if is_sampled(uncertain.steps) else plant.dt)
-
-
-def is_sampled(steps: tuple[tuple[str, float], ...]) -> bool:
-    """Whether a plant was sampled since it was written."""
-    return any(kind == SAMPLED for kind, _ in steps)
+    return DescriptorSystem(**matrices, dt=0.0 if any(kind == SAMPLED for kind, _ in uncertain.steps) else plant.dt)
 
 
 def drawn_points(count: int, runs: int, seed: int, *, vertices: float = 0.5) -> FloatArray:
@@ -817,7 +812,7 @@ def _named(names: tuple[str, ...], shares: FloatArray) -> dict[str, float]:
 def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict, tuple[complex, ...]]:
     """Return whether the plant is stable on the box, but for modes that no constant touches, and these."""
     box, uncertain = affine.box, plant.uncertainty
-    sampled = uncertain is not None and is_sampled(uncertain.steps)
+    sampled = uncertain is not None and any(kind == SAMPLED for kind, _ in uncertain.steps)
     discrete = plant.is_discrete and not sampled
     basis = moving_basis(plant, box)
     whole = moving_family(plant, box, basis)

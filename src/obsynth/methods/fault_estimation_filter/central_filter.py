@@ -130,10 +130,6 @@ class GainProblem:
         state, direct = np.vstack([self.B, self.D]), float(np.linalg.norm(self.Zd))
         return float(np.linalg.norm(self.Z) * np.linalg.norm(state)) + direct
 
-    def without_disturbance(self) -> GainProblem:
-        """Return the problem without its disturbance."""
-        return replace(self, B=self.B[:, :0], D=self.D[:, :0], Zd=self.Zd[:, :0])
-
     def noise_as_disturbance(self) -> GainProblem:
         """Return the problem with its noise in the disturbance's place."""
         return replace(self, B=self.Bn, D=self.Dn, Zd=self.Zn)

@@ -29,7 +29,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -365,7 +365,7 @@ def found_gains(
         least = replace(least, starting_gain=NOMINAL_GAIN * size)
     elif unfelt:
         # What is left of the disturbance in the estimates is rounding: nothing to minimise.
-        problem = problem.without_disturbance()
+        problem = replace(problem, B=problem.B[:, :0], D=problem.D[:, :0], Zd=problem.Zd[:, :0])
         least = replace(_least_gain(problem, asked), gain=least.starting_gain)
     elif engine == "lmi" or (engine == "auto" and _leaves_little(asked.gamma, least.gain, problem)):
         progress("refining the least gain")
@@ -502,12 +502,14 @@ def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progres
     search = partial(found_within, problem, limited, asked, printed=printed, progress=progress)
     found = search(exactly=False)
     progress("building the realisation and its certificate")
-    shipped = _Shipped.of(plant, prepared, parts, found, nominal, tries=FIRST_TRIES)
-    if not shipped.proved:
-        if not replace(found.problem, judged_exactly=True).reaches(found.chosen, shipped.level):
+    level = found.gamma if found.problem.disturbances else nominal
+    gains, realised, factor, proved = _shipped(plant, prepared, parts, found, level, tries=FIRST_TRIES)
+    if not proved:
+        if not replace(found.problem, judged_exactly=True).reaches(found.chosen, level):
             found = search(exactly=True)  # a peak was missed
-        shipped = _Shipped.of(plant, prepared, parts, found, nominal, tries=None)
-    gains, observer, tracking, lag, level, factor = shipped[:6]
+            level = found.gamma if found.problem.disturbances else nominal
+        gains, realised, factor, _ = _shipped(plant, prepared, parts, found, level, tries=None)
+    observer, tracking, lag = realised
     claims, witnesses = {"state_lag": float(lag)}, {"P_factor": factor, "tracking": tracking}
     if plant.nd:
         progress("proving that no filter has a smaller gain")
@@ -567,35 +569,20 @@ def _least(
     return claims, proof
 
 
-class _Shipped(NamedTuple):
-    """Gains, their realisation, and the certificate of the level that is claimed."""
-
-    gains: dict[str, FloatArray]
-    observer: LinearObserver
-    tracking: FloatArray
-    lag: int
-    level: float
-    factor: FloatArray
-    proved: bool
-
-    @classmethod
-    def of(
-        cls,
-        plant: DescriptorSystem,
-        prepared: PreparedPlant,
-        parts: _Parts,
-        found: FoundGains,
-        nominal: float,
-        *,
-        tries: int | None,
-    ) -> _Shipped:
-        gains = _gains(prepared, parts, found.chosen)
-        observer, tracking, lag = realise_filter(plant, prepared.plant, gains, prepared.detectability)
-        level = found.gamma if found.problem.disturbances else nominal
-        factor, proved = bounded_real_certificate(
-            plant, observer, tracking, level, core=prepared.plant.nx, lag=lag, tries=tries
-        )
-        return cls(gains, observer, tracking, lag, level, factor, proved)
+def _shipped(
+    plant: DescriptorSystem,
+    prepared: PreparedPlant,
+    parts: _Parts,
+    found: FoundGains,
+    level: float,
+    *,
+    tries: int | None,
+) -> tuple[dict[str, FloatArray], tuple[LinearObserver, FloatArray, int], FloatArray, bool]:
+    """Return gains, their realisation, the certificate of the level that is claimed, and whether it proves that."""
+    gains = _gains(prepared, parts, found.chosen)
+    observer, tracking, lag = realise_filter(plant, prepared.plant, gains, prepared.detectability)
+    proof = bounded_real_certificate(plant, observer, tracking, level, core=prepared.plant.nx, lag=lag, tries=tries)
+    return gains, (observer, tracking, lag), *proof
 
 
 @dataclass(frozen=True, eq=False)

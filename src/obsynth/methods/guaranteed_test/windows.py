@@ -276,8 +276,11 @@ class Window:
     @cached_property
     def scales(self) -> tuple[np.ndarray, np.ndarray]:
         """Exponents of the powers of two by which rows and columns are multiplied before anything is computed."""
-        columns = np.where(self.bounded, _exponent(np.where(self.bounded, self.bar, 1.0)), 0)
-        rows, size = np.zeros(self.rows, dtype=np.int64), _exponent(self.value * self.times)
+        columns, size = (
+            np.frexp(part)[1].astype(np.int64)
+            for part in (np.where(self.bounded, self.bar, 1.0), self.value * self.times)
+        )
+        columns, rows = np.where(self.bounded, columns, 0), np.zeros(self.rows, dtype=np.int64)
         for _ in range(SCALING_ROUNDS):
             rows = -_middle(size + columns[self.j], self.i, self.rows)
             moved = -_middle(size + rows[self.i], self.j, len(self.bar))
@@ -511,11 +514,6 @@ def _course(question: Question, builder: Builder, acting: Any, span: range) -> N
             later = range(k, len(span)) if k > target else range(k)
             for there in later:
                 acting("f", which, there, change, 1 if k > target else -1)
-
-
-def _exponent(values: FloatArray) -> np.ndarray:
-    """Return the exponents of the powers of two next to absolute values."""
-    return np.frexp(values)[1].astype(np.int64)
 
 
 def _middle(exponents: np.ndarray, at: np.ndarray, count: int) -> np.ndarray:

@@ -124,7 +124,9 @@ def _explicit_conditions(judge: Evaluator) -> Iterator[Condition]:
         return told, _null_names(columns, plant.fault_names)
 
     def hidden(rosenbrock: FloatArray) -> tuple[str, tuple[str, ...]]:
-        names = leading_names(_null_vector(rosenbrock)[plant.nx :], plant.fault_names, most=MOST_NAMES)
+        names = leading_names(
+            np.linalg.svd(equilibrate(rosenbrock))[2][-1, plant.nx :], plant.fault_names, most=MOST_NAMES
+        )
         told = (
             f"there is a zero at s = 0, where a constant fault {', '.join(map(repr, names))} has no effect on the "
             "outputs in steady state. Measure another signal."
@@ -184,13 +186,8 @@ def _hidden_mode(plant: DescriptorSystem, hidden: Sequence[complex]) -> Conditio
     )
 
 
-def _null_vector(matrix: FloatArray) -> FloatArray:
-    """Return the direction (of unit columns) that a matrix shows least."""
-    return np.asarray(np.linalg.svd(equilibrate(matrix))[2][-1])
-
-
 def _null_names(matrix: FloatArray, names: tuple[str, ...]) -> tuple[str, ...]:
     lengths = np.linalg.norm(matrix, axis=0)
     if np.any(lengths == 0.0):
         return tuple(name for name, length in zip(names, lengths, strict=True) if length == 0.0)
-    return leading_names(_null_vector(matrix), names, most=MOST_NAMES)
+    return leading_names(np.linalg.svd(equilibrate(matrix))[2][-1], names, most=MOST_NAMES)

@@ -201,29 +201,22 @@ def paper_decoupling(
     return correction, u, c_sharp + correction @ (np.eye(ny) - plant.C @ c_sharp)
 
 
-@dataclass(frozen=True, eq=False)
-class ObserverGains:
-    """Gains for the augmented plant."""
-
-    U: FloatArray  # (na, na)
-    D: FloatArray  # (na, ny)
-    K: FloatArray  # (na, ny)
-
-
 def realise(
-    plant: DescriptorSystem, model: Exosystem, gains: ObserverGains, seen: FloatArray
+    plant: DescriptorSystem, model: Exosystem, gains: tuple[FloatArray, FloatArray, FloatArray], seen: FloatArray
 ) -> tuple[LinearObserver, dict[str, FloatArray]]:
-    """Return the observer, and its matrices by the paper's letters; ``seen (nr, ny)``."""
+    """Return the observer with gains ``U (na, na)``, ``D (na, ny)`` and ``K (na, ny)`` of the augmented plant, and its
+    matrices by the paper's letters; ``seen (nr, ny)``."""
+    u, d, k = gains
     augmented = AugmentedPlant.of(plant, model)
     nx, na = plant.nx, augmented.order
-    a_hat = gains.U @ augmented.A - gains.K @ augmented.C
+    a_hat = u @ augmented.A - k @ augmented.C
     # Rows that follow nothing, or show nothing, are zero: rounding would be all that their identities are judged by.
-    b_hat = product_but_rounding(a_hat, gains.D, gains.K)
-    j_hat = gains.U @ augmented.B
+    b_hat = product_but_rounding(a_hat, d, k)
+    j_hat = u @ augmented.B
     faults = np.hstack([np.zeros((plant.nf, nx)), model.Cw])
     rows = np.vstack([np.eye(nx, na), faults, -seen @ augmented.C])
     shown = np.vstack([np.zeros((nx + plant.nf, plant.ny)), seen])
-    direct = product_but_rounding(rows, gains.D, shown)
+    direct = product_but_rounding(rows, d, shown)
     names = (
         plant.output_names if np.array_equal(seen, np.eye(plant.ny)) else tuple(f"r{i + 1}" for i in range(len(seen)))
     )
@@ -243,7 +236,7 @@ def realise(
         state_delays=(0,) * nx,
         fault_delays=(0,) * plant.nf,
     )
-    letters = {"U_a": gains.U, "D_a": gains.D, "K_a": gains.K, "Ahat": a_hat, "Bhat": b_hat, "Jhat": j_hat}
+    letters = {"U_a": u, "D_a": d, "K_a": k, "Ahat": a_hat, "Bhat": b_hat, "Jhat": j_hat}
     return observer, letters
 
 

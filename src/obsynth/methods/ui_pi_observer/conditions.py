@@ -276,13 +276,8 @@ D1_BLOCKS = (("E", None, "Bd"), ("C", "Dd", None), (None, None, "Dd"))
 
 def decoupling_rank(judge: Evaluator) -> RankDecision:
     """Decide (D1): ``rank [E 0 Bd; C Dd 0; 0 0 Dd]``, with what it must be."""
-    expected = judge.plant.nx + judge.rank_itself(FullRank([["Dd"]])) + disturbance_rank(judge)
+    expected = judge.plant.nx + judge.rank_itself(FullRank([["Dd"]])) + judge.rank_itself(FullRank([["Bd"], ["Dd"]]))
     return judge.rank(FullRank(D1_BLOCKS, rank=expected))
-
-
-def disturbance_rank(judge: Evaluator) -> int:
-    """Return ``rank [Bd; Dd]``: repeated disturbances count once."""
-    return judge.rank_itself(FullRank([["Bd"], ["Dd"]]))
 
 
 def decoupling_data(judge: Evaluator) -> tuple[Transformation | None, str, str]:
@@ -448,7 +443,7 @@ def _key(model: Exosystem, *, exactly: bool) -> tuple[bool, *tuple[bytes, ...]]:
 
 
 def _decided(judge: Evaluator, model: Exosystem) -> Existence:
-    plant, rank = judge.plant, disturbance_rank(judge)
+    plant, rank = judge.plant, judge.rank_itself(FullRank([["Bd"], ["Dd"]]))
     holds = rank <= plant.ny
     enough = Condition(
         "nd <= ny",

@@ -26,7 +26,6 @@ from obsynth.methods.placement.region import KalmanProblem
 from obsynth.methods.ui_pi_observer.augmented_plant import (
     AugmentedPlant,
     Decoupled,
-    ObserverGains,
     combinations_seen,
     decouple,
     direct_part,
@@ -80,14 +79,12 @@ class PlacementProblem:
     split: ObservableSplit  # of the pair
     rate: float  # median of abs(s) over the plant's modes, in scaled time
 
-    def gains(self, placed: FloatArray) -> ObserverGains:
-        """Return the gains in the user's units for one of the observable part ``(no, rows)``."""
+    def gains(self, placed: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return U, D and K in the user's units for one of the observable part ``(no, rows)``."""
         k = self.split.lift(placed)
         u, d, k = _completed(self, k)
         states, outputs = self.units.augmented_states[:, None], self.units.outputs
-        return ObserverGains(
-            states * u * self.units.augmented_equations, states * d * outputs, states * k * outputs / self.units.rate
-        )
+        return states * u * self.units.augmented_equations, states * d * outputs, states * k * outputs / self.units.rate
 
     @property
     def fixed_modes(self) -> ComplexArray:
@@ -361,7 +358,7 @@ def synthesis_from_gains(plant: DescriptorSystem, *, U: Any, D: Any, K: Any, F: 
     for name, shape in shapes.items():
         require_shape(given[name].shape, shape, name)
     u, d = with_faults(given["U"], given["D"], plant, model)
-    gains = ObserverGains(u, d, np.vstack([given["K"], given["F"]]))
+    gains = u, d, np.vstack([given["K"], given["F"]])
     options = {"from_gains": True, "fault_model": plain(fault_model)}
     found = assembled(plant, model, gains, None, {}, structured=True)
     return Synthesis(options, found.gains, found.observer, found.certificate)
@@ -370,7 +367,7 @@ def synthesis_from_gains(plant: DescriptorSystem, *, U: Any, D: Any, K: Any, F: 
 def assembled(
     plant: DescriptorSystem,
     model: Exosystem,
-    gains: ObserverGains,
+    gains: tuple[FloatArray, FloatArray, FloatArray],
     poles: ComplexArray | None,
     claims: dict[str, float],
     *,
@@ -378,15 +375,15 @@ def assembled(
 ) -> Synthesis:
     """Return realisation and certificate of gains in the plant's units; poles that were not asked for are computed."""
     observer, letters = realise(plant, model, gains, combinations_seen(plant))
-    nx = plant.nx
+    nx, (u, d, k) = plant.nx, gains
     if structured:
-        letters |= {"U": gains.U[:nx, :nx], "D": gains.D[:nx], "K": gains.K[:nx], "F": gains.K[nx:]}
+        letters |= {"U": u[:nx, :nx], "D": d[:nx], "K": k[:nx], "F": k[nx:]}
         letters["Hhat"] = letters["U"] @ plant.Bf
     letters |= {"Phi": model.Phi, "Cw": model.Cw}
     poles = _shipped_poles(observer, poles)
     order = np.lexsort((poles.imag, poles.real))
     matrices = {
-        "tracking": gains.U,
+        "tracking": u,
         "Phi": model.Phi,
         "Cw": model.Cw,
         "poles": np.column_stack([poles.real, poles.imag])[order] if poles.size else np.zeros((0, 2)),
