@@ -349,3 +349,35 @@ def test_what_rounding_leaves_of_an_integrator_is_no_time_of_the_plant(scatter: 
     a = [[1.0 + scatter, 1.0], [0.0, 1.0]]
     sampled = obsynth.DescriptorSystem(None, a, C=[[1, 0]], Bf=[[0], [1]], dt=0.5)
     assert kalman_gain.settling_time(sampled) == 10.0
+
+
+def test_a_default_walk_shows_a_step_where_none_does_at_once() -> None:
+    # Its unstable poles set the pace: after four samples no walk shows a step, and the slowest of all was taken, with
+    # a pole at 1 - 1e-10 and a note that a step is estimated after 2 s.  The design was lost for what it then missed.
+    e = [[1, 1, 1, 0, -1], [0, 1, 0, -1, 0], [0, 0, 1, 1, 0], [0, 0, 0, 1, -1], [0, 0, 0, 0, 1]]
+    a = [[-4, 4, 1, -4, 0], [-1, 1, 4, -3, 3], [0, -2, 3, -4, -1], [-3, -2, 3, -1, 0], [-3, 0, -4, 1, -3]]
+    plant = obsynth.DescriptorSystem(
+        e, np.array(a) / 4, C=[[1, 1, -1, -2, -2]], Bf=[[-2], [-1], [1], [2], [-2]], Df=[[1]], dt=0.5
+    )
+    design = obsynth.functional_filter(plant)
+    assert design.report.passed
+    seconds = float(next(note for note in design.notes if "slowest with which" in note).split(" after ")[1].split()[0])
+    assert seconds < 20.0
+    x, outputs = np.zeros(5), []
+    for _ in range(round(seconds / plant.dt) + 1):
+        outputs.append(plant.C @ x + plant.Df[:, 0])
+        x = np.linalg.solve(plant.E, plant.A @ x + plant.Bf[:, 0])
+    assert design.observer.run(np.array(outputs)).faults[-1, 0] == pytest.approx(1.0, abs=0.5)
+
+
+def test_a_fault_that_equations_without_noise_tell_has_a_walk() -> None:
+    # No noise reaches what tells the second fault: all walks that were tried were zero.
+    plant = obsynth.DescriptorSystem(
+        [[1, 1], [0, 0]],
+        [[-1, -1], [-0.5, -0.5]],
+        C=[[1, -1], [2, 1]],
+        Bf=[[0, 1], [0, -2]],
+        Df=[[1, 0], [0, 0]],
+        dt=0.5,
+    )
+    assert obsynth.functional_filter(plant).observer.fault_names == ("f1", "f2")

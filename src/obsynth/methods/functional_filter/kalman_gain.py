@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -132,6 +132,7 @@ class KalmanGain:
     lag: tuple[FloatArray, ...]  # (n, p) each: gain of xi(k) from the innovation at k + j
     innovation: FloatArray  # (p, p), its covariance; intensity in continuous time
     covariance: FloatArray | None = None  # (n, n), of the errors of the prediction; ``None``: of poles
+    seen: tuple[float, float] | None = None  # of a walk by default: seconds, and share of a step still missing then
 
 
 def exact_rows(model: FilterModel) -> FloatArray:
@@ -317,7 +318,9 @@ RATE_REACHED, ASKED_AT = 0.1, (1.0, 1.5, 2.5)
 #: Where no walk shows a step in time: walks that miss it by so much more than the best are as good.
 AS_CLOSE = 0.05
 #: A walk that misses a step by more shows nothing of it in time: how much more than that is a matter of rounding.
-NOTHING_SHOWN = 0.5
+#: Where no walk shows more, it has so many times as long, this often: the slowest of all would show nothing ever, and
+#: is taken only where rounding hides what faster ones show.
+NOTHING_SHOWN, LONGER, MOST_LONGER = 0.5, 2.0, 10
 #: Errors that need longer than so many settling times to decay would stay in any run: the gain moves such poles.
 FOR_GOOD = 1e5
 #: Decades of the search around a rate of the size of the noise, and its steps per decade at the end.
@@ -334,7 +337,9 @@ def settling_time(plant: DescriptorSystem) -> float:
     return max(wanted, LEAST_SAMPLES * plant.dt)
 
 
-def default_rates(model: FilterModel, seconds: float, *, lag: int) -> tuple[FloatArray, KalmanGain]:
+def default_rates(
+    model: FilterModel, seconds: float, *, lag: int, longer: int = MOST_LONGER
+) -> tuple[FloatArray, KalmanGain]:
     """Return the slowest walk of all fault models with which steps are seen in time, and its gain."""
     states = model.drive.shape[1]
     natural = np.max(np.abs(model.estimate[:, model.order :]), axis=0, initial=0.0)
@@ -342,6 +347,7 @@ def default_rates(model: FilterModel, seconds: float, *, lag: int) -> tuple[Floa
     for row, size in zip(model.estimate[:, model.order :], model.fault_sizes, strict=True):
         sizes[row != 0.0] = max(float(size), np.finfo(np.float64).tiny)
     noise = max(float(np.max(np.abs(model.M), initial=0.0)), float(np.max(np.abs(model.N), initial=0.0)))
+    noise = noise or 1.0  # a fault that equations without noise tell
     unit = np.where(natural > 0.0, noise / sizes, noise / float(np.max(sizes, initial=1.0)))
     tried: dict[float, KalmanGain | None] = {}
 
@@ -353,25 +359,30 @@ def default_rates(model: FilterModel, seconds: float, *, lag: int) -> tuple[Floa
                 tried[exponent] = None
         return tried[exponent]
 
-    def in_time(exponent: float) -> bool:
+    def missed(exponent: float, seconds: float) -> float:
         found = gain(exponent)
-        return found is not None and step_misses(model, found, seconds) <= RATE_REACHED
+        return np.inf if found is None else step_misses(model, found, seconds)
 
-    high = next((float(e) for e in range(-DECADES, DECADES + 1) if in_time(float(e))), None)
+    exponents = [float(e) for e in range(-DECADES, DECADES + 1)]
+    for seconds in (seconds * LONGER**times for times in range(longer + 1)):
+        high = next((e for e in exponents if missed(e, seconds) <= RATE_REACHED), None)
+        least = min(missed(e, seconds) for e in exponents) if high is None else 0.0
+        if least <= NOTHING_SHOWN:
+            break
+    if not any(found is not None for found in tried.values()):
+        raise SolverError("No random-walk intensity of the fault gives a stable filter: give fault_rate, or poles.")
     if high is None:
         # Some zero keeps every estimate from a step for long: the slowest walk that comes about as close as any.
-        misses = {e: step_misses(model, found, seconds) for e, found in tried.items() if found is not None}
-        if not misses:
-            raise SolverError("No random-walk intensity of the fault gives a stable filter: give fault_rate, or poles.")
-        least = min(misses.values())
-        high = min(e for e, miss in misses.items() if miss <= least + AS_CLOSE or least > NOTHING_SHOWN)
+        close = np.inf if least > NOTHING_SHOWN else least + AS_CLOSE
+        high = next(e for e in exponents if tried[e] is not None and missed(e, seconds) <= close)
     else:
         low = high - 1.0
         for _ in range(RATE_BISECTIONS):
             middle = 0.5 * (low + high)
-            low, high = (low, middle) if in_time(middle) else (middle, high)
+            low, high = (low, middle) if missed(middle, seconds) <= RATE_REACHED else (middle, high)
     walks = 10.0**high * unit
-    return walks, _forgetting(model, walks, _known(gain(high)), seconds, lag)
+    found = _forgetting(model, walks, _known(gain(high)), seconds, lag)
+    return walks, replace(found, seen=(seconds, step_misses(model, found, seconds)))
 
 
 def _forgetting(model: FilterModel, walks: FloatArray, found: KalmanGain, seconds: float, lag: int) -> KalmanGain:

@@ -20,10 +20,12 @@ import flint
 import numpy as np
 from scipy.linalg import block_diag, schur
 
-from obsynth.errors import SpecError
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.functional_filter.checks import estimate_deviations, tracking_map
 from obsynth.methods.functional_filter.conditions import chosen_faults, residual_sets
 from obsynth.methods.functional_filter.kalman_gain import (
+    MOST_LONGER,
+    RATE_REACHED,
     FilterModel,
     KalmanGain,
     default_rates,
@@ -37,7 +39,7 @@ from obsynth.methods.functional_filter.kalman_gain import (
 from obsynth.methods.functional_filter.method import FunctionalFilter
 from obsynth.methods.method import Synthesis
 from obsynth.methods.placement.region import checked_poles, place
-from obsynth.methods.refusals import require_all_told
+from obsynth.methods.refusals import require_above_rounding, require_all_told
 from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, product_but_rounding, rounding_rank
 from obsynth.numerics.scaling import balanced_matrix
@@ -224,10 +226,12 @@ def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Ca
     progress("decoupling the unknown inputs")
     models = _models(noisy, model, asked)
     progress("choosing the gains")
-    parts, rates = _parts(noisy, models, asked)
+    for longer in (MOST_LONGER, 0):
+        parts, rates, seen = _parts(noisy, models, asked, longer)
+        observer, t, t0 = assembled(plant, parts, _residual_names(plant, models, parts, asked))
+        if not any(seconds > settling_time(plant) for seconds, _ in seen) or _is_above_rounding(plant, observer):
+            break
     progress("building the realisation and its certificate")
-    names = _residual_names(plant, models, parts, asked)
-    observer, t, t0 = assembled(plant, parts, names)
     estimated = [plant.fault_names.index(name) for name in observer.fault_names]
     walks = np.zeros(model.order)
     for part, walk in zip(models, rates, strict=True):
@@ -250,9 +254,18 @@ def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Ca
         {"T": t, "T0": t0},
         observer,
         Certificate(matrices, claims),
-        notes=(*notes, *_notes(plant, asked, slowest, rates)),
+        notes=(*notes, *_notes(plant, slowest, rates, seen)),
         plant=noisy if noisy is not plant else None,
     )
+
+
+def _is_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> bool:
+    """Whether rounding of the outputs leaves something of the estimates."""
+    try:
+        require_above_rounding(plant, observer)
+    except PreconditionError:
+        return False
+    return True
 
 
 def require_stated(plant: DescriptorSystem, asked: FunctionalFilter) -> None:
@@ -305,23 +318,24 @@ def _models(plant: DescriptorSystem, model: Exosystem, asked: FunctionalFilter) 
 
 
 def _parts(
-    plant: DescriptorSystem, models: Sequence[FilterModel], asked: FunctionalFilter
-) -> tuple[list[FilterPart], list[FloatArray]]:
-    """Return the filters, and the walks of their fault models' states."""
+    plant: DescriptorSystem, models: Sequence[FilterModel], asked: FunctionalFilter, longer: int
+) -> tuple[list[FilterPart], list[FloatArray], list[tuple[float, float]]]:
+    """Return the filters, the walks of their fault models' states, and when steps are seen with walks by default."""
     if asked.poles is not None:
-        return _placed(plant, models, asked), [np.zeros(model.drive.shape[1]) for model in models]
+        return _placed(plant, models, asked), [np.zeros(model.drive.shape[1]) for model in models], []
     given = asked.rates(plant)
-    parts, rates = [], []
+    parts, rates, seen = [], [], []
     for model in models:
         require_noise(model, plant.output_names, plant.Dw)
-        walks, gain = _gain(plant, model, given, asked)
+        walks, gain = _gain(plant, model, given, asked, longer)
         rates.append(walks)
+        seen += [] if gain.seen is None else [gain.seen]
         parts.append(filter_part(model, gain, whitening(gain.innovation), delay=asked.delay, mean=asked.mean))
-    return parts, rates
+    return parts, rates, seen
 
 
 def _gain(
-    plant: DescriptorSystem, model: FilterModel, given: FloatArray | None, asked: FunctionalFilter
+    plant: DescriptorSystem, model: FilterModel, given: FloatArray | None, asked: FunctionalFilter, longer: int
 ) -> tuple[FloatArray, KalmanGain]:
     if not model.drive.shape[1]:
         return np.zeros(0), kalman_gain(model, np.zeros(0), decay=asked.decay or 0.0)
@@ -337,7 +351,7 @@ def _gain(
                         path="method.options.fault_rate",
                     )
         return walks, kalman_gain(model, walks, lag=asked.delay, decay=asked.decay or 0.0)
-    return default_rates(model, settling_time(plant), lag=asked.delay)
+    return default_rates(model, settling_time(plant), lag=asked.delay, longer=longer)
 
 
 def _placed(plant: DescriptorSystem, models: Sequence[FilterModel], asked: FunctionalFilter) -> list[FilterPart]:
@@ -396,15 +410,21 @@ def _resolved(
     return found
 
 
-def _notes(plant: DescriptorSystem, asked: FunctionalFilter, slowest: float, rates: Sequence[FloatArray]) -> list[str]:
+def _notes(
+    plant: DescriptorSystem, slowest: float, rates: Sequence[FloatArray], seen: Sequence[tuple[float, float]]
+) -> list[str]:
     notes = []
     unit = "per sample" if plant.dt > 0.0 else "per square root of a second"
-    if asked.residuals is None and asked.fault_rate is None and asked.poles is None and asked.decay is None:
-        largest = float(max((np.max(walk, initial=0.0) for walk in rates), default=0.0))
+    if seen:
+        largest = float(max(np.max(walk, initial=0.0) for walk in rates))
+        seconds, missed = (max(values) for values in zip(*seen, strict=True))
+        close = (
+            "" if missed <= RATE_REACHED else f" (with any intensity, up to {missed:.0%} of it are still missing then)"
+        )
         notes.append(
             f"fault_rate was not given: a random-walk intensity of {largest:.3g} {unit} is the slowest with which a "
-            "step is estimated after "
-            f"{settling_time(plant):.3g} s. A delay reduces the noise only relative to a fault_rate that you state."
+            f"step is estimated after {seconds:.3g} s{close}. A delay reduces the noise only relative to a fault_rate "
+            "that you state."
         )
     if np.isfinite(slowest) and slowest * SLOW_ERRORS * settling_time(plant) < 1.0:
         notes.append(
