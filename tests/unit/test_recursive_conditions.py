@@ -117,13 +117,13 @@ class TestParameters:
     def test_a_bias_of_a_sensor_of_an_integrator(self) -> None:
         error = refusal(self.plant(np.diag([1.0, 0.7]), Df=[[1], [0]], fault_names=["bias"]), "adaptive-observer")
         assert error.signals == ("bias",)
-        assert "cannot be distinguished from constant shifts of 'x1'" in str(error)
+        assert "the parameter 'bias' cannot be distinguished from constant shifts of 'x1'" in str(error)
         assert obsynth.adaptive_observer(self.plant(Df=[[1], [0]]), **NOISE).report.passed
 
     def test_one_that_enters_nowhere(self) -> None:
         for form in ({}, {"form": "random-walk", "random_walk": 1.0}):
             error = refusal(self.plant(Bf=[[0], [0]]), "adaptive-observer", **form)
-            assert "'f1' leaves no trace" in str(error)
+            assert "the parameter 'f1' has no effect on the outputs" in str(error)
 
     def test_rank_in_a_random_plant_with_known_kernel(self) -> None:
         """Phi and Psi are chosen such that one combination, with one constant state, vanishes; then it is broken."""

@@ -52,7 +52,7 @@ class Identifiability:
 
     @property
     def unseen(self) -> tuple[dict[str, float], ...]:
-        """Each direction that leaves no trace in the outputs: signal -> share, of entries worth naming."""
+        """Each direction that has no effect on the outputs: signal -> share, of entries worth naming."""
         return tuple(self._shares(row) for row in self.directions[self.rank :])
 
     @property

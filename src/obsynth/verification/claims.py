@@ -228,7 +228,7 @@ KNOWN_CLAIMS = ("gamma", "gamma_min", "gamma_bracket_low", "gamma_bracket_high",
 #: Gains are norms found in different coordinates: they may be out of order by this share of the claimed one.
 ORDER_TOLERANCE = 1e-6
 #: Why a variance is not known.
-UNCERTAIN = "rounding leaves no digit: two ways of computing it disagree"
+UNCERTAIN = "at rounding level: two ways of computing it disagree"
 
 
 def claimed(claims: Mapping[str, Any], name: str) -> float:

@@ -70,8 +70,8 @@ class AdaptiveObserver(DescriptorKalman):
     PreconditionError
         As for `descriptor_kalman`; no parameters; parameters that the outputs cannot distinguish from each other or
         from the state (of a time-invariant plant: ``rank [A - E, Phi; C, Psi] < nx + nq``), which are named with the
-        ratio in which they leave no trace; or form ``literal`` where ``rank E + ny - nx`` is zero, so that it would
-        never learn.
+        ratio in which they have no effect on the outputs; or form ``literal`` where ``rank E + ny - nx`` is zero, so
+        that it would never learn.
     VerificationError
         The observer fails a check.
 
@@ -82,7 +82,8 @@ class AdaptiveObserver(DescriptorKalman):
     printed it is form ``literal``, refused where it has no residual direction.  States are those after the correction
     ``xhat + Upsilon (theta(k+1) - theta(k))``, as (18a) lags by one update.  The covariance of theta is carried besides
     S, which is none.  S is a triangle, bounded where excitation ends.  Parameters may walk randomly (the augmented
-    Kalman filter).  Those that leave no trace, or none of their own, are refused: (26) cannot hold for them.
+    Kalman filter).  Those that have no effect on the outputs, or none of their own, are refused: (26) cannot hold for
+    them.
 
     References
     ----------

@@ -136,7 +136,9 @@ class GuaranteedTestMethod(Asked, Method):
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "threshold": ClaimMeaning("", "never passed without the fault, in the fault's unit", "threshold"),
         "least": ClaimMeaning("", "no function of these samples estimates the fault to within less", "least"),
-        "surely_found": ClaimMeaning("", "a fault of this size and course surely alarms", "surely found"),
+        "surely_found": ClaimMeaning(
+            "", "a fault of this size and course is certain to alarm, on the nominal plant", "surely found"
+        ),
         "delay": ClaimMeaning("s", "after which it does so at the latest", "delay"),
         "mean_threshold": ClaimMeaning(
             "",

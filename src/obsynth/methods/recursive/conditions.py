@@ -115,8 +115,10 @@ def _explained(
     hidden = ", ".join(map(repr, states))
     with_states = f" together with constant shifts of {hidden}" if hidden else ""
     if len(names) == 1:
-        text = f"the parameter {names[0]!r} leaves no trace in the outputs"
-        text += f": it cannot be distinguished from constant shifts of {hidden}" if hidden else ""
+        effect = (
+            f"cannot be distinguished from constant shifts of {hidden}" if hidden else "has no effect on the outputs"
+        )
+        text = f"the parameter {names[0]!r} {effect}"
     else:
         values = [parameters[plant.parameter_names.index(name)] for name in names]
         size = values[int(np.argmax(np.abs(values)))]
@@ -124,7 +126,7 @@ def _explained(
         text = (
             f"the parameters {', '.join(map(repr, names))} cannot be distinguished from each other: in the ratio "
             f"{ratio}"
-            f"{with_states} they leave no trace in the outputs"
+            f"{with_states} they have no effect on the outputs"
         )
     return f"{text}. Estimate fewer parameters, or measure something that they act on."
 
