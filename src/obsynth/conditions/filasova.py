@@ -122,7 +122,8 @@ def filasova_theorem2(
     Returns
     -------
     Conditions
-        As for `filasova_theorem1`, with a symmetric ``P3``; constraints ``"(61) P"``, ``"(61) Q"``, ``"(62)"``.
+        As for `filasova_theorem1`, with a symmetric ``P3``; constraints ``"(61) P"``, ``"(61) Q"``, ``"(62)"``.  Its
+        ``design()`` verifies the gains, and claims Theorem 1 of them; `obsynth.pd_observer` claims Theorem 2.
 
     Raises
     ------
