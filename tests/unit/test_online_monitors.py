@@ -511,3 +511,24 @@ def test_the_bound_of_the_paper_asks_for_no_noise_bound_that_it_does_not_take() 
     with pytest.raises(SpecError, match=r"\(66\) bounds nothing else: use pointwise") as caught:
         obsynth.online_monitor(design, "paper")
     assert "noise_bound" not in str(caught.value)
+
+
+@pytest.mark.parametrize("method", ["functional-filter", "ui-pi-observer"])
+def test_a_guarantee_waits_for_what_a_gap_left_where_inputs_moved_unseen(method: str) -> None:
+    """Rows are missing in which a large input moved: 2 % of what the model then missed by passed the threshold."""
+    plant = obsynth.DescriptorSystem(
+        None, [[-0.9, 0.1], [-0.5, -0.1]], [[1.0], [0.5]], np.eye(2), Bf=[[1.0], [0.0]], Bd=[[0.0], [0.3]],
+        Bw=np.zeros((2, 2)), Dw=0.01 * np.eye(2), dt=0.1,
+    )  # fmt: skip
+    design = obsynth.design(plant, method)
+    monitor = obsynth.online_monitor(design, disturbance_bounds={"d1": 0.2}, noise_bound=1.5)
+    rng, x, rows = np.random.default_rng(3), np.zeros(2), []
+    for k in range(160):
+        u = 100.0 * (-1.0) ** (k // 13)
+        rows.append([0.1 * k, u, *(x + 0.015 * rng.choice([-1, 1], 2))])
+        x = plant.A @ x + plant.B[:, 0] * u + plant.Bd[:, 0] * 0.2 * rng.choice([-1, 1])
+    log = pd.DataFrame(rows, columns=["time", *plant.input_names, *plant.output_names])
+    table = run_on_data(design, log.drop(index=range(60, 72)).reset_index(drop=True), monitor=monitor).table
+    assert (table["alarm"] == "").all()
+    assert table["threshold"][60:64].isna().all()
+    assert table["threshold"][100:].notna().all()

@@ -190,6 +190,4 @@ def _recursive_options(stated: Mapping[str, Any], found: Calibration) -> dict[st
         whole = np.diag(np.concatenate([np.zeros(len(own)), more]))
         whole[: len(own), : len(own)] = own
         options["initial_covariance"] = whole.tolist()
-    if found.outlier_sizes:
-        options |= {"outliers": "gate", "outlier_sizes": dict(found.outlier_sizes)}
     return options

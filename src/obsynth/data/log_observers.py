@@ -346,6 +346,9 @@ KEPT_INTERVALS = 64
 #: A gap is over when what it can have left in fault estimates and residuals is below this share of their usual changes
 #: from row to row, which so many rows must have shown, or below what the stated noise of the sensors makes of them.
 GAP_LEFT_SHARE, LEAST_SHOWN = 1.0, 20
+#: What is guaranteed waits until what a gap has left is below this share of that, for so many initial-condition
+#: responses at most.
+GUARANTEED_SHARE, MOST_TRANSIENTS = 1e-3, 10
 SAMPLED_GAP = "gap is for continuous-time designs: for a sampled one missing rows follow from the time stamps."
 #: What goes from row to row.
 SAVED = (
@@ -514,10 +517,10 @@ class LinearLogObserver(LogObserver):
             if missing:
                 self._bridge_interval(seconds, missing, u)
                 seconds = 0.0 if self.observer.dt == 0.0 else seconds
-            recovered = self.warm_up
+            recovered = unsure = self.warm_up
             if good and self.model is not None:
                 self._propagate(seconds, u)
-                recovered = self._recovering(seconds, values, longest)
+                recovered, unsure = self._recovering(seconds, values, longest)
                 # What has become usual before a new start would have settled needs none.
                 if recovered >= self.warm_up and self._lost(values):
                     self._restart()
@@ -543,7 +546,7 @@ class LinearLogObserver(LogObserver):
                     self.settled_at += since * missing / (missing + 1)
                     if self.phase != WARM_UP or time >= self.settled_at:
                         self.settled_at, self.phase = self._after(time, recovered), RECOVERING
-                    self.clear_at = self._after(time, max(self.warm_up, self.transient))
+                    self.clear_at = self._after(time, max(self.warm_up, self.transient, unsure))
                 status = OK if time >= self.settled_at else self.phase
             else:
                 found, status = self._unmeasured(seconds, u, values), GAP
@@ -665,8 +668,9 @@ class LinearLogObserver(LogObserver):
         self.changes = np.cumsum(np.vstack([self.changes, squares]), axis=0)[-1]
         self.counted += len(changes)
 
-    def _recovering(self, seconds: float, v: FloatArray, longest: float) -> float:
-        """Return the seconds after a gap in which nothing may be decided; the model stands at this row already.
+    def _recovering(self, seconds: float, v: FloatArray, longest: float) -> tuple[float, float]:
+        """Return the seconds after a gap in which nothing may be decided, and those in which nothing is guaranteed; the
+        model stands at this row already.
 
         The outputs of the model missed those of the plant by no more during the gap than they do now, as errors of a
         model grow: what that can have left in fault estimates and residuals is followed until it is usual.
@@ -678,7 +682,7 @@ class LinearLogObserver(LogObserver):
         usual, step = self._usual(), self.observer.dt or longest
         if not (np.isfinite(self.left).all() and step > 0.0):
             self.carried = np.full_like(self.carried, np.inf)
-            return self.warm_up
+            return self.warm_up, self.warm_up
         a, left = self.observer.Az, self.left
         if self.observer.dt == 0.0:
             transition, constant, _ = self._hold(seconds or step)
@@ -686,14 +690,18 @@ class LinearLogObserver(LogObserver):
             a, left = self._hold(step)[0], transition @ left + constant * told
         self.excess = left * missed
         if usual is None:
-            return self.warm_up
-        rows, waited = self.observer.Cz[self.shown], 0.0
+            return self.warm_up, self.warm_up
+        rows, waited, recovered = self.observer.Cz[self.shown], 0.0, self.warm_up
+        longest_wait = MOST_TRANSIENTS * self.transient
         # The first row after a gap always counts as recovering.
-        while waited < self.warm_up:
+        while waited < max(self.warm_up, longest_wait if np.isfinite(longest_wait) else 0.0):
             left, waited = a @ left, waited + step
-            if np.all(np.abs(rows @ left) @ missed <= usual):
+            kept = np.abs(rows @ left) @ missed
+            if np.all(kept <= usual):
+                recovered = min(recovered, waited)
+            if np.all(kept <= GUARANTEED_SHARE * usual):
                 break
-        return min(waited, self.warm_up)
+        return recovered, waited
 
     def _lost(self, v: FloatArray) -> bool:
         """Whether the model, after a gap in which it stood in for outputs, misses them by more than their whole size
