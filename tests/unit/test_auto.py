@@ -87,3 +87,16 @@ def test_figures_are_what_a_simulation_gives() -> None:
     assert found.most == pytest.approx(0.02 * np.argmax(estimate >= 0.9))
     assert found.deviation == pytest.approx(design.certificate.matrices["deviations"][0, 0], rel=0.02)
     assert found.unknown_input_gain < 1e-9
+
+
+def test_auto_and_compare_say_why_they_differ() -> None:
+    plant = obsynth.DescriptorSystem(
+        None, [[0.5, 0.25, 0.0], [0.0, 0.75, -0.25], [0.25, 0.0, 0.25]], C=[[1, 0, 0], [0, 1, 1]],
+        Bf=[[1], [0], [1]], Bw=np.eye(3, 5), Dw=np.eye(2, 5, 3), dt=0.5,
+    )  # fmt: skip
+    chosen, compared = obsynth.design(plant), obsynth.compare(plant, runs=5)
+    assert compared.recommended != chosen.method
+    assert f"auto, which knows no scenario, takes {chosen.method}" in compared.advice
+    assert "obsynth compare ranks by errors over a scenario instead" in chosen.notes[0]
+    alone = obsynth.compare(plant, methods=[chosen.method], runs=5)
+    assert "auto" not in alone.advice

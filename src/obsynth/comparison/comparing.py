@@ -873,11 +873,14 @@ def side_by_side(
     )
     shown = faulty if log is None else log
     best = next((entry for entry in compared if not entry.refused), None)
+    settling = settling_time(plant)
+    among = [entry for entry in found if entry.figures and "faults" in method_class(entry.method).purposes]
+    usual = min(among, key=lambda entry: entry.rank(sampled.nd > 0, settling), default=None)
     from_file = isinstance(data, (str, Path))
     return Comparison(
         tuple(compared),
         "" if best is None else best.method,
-        _reason(best, compared, sampled),
+        _reason(best, compared, sampled, "" if usual is None else usual.method),
         dt,
         read_only(shown.times),
         read_only(shown.truth),
@@ -1060,7 +1063,9 @@ def _sized(compared: Sequence[ComparedMethod]) -> list[ComparedMethod]:
     ]
 
 
-def _reason(best: ComparedMethod | None, compared: Sequence[ComparedMethod], plant: DescriptorSystem) -> str:
+def _reason(
+    best: ComparedMethod | None, compared: Sequence[ComparedMethod], plant: DescriptorSystem, by_default: str
+) -> str:
     if best is None:
         return compared[0].refused if compared else "no method was asked for"
     others = [entry for entry in compared if not entry.refused and entry is not best]
@@ -1075,4 +1080,9 @@ def _reason(best: ComparedMethod | None, compared: Sequence[ComparedMethod], pla
     slow = [entry.method for entry in others if not entry.fast_enough] if best.fast_enough else []
     if slow:
         words.append(f"90 % of a step is reached too late or never: {', '.join(slow)}")
+    if by_default not in ("", best.method):
+        words.append(
+            f"auto, which knows no scenario, takes {by_default}, by whether a step is reached, by the gain from "
+            "unknown inputs, and by noise against delay"
+        )
     return "; ".join(words)

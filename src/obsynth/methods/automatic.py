@@ -349,7 +349,8 @@ def reason(best: Candidate, others: list[Candidate], plant: DescriptorSystem) ->
     deviation = ", ".join(f"{found.deviation:.3g}" for found in best.figures)
     delay = ", ".join(f"{found.most:.3g}" for found in best.figures)
     words.append(f"deviation {deviation} at 90 % of a step after {delay} s")
-    return f"{'; '.join(words)}; after it: {', '.join(other.method for other in others)}"
+    after = ", ".join(other.method for other in others)
+    return f"{'; '.join(words)}; after it: {after}; obsynth compare ranks by errors over a scenario instead"
 
 
 def _with_note(design: ObserverDesign, why: str) -> ObserverDesign:
