@@ -393,10 +393,6 @@ class Objective:
         """Return a minimum within the bounds near a start, and where it is."""
         return descent(self, np.clip(start, self.low, self.high), self.low, self.high, self.scale)
 
-    def plain(self, z: FloatArray) -> float:
-        """Return the negative log likelihood alone."""
-        return self.likelihood(self.full(z))[0]
-
     def constants(self, z: FloatArray) -> FloatArray:
         """Return the unknown constants ``(nt,)``."""
         return np.asarray(z[: self.nt] * self.problem.widths)
@@ -993,7 +989,7 @@ def innovations_fit(
     has_offsets = isinstance(problem.plant, PlantWithNoise) and bool(problem.plant.states.offsets)
     return InnovationsFit(
         objective.constants(maximum.z),
-        objective.plain(maximum.z),
+        objective.likelihood(objective.full(maximum.z))[0],
         found,
         sides,
         Q,

@@ -82,9 +82,11 @@ class CalibrationPlant(ABC):
     unknown_inputs: tuple[str, ...] = ()  # of which nothing is known, among ``values``
     bounds: Mapping[str, tuple[float, float]] = MappingProxyType({})  # of what is sought beside constants, by name
 
-    @abstractmethod
+    own_integration: str  # unless something else is asked for; a discrete plant is stepped as it is
+
     def integration(self, asked: str) -> str:
         """Return how the plant is integrated at first."""
+        return self.own_integration if asked == "auto" or self.own_integration == EXACT_STEP else asked
 
     @abstractmethod
     def signals(self, log: Log) -> FloatArray:
@@ -102,6 +104,8 @@ class CalibrationPlant(ABC):
 class NonlinearPlant(CalibrationPlant):
     """A `DAEModel`; its signals are its inputs."""
 
+    own_integration = "backward-euler"
+
     def __init__(self, model: DAEModel) -> None:
         self.model = model
         self.state_names, self.equation_names = model.state_names, model.equation_names
@@ -111,10 +115,6 @@ class NonlinearPlant(CalibrationPlant):
         self.state_deviations = CALIBRATED_STATE_SHARE * self.state_scales
         self.nominal_signals = np.array(model.nominal_input)
         self._promoted: dict[tuple[str, ...], DAEModel] = {}
-
-    def integration(self, asked: str) -> str:
-        """Return backward Euler unless something else is asked for."""
-        return "backward-euler" if asked == "auto" else asked
 
     def signals(self, log: Log) -> FloatArray:
         """Return the inputs ``(n, nu)``."""
@@ -205,6 +205,11 @@ def _of_sequence(matrix: MatrixSequence) -> _Matrix:
     )
 
 
+def _outputs_function(x: Any, s: Any, t: Any, y: Any) -> Any:
+    """Return the function from state, signals and constants to y, H and L."""
+    return ca.Function("outputs", [x, s, t], [ca.densify(part) for part in (y, ca.jacobian(y, x), ca.jacobian(y, t))])
+
+
 def _dense(rows: Sequence[Sequence[Any]], shape: tuple[int, int]) -> Any:
     return ca.vertcat(*(ca.horzcat(*row) for row in rows)) if all(shape) else ca.SX(*shape)
 
@@ -244,7 +249,7 @@ class LinearPlant(CalibrationPlant):
                 f"Of the unknown inputs ({', '.join(unknown)}) no bounds are known: the noise of the equations "
                 "represents them.",
             )
-        self.integrations = tuple(BUTCHER) if self.continuous else (EXACT_STEP,)
+        self.own_integration = "radau" if self.continuous else EXACT_STEP
         if self.matrices["E"].shape != (self.nx, self.nx):
             raise SpecError(
                 "The plant has another number of equations than of states: they do not determine a step, "
@@ -260,12 +265,6 @@ class LinearPlant(CalibrationPlant):
         self.nominal_signals = first[min(1, len(first) - 1)]
         # A linear plant says nothing of the size of its states: the outputs do, so that units change no answer.
         self.state_scales = self.state_deviations = self._sizes(log, first)
-
-    def integration(self, asked: str) -> str:
-        """Return Radau unless something else is asked for; a discrete plant is stepped as it is."""
-        if self.integrations == (EXACT_STEP,):
-            return EXACT_STEP
-        return "radau" if asked == "auto" else asked
 
     def _algebraic(self, log: Log) -> list[int]:
         """Return the rows of E that are zero for every k of the log, of a discrete plant."""
@@ -373,12 +372,11 @@ class LinearPlant(CalibrationPlant):
         y = at("C", True) @ x + self._product(at("L", False), f) + ca.DM(self.output_point)
         if "D" in self.matrices:
             y = y + self._product(at("D", True), s[self.nu : 2 * self.nu])
-        parts = [y, ca.jacobian(y, x), ca.jacobian(y, t)]
-        return ca.Function("outputs", [x, s, t], [ca.densify(part) for part in parts])
+        return _outputs_function(x, s, t, y)
 
     def _sizes(self, log: Log, signals: FloatArray) -> FloatArray:
         """Return how large each initial state can be ``(nx,)``: so that alone it makes outputs as large as they are."""
-        stages, equations = self.step((), self.integrations[0])
+        stages, equations = self.step((), next(iter(BUTCHER)) if self.continuous else EXACT_STEP)
         X, x, s = ca.SX.sym("X", self.nx * stages), ca.SX.sym("x", self.nx), ca.SX.sym("s", signals.shape[1])
         found = equations(X, x, s, ca.SX(0, 1), log.dt)
         both = ca.Function("both", [s], [ca.densify(ca.jacobian(found, X)), ca.densify(ca.jacobian(found, x))])
@@ -491,7 +489,7 @@ class PlantWithNoise(CalibrationPlant):
             **{correlation_name(name): first for name in states.searched},
         }
         self.unstated = inner.unstated - set(states.loads)
-        self.units, self.has_levels = inner.units, inner.has_levels
+        self.units, self.has_levels, self.own_integration = inner.units, inner.has_levels, inner.own_integration
         self.notes = () if set(inner.unknown_inputs) <= set(states.loads) else inner.notes
         self.unknown_inputs = inner.unknown_inputs
         self.nominal_signals = inner.nominal_signals
@@ -509,10 +507,6 @@ class PlantWithNoise(CalibrationPlant):
         """Equations of further states that noise drives: all but those of offsets."""
         fixed = {offset_state(name) for name in self.states.offsets}
         return tuple(name for name in self.added if name not in fixed)
-
-    def integration(self, asked: str) -> str:
-        """Return how the plant is integrated at first."""
-        return self.inner.integration(asked)
 
     def signals(self, log: Log) -> FloatArray:
         """Return what steps and outputs take of each row ``(n, ns)``."""
@@ -600,8 +594,7 @@ class PlantWithNoise(CalibrationPlant):
         for column, name in enumerate((*self.coloured, *self.states.offsets)):
             shown[self._outputs.index(name), column] = 1.0
         y = ca.densify(y) + ca.mtimes(ca.DM(shown), x[self.own : self.own + shown.shape[1]]) if shown.size else y
-        parts = [y, ca.jacobian(y, x), ca.jacobian(y, t)]
-        return ca.Function("outputs", [x, s, t], [ca.densify(part) for part in parts])
+        return _outputs_function(x, s, t, y)
 
 
 #: Optimisation costs more than it gains on straight code of thousands of lines.

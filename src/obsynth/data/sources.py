@@ -849,7 +849,11 @@ def _readable(path: Path) -> Iterator[None]:
 def _read_by_package(path: Path) -> Iterator[None]:
     """Turn whatever the package of a file raises about it, as it may be damaged in any place, into an error that names
     both.  What the package would log is in that error."""
-    _require_beginning(path)
+    wanted = _BEGINNINGS[path.suffix.lower()]
+    with path.open("rb") as stream:
+        if stream.read(len(wanted)) != wanted:
+            # Its package would read nothing.
+            raise SpecError(f"{path} cannot be read: it is no {path.suffix} file.", path=str(path))
     package = NEEDED_PACKAGES[path.suffix.lower()][0]
     import_module(package)
     loggers = [
@@ -1129,16 +1133,6 @@ def _frames(found: dict[str, Any], others: dict[str, Any], signals: Signals, row
 
 #: How files of these kinds begin.
 _BEGINNINGS = {".parquet": b"PAR1", ".tdms": b"TDSm", ".mf4": b"MDF ", ".mdf": b"MDF ", ".dat": b"MDF "}
-
-
-def _require_beginning(path: Path) -> None:
-    """Raise `SpecError` for a file that is something else than its name says: its package would read nothing."""
-    wanted = _BEGINNINGS.get(path.suffix.lower())
-    if wanted is None:
-        return
-    with path.open("rb") as stream:
-        if stream.read(len(wanted)) != wanted:
-            raise SpecError(f"{path} cannot be read: it is no {path.suffix} file.", path=str(path))
 
 
 #: What yields the rows of a file, and what names all of its columns, of which some are wanted, the time first.

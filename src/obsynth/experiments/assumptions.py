@@ -89,14 +89,9 @@ class Assumptions:
         """All bounds in one phrase; empty where there are none."""
         return _joined(self.parts())
 
-    @property
-    def model_phrase(self) -> str:
-        """What is assumed of the model."""
-        return "an exact model" if self.box is None else self.box.phrase
-
     def phrase(self) -> str:
         """Return everything that is assumed in one phrase."""
-        return _joined([*self.parts(), self.model_phrase])
+        return _joined([*self.parts(), "an exact model" if self.box is None else self.box.phrase])
 
 
 def _joined(parts: Sequence[str]) -> str:

@@ -543,7 +543,11 @@ def thresholds_from_rows(
     centres, scales = rows[known, :faults].mean(axis=0), rows[known, :faults].std(axis=0)
     if scores is not None:
         centres = scores.chosen(slice(len(rows) // 2 if conformal else None)).centre()
-    found = signatures(design, kept, np.sqrt(np.nanvar(x, axis=0))) if like is None else like.statistics.directions
+    found = (
+        signatures(design, kept, np.sqrt(np.nanvar(x, axis=0)))
+        if like is None
+        else (like.statistics.signatures, like.statistics.told)
+    )
     statistics = Statistics(model, *found, estimates=() if scores is None else names[:faults])
     lasting, extrapolated = 0.0, False
     if conformal:

@@ -183,11 +183,6 @@ class ScoreModel:
         whites = models[0].whitened(units), models[1].whitened(estimates)
         return cls(*models, whites, root, scores.information)
 
-    @property
-    def order(self) -> int:
-        """Rows before a first one with innovations."""
-        return max(self.model.order, self.followed.order)
-
     def drawn(self, whites: Sequence[FloatArray], places: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return streams of scores ``(runs, n, nf)``, information and estimates, from innovations and the places that
         they are of."""
@@ -271,11 +266,6 @@ class Statistics:
         likely = (f"GLR of a {shape} in {name}" for shape in ("step", "ramp") for name in self.told)
         changes = (f"GLR of a change of {name}" for name in self.estimates)
         return ("T2", *means, *likely, *changes, *(f"square of {name}" for name in self.estimates))
-
-    @property
-    def directions(self) -> tuple[FloatArray, tuple[str, ...]]:
-        """Signatures, and what they show."""
-        return self.signatures, self.told
 
     def responses(self) -> tuple[FloatArray, FloatArray]:
         """Return what steps, then ramps, of each signature do to e: their first p + 1 rows ``(2 s, p + 1, m)``, and
@@ -522,7 +512,7 @@ def learned_levels(
     beside = None if scores is None else ScoreModel.of(scores)
     parts = [model.whitened(x), *(() if beside is None else beside.whites)]
     known = np.asarray(np.isfinite(np.hstack(parts)).all(axis=1))
-    known[: max(model.order, 0 if beside is None else beside.order)] = False
+    known[: max(model.order, *(() if beside is None else (beside.model.order, beside.followed.order)), 0)] = False
     e, *others = [part[known] - part[known].mean(axis=0) for part in parts]
     # What is drawn together happened together.
     places = drawn_places(len(e), STREAMS, BURN_IN_ROWS + n + rows, rng)
