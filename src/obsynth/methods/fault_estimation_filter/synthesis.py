@@ -99,14 +99,12 @@ class Goal:
         """Return whether the true gain is within the level, and the weight within its limit."""
         # A filter is asked for more than once, and for many states each answer takes a Riccati equation.
         if id(injection) not in self.judged:
-            self.judged[id(injection)] = (injection, self._reached(injection))
+            problem, limit = self.problem, self.problem.weight_limit
+            reached = not (limit is not None and limit.norm(injection.V) > limit.bound) and (
+                problem.reaches(injection, self.gain) if problem.disturbances else problem.radius(injection) < 1.0
+            )
+            self.judged[id(injection)] = (injection, reached)
         return self.judged[id(injection)][1]
-
-    def _reached(self, injection: Injection) -> bool:
-        problem, limit = self.problem, self.problem.weight_limit
-        if limit is not None and limit.norm(injection.V) > limit.bound:
-            return False
-        return problem.reaches(injection, self.gain) if problem.disturbances else problem.radius(injection) < 1.0
 
     def is_fast(self, injection: Injection) -> bool:
         """Return whether the filter decays fast enough."""

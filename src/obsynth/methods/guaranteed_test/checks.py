@@ -17,7 +17,6 @@ import numpy as np
 from obsynth.analysis.transformations.linearisation import bounded_model
 from obsynth.errors import ObsynthError
 from obsynth.methods.guaranteed_test.conditions import samples_decided_on
-from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.guaranteed_test.problem import (
     Problem,
     Programmes,
@@ -37,7 +36,7 @@ from obsynth.methods.guaranteed_test.proofs import (
     repaired_multipliers,
     repaired_point,
 )
-from obsynth.methods.guaranteed_test.windows import MEAN_ROOM, Window, courses_of, mean_over_record, part_beside
+from obsynth.methods.guaranteed_test.windows import MEAN_ROOM, Asked, Window, courses_of, mean_over_record, part_beside
 from obsynth.numerics.arguments import FloatArray
 from obsynth.observers.linear.observer import LinearObserver, WindowObserver
 from obsynth.plants.constants import shown

@@ -9,10 +9,9 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
-from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.guaranteed_test.problem import Problem, missing_bounds, problem_of, samples_given
 from obsynth.methods.guaranteed_test.proofs import Condensed, proved_ray, repaired_multipliers
-from obsynth.methods.guaranteed_test.windows import Window, fault_names
+from obsynth.methods.guaranteed_test.windows import Asked, Window, fault_names
 from obsynth.numerics.arguments import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
 

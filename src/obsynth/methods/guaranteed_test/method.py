@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
-from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.guaranteed_test.windows import Asked
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem

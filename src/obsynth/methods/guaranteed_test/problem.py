@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.guaranteed_test.windows import (
+    Asked,
     Bounds,
     Question,
     Window,

@@ -33,7 +33,6 @@ from obsynth.methods.guaranteed_test.checks import (
     proved_hidden,
 )
 from obsynth.methods.guaranteed_test.conditions import SOURCE, conditions, told
-from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.guaranteed_test.problem import (
     COURSES,
     MOST_STATES,
@@ -58,6 +57,7 @@ from obsynth.methods.guaranteed_test.proofs import (
     repaired_point,
 )
 from obsynth.methods.guaranteed_test.windows import (
+    Asked,
     Beside,
     Question,
     Window,

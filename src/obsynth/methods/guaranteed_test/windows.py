@@ -1,4 +1,6 @@
-r"""The equations of a plant over a window of samples, as one sparse matrix.
+r"""The options of a guaranteed test, each with its range; what they mean says the method.
+
+The equations of a plant over a window of samples, as one sparse matrix.
 
 .. math::
     M_z z + m \theta + M_s s = b(y, u), \qquad |s_i| \le \bar s_i, \quad z \text{ free}
@@ -19,13 +21,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Le
 
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import FloatArray
+from obsynth.numerics.arguments import FewSamples, FloatArray, Positive, WrittenAs
 from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.linear.observer import LinearObserver, WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
@@ -36,6 +39,35 @@ from obsynth.verification.error_structure import ErrorStructure, Tracking, error
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Options as asked for."""
+
+    fault: Annotated[Any, WrittenAs("text")] = None
+    samples: Annotated[Any, WrittenAs("samples")] = "auto"
+    course: Literal["step", "constant", "any", "ramp", "rate"] = "step"
+    lag: FewSamples | None = None
+    before: FewSamples = 10
+    after: Annotated[int, Ge(1), Le(1000)] | None = None
+    disturbance_bounds: Annotated[Any, WrittenAs("named bounds")] = None
+    noise_bound: Annotated[Any, WrittenAs("named bounds")] = None
+    disturbance: Literal["jump", "held", "rate"] = "jump"
+    disturbance_rate: Annotated[Any, WrittenAs("named bounds")] = None
+    fault_rate: Positive | None = None
+    state_bounds: Annotated[Any, WrittenAs("named bounds")] = None
+    initial_bounds: Annotated[Any, WrittenAs("named bounds")] = None
+    free: Annotated[Any, WrittenAs("free faults")] = "others"
+    free_course: Literal["any", "constant"] = "any"
+    norm: Literal["box", "ellipsoid"] = "box"
+    isolate: bool = False
+    exact: bool = False
+    missing: Literal["wait", "solve"] = "wait"
+    region: Annotated[Any, WrittenAs("named pairs")] = None
+    sample_time: Positive | None = None
+    given: Annotated[Any, WrittenAs("named vector")] = None
+    model: Annotated[Any, WrittenAs("function")] = None
 
 
 #: Entries below this power of two times the largest of their row or column do not count in its scale.
