@@ -37,6 +37,7 @@ from obsynth.plants.constants import SAME_TOLERANCE, SAMPLED, UNCERTAIN_MATRICES
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse
+from obsynth.proofs.exact_arithmetic import nearest_doubles, null_basis, pivot_columns, written_matrix
 from obsynth.results.design import (
     ROBUSTNESS,
     SHOWN_DIGITS,
@@ -379,7 +380,13 @@ def index_one_on_box(plant: DescriptorSystem) -> BoxVerdict:
         return BoxVerdict("proved" if index is not None and index <= 1 else "refuted", 0, np.zeros(0))
     numbers = as_written(plant, written)
     affine = written.affine(numbers, written.box)
-    dynamic, algebraic = compressed_rows(affine["E"].at(written.box.offsets))
+    # Rows of E of full rank, and combinations of its rows that vanish exactly.
+    e = affine["E"].at(written.box.offsets)
+    n = len(e)
+    exact = written_matrix(e.T)
+    chosen = pivot_columns(exact)
+    null = nearest_doubles(null_basis(exact)) if len(chosen) < n else np.zeros((n, 0))
+    dynamic, algebraic = np.eye(n)[chosen], np.asarray(null.T)
     changed, size = affine["E"].after(algebraic), np.abs(algebraic) @ affine["E"].magnitude
     moving = np.abs(changed.parts).sum(axis=0) > VANISHING_SHARE * size
     if moving.any():
@@ -399,17 +406,6 @@ def index_one_on_box(plant: DescriptorSystem) -> BoxVerdict:
         return np.vstack([dynamic @ found["E"], algebraic @ found["A"]])
 
     return proved_regular(build, len(written.box.names), exactly)
-
-
-def compressed_rows(e: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return ``R1, R2``: rows of E that have full rank, and a rational basis of ``R2 E = 0``; numbers as written."""
-    from obsynth.proofs.exact_arithmetic import nearest_doubles, null_basis, pivot_columns, written_matrix
-
-    n = len(e)
-    exact = written_matrix(e.T)
-    chosen = pivot_columns(exact)
-    null = nearest_doubles(null_basis(exact)) if len(chosen) < n else np.zeros((n, 0))
-    return np.eye(n)[chosen], np.asarray(null.T)
 
 
 #: A design without tolerances says this.

@@ -95,22 +95,6 @@ def _growing(top: FloatArray, image: FloatArray, reached: FloatArray) -> FloatAr
     return np.asarray(top @ pairs @ vectors[:, :count])
 
 
-def output_nulling_part(problem: GainProblem) -> GainProblem:
-    """Return the problem on the states that matter: outside the dual inequalities have no strict solution."""
-    top, _, image = invisible_pairs(problem)
-    reached = reached_from_rest(top, image)
-    subspace = _range(np.hstack([reached, _growing(top, image, reached)]))
-    t = subspace.T
-    return replace(
-        problem,
-        A=t @ problem.A @ subspace,
-        C=problem.C @ subspace,
-        Z=problem.Z @ subspace,
-        B=t @ problem.B,
-        Bn=t @ problem.Bn,
-    )
-
-
 def strict_point(top: FloatArray, image: FloatArray) -> FloatArray:
     """Return ``Z1 > 0`` with ``image Z1 image' - top Z1 top' > 0``, from pairs of all kinds."""
     n, size = top.shape
@@ -191,7 +175,20 @@ def _with_fewer_disturbances(problem: GainProblem) -> Iterator[GainProblem]:
 
 
 def _bound_in(normalised: NormalisedProblem, solver: str) -> float:
-    work = output_nulling_part(normalised.problem)
+    # On the states that matter: outside the dual inequalities have no strict solution.
+    whole = normalised.problem
+    top, _, image = invisible_pairs(whole)
+    reached = reached_from_rest(top, image)
+    subspace = _range(np.hstack([reached, _growing(top, image, reached)]))
+    t = subspace.T
+    work = replace(
+        whole,
+        A=t @ whole.A @ subspace,
+        C=whole.C @ subspace,
+        Z=whole.Z @ subspace,
+        B=t @ whole.B,
+        Bn=t @ whole.Bn,
+    )
     if work.disturbances == 0:
         return 0.0
     if work.order == 0:
