@@ -735,7 +735,12 @@ class EnclosedPencil:
         characteristic = (a - e * shift).solve(e).charpoly().coeffs()
         degree = int(self.E.rank())
         found = characteristic[::-1][: degree + 1]
-        return _trimmed(_translated(found, -shift))
+        # The coefficients of p(z - shift).
+        moved = list(found)
+        for start in range(len(moved)):
+            for i in range(len(moved) - 2, start - 1, -1):
+                moved[i] = moved[i] + (-shift) * moved[i + 1]
+        return _trimmed(moved)
 
 
 def greatest_common_divisor(first: Sequence[Any], second: Sequence[Any]) -> list[Any]:
@@ -765,13 +770,4 @@ def _trimmed(coefficients: Sequence[Any]) -> list[Any]:
     found = list(coefficients)
     while found and found[-1].contains(0):
         found.pop()
-    return found
-
-
-def _translated(coefficients: Sequence[Any], by: Any) -> list[Any]:
-    """Return the coefficients of ``p(z + by)``."""
-    found = list(coefficients)
-    for start in range(len(found)):
-        for i in range(len(found) - 2, start - 1, -1):
-            found[i] = found[i] + by * found[i + 1]
     return found

@@ -229,13 +229,6 @@ def _gain_rows(design: ObserverDesign, model: ErrorModel, gamma: float | None) -
     )
 
 
-def _around(angles: FloatArray, unit: float, dt: float) -> FloatArray:
-    """Return frequencies on both sides of each angle, ever closer to it."""
-    apart = unit * np.geomspace(SLOWEST_CLAIMED, MOST_DISTANCE, CLAIM_POINTS // 4)
-    found = np.abs(np.concatenate([angles[:, None] - apart, angles[:, None] + apart], axis=1)).ravel()
-    return np.asarray(np.minimum(found, np.pi) if dt > 0.0 else found)
-
-
 class _Composite:
     """The transfer from the disturbances to the fault error of a plant and its stored observer, at any frequency."""
 
@@ -253,15 +246,6 @@ class _Composite:
         own = np.abs(poles_of(observer)) if observer.order else np.ones(1)
         self.fastest = float(max(np.max(own, initial=0.0), np.finfo(np.float64).tiny))
 
-    def boundary_angles(self, unit: float) -> FloatArray:
-        """Return the frequencies (rad per sample, or rad/s) of the plant's poles on the boundary or about it."""
-        discrete, poles = self.plant.dt > 0.0, self.poles
-        near = poles[np.abs(np.abs(poles) - 1.0 if discrete else poles.real / unit) <= ABOUT_THE_BOUNDARY]
-        angles = sorted(set(np.abs(np.angle(near) if discrete else near.imag).tolist()))
-        # Scattered multiple poles have angles next to each other.
-        kept = [angle for i, angle in enumerate(angles) if not i or angle - angles[i - 1] > APART * unit]
-        return np.asarray(kept[:MOST_ANGLES], dtype=np.float64)
-
     @property
     def is_plant_stable(self) -> bool:
         """Whether no pole of the plant is on the boundary of stability, as far as can be told, or outside."""
@@ -275,14 +259,21 @@ class _Composite:
 
     def swept(self, unit: float, level: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return frequencies, the gains there, and for those above a level how far the next pole on the boundary is."""
-        discrete = self.plant.dt > 0.0
+        discrete, poles = self.plant.dt > 0.0, self.poles
         few = self.plant.nx + self.observer.order <= MANY_JOINT_STATES
         points = CLAIM_POINTS if few else FEWER_POINTS
         frequencies = unit * np.geomspace(SLOWEST_CLAIMED, np.pi if discrete else 10.0, points)
-        angles = self.boundary_angles(unit)
+        # The poles of the plant on the boundary or about it; scattered multiple ones have angles next to each other.
+        near = poles[np.abs(np.abs(poles) - 1.0 if discrete else poles.real / unit) <= ABOUT_THE_BOUNDARY]
+        found = sorted(set(np.abs(np.angle(near) if discrete else near.imag).tolist()))
+        kept = [angle for i, angle in enumerate(found) if not i or angle - found[i - 1] > APART * unit]
+        angles = np.asarray(kept[:MOST_ANGLES], dtype=np.float64)
         if few:
-            around = _around(angles[angles > SLOWEST_CLAIMED * unit], unit, self.plant.dt)
-            frequencies = np.concatenate([frequencies, around])
+            # On both sides of each angle, ever closer to it.
+            turning = angles[angles > SLOWEST_CLAIMED * unit][:, None]
+            apart = unit * np.geomspace(SLOWEST_CLAIMED, MOST_DISTANCE, CLAIM_POINTS // 4)
+            around = np.abs(np.concatenate([turning - apart, turning + apart], axis=1)).ravel()
+            frequencies = np.concatenate([frequencies, np.minimum(around, np.pi) if discrete else around])
         gains = self.gains(frequencies)
         beyond = frequencies[gains > level]
         nearest = np.min(np.abs(beyond[:, None] - angles[None, :]), axis=1, initial=np.inf) / unit
