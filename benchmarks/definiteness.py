@@ -19,7 +19,7 @@ import obsynth
 from obsynth.methods.pd_observer.checks import prove_gains
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.balls import LARGEST_ORDER, DefinitenessProof, prove_positive_definite
-from obsynth.verification.certificates import prove_bounded_real, prove_stable
+from obsynth.verification.claims import prove_bounded_real, prove_stable
 
 SECONDS_PER_CELL = 1.0
 Action = Callable[[], DefinitenessProof]

@@ -21,7 +21,7 @@ from obsynth.proofs.balls import (
     prove_by_ball_arithmetic,
     prove_positive_definite,
 )
-from obsynth.verification.certificates import prove_bounded_real, prove_gain, prove_stable
+from obsynth.verification.claims import prove_bounded_real, prove_gain, prove_stable
 
 ULP = 2.0**-52
 

@@ -35,8 +35,7 @@ from obsynth import (
 )
 from obsynth.proofs.balls import Ball
 from obsynth.spec import load_spec
-from obsynth.verification.certificates import prove_gain
-from obsynth.verification.claims import WITNESS_CLAIMS
+from obsynth.verification.claims import WITNESS_CLAIMS, prove_gain
 
 PAPER = Path(__file__).parents[2] / "designs" / "filasova" / "spec.yaml"
 

@@ -21,7 +21,7 @@ from obsynth.numerics.spectra import rounding_of_eigenvalues
 from obsynth.proofs import contraction
 from obsynth.proofs.balls import Ball, enclosed_eigenvalues, middle_of
 from obsynth.proofs.contraction import LEFT_OF_SUM, prove_contraction, proved_contractions
-from obsynth.verification import certificates, stored_numbers
+from obsynth.verification import claims, stored_numbers
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
@@ -171,8 +171,8 @@ def test_an_inequality_is_proved_once_for_the_same_numbers_and_again_for_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     design = obsynth.fault_estimation_filter(PLANTS["sampled"])
-    plain, tried = certificates.prove_positive_definite, []
-    monkeypatch.setattr(certificates, "prove_positive_definite", lambda given: tried.append(given) or plain(given))
+    plain, tried = claims.prove_positive_definite, []
+    monkeypatch.setattr(claims, "prove_positive_definite", lambda given: tried.append(given) or plain(given))
 
     def lmi(changed: obsynth.ObserverDesign) -> tuple[int, bool]:
         tried.clear()

@@ -33,7 +33,7 @@ from obsynth.methods.pd_observer.realisation import (
 from obsynth.numerics.continuous import ContinuousNorms
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
-from obsynth.verification.certificates import prove_gain, prove_symmetric_positive
+from obsynth.verification.claims import prove_gain, prove_symmetric_positive
 
 FOLDER = Path(__file__).parents[2] / "designs" / "filasova"
 PLANT = load_spec(FOLDER / "spec.yaml").plant

@@ -30,8 +30,7 @@ from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, prove_positive_definite, r
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.results.checks import Check, fitting_check, information
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.certificates import prove_gain
-from obsynth.verification.claims import equality, relative_tolerance, tracking_identities
+from obsynth.verification.claims import equality, prove_gain, relative_tolerance, tracking_identities
 from obsynth.verification.error_system import ErrorModel, contraction_of
 from obsynth.verification.plant import condition_rows, plant_information
 

@@ -32,13 +32,13 @@ from obsynth.observers.linear.observer import LinearObserver, modes_of
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, fitting_check, information, nothing_wrong, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.certificates import prove_bounded_real
 from obsynth.verification.claims import (
     Identity,
     claim_rows,
     claimed,
     equality,
     fault_noise_rows,
+    prove_bounded_real,
     recovery_rows,
     tracking_identities,
     tracking_totals,

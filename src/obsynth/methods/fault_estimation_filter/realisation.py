@@ -36,7 +36,7 @@ from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.linear.observer import LinearObserver, poles_of
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
-from obsynth.verification.certificates import prove_bounded_real
+from obsynth.verification.claims import prove_bounded_real
 from obsynth.verification.error_system import ErrorModel
 
 #: Levels, relative to the claimed one, at which coordinates are improved on the way to it.

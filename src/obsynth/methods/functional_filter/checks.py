@@ -21,8 +21,7 @@ from obsynth.proofs.balls import arb_matrix
 from obsynth.proofs.products import EXPONENTIAL_BITS, as_ball, certain_noise_covariance
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.certificates import decay_row, stability_row
-from obsynth.verification.claims import Identity, equality, relative_tolerance
+from obsynth.verification.claims import Identity, decay_row, equality, relative_tolerance, stability_row
 from obsynth.verification.error_system import ErrorModel, natural_scaling
 from obsynth.verification.plant import condition_rows, plant_information
 

@@ -33,7 +33,7 @@ from obsynth.numerics.scaling import balanced_matrix
 from obsynth.numerics.spectra import abscissa, moving_speeds
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
-from obsynth.verification.certificates import slowest_decay
+from obsynth.verification.claims import slowest_decay
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,7 +49,7 @@ from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.proofs.balls import arb_matrix
 from obsynth.proofs.products import EXPONENTIAL_BITS, as_ball
 from obsynth.results.design import Certificate
-from obsynth.verification.certificates import slowest_decay, stability_factor
+from obsynth.verification.claims import slowest_decay, stability_factor
 
 #: A matrix larger than its eigenvalues by this is given in coordinates in which it is triangular.
 FAR_FROM_NORMAL = 1e3

@@ -37,8 +37,17 @@ from obsynth.plants.descriptor import DescriptorSystem, listed
 from obsynth.proofs.balls import Ball, DefinitenessProof, Enclosed, block, prove_positive_definite
 from obsynth.results.checks import Check, fitting_check, information, lower_bound_check, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.certificates import proof_row, prove_gain, prove_symmetric_positive
-from obsynth.verification.claims import ALIKE, equality, relative_tolerance, residual, tracking_identities, worst
+from obsynth.verification.claims import (
+    ALIKE,
+    equality,
+    proof_row,
+    prove_gain,
+    prove_symmetric_positive,
+    relative_tolerance,
+    residual,
+    tracking_identities,
+    worst,
+)
 from obsynth.verification.error_system import ErrorModel, natural_scaling
 from obsynth.verification.plant import condition_rows, plant_information
 

@@ -43,7 +43,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball
 from obsynth.results.design import Certificate
-from obsynth.verification.certificates import prove_gain
+from obsynth.verification.claims import prove_gain
 from obsynth.verification.error_system import ErrorModel
 
 

@@ -58,7 +58,7 @@ from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
-from obsynth.verification.certificates import prove_symmetric_positive
+from obsynth.verification.claims import prove_symmetric_positive
 
 #: Beside the given units of signals that of time is the power of two nearest to this many times the inverse of the
 #: plant's fastest mode, where the objective weighs J and L as it does for a plant with modes of a few 1/s in seconds.

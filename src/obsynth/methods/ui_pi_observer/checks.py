@@ -53,15 +53,16 @@ from obsynth.proofs.balls import enclosed_eigenvalues, middle_of
 from obsynth.proofs.products import certain_noise_covariance
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.certificates import decay_row, stability_row
 from obsynth.verification.claims import (
     ALIKE,
     UNCERTAIN,
     Residual,
+    decay_row,
     equality,
     fault_noise_rows,
     relative_tolerance,
     residual,
+    stability_row,
     worst,
 )
 from obsynth.verification.error_system import ErrorModel

@@ -54,7 +54,7 @@ from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.proofs.balls import enclosed_eigenvalues, middle_of
 from obsynth.proofs.products import certain_noise_covariance
 from obsynth.results.design import Certificate
-from obsynth.verification.certificates import slowest_decay, stability_factor
+from obsynth.verification.claims import slowest_decay, stability_factor
 
 #: Where all modes are slower than this share of the pair's size, they are integrators that rounding has scattered.
 INTEGRATOR_SCATTER = 3e-5
