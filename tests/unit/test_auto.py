@@ -19,7 +19,7 @@ def test_the_design_names_the_method_and_why(tmp_path: Path) -> None:
     plant = load_spec(DESIGNS / "motor" / "sampled.yaml").plant
     found = obsynth.design(plant)
     assert found.method == "functional-filter"
-    assert found.notes[0].startswith("Method chosen by auto: functional-filter (it reaches every step")
+    assert found.notes[0].startswith("Method chosen by auto: functional-filter (its estimates reach every step")
     assert obsynth.load(found.save(tmp_path / "gains.json")).method == "functional-filter"
 
 

@@ -400,10 +400,13 @@ def _require_positive(given: Mapping[str, Any], sensors: Sequence[Sensor], what:
 
 
 def _note(search: SensorSearch, exact: bool, bound: int, most: int, count: int) -> str:
-    if exact and not count:
-        return f"No set of at most {bound} of {len(search.sensors)} candidates does it: all were tried."
+    tried = f"at most {bound} of {len(search.sensors)} candidates"
     if exact:
-        return f"These are all sets of at most {bound} of {len(search.sensors)} candidates that no sensor can leave."
+        return (
+            f"These are all sets of {tried} that need each of their sensors."
+            if count
+            else f"No set of {tried} does it: all were tried."
+        )
     if count >= most:
         return f"The first {most} inclusion-minimal sets found, the most sensitive at a generic point first."
     plain = search.goal == "detect"

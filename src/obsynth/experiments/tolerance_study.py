@@ -89,7 +89,7 @@ class ToleranceStudy:
             tolerance for tolerance, alarms in zip(self.tolerances, self.false_alarms, strict=True) if alarms[0] > 0.0
         ]
         if not alarming:
-            return f"The {FIXED} had no false alarm in these runs: it is enough, and the {ADAPTIVE} proves it."
+            return f"The {FIXED} had no false alarm in these runs; of the {ADAPTIVE} it is proved that it has none."
         blind = [
             tolerance
             for tolerance, least in zip(self.tolerances, self.least_faults, strict=True)

@@ -343,14 +343,14 @@ def reason(best: Candidate, others: list[Candidate], plant: DescriptorSystem) ->
     if not others:
         return "no other method exists for this plant"
     gain = max(found.unknown_input_gain for found in best.figures)
-    words = ["it reaches every step"] if best.rank(False)[0] == 0.0 else []
+    words = ["its estimates reach every step"] if best.rank(False)[0] == 0.0 else []
     if plant.nd:
         words.append(f"gain from the unknown inputs {gain:.1e}")
     deviation = ", ".join(f"{found.deviation:.3g}" for found in best.figures)
     delay = ", ".join(f"{found.most:.3g}" for found in best.figures)
-    words.append(f"deviation {deviation} at 90 % of a step after {delay} s")
-    after = ", ".join(other.method for other in others)
-    return f"{'; '.join(words)}; after it: {after}; obsynth compare ranks by errors over a scenario instead"
+    words.append(f"90 % of a step after {delay} s, with a deviation of {deviation}")
+    below = ", ".join(other.method for other in others)
+    return f"{'; '.join(words)}; ranked below it: {below}; obsynth compare ranks by errors over a scenario instead"
 
 
 def _with_note(design: ObserverDesign, why: str) -> ObserverDesign:
