@@ -99,6 +99,9 @@ TWINS = [[0.5, 1.0], [1, 2.0], [0.2, 0.4]]
 #: Corruption -> what must fail, at least.
 TABLE: dict[str, tuple[str, Corruption, set[str]]] = {
     "another A": ("innovation", with_model(A=OTHER_A), {FITS, STATE, REGRESSOR, CLAIMS}),
+    "another operating point": ("innovation", with_model(operating_point={"x1": 1.0}), {FITS}),
+    "other units": ("innovation", with_model(units={"x1": "m"}), {FITS}),
+    "other scales": ("innovation", with_model(scales={"y1": 2.0}), {FITS}),
     "another E": ("innovation", with_model(E=np.diag([1.0, 1.1, 0])), {FITS, STATE, REGRESSOR, CLAIMS}),
     "another B": ("innovation", with_model(B=[[1], [0.5], [0.3]]), {FITS, STATE}),
     "another C": ("innovation", with_model(C=[[1, 0, 0.3], [0, 1, 1.1]]), {FITS, STATE, CLAIMS}),

@@ -137,6 +137,7 @@ CORRUPTED = {
     "inputs in the error": lambda found: {"observer": replace(found.observer, Bu=found.observer.Bu + 1.0)},
     "state in the residuals": lambda found: {"observer": replace(found.observer, Cz=found.observer.Cz * 1.001)},
     "inputs in the residuals": lambda found: {"observer": replace(found.observer, Du=found.observer.Du + 1.0)},
+    "gains": lambda found: {"gains": {**found.gains, "L": 1.001 * found.gains["L"]}},
     "disturbance gain": lambda found: claiming(found, disturbance_gain=0.999),
     "fault sensitivity": lambda found: claiming(found, fault_sensitivity=found.fault_sensitivity * 1.001),
     "disturbance gain ": lambda found: {

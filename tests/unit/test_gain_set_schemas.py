@@ -95,8 +95,10 @@ def test_what_is_stored_twice_is_compared(smib):
     def failures(**changes: object) -> set[str]:
         return {check.name for check in verify(smib.replace(**changes)).failures}
 
+    hidden = next(name for name in plant.state_names if name not in plant.output_names)
     for changed in (
         plant.replace(units={**plant.units, plant.output_names[0]: "km"}),
+        plant.replace(units={**plant.units, hidden: "km"}),
         plant.replace(operating_point={**plant.operating_point, plant.output_names[0]: 7.0}),
         plant.replace(Dw=1.001 * plant.Dw),
     ):

@@ -223,6 +223,9 @@ def corrupted(design: obsynth.ObserverDesign, what: str) -> obsynth.ObserverDesi
         )
     elif what == "radius":
         matrices["multiplier_radius"] = 1e-3 * matrices["multiplier_radius"]
+    elif what in ("h", "a gain without a number"):
+        h = design.gains["h"]
+        return design.replace(gains={**design.gains, "h": 1.001 * h if what == "h" else np.full_like(h, np.nan)})
     elif what == "weights":
         observer = replace(observer, By=observer.By * (1.0 + 1e-12))
     else:
@@ -233,7 +236,8 @@ def corrupted(design: obsynth.ObserverDesign, what: str) -> obsynth.ObserverDesi
 CORRUPTED = {
     "threshold": "threshold", "surely_found": "surely found", "delay": "delay", "least": "least",
     "multipliers": "multipliers", "witness": "least", "rounding": "rounding", "one of the witness": "witness",
-    "radius": "multipliers", "weights": "weights", "bounds": "threshold",
+    "radius": "multipliers", "weights": "weights", "bounds": "threshold", "h": "gains",
+    "a gain without a number": "gains",
 }  # fmt: skip
 
 

@@ -26,14 +26,15 @@ def tracking_of(design: ObserverDesign, affine: AffinePlant) -> Tracking:
     plant, observer = design.linear
     if any(observer.state_delays):
         raise PreconditionError(
-            "The state estimate has a delay: it does not determine the effect of a tolerance on newer states, so that "
-            "no bound exists. Use a design whose estimate has no delay (detectability indexes of 1).",
+            "The state estimate has a delay: it does not determine the effect of a tolerance, or of a start "
+            "(initial_set), on newer states, so that no bound exists. Use a design whose estimate has no delay "
+            "(detectability indexes of 1), or state neither.",
             condition="full state estimate",
         )
     if observer.state_names != plant.state_names:
         raise PreconditionError(
-            "The design does not estimate the full state, which a bound over tolerances needs: take a "
-            "fault-estimation-filter or a ui-pi-observer, or state no tolerances.",
+            "The design does not estimate the full state, which a bound over tolerances, or from a start "
+            "(initial_set), needs: take a fault-estimation-filter or a ui-pi-observer, or state neither.",
             condition="full state estimate",
         )
     model = error_model(design)

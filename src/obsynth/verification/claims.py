@@ -269,6 +269,8 @@ def _contracts(a: FloatArray, dt: float, rate: float) -> bool:
 
 #: Equalities may miss by this much, relative to the terms they are made of.
 EQUALITY_TOLERANCE = 1e-9
+#: Gains smaller than this are compared as they are.
+LEAST_GAIN_SIZE = 1e-12
 #: Sizes of states that are told by what drives them alone are known to within this factor.
 ROUGHLY = 4.0
 
@@ -686,3 +688,28 @@ def mean_noise_rows(design: ObserverDesign) -> Iterator[Check]:
             float(np.sqrt(max(float(variance), 0.0))),
             source="recomputed, Lyapunov equation",
         )
+
+
+def listed_gains(
+    design: ObserverDesign, found: Mapping[str, FloatArray], *, tolerance: float = EQUALITY_TOLERANCE
+) -> Check:
+    """Return the row on the listed gains, which run; of a recursion they are those of the last step looked at."""
+    wrong = [letter for letter in design.gains if letter not in found]
+    gap = 0.0
+    for letter, matrix in found.items():
+        listed = design.gains.get(letter, matrix)
+        if listed.shape != matrix.shape:
+            wrong.append(letter)
+        elif matrix.size:
+            size = max(float(np.max(np.abs(matrix))), LEAST_GAIN_SIZE)
+            # `max` would take a gain that is no number as none at all.
+            gap = float(np.maximum(gap, np.max(np.abs(listed - matrix)) / size))
+    return upper_bound_check(
+        "gains",
+        "the listed gains are those that run",
+        np.inf if wrong else gap,
+        tolerance,
+        source="gain set",
+        kind="equality",
+        detail=f"wrong: {', '.join(wrong)}" if wrong else "",
+    )

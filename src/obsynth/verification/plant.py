@@ -365,6 +365,7 @@ def stored_twice_rows(design: ObserverDesign) -> Iterator[Check]:
     if source is not None:
         wrong += [f"{name} as written" for name in _KEPT_NAMES if getattr(source.plant, name) != getattr(plant, name)]
         signals = {name for field in _KEPT_NAMES for name in getattr(plant, field)}
+        signals |= set(plant.state_names) & set(source.plant.state_names)
         for label in ("units", "scales", "operating_point"):
             one, other = getattr(source.plant, label), getattr(plant, label)
             if any(one.get(name) != other.get(name) for name in signals):

@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.errors import ObsynthError, SolverError
 from obsynth.methods.dae_adaptive_observer.conditions import SOURCE, dae_conditions
-from obsynth.methods.recursive.checks import claims_row, failed_run, listed_gains, refinement_rows
+from obsynth.methods.recursive.checks import CLAIM_TOLERANCE, claims_row, failed_run, refinement_rows
 from obsynth.numerics.arguments import FloatArray
 from obsynth.numerics.newton import LARGEST_RESIDUAL
 from obsynth.numerics.ranks import SINGULAR_CONDITION, covariance_factor
@@ -32,6 +32,7 @@ from obsynth.proofs.products import logarithm_of_product
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae
+from obsynth.verification.claims import listed_gains
 from obsynth.verification.plant import condition_rows
 
 #: Central differences over this share of a size leave about its square, and rounding over it.
@@ -73,7 +74,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     try:
         facts = dae_facts(observer)
         yield from _model_rows(observer, facts)
-        yield listed_gains(design, {"K": facts.K, "Upsilon": facts.Upsilon})
+        yield listed_gains(design, {"K": facts.K, "Upsilon": facts.Upsilon}, tolerance=CLAIM_TOLERANCE)
         found = {
             "index": float(facts.index),
             "condition": facts.condition,

@@ -30,7 +30,7 @@ from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, prove_positive_definite, r
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.results.checks import Check, fitting_check, information
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.claims import equality, prove_gain, relative_tolerance, tracking_identities
+from obsynth.verification.claims import equality, listed_gains, prove_gain, relative_tolerance, tracking_identities
 from obsynth.verification.error_system import ErrorModel, contraction_of
 from obsynth.verification.plant import condition_rows, plant_information
 
@@ -255,6 +255,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     identities = tracking_identities(ErrorModel(plant, observer, np.eye(plant.nx)))
     for key, (name, claim) in _DETECTION_IDENTITIES.items():
         yield equality(name, claim, identities[key].residual(), _SOURCE, bound=tolerance)
+    yield listed_gains(design, {"L": observer.By, "V": observer.Dy})
     yield from _norm_rows(design)
 
 

@@ -21,7 +21,14 @@ from obsynth.proofs.balls import arb_matrix
 from obsynth.proofs.products import EXPONENTIAL_BITS, as_ball, certain_noise_covariance
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.claims import Identity, decay_row, equality, relative_tolerance, stability_row
+from obsynth.verification.claims import (
+    Identity,
+    decay_row,
+    equality,
+    listed_gains,
+    relative_tolerance,
+    stability_row,
+)
 from obsynth.verification.error_system import ErrorModel, natural_scaling
 from obsynth.verification.plant import condition_rows, plant_information
 
@@ -227,6 +234,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     tolerance = relative_tolerance(printed_digits, plant.nx + plant.ny + observer.order)
     for name, claim, identity in _identities(plant, observer, matrices["T"], matrices["T0"]):
         yield equality(name, claim, identity.residual(), _SOURCE, bound=tolerance)
+    yield listed_gains(design, {name: matrices[name] for name in ("T", "T0")})
     yield stability_row(observer.Az, matrices["stability"], plant.dt, "Lyapunov")
     claims = design.certificate.claims
     order = claims.get("order", float("nan"))

@@ -45,6 +45,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
 from obsynth.results.checks import Check, information, lower_bound_check, nothing_wrong, upper_bound_check
 from obsynth.results.design import Certificate, ObserverDesign
+from obsynth.verification.claims import listed_gains
 
 SOURCE = "duality of linear programmes; exact arithmetic on the shipped numbers"
 #: What certificates hold by programme, as wide as the widest; of a plant with constant matrices one row.
@@ -259,6 +260,7 @@ def _of_what_runs(
 ) -> Iterator[Check]:
     windows, rooms = programmes.windows, {}
     implied: LinearObserver | WindowObserver | None = None
+    gains: dict[str, FloatArray] = {}
     multipliers = [tests[k].values if k in tests else np.zeros(window.rows) for k, window in enumerate(windows)]
     room = np.array([[known_room(*both)] for both in zip(windows, multipliers, strict=True)])
     if isinstance(problem.plant, DescriptorSystem):
@@ -266,12 +268,13 @@ def _of_what_runs(
         # The observer beside the test may be any: its error is bounded by what it is.
         beside = None if tracking is None else part_beside(observer, min(len(tracking), observer.order))
         implied, rooms = observer_of(windows[0], multipliers[0], beside), {"Bu": room, "Du": room}
+        gains = dict(zip("hg", windows[0].weights(multipliers[0])[:2], strict=True))
     elif isinstance(design.observer, WindowObserver):
         has_test = np.isin(np.arange(len(windows)), list(tests))
         # Rows whose programme has a test may be left without a verdict.
         kept = shipped["programmes"].ravel()
         implied = replace(observer_of_rows(problem, programmes, has_test, multipliers), programmes=kept)
-        rooms = {"weights": room}
+        rooms, gains = {"weights": room}, {"weights": design.observer.weights}
     yield upper_bound_check(
         "weights",
         "the weights that run are those of the multipliers",
@@ -281,6 +284,7 @@ def _of_what_runs(
         kind="equality",
         detail="largest difference, in roundings of the sums that the weights are; a wrong shape or name is infinite",
     )
+    yield listed_gains(design, gains)
 
 
 def _over_tolerances(design: ObserverDesign, window: Window, test: Repaired) -> Check:
@@ -559,7 +563,7 @@ def tests_of(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]) -
             design.replace(
                 name=f"test of {name}",
                 options={field: getattr(own, field) for field in design.options},
-                gains={},
+                gains={key.removesuffix(ending): gain for key, gain in design.gains.items() if key.endswith(ending)},
                 observer=_cut(observer, window, fault, whole, length),
                 certificate=Certificate({**matrices, "trade_off": table[:, [0, fault + 1]]}, claims),
                 notes=(),

@@ -56,7 +56,7 @@ from obsynth.proofs.contraction import Contraction, column_norms, prove_contract
 from obsynth.proofs.products import AT_ONCE, logarithm_of_product, product_of_stack, stacked_product
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.claims import EQUALITY_TOLERANCE
+from obsynth.verification.claims import EQUALITY_TOLERANCE, listed_gains
 from obsynth.verification.plant import condition_rows
 
 #: Trials and steps: a wrong variance of 10 % is 20 standard deviations away.
@@ -452,8 +452,6 @@ def noise_is_definite(stated: RecursiveObserver) -> bool:
 CLAIM_TOLERANCE = 1e-6
 #: The recursion may differ from the batch solution by this much, relative to standard deviations, times cond H.
 BATCH_TOLERANCE = 1e-9
-#: Gains smaller than this are compared as they are.
-LEAST_GAIN_SIZE = 1e-12
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
@@ -587,7 +585,7 @@ def _dynamic_rows(
                 source="recomputed",
                 detail=observer.plant.units.get(name, ""),
             )
-    yield listed_gains(design, {"L": facts.L, "K": facts.K})
+    yield listed_gains(design, {"L": facts.L, "K": facts.K}, tolerance=CLAIM_TOLERANCE)
     yield _claims(design, facts, ranks)
     yield from consistency(stated, observer, looked_at(observer))
 
@@ -614,27 +612,6 @@ def _contraction_row(facts: GainScheduleSummary, proof: HorizonProof | None) -> 
         source=source,
         detail=detail,
         kind="proved" if proved else "computed",
-    )
-
-
-def listed_gains(design: ObserverDesign, found: Mapping[str, FloatArray]) -> Check:
-    """Return the row on the listed gains, which are those of the last step of the run that is looked at."""
-    wrong = [letter for letter in design.gains if letter not in found]
-    gap = 0.0
-    for letter, matrix in found.items():
-        listed = design.gains.get(letter, matrix)
-        if listed.shape != matrix.shape:
-            wrong.append(letter)
-        elif matrix.size:
-            gap = max(gap, float(np.max(np.abs(listed - matrix)) / max(float(np.max(np.abs(matrix))), LEAST_GAIN_SIZE)))
-    return upper_bound_check(
-        "gains",
-        "the listed gains are those of the run that is checked",
-        np.inf if wrong else gap,
-        CLAIM_TOLERANCE,
-        source="gain set",
-        kind="equality",
-        detail=f"wrong: {', '.join(wrong)}" if wrong else "",
     )
 
 
@@ -685,10 +662,11 @@ def misfit(design: ObserverDesign) -> str:
         return "the options stand for no observer of this plant"
     filters = ("early_constraints", "outliers", "outlier_limit", "outlier_sizes", "sensors", "state_bounds")
     names = ("state_names", "input_names", "output_names", "parameter_names", "dt", "horizon")
+    labels = ("units", "scales", "operating_point")
     adaptation = ("form", "forgetting", "guard", "window", "reset", "initial_parameters", "initial_covariance", "walk")
     for ours, theirs, fields in (
         (stated, observer, filters),
-        (plant, observer.plant, names),
+        (plant, observer.plant, (*names, *labels)),
         (stated.adaptation, observer.adaptation, adaptation),
         (stated, observer, ("initial_state", "initial_covariance")),
     ):
