@@ -261,7 +261,7 @@ def test_other_plants_and_methods_are_refused_by_kind() -> None:
     plain = obsynth.DescriptorSystem(E=None, A=[[0.5]], C=[[1.0]], dt=1.0)
     with pytest.raises(PreconditionError, match="nonlinear DAEModel"):
         dae_adaptive_observer(plain, dt=1.0, Q=1.0, R=1.0)
-    found = check(exchanger(), {"dae-adaptive-observer": {"dt": 1.0}})
+    found = check(exchanger(), {"dae-adaptive-observer": OPTIONS})
     assert {method for method, report in found.items() if report.passed} == {"dae-adaptive-observer"}
 
 
