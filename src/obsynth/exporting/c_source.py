@@ -294,11 +294,6 @@ class Alarms:
         return cls(levels, tuple(columns), tuple(fault_names), warm_up, learned)
 
 
-def finite_warm_up(seconds: float) -> float:
-    """Return a number that a file may hold: an observer that never settles raises no alarm."""
-    return seconds if math.isfinite(seconds) else _NEVER
-
-
 def linear_alarms(
     found: Realisation,
     thresholds: Mapping[str, float] | None,
@@ -309,7 +304,9 @@ def linear_alarms(
     observer = found.observer
     columns = (*observer.row_names[observer.fault_rows], *observer.row_names[observer.residual_rows])
     # That of the design itself, as runs have it: sampling changes no mode.
-    seconds = finite_warm_up(checked_warm_up(warm_up, transient(found.running)))
+    seconds = checked_warm_up(warm_up, transient(found.running))
+    # A file may hold finite numbers alone: an observer that never settles raises no alarm.
+    seconds = seconds if math.isfinite(seconds) else _NEVER
     return Alarms.of(columns, observer.fault_names, thresholds, seconds, learned)
 
 
@@ -821,9 +818,9 @@ def filled_table(table: FloatArray) -> FloatArray:
     return found
 
 
-def integer_table(name: str, values: Sequence[int]) -> list[str]:
-    """Return a constant table of whole numbers."""
-    return [f"static const int {name}[{max(len(values), 1)}] = {{{', '.join(map(str, values)) or '0'}}};"]
+def integer_table(name: str, values: Sequence[object], kind: str = "int") -> list[str]:
+    """Return a constant table of whole numbers, or of texts of another kind of numbers."""
+    return [f"static const {kind} {name}[{max(len(values), 1)}] = {{{', '.join(map(str, values)) or '0'}}};"]
 
 
 def template(name: str) -> str:

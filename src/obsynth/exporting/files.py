@@ -127,8 +127,13 @@ def require_fixed(design: ObserverDesign, suffix: str) -> None:
             "set.",
             path="observer",
         )
-    if not is_window(design) or suffix != ".c":
-        _require_about_zero(design)
+    if (not is_window(design) or suffix != ".c") and design.linear[1].constant is not None:
+        # Other formats have no place for the middle of such bounds.
+        raise SpecError(
+            f"Design {design.name!r} has bounds that do not lie about zero, so that its row has a constant part, which "
+            "is exported as C (.c) only, without tolerances.",
+            path="disturbance_bounds",
+        )
     for name, asked in (("exact", design.options.get("exact")), ("missing", design.options.get("missing") == "solve")):
         if asked:
             raise SpecError(
@@ -137,16 +142,6 @@ def require_fixed(design: ObserverDesign, suffix: str) -> None:
                 "exported.",
                 path=name,
             )
-
-
-def _require_about_zero(design: ObserverDesign) -> None:
-    """Raise `SpecError` for bounds that do not lie about zero, in formats that have no place for their middle."""
-    if design.linear[1].constant is not None:
-        raise SpecError(
-            f"Design {design.name!r} has bounds that do not lie about zero, so that its row has a constant part, which "
-            "is exported as C (.c) only, without tolerances.",
-            path="disturbance_bounds",
-        )
 
 
 def is_window(design: ObserverDesign) -> bool:

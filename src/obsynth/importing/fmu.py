@@ -80,18 +80,14 @@ class Instance:
             for name, v in self.variables.items()
             if v.causality in ("input", "parameter") or name in self.state_names or v.initial in ("exact", "approx")
         ]
-        self.model = self._instantiate(folder)
-
-    def _instantiate(self, folder: str) -> Any:
-        kind = getattr(import_module(f"fmpy.fmi{self.version[0]}"), _SPELLED[self.version][0])
-        model = kind(
+        kind: Any = getattr(import_module(f"fmpy.fmi{self.version[0]}"), _SPELLED[self.version][0])
+        self.model = kind(
             guid=self.description.guid,
             unzipDirectory=folder,
             instanceName="linearised",
             modelIdentifier=self.description.modelExchange.modelIdentifier,
         )
-        model.instantiate()
-        return model
+        self.model.instantiate()
 
     def _call(self, position: int, *arguments: Any) -> Any:
         """Call what the version of FMI calls the function at a position of `_SPELLED`."""

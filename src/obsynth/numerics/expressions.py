@@ -83,11 +83,6 @@ ARITHMETIC: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = {
 DECIDING_WORDS = frozenset({"if", "else", "and", "or", "not"})
 
 
-def _as_it_is(operation: Callable[..., Any]) -> Callable[..., Any]:
-    """Translate nothing: numbers and arrays."""
-    return operation
-
-
 @dataclass(frozen=True)
 class Expression:
     """An expression that was parsed: its text, the names whose values it needs, and what ``der(...)`` is taken of."""
@@ -105,7 +100,7 @@ class Expression:
         """Return the value, NaN or infinite where there is none; ``values`` are numbers or arrays by name."""
         # What is not finite is found by the caller, who knows where it came from.
         with np.errstate(all="ignore"):
-            return self._evaluator(values, _as_it_is)
+            return self._evaluator(values, lambda operation: operation)
 
     def translated(self, values: Mapping[str, Any], translation: Translation) -> Any:
         """Return the value on other things than numbers."""

@@ -134,22 +134,7 @@ def plot_sweep(results: Sequence[Any], claim: str | None = None, *, parameter: s
             markersize=4,
             label=label if label and number < MOST_LINES else None,
         )
-    _mark_failures(panel, lines)
-    values = [result.claims[claim] for result in results if claim in result.claims]
-    if _spread(values):
-        panel.set_yscale("log")
-    if along is not None and _spread([place for points in lines.values() for place, _ in points]):
-        panel.set_xscale("log")
-    panel.set_xlabel("case" if along is None else along)
-    panel.set_ylabel(claim)
-    tidy(panel)
-    if panel.get_legend_handles_labels()[1]:
-        panel.legend(frameon=False, fontsize="small")
-    return figure
-
-
-def _mark_failures(panel: Axes, lines: Mapping[str, list[tuple[float, Any]]]) -> None:
-    """Mark cases without a design at the lower edge of the panel, by what they came to."""
+    # Cases without a design are marked at the lower edge, by what they came to.
     for status, marker in FAILED.items():
         places = [place for points in lines.values() for place, result in points if result.status == status]
         if places:
@@ -163,6 +148,17 @@ def _mark_failures(panel: Axes, lines: Mapping[str, list[tuple[float, Any]]]) ->
                 transform=panel.get_xaxis_transform(),
                 label=f"{status}: {len(places)}",
             )
+    values = [result.claims[claim] for result in results if claim in result.claims]
+    if _spread(values):
+        panel.set_yscale("log")
+    if along is not None and _spread([place for points in lines.values() for place, _ in points]):
+        panel.set_xscale("log")
+    panel.set_xlabel("case" if along is None else along)
+    panel.set_ylabel(claim)
+    tidy(panel)
+    if panel.get_legend_handles_labels()[1]:
+        panel.legend(frameon=False, fontsize="small")
+    return figure
 
 
 def _claim(results: Sequence[Any], claim: str | None) -> str:

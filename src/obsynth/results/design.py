@@ -125,6 +125,7 @@ def _zipped(members: Mapping[str, str | bytes]) -> bytes:
 
 def _body_of(design: Any) -> dict[str, Any]:
     """Return everything that a gain set holds, with arrays."""
+    kind = next((kind for kind in DESIGN_KINDS if isinstance(design.observer, types_of(kind)[1])), None)
     return {
         "name": design.name,
         "method": design.method,
@@ -139,7 +140,7 @@ def _body_of(design: Any) -> dict[str, Any]:
         "report": design.report.as_dict(),
         "source": None if design.source is None else design.source.as_dict(),
         **({"input_delay": design.input_delay} if design.input_delay else {}),
-        **_tag(design),
+        **({} if kind is None else {"kind": kind}),
     }
 
 
@@ -151,12 +152,6 @@ def types_of(kind: str | None) -> tuple[Any, Any]:
         "dae": (DAEModel, DAEObserver),
     }
     return others.get(kind, (DescriptorSystem, LinearObserver))
-
-
-def _tag(design: Any) -> dict[str, str]:
-    """Return the entry that tells of which kind plant and observer are."""
-    found = next((kind for kind in DESIGN_KINDS if isinstance(design.observer, types_of(kind)[1])), None)
-    return {} if found is None else {"kind": found}
 
 
 def _fields_of(record: StateRecovery) -> dict[str, Any]:

@@ -177,12 +177,11 @@ class RecoveryOperator:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> RecoveryOperator:
         """Return what `as_dict` wrote."""
-        from scipy.sparse import csr_array
 
         def matrix(entry: Mapping[str, Any]) -> Any:
             indices, starts = (np.asarray(entry[name]).astype(np.int64) for name in ("indices", "starts"))
             shape = int(entry["rows"]), int(entry["columns"])
-            return csr_array((np.asarray(entry["values"]), indices, starts), shape=shape)
+            return scipy.sparse.csr_array((np.asarray(entry["values"]), indices, starts), shape=shape)
 
         parts = {name: matrix(data[name]) for name in ("dynamic", "algebraic", "coupling", "right")}
         noise = None if data["noise"] is None else np.asarray(data["noise"])

@@ -830,7 +830,13 @@ def bounded_model(
     linear = linearise(model, given=given, faults=list(faults), disturbances=list(disturbances))
     signals = (*model.state_names, *linear.input_names, *linear.fault_names, *linear.disturbance_names)
     middles, halves = _region(model, linear, signals, region)
-    _require_sure_derivatives(linear)
+    several = np.sum(linear.E != 0.0, axis=1) > 1
+    if np.any(linear.E[several] != np.round(linear.E[several])):
+        raise PreconditionError(
+            "An equation has several derivatives whose coefficients are no whole numbers: their rounding has no bound "
+            "here. Write one derivative in each equation.",
+            condition="remainder",
+        )
     equations, outputs = _remainders(model, linear, signals, middles, halves, given or {})
     found = discretise(linear, sample_time).plant
     if any(name.startswith("xi ") for name in found.state_names):
@@ -844,22 +850,19 @@ def bounded_model(
     bounds = _sampled(linear, own, sample_time, (equations, outputs), dict(zip(signals, at.tolist(), strict=True)))
     if shipped is not None:
         return shipped, bounds
-    return _with_remainders(found), bounds
+    nx, ny = found.nx, found.ny
+    with_remainders = found.replace(
+        Bd=np.hstack([found.Bd, np.eye(nx), np.zeros((nx, ny))]),
+        Dd=np.hstack([found.Dd, np.zeros((ny, nx)), np.eye(ny)]),
+        disturbance_names=[*found.disturbance_names, *remainder_names(found)],
+    )
+    return with_remainders, bounds
 
 
 def remainder_names(plant: DescriptorSystem) -> list[str]:
     """Return what stands for the remainder in each state and each output."""
     into = [f"remainder of {name}" for name in plant.state_names]
     return [*into, *(f"remainder in {name}" for name in plant.output_names)]
-
-
-def _with_remainders(plant: DescriptorSystem) -> DescriptorSystem:
-    nx, ny = plant.nx, plant.ny
-    return plant.replace(
-        Bd=np.hstack([plant.Bd, np.eye(nx), np.zeros((nx, ny))]),
-        Dd=np.hstack([plant.Dd, np.zeros((ny, nx)), np.eye(ny)]),
-        disturbance_names=[*plant.disturbance_names, *remainder_names(plant)],
-    )
 
 
 def require_linear_rates(model: DAEModel) -> None:
@@ -871,17 +874,6 @@ def require_linear_rates(model: DAEModel) -> None:
         raise PreconditionError(
             "A derivative is taken of a nonlinear expression, or multiplied by a signal: its remainder has no bound "
             "here. Write the equations with derivatives of states times constants.",
-            condition="remainder",
-        )
-
-
-def _require_sure_derivatives(linear: DescriptorSystem) -> None:
-    """Raise `PreconditionError` where rounding of coefficients of several derivatives could make a difference."""
-    several = np.sum(linear.E != 0.0, axis=1) > 1
-    if np.any(linear.E[several] != np.round(linear.E[several])):
-        raise PreconditionError(
-            "An equation has several derivatives whose coefficients are no whole numbers: their rounding has no bound "
-            "here. Write one derivative in each equation.",
             condition="remainder",
         )
 

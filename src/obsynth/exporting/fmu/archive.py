@@ -32,6 +32,7 @@ from obsynth.exporting.c_source import (
     dae_c_texts,
     header_text,
     in_precision,
+    integer_table,
     linear_alarms,
     require_no_sample_time,
     source_text,
@@ -387,9 +388,9 @@ def _layout(design: ObserverDesign, signals: Signals, token: str) -> str:
             "",
             f"typedef {_PREFIX}_state observer_memory;",
             "",
-            _table("double", "start_values", starts),
-            _table("int", "point_of_in", points),
-            _table("int", "point_of_out", shown),
+            *integer_table("start_values", starts, "double"),
+            *integer_table("point_of_in", points),
+            *integer_table("point_of_out", shown),
             "",
             "static void begin_observer(observer_memory *memory)",
             "{",
@@ -405,10 +406,6 @@ def _layout(design: ObserverDesign, signals: Signals, token: str) -> str:
             "",
         ]
     )
-
-
-def _table(kind: str, name: str, values: list[object] | list[int] | list[str]) -> str:
-    return f"static const {kind} {name}[{max(len(values), 1)}] = {{{', '.join(map(str, values)) or '0'}}};"
 
 
 def _taking_linear(design: ObserverDesign, signals: Signals) -> list[str]:
