@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import obsynth
 from obsynth.methods.automatic import FaultFigures
 
 ROOT = Path(__file__).parents[2]
@@ -89,3 +90,24 @@ def test_the_name_that_was_changed_still_answers() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert figures.unknown_input_gain == 0.25
+
+
+#: A text within a line, and a name with a line below in it that is neither quoted nor called.
+TEXT, NAME = re.compile(r'"([^"\n]*)"'), re.compile(r"(?<![\w.`'{-])[a-z]+_\w+(?![\w(`'=.:])")
+
+
+def named_in_prose(source: str, names: set[str]) -> set[str]:
+    """Return such names in the texts of a module that have several words; documentation is left out."""
+    prose = (text for line in source.splitlines() if '"""' not in line for text in TEXT.findall(line))
+    return {name for text in prose if text.count(" ") >= 3 for name in NAME.findall(text)} & names
+
+
+def test_messages_name_no_function_that_only_we_know() -> None:
+    sources = [path.read_text("utf-8") for path in (ROOT / "src").rglob("*.py")]
+    whole = "\n".join(sources)
+    # What a user knows: public names, and those of arguments and fields.
+    known = {*obsynth.__all__, *obsynth.conditions.__all__, *obsynth.plotting.__all__, *re.findall(r"(\w+)[=:]", whole)}
+    names = set(re.findall(r"^def (\w+)", whole, flags=re.MULTILINE)) - known
+    assert "listed_sets" in names
+    assert set().union(*(named_in_prose(source, names) for source in sources)) == set()
+    assert named_in_prose('raise ValueError(f"{count} sets are listed_sets for you")', {"listed_sets"})

@@ -545,7 +545,7 @@ MOST_ADDITIONS = 300
 #: Zeros that are named in a sentence; the others are counted.
 MOST_ZEROS = 4
 _PART_OF_THE_BANK = (
-    "Of {count} faults, the residuals listed_sets see all faults, all but one, or one alone; others may exist. "
+    "Of {count} faults, the residuals listed see all faults, all but one, or one alone; others may exist. "
     "diagnose(..., whole_bank=True) and obsynth check --whole-bank list all of up to 12 faults."
 )
 
@@ -608,7 +608,7 @@ def diagnose(
     model = exosystem(fault_model, plant.fault_names, plant.dt)
     if whole_bank and plant.nf > MOST_FAULTS_OF_WHOLE_BANK:
         raise SpecError(
-            f"The plant has {plant.nf} faults: the whole bank of residuals is listed_sets for up to "
+            f"The plant has {plant.nf} faults: the whole bank of residuals is listed for up to "
             f"{MOST_FAULTS_OF_WHOLE_BANK}. Leave faults out, or whole_bank.",
             path="whole_bank",
         )
