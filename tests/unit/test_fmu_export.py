@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import subprocess
+import tempfile
 import zipfile
 from pathlib import Path
 
@@ -268,6 +270,27 @@ def test_wrong_options_are_refused(design, tmp_path, options, words):
         obsynth.export(design, tmp_path / "observer.fmu", **options)
     assert all(word in str(caught.value) for word in words)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("refused", ["no folder", "nothing is written there"])
+def test_a_folder_for_temporary_files_that_cannot_be_used_is_told(design, tmp_path, monkeypatch, refused):
+    """It was told as standard output that cannot be written."""
+
+    class Refused(tempfile.TemporaryDirectory):
+        def __init__(self, *arguments, **options):
+            if refused == "no folder":
+                raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found")
+            super().__init__(*arguments, **options)
+
+        def __enter__(self):
+            return f"{super().__enter__()}/gone"
+
+    monkeypatch.setattr("tempfile.TemporaryDirectory", Refused)
+    with pytest.raises(
+        SpecError, match=r"The folder for temporary files cannot be used: No .*Name another one in TMPDIR"
+    ):
+        obsynth.export(design, tmp_path / "observer.fmu", fmi="2.0")
+    assert not (tmp_path / "observer.fmu").exists()
 
 
 def test_thresholds_are_for_units_and_c_only(design, tmp_path):

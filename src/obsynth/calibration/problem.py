@@ -21,12 +21,10 @@ implicit function theorem does the rest.  Machine code where a C compiler is the
 from __future__ import annotations
 
 import math
-import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -35,6 +33,7 @@ import numpy as np
 from obsynth.analysis.transformations.linearisation import promoted
 from obsynth.calibration.logs import EVEN, Log, bad_log, quantum, refused, repeats, roughness
 from obsynth.errors import SpecError
+from obsynth.files.outputs import working_folder
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import (
     SMALLEST,
@@ -615,15 +614,15 @@ def compiled(functions: Sequence[Any]) -> list[Any]:
                 generator.dump(), tuple(function.name() for function in functions), (*command, *STRAIGHT_CODE_FLAGS)
             )
         )
-    except SpecError:
+    except (SpecError, RuntimeError):  # CasADi, of a folder from which nothing is loaded
         return list(functions)
 
 
 @lru_cache(maxsize=16)
 def _loaded(code: str, names: tuple[str, ...], command: tuple[str, ...]) -> tuple[Any, ...]:
     """Return functions of C code; the same code is compiled once."""
-    with tempfile.TemporaryDirectory(prefix="obsynth-", ignore_cleanup_errors=True) as folder:
-        library = shared_library(Path(folder), {"calibration.c": code}, command, path="calibrate")
+    with working_folder() as folder:
+        library = shared_library(folder, {"calibration.c": code}, command, path="calibrate")
         # What is loaded stays when the file is gone; Windows keeps the file.
         return tuple(ca.external(name, str(library)) for name in names)
 

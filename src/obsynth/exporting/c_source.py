@@ -16,7 +16,6 @@ import ctypes
 import json
 import math
 import re
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -39,7 +38,7 @@ from obsynth.experiments.monitors.learned_levels import (
     MODEL_SHARE,
     parameter_walk,
 )
-from obsynth.files.outputs import write_together
+from obsynth.files.outputs import working_folder, write_together
 from obsynth.numerics.arguments import SMALLEST, FloatArray, real_number, require_mapping
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import (
@@ -1131,8 +1130,8 @@ def float_error(design: ObserverDesign, prefix: str, source: str, declared: str)
     model = design.nonlinear[0]
     names = [*(f"xhat[{name}]" for name in model.state_names), *(f"fhat[{name}]" for name in model.parameter_names)]
     worst, shares = np.zeros(len(names)), np.zeros(len(names))
-    with tempfile.TemporaryDirectory(prefix="obsynth-", ignore_cleanup_errors=True) as folder:
-        library = _compiled(Path(folder), prefix, source, declared, model.nu, model.ny, (model.nx, model.nq))
+    with working_folder() as folder:
+        library = _compiled(folder, prefix, source, declared, model.nu, model.ny, (model.nx, model.nq))
         for seed in SEEDS:
             u, y, expected = _record(design, seed)
             wanted = np.hstack([expected.states, expected.faults])

@@ -394,6 +394,19 @@ def made_folder(folder: Path) -> Iterator[Path]:
         raise
 
 
+@contextmanager
+def working_folder() -> Iterator[Path]:
+    """Give a temporary folder for what is compiled or unpacked; what the system refuses there is a `SpecError`."""
+    try:
+        with tempfile.TemporaryDirectory(prefix="obsynth-", ignore_cleanup_errors=True) as folder:
+            yield Path(folder)
+    except OSError as error:
+        raise SpecError(
+            f"The folder for temporary files cannot be used: {reason(error)}. Name another one in TMPDIR.",
+            path="TMPDIR",
+        ) from error
+
+
 def write_atomically(path: str | Path, content: str | bytes) -> Path:
     """Write ``content`` (text as UTF-8) to ``path`` so that the file is there whole or not at all."""
     target = check_output(path)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,7 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.files.outputs import path_of
+from obsynth.files.outputs import path_of, working_folder
 from obsynth.importing.linear_models import plant_of
 from obsynth.numerics.arguments import FloatArray, arguments_checked, real_number
 from obsynth.numerics.libraries import imported
@@ -297,10 +296,10 @@ def _instance(path: Path) -> Iterator[Instance]:
     differentiates = _differentiates(fmpy, path)
     description = _read(lambda: fmpy.read_model_description(str(path)), path)
     before = os.getcwd()
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+    with working_folder() as folder:
         try:
-            _read(lambda: fmpy.extract(str(path), folder), path)
-            instance = _read(lambda: Instance(description, folder, differentiates=differentiates), path)
+            _read(lambda: fmpy.extract(str(path), str(folder)), path)
+            instance = _read(lambda: Instance(description, str(folder), differentiates=differentiates), path)
             try:
                 yield instance
             finally:

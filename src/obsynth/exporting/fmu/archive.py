@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import platform
 import sys
-import tempfile
 import uuid
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,7 +37,7 @@ from obsynth.exporting.c_source import (
     source_text,
     verification_words,
 )
-from obsynth.files.outputs import write_atomically
+from obsynth.files.outputs import working_folder, write_atomically
 from obsynth.observers.dae.observer import FLAGS, DAEObserver, compiler, shared_library
 from obsynth.results.design import ObserverDesign, unverified_mark
 
@@ -477,9 +476,9 @@ def _binary(sources: Mapping[str, str]) -> bytes | None:
     command = compiler()
     if command is None:
         return None
-    with tempfile.TemporaryDirectory(prefix="obsynth-") as folder:
+    with working_folder() as folder:
         hidden = [*command, *FLAGS, "-fvisibility=hidden"]
-        return shared_library(Path(folder), sources, hidden, path="fmu").read_bytes()
+        return shared_library(folder, sources, hidden, path="fmu").read_bytes()
 
 
 def _zipped(content: Mapping[str, bytes]) -> bytes:

@@ -19,7 +19,6 @@ import re
 import shlex
 import shutil
 import subprocess
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
@@ -31,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
+from obsynth.files.outputs import working_folder
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics import newton
 from obsynth.numerics.arguments import FloatArray, all_finite, as_given, checked_value, read_only, real_array
@@ -477,9 +477,9 @@ def compiler() -> list[str] | None:
 @lru_cache(maxsize=16)
 def _loaded(code: str, command: tuple[str, ...]) -> ctypes.CDLL:
     """Return C code as a library; the same code is compiled once."""
-    with tempfile.TemporaryDirectory(prefix="obsynth-", ignore_cleanup_errors=True) as folder:
+    with working_folder() as folder:
         # It stays loaded when the file is gone; Windows keeps the file.
-        return ctypes.CDLL(str(shared_library(Path(folder), {"observer.c": code}, command, path="compiled")))
+        return ctypes.CDLL(str(shared_library(folder, {"observer.c": code}, command, path="compiled")))
 
 
 def shared_library(folder: Path, texts: Mapping[str, str], command: Sequence[str], *, path: str) -> Path:
