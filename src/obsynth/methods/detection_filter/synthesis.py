@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,10 +81,10 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
     low, high = (float(value) for value in asked.band)
     least, where = _sensitivity(smooth, observer, low, high)
     reached = error_transfer(smooth, observer, smooth.Bf, smooth.Df)
-    shares = (least * (1.0 - margin) for margin in SENSITIVITY_MARGINS)
+    levels = [least * (1.0 - margin) for margin in SENSITIVITY_MARGINS]
     claims = {
         "disturbance_gain": bound,
-        "fault_sensitivity": next((level for level in shares if sensitivity_is_proved(reached, level, low, high)), 0.0),
+        "fault_sensitivity": _first_proved(levels, lambda level: sensitivity_is_proved(reached, level, low, high)),
         "band_from": low,
         "band_to": high,
         "frequency": where,
@@ -97,6 +97,15 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
         notes=_notes(smooth, observer, claims),
         transformation=found if found.description else None,
     )
+
+
+def _first_proved(levels: Sequence[float], is_proved: Callable[[float], bool]) -> float:
+    """Return the first of falling levels that is proved, or zero: where the lowest has no proof none has, and a failure
+    takes seconds."""
+    if is_proved(levels[0]):
+        return levels[0]
+    lower = levels[1:] if is_proved(levels[-1]) else ()
+    return next((level for level in lower if is_proved(level)), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
