@@ -142,6 +142,14 @@ def test_an_exact_interval_proves_alarms_that_the_fixed_test_does_not_raise() ->
     assert obsynth.prove_alarm(found, data, row).proved
 
 
+def test_gains_of_a_bank_are_those_of_its_tests() -> None:
+    bank = tank(isolate=True, fault=None)
+    name, gain = next((name, gain) for name, gain in bank.gains.items() if name.startswith("h["))
+    for gains, row in (({name: 1.001 * gain}, name.replace("h", "gains")), ({"K[none]": gain}, "bank")):
+        report = obsynth.verify(bank.replace(gains={**bank.gains, **gains}))
+        assert row in {check.name for check in report.failures}
+
+
 def test_a_bank_proves_which_fault_it_is_and_bounds_are_those_of_the_design() -> None:
     bank = tank(isolate=True, fault=None)
     proof = obsynth.prove_alarm(bank, record(3.0 * tank().threshold), 20)

@@ -600,8 +600,11 @@ def bank_checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]
         tests, reason = tests_of(design, read), ""
         fits = len(tests) == plant.nf and observer.residual_names == plant.fault_names
         fits = fits and all(fault in group for fault, group in enumerate(groups_of(design)))
-        faults = {name.partition("[")[2].rstrip("]") for name in design.certificate.claims}
-        fits = fits and faults == set(plant.fault_names)
+        faults, gains = (
+            {name.partition("[")[2].rstrip("]") for name in named}
+            for named in (design.certificate.claims, design.gains)
+        )
+        fits = fits and faults == set(plant.fault_names) and gains <= faults
     # A file that was changed may hold anything: what cannot be cut is no bank.
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RuntimeError) as error:
         tests, fits, reason = (), False, str(error)
