@@ -40,6 +40,7 @@ NOISE = {"dt": 1.0, "Q": 1e-4, "R": 1e-4}
         (BIASED, "dae-adaptive-observer", NOISE, "initial_parameter_covariance is missing"),
         (LINEAR.replace(Bw=np.ones((3, 2)), Dw=np.eye(2)), "descriptor-kalman", {}, "Bw Dw' is not zero"),
         (LINEAR.replace(Bw=np.ones((3, 2)), Dw=np.eye(2)), "adaptive-observer", {}, "Bw Dw' is not zero"),
+        (LINEAR.replace(Bd=np.eye(3), Dd=np.zeros((2, 3))), "descriptor-kalman", {}, "drive every equation"),
         (LINEAR.replace(Bw=np.eye(3), Dw=np.zeros((2, 3))), "functional-filter", {}, "free of noise"),
         (LINEAR.replace(dt=0.0, A=-LINEAR.A), "functional-filter", {"delay": 2}, "count samples"),
     ],

@@ -118,10 +118,12 @@ class DescriptorKalman(Method):
         return kalman_conditions(plant, early=self.early_constraints)
 
     def require_stated(self, plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> None:
-        """Raise `SpecError` where the noise that the plant states is none that the method covers."""
-        from obsynth.methods.recursive.synthesis import with_stated_noise
+        """Raise `SpecError` where noise or unknown inputs of the plant are none that the method covers."""
+        from obsynth.methods.recursive.synthesis import with_stated_noise, without_unknown_inputs
 
         with_stated_noise(plant, self.as_given())
+        if isinstance(plant, DescriptorSystem) and plant.nd:
+            without_unknown_inputs(plant)
 
     def synthesise(
         self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, progress: Callable[[str], None]

@@ -129,6 +129,12 @@ def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
         names = tuple(f"unknown input {i + 1}" for i in range(rank))
     left, sizes_of_entry, _ = np.linalg.svd(rows * bd @ hidden)
     moved = numerical_rank(sizes_of_entry, scale=1.0)
+    if moved == plant.nx:
+        raise SpecError(
+            f"Unknown inputs ({', '.join(plant.disturbance_names)}) drive every equation: none is left to predict the "
+            "state with. State one of them as noise (Bw), or leave it out.",
+            path="Bd",
+        )
     equations = left[:, moved:].T * own.equations if moved else np.eye(plant.nx)
     if rank == plant.nd:
         # In their own units again, with their own names.
