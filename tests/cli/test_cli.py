@@ -329,7 +329,7 @@ class TestEndings:
         def interrupted(spec: Any, **_: Any) -> Any:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("obsynth.spec.loader.design_of_spec", interrupted)
+        monkeypatch.setattr("obsynth.cli.commands.design_of_spec", interrupted)
         assert main(["design", "--system", str(WANG), "--quiet"]) == 130
         assert capsys.readouterr().err == "Interrupted.\n"
         assert list(Path.cwd().iterdir()) == []
