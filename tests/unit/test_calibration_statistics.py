@@ -299,3 +299,15 @@ def test_a_box_ends_where_the_deviance_says_or_at_the_bound_that_was_given() -> 
     there = Maximum(np.array([0.0, 0.023 / 0.3]), 0.0, objective.hessian, np.zeros(2))
     at_it = profile_box(objective, there, 2.0, SimpleNamespace(undetermined=()))[1][1]
     assert (at_it.value, at_it.is_open) == (0.023, True)
+
+
+def test_rows_in_which_a_move_of_a_constant_has_no_number_are_left_out() -> None:
+    """A move beyond what the plant can be simulated with ended in LAPACK's words: its SVD did not converge."""
+    rng = np.random.default_rng(3)
+    column, other = rng.standard_normal((2, 60))
+    regressor = column + 0.5 * rng.standard_normal(60)
+    broken = np.where(np.arange(60) % 5 == 0, np.nan, other)
+    kept = np.isfinite(broken)
+    found = regression_gain(column, [broken], regressor)
+    assert found == pytest.approx(regression_gain(column[kept], [other[kept]], regressor[kept]), rel=1e-12)
+    assert regression_gain(column, [np.full(60, np.nan)], regressor) == 0.0

@@ -397,8 +397,9 @@ def _together(innovations: FloatArray, regressors: FloatArray) -> tuple[float, F
 
 def regression_gain(column: FloatArray, others: Sequence[FloatArray], regressor: FloatArray) -> float:
     """Return what a regressor ``(n,)`` of innovations ``(n,)`` gains beside others, in nats."""
-    seen = np.isfinite(column) & np.isfinite(regressor)
-    y, x = column[seen], np.column_stack([*others, regressor])[seen]
+    x = np.column_stack([*others, regressor])
+    seen = np.isfinite(column) & np.isfinite(x).all(axis=1)
+    y, x = column[seen], x[seen]
     left = [float(np.sum((y - part @ np.linalg.lstsq(part, y, rcond=None)[0]) ** 2)) for part in (x[:, :-1], x)]
     return 0.5 * len(y) * float(np.log(left[0] / left[1])) if left[1] > 0.0 else 0.0
 
