@@ -192,12 +192,26 @@ def test_a_covariance_that_starts_again_says_nothing() -> None:
 def test_a_fault_is_named_where_it_explains_more_than_any_other() -> None:
     assert most_likely_change(np.array([[5.0, 1.0], [40.0, 20.0]])) == 0
     assert most_likely_change(np.array([[1.0, 60.0], [40.0, 20.0]])) == 1
-    # Odds below 90, or less than a model that is off by some percent explains.
+    # Odds below 90.
     assert most_likely_change(np.array([[30.0, 22.0]])) == NOT_DISTINGUISHED
-    assert most_likely_change(np.array([[900.0, 880.0]])) == NOT_DISTINGUISHED
-    assert most_likely_change(np.array([[900.0, 850.0, 100.0]])) == 0
+    assert most_likely_change(np.array([[900.0, 880.0, 100.0]])) == 0
     assert most_likely_change(np.array([[30.0]])) == 0
     assert most_likely_change(np.array([[8.0]])) == NOT_DISTINGUISHED
+
+
+@pytest.mark.parametrize("angle", [0.02, 0.05, 0.099, 0.12, 0.3])
+def test_no_fault_is_named_for_another_whose_effect_is_off_by_less_than_10_percent(angle: float) -> None:
+    """Of two directions, the innovations have the second one, off by a share of their size to either side."""
+    first = np.array([np.cos(angle), np.sin(angle)])
+
+    def named(off: float) -> set[int]:
+        shown = [1e3 * np.array([np.sqrt(1.0 - part**2), part]) for part in np.linspace(-off, off, 401)]
+        return {most_likely_change(np.array([[(y @ first) ** 2, y[0] ** 2]])) for y in shown}
+
+    assert 0 not in named(0.0995)
+    assert 0 in named(0.3)
+    exact = most_likely_change(np.array([[1e6, (1e3 * np.cos(angle)) ** 2]]))
+    assert exact == (0 if angle > 0.1 else NOT_DISTINGUISHED)
 
 
 @functools.cache

@@ -34,8 +34,9 @@ from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 
 #: A fault is named where a change of it alone is more likely than one of any other by so much in twice the log
-#: likelihood (odds of 90), and by this share of its own: constants that are off by some percent explain as much.
-DISTINGUISHED, MODEL_SHARE = 9.0, 0.05
+#: likelihood (odds of 90), and by this share of its own: where the effect of another fault on the innovations is off by
+#: less than 10 % of its size, that one lies behind by less than the square of it (the sine of the angle between them).
+DISTINGUISHED, MODEL_SHARE = 9.0, 0.01
 #: Share of the information before it that a sample adds at least: less is what rounding leaves of the difference.
 LEAST_ADDED = 1e-9
 
