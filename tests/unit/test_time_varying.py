@@ -138,6 +138,7 @@ def nan_at_5(k):
         ({"dt": -1.0}, "dt is -1", "dt"),
         ({"horizon": 0}, "horizon is 0", "horizon"),
         ({"horizon": True}, "horizon is True", "horizon"),
+        ({"horizon": 10**9}, "1000000000 steps is too long for .*Leave the horizon out", "horizon"),
         ({"constants": {"k": 1.0}}, "constants names 'k'", "constants"),
         ({"constants": {"half": float("nan")}}, "'half' is nan", "constants.half"),
         ({"state_names": ["a"]}, r"1 name\(s\), but there are 2", "state_names"),

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import (
+    MAXIMUM_ENTRIES,
     FloatArray,
     arguments_checked,
     as_given,
@@ -1098,10 +1099,18 @@ def checked_horizon(horizon: int | None, values: Mapping[str, MatrixSequence]) -
 
 def check_every_k(values: Mapping[str, MatrixSequence], horizon: int | None) -> None:
     """Evaluate callables and expressions along the horizon, so that a bad k is found before anything runs."""
-    for name, matrix in values.items():
-        if matrix.values is None and horizon is not None:
-            for k in range(_FIRST_INDEX[name], horizon + _FIRST_INDEX[name]):
-                matrix.at(k)
+    if horizon is None:
+        return
+    moving = {name: matrix for name, matrix in values.items() if matrix.values is None}
+    if horizon * sum(matrix.shape[0] * matrix.shape[1] for matrix in moving.values()) > MAXIMUM_ENTRIES:
+        raise SpecError(
+            f"a horizon of {horizon} steps is too long for {', '.join(moving)}: more than {MAXIMUM_ENTRIES:,} entries "
+            "are to be evaluated before anything runs. Leave the horizon out: a step is then evaluated when it comes.",
+            path="horizon",
+        )
+    for name, matrix in moving.items():
+        for k in range(_FIRST_INDEX[name], horizon + _FIRST_INDEX[name]):
+            matrix.at(k)
 
 
 @dataclass(frozen=True, eq=False, init=False)
