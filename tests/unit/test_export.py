@@ -226,6 +226,13 @@ def test_c_survives_any_name(sampled, tmp_path):
     )
 
 
+@pytest.mark.parametrize("name", ["math.c", "Time.c"])
+def test_a_header_of_c_is_not_shadowed(sampled, tmp_path, name):
+    with pytest.raises(SpecError, match="in place of C's own: name it otherwise"):
+        obsynth.export(sampled, tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("stem", "wanted"),
     [("wang2015", "wang2015"), ("2a", "obs_2a"), ("while", "obs_while"), ("_a", "obs__a"), ("é", "obs__")],

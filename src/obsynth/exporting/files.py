@@ -8,6 +8,7 @@ Guaranteed tests as C99: a window of samples, a dot product for each test, and i
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -237,6 +238,14 @@ EXPORTED = {
 }
 
 
+#: Headers of C11, without their suffix.
+_C_HEADERS = re.compile(
+    "assert|complex|ctype|errno|fenv|float|inttypes|iso646|limits|locale|math|setjmp|signal|stdalign|stdarg|stdatomic|"
+    "stdbool|stddef|stdint|stdio|stdlib|stdnoreturn|string|tgmath|threads|time|uchar|wchar|wctype",
+    re.IGNORECASE,
+)
+
+
 @arguments_checked
 def export(
     design: ObserverDesign,
@@ -322,6 +331,12 @@ def export(
     suffix = target.suffix.lower()
     if suffix not in EXPORT_SUFFIXES:
         raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(EXPORT_SUFFIXES)}.", path=str(target))
+    if suffix == ".c" and _C_HEADERS.fullmatch(target.stem):
+        raise SpecError(
+            f"{target} comes with a header {target.stem}.h, which a compiler may read in place of C's own: name it "
+            "otherwise, such as observer.c.",
+            path=str(target),
+        )
     require_verified(design, unverified=unverified)
     require_fixed(design, suffix)
     if isinstance(design.observer, RecursiveObserver):
