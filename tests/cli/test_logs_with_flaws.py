@@ -163,8 +163,13 @@ def test_run_thresholds_validate_and_smoothing_take_each_flaw(
         assert (after["status"] == "ok").all()
         assert (table["alarm"] == "").all()
         assert np.abs(after[f"fhat[{fault}]"].astype(float)).max() < (2e-3 if kind == "nonlinear" else 0.5)
-    call("thresholds", *given, "--out", tmp_path / "normal.json")
-    call("run", *given, "--out", out, "--force", "--monitor", "learned", "--normal", tmp_path / "normal.json")
+    if (kind, flaw) == ("nonlinear", "stuck sensor"):
+        # The diode's one sensor repeats 70 of 220 rows, which count as not measured.
+        assert main([str(part) for part in ("thresholds", *given, "--out", tmp_path / "normal.json")]) == 2
+        assert "Only 50 rows of the log can be used" in capsys.readouterr().err
+    else:
+        call("thresholds", *given, "--out", tmp_path / "normal.json")
+        call("run", *given, "--out", out, "--force", "--monitor", "learned", "--normal", tmp_path / "normal.json")
     call("run", *given, "--out", out, "--force", "--smooth")
     assert main([str(part) for part in ("validate", *given)]) == (6 if flaw == "stuck sensor" else 0)
     assert "Traceback" not in "".join(capsys.readouterr())

@@ -522,8 +522,8 @@ def thresholds_from_rows(
     count = int(known.sum())
     if count < LEAST_NORMAL:
         raise SpecError(
-            f"Only {count} rows of the log can be used, as warm-up and gaps do not count: give "
-            f"{LEAST_NORMAL} and more.",
+            f"Only {count} rows of the log can be used, as warm-up, gaps and what a stuck sensor repeats do not count: "
+            f"give {LEAST_NORMAL} and more.",
             path="normal",
         )
     conformal = is_conformal(count, others)
