@@ -316,10 +316,13 @@ def _filter_truth(m: dict[str, np.ndarray], dt: float) -> tuple[bool, str] | Non
     return stable, "exists" if stable else "a zero outside the unit circle"
 
 
-def _ui_pi_truth(m: dict[str, np.ndarray], dt: float) -> tuple[bool, str] | None:
+def _ui_pi_truth(m: dict[str, np.ndarray], dt: float) -> tuple[bool | None, str] | None:
     if not _decoupled(m):
         reduced = _eliminated(m)
-        if reduced is None or not _decoupled(reduced):
+        if reduced is None:
+            # What is not decoupled may be a state that no other equation needs; estimates that are found are judged.
+            return None, "the algebraic states cannot be eliminated"
+        if not _decoupled(reduced):
             return False, "the unknown input cannot be decoupled"
         m = reduced
     nd, n = m["Bd"].shape[1], len(m["A"])
