@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from benchmarks.campaigns._rational_plants import drawn_plant
 
 import obsynth
 from obsynth.methods.functional_filter import kalman_gain
@@ -368,6 +369,16 @@ def test_a_default_walk_shows_a_step_where_none_does_at_once() -> None:
         outputs.append(plant.C @ x + plant.Df[:, 0])
         x = np.linalg.solve(plant.E, plant.A @ x + plant.Bf[:, 0])
     assert design.observer.run(np.array(outputs)).faults[-1, 0] == pytest.approx(1.0, abs=0.5)
+
+
+@pytest.mark.parametrize(("seed", "times"), [(40134, 4), (52070, 256), (52298, 4096)])
+def test_a_default_walk_waits_twice_as_long_until_a_step_shows(seed: int, times: int) -> None:
+    given = drawn_plant("functional-filter", seed)
+    plant = obsynth.DescriptorSystem(**{name: given.given[name] for name in ("E", "A", "C", "Bf", "Df", "Bd", "Dd")},
+                                     dt=given.dt)  # fmt: skip
+    note = next(note for note in obsynth.functional_filter(plant).notes if "slowest with which" in note)
+    waited = float(note.split(" after ")[1].split()[0])
+    assert waited == pytest.approx(times * kalman_gain.settling_time(plant), rel=5e-3)
 
 
 def test_a_fault_that_equations_without_noise_tell_has_a_walk() -> None:

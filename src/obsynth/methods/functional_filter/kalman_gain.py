@@ -320,7 +320,7 @@ AS_CLOSE = 0.05
 #: A walk that misses a step by more shows nothing of it in time: how much more than that is a matter of rounding.
 #: Where no walk shows more, it has so many times as long, this often: the slowest of all would show nothing ever, and
 #: is taken only where rounding hides what faster ones show.
-NOTHING_SHOWN, LONGER, MOST_LONGER = 0.5, 2.0, 10
+NOTHING_SHOWN, LONGER, MOST_LONGER = 0.5, 2.0, 55
 #: Errors that need longer than so many settling times to decay would stay in any run: the gain moves such poles.
 FOR_GOOD = 1e5
 #: Decades of the search around a rate of the size of the noise, and its steps per decade at the end.
@@ -364,17 +364,23 @@ def default_rates(
         return np.inf if found is None else step_misses(model, found, seconds)
 
     exponents = [float(e) for e in range(-DECADES, DECADES + 1)]
-    for seconds in (seconds * LONGER**times for times in range(longer + 1)):
-        high = next((e for e in exponents if missed(e, seconds) <= RATE_REACHED), None)
-        least = min(missed(e, seconds) for e in exponents) if high is None else 0.0
+    for waited in range(longer + 1):
+        seconds *= LONGER if waited else 1.0
+        misses: list[float] = []
+        for exponent in exponents:
+            misses.append(missed(exponent, seconds))
+            if misses[-1] <= RATE_REACHED:
+                break
+        least = min(misses)
         if least <= NOTHING_SHOWN:
             break
     if not any(found is not None for found in tried.values()):
         raise SolverError("No random-walk intensity of the fault gives a stable filter: give fault_rate, or poles.")
-    if high is None:
+    high = exponents[len(misses) - 1]
+    if least > RATE_REACHED:
         # Some zero keeps every estimate from a step for long: the slowest walk that comes about as close as any.
         close = np.inf if least > NOTHING_SHOWN else least + AS_CLOSE
-        high = next(e for e in exponents if tried[e] is not None and missed(e, seconds) <= close)
+        high = next(e for e, miss in zip(exponents, misses, strict=True) if tried[e] is not None and miss <= close)
     else:
         low = high - 1.0
         for _ in range(RATE_BISECTIONS):
