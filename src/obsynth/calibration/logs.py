@@ -125,9 +125,10 @@ class Log:
 
     def unstuck(self) -> Log:
         """Return the log without what sensors repeated while they were stuck, which no noise of theirs moved."""
-        y = without_repeats(self.y)
-        if np.array_equal(y, self.y, equal_nan=True):
+        stuck = [stuck_rows(column) for column in self.y.T]
+        if not any(stuck):
             return self
+        y = without_repeats(self.y, stuck)
         return replace(self, y=read_only(y), notes=(*self.notes, "What a stuck sensor repeats counts as not measured."))
 
 

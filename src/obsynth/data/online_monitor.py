@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from obsynth.data.log_observers import DECIDING, STALE, Row, SteppingLogObserver
 from obsynth.data.run import LogRun
-from obsynth.data.sources import CHUNK_ROWS, TIME_HEADER, Data, Signals, Stamps, chunks, parsed_rows
+from obsynth.data.sources import CHUNK_ROWS, TIME_HEADER, Data, Stamps, chunks, parsed_rows
 from obsynth.data.stuck_sensors import stuck_rows, stuck_texts, without_repeats
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions
@@ -101,13 +101,18 @@ AFTER_A_MOVE, LEAST_MOVES, LARGE_SHARE, LARGER = 3, 20, 0.1, 2.0
 
 
 def notes_of_normal_rows(
-    raised: Raised, numbers: NDArray[np.int64], log: FloatArray, rows: slice, signals: Signals, stamps: Stamps
+    raised: Raised,
+    numbers: NDArray[np.int64],
+    times: FloatArray,
+    rows: slice,
+    stuck: Mapping[str, Sequence[tuple[int, int]]],
+    stamps: Stamps,
 ) -> tuple[str, ...]:
-    """Return the notes on ``rows`` of a ``log (n, 1 + nu + ny)``, from 0: on events that stand in rows of these
-    ``numbers``, and on outputs that are stuck."""
+    """Return the notes on ``rows`` of a log with ``times (n,)``, from 0: on events that stand in rows of these
+    ``numbers``, and on outputs, by name, that are stuck."""
 
     def shown(first: int, last: int) -> str:
-        begin, end = (stamps.shown(float(log[row, 0])) for row in (first, last))
+        begin, end = (stamps.shown(float(times[row])) for row in (first, last))
         return f"row {first} ({begin})" if first == last else f"rows {first} to {last} ({begin} to {end})"
 
     def found() -> Iterator[str]:
@@ -121,11 +126,11 @@ def notes_of_normal_rows(
                 f"smaller would pass that of {raised.statistic!r}. Look whether the plant was as usual there; if it "
                 "was not, blank its outputs in these rows, or give another log."
             )
-        stuck = {
-            name: [(begin, end) for begin, end in stuck_rows(log[:, i]) if end >= rows.start and begin < rows.stop]
-            for i, name in enumerate(signals.names[signals.inputs :], 1 + signals.inputs)
+        told = {
+            name: [(begin, end) for begin, end in runs if end >= rows.start and begin < rows.stop]
+            for name, runs in stuck.items()
         }
-        yield from stuck_texts(stuck, shown, ": what it repeats there counts as not measured")
+        yield from stuck_texts(told, shown, ": what it repeats there counts as not measured")
 
     return tuple(found())
 
@@ -289,7 +294,8 @@ def learn_thresholds(
     if len(log) < LEAST_NORMAL:
         raise SpecError(f"The log has {len(log)} rows: give {LEAST_NORMAL} and more.", path="normal")
     before = 1 + first_run.signals.inputs
-    given_log, log = log, np.hstack([log[:, :before], without_repeats(log[:, before:])])
+    stuck = [stuck_rows(column) for column in log[:, before:].T]
+    log = np.hstack([log[:, :before], without_repeats(log[:, before:], stuck)])
     said, sizes = _sized(design, started, log)
     dt = design.observer.dt or float(np.median(np.diff(said.times)))
     every = rows_per_alarm(false_alarms, dt)
@@ -310,7 +316,9 @@ def learn_thresholds(
         **given,
     )
     raised = raised_levels(design, found, watched, scores, **given)
-    notes = notes_of_normal_rows(raised, said.numbers[chosen], given_log, slice(first, last), first_run.signals, stamps)
+    outputs = first_run.signals.names[first_run.signals.inputs :]
+    by_name = dict(zip(outputs, stuck, strict=True))
+    notes = notes_of_normal_rows(raised, said.numbers[chosen], log[:, 0], slice(first, last), by_name, stamps)
     white = found.statistics.model.whitened(watched_rows(design, found, watched))
     inputs = log[said.numbers[chosen], 1 : 1 + first_run.signals.inputs]
     divided = notes_of_starts(divided_at_starts(design.observer, scores if found.statistics.estimates else None))

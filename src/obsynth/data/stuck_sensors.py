@@ -6,7 +6,7 @@ What a log has shown is gathered row by row in constant memory, so that streams 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -209,11 +209,12 @@ def stuck_rows(values: FloatArray) -> list[tuple[int, int]]:
     return gathered.stuck()[0]
 
 
-def without_repeats(values: FloatArray) -> FloatArray:
-    """Return outputs ``(n, ny)`` with NaN for what each repeats while it is stuck: no noise of its sensor is there."""
+def without_repeats(values: FloatArray, stuck: Iterable[Sequence[tuple[int, int]]]) -> FloatArray:
+    """Return outputs ``(n, ny)`` with NaN for what each repeats in the rows in which it is stuck: no noise of its
+    sensor is there."""
     found = np.array(values)
-    for i, column in enumerate(values.T):
-        for first, last in stuck_rows(column):
+    for i, runs in enumerate(stuck):
+        for first, last in runs:
             found[first + 1 : last + 1, i] = np.nan
     return found
 

@@ -131,7 +131,8 @@ def as_given(value: Any, name: str, ragged: str) -> NDArray[Any]:
         raise SpecError(f"{name} is a {type(value).__name__} that is no array: {error}.", path=name) from error
 
 
-#: Larger matrices in files are refused; of sparse ones, the entries that are stored count.
+#: More entries of matrices are not taken: of one in a file (of a sparse one, those that are stored), and along a
+#: horizon of all that change.
 MAXIMUM_ENTRIES = 50_000_000
 
 
