@@ -24,8 +24,8 @@ import numpy as np
 
 import obsynth
 from obsynth.methods.registry import method_class
-from obsynth.observers.dae.building import dae_observer_from_options
-from obsynth.spec import load_spec
+from obsynth.observers.nonlinear.building import dae_observer_from_options
+from obsynth.specs.loader import load_spec
 
 SPEC = Path(__file__).parents[1] / "designs" / "moussaali2013_dae" / "spec.yaml"
 SAMPLES, TRIALS, FEWER_TRIALS, REPEATS = 1001, 1000, 20, 5

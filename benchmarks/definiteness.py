@@ -16,10 +16,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 import obsynth
-from obsynth.methods.pd_observer.checks import prove_gains
+from obsynth.methods.pd_observer.certificate_proofs import prove_gains
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.proofs.balls import LARGEST_ORDER, DefinitenessProof, prove_positive_definite
-from obsynth.verification.claims import prove_bounded_real, prove_stable
+from obsynth.proofs.definiteness import LARGEST_ORDER, DefinitenessProof, prove_positive_definite
+from obsynth.verification.inequalities import prove_bounded_real, prove_stable
 
 SECONDS_PER_CELL = 1.0
 Action = Callable[[], DefinitenessProof]

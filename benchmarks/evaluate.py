@@ -17,7 +17,7 @@ import control
 import numpy as np
 
 import obsynth
-from obsynth.experiments.simulation import make_bench
+from obsynth.simulation.benches import make_bench
 
 sys.path.insert(0, str(Path(__file__).parent))
 from run_on_data import made_up

@@ -22,12 +22,12 @@ from pathlib import Path
 import numpy as np
 
 import obsynth
-from obsynth.methods.fault_estimation_filter.central_filter import GainProblem
-from obsynth.methods.fault_estimation_filter.conditions import prepare
+from obsynth.analysis.existence.restricted_equivalent import prepare
 from obsynth.methods.fault_estimation_filter.synthesis import gain_problem, with_weight_limit
+from obsynth.numerics.injection_problem import GainProblem
 from obsynth.numerics.norms import hinf_norm
-from obsynth.proofs.balls import prove_positive_definite
-from obsynth.spec import load_spec
+from obsynth.proofs.definiteness import prove_positive_definite
+from obsynth.specs.loader import load_spec
 
 ROOT = Path(__file__).parents[1]
 FAMILIES = ("brief", "noise", "delay")

@@ -35,7 +35,7 @@ from recursive_filters import Problem, observer_of
 from run_on_data import made_up
 
 import obsynth
-from obsynth.methods.fault_estimation_filter.conditions import prepare
+from obsynth.analysis.existence.restricted_equivalent import prepare
 from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
 
 HERE = Path(__file__).resolve().parent

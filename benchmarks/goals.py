@@ -180,7 +180,7 @@ def questions(seeds: Sequence[int], *, small: bool) -> Iterator[Goal]:
 def recursive(seeds: Sequence[int], *, small: bool) -> Iterator[Goal]:
     """Yield steps a second of recursive observers, and those of plain loops beside them."""
     from obsynth.methods.registry import method_class
-    from obsynth.observers.dae.building import dae_observer_from_options
+    from obsynth.observers.nonlinear.building import dae_observer_from_options
 
     repeats = 1 if small else SEEDS
     for size, least in (((2, 1, 1), 40.3e3), ((20, 5, 3), 27.3e3)):

@@ -129,9 +129,9 @@ def least_gains(first: int, cases: int) -> None:
     import numpy as np
     from benchmarks.campaigns.conditions import _plant
 
-    from obsynth.methods.fault_estimation_filter.central_filter import NEGLIGIBLE_GAIN, search_least_gain
-    from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
+    from obsynth.analysis.existence.wang2015 import examine_fault_filter
     from obsynth.methods.fault_estimation_filter.synthesis import centred, gain_problem
+    from obsynth.numerics.central_filter import NEGLIGIBLE_GAIN, search_least_gain
 
     for seed in range(first, first + cases):
         # One in four is usual: the disturbance in all measurements, poles of .7.

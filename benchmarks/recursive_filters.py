@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import obsynth
-from obsynth.numerics.arguments import FloatArray
+from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.recursive.observer import observer_from_options
 
 SIZES = ((2, 1, 1), (20, 5, 3))

@@ -19,7 +19,7 @@ import control
 import numpy as np
 
 import obsynth
-from obsynth.spec import load_spec
+from obsynth.specs.loader import load_spec
 
 ROOT = Path(__file__).parents[1]
 SAMPLE_TIME = 0.2

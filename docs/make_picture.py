@@ -12,8 +12,8 @@ import numpy as np
 
 import obsynth
 from obsynth.plotting import plot_faults
-from obsynth.simulation import simulate_plant
-from obsynth.spec import load_spec
+from obsynth.simulation.linear import simulate_plant
+from obsynth.specs.loader import load_spec
 
 mpl.use("Agg")
 HERE = Path(__file__).parent

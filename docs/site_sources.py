@@ -14,7 +14,7 @@ MADE = "made"
 SECTIONS = (
     ("obsynth.errors", "Errors"),
     ("obsynth.importing", "Plants from other tools"),
-    ("obsynth.spec", "Specs"),
+    ("obsynth.specs", "Specs"),
     ("obsynth.plants", "Plants"),
     ("obsynth.analysis", "What is possible"),
     ("obsynth.methods", "Designs"),

@@ -92,7 +92,7 @@ def looked_at(cases: Sequence[Any], parts: int, config: pytest.Config) -> Sequen
 def taken_as_verified(monkeypatch: pytest.MonkeyPatch) -> None:
     """Designs are made without their verification: for tests of what runs, of which it would be most of the time."""
     from obsynth.results.checks import upper_bound_check
-    from obsynth.results.design import VerificationReport
+    from obsynth.results.verification_report import VerificationReport
 
     row = upper_bound_check("not checked", "taken as verified by a test", 0.0, 1.0, source="tests")
     monkeypatch.setattr("obsynth.methods.designing.verify", lambda _, **__: VerificationReport((row,)))

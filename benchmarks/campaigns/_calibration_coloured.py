@@ -13,7 +13,7 @@ import argparse
 
 import numpy as np
 
-from obsynth.calibration.calibrating import calibrate
+from obsynth.monitoring.calibration.calibrating import calibrate
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system

@@ -15,12 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-from obsynth.calibration.fits import Objective, guarded_maximum, profile_root, quantile, simulation_fits
-from obsynth.calibration.logs import Log
-from obsynth.calibration.problem import NonlinearPlant, Problem, calibration_problem
+from obsynth.monitoring.calibration.innovations_fit import guarded_maximum
+from obsynth.monitoring.calibration.intervals import profile_root, quantile
+from obsynth.monitoring.calibration.logs import Log
+from obsynth.monitoring.calibration.maximum import Objective
+from obsynth.monitoring.calibration.plants import NonlinearPlant
+from obsynth.monitoring.calibration.problem import Problem, calibration_problem
+from obsynth.monitoring.calibration.simulation_error import simulation_fits
 from obsynth.plants.dae import DAEModel
 from obsynth.simulation.dae import simulate_dae
-from obsynth.spec import load_spec
+from obsynth.specs.loader import load_spec
 
 DESIGN = Path(__file__).parents[2] / "designs" / "threetank"
 BOUNDS = {"a1": (0.005, 0.08), "a2": (0.005, 0.08), "b1": (0.01, 0.1), "b2": (0.01, 0.1)}

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.calibration.calibrating import Calibration, calibrate
+from obsynth.monitoring.calibration.calibrating import calibrate
+from obsynth.monitoring.calibration.result import Calibration
 from obsynth.plants.descriptor import DescriptorSystem
 
 ROWS = 300

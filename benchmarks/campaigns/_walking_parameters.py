@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.methods.functions import adaptive_observer, dae_adaptive_observer
-from obsynth.numerics.arguments import FloatArray
+from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.batches import run_dae_batch
 from obsynth.plants.dae import DAEModel
-from obsynth.plants.descriptor import TimeVaryingDescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.dae import simulate_dae
 
 SAMPLES = 120

@@ -24,9 +24,11 @@ import numpy as np
 from benchmarks.campaigns.frame import Outcome
 
 import obsynth
-from obsynth.data.alarm_proof import verify_alarm
-from obsynth.experiments.alarm_proof import proved_alarm
-from obsynth.results.design import calibration_text, design_as_dict, digest_of, loaded, restored, verify_calibration
+from obsynth.monitoring.alarms.certificates import verify_alarm
+from obsynth.monitoring.alarms.proof_file import proved_alarm
+from obsynth.results.calibration_files import calibration_text, verify_calibration
+from obsynth.results.gain_set_writing import design_as_dict, digest_of, restored
+from obsynth.results.gain_sets import loaded
 
 CASES = 3000
 LIMIT = 120.0

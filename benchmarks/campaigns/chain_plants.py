@@ -148,7 +148,7 @@ def _along(way: str, truth: Truth, variation: str) -> Any:
     if way in ("sampled", "eliminated and sampled"):
         return obsynth.discretise(plant, STEP).plant
     if way == "a fault as state":
-        from obsynth.analysis.transformations.linear_plants import augment_faults
+        from obsynth.plants.transformations.fault_states import augment_faults
 
         return augment_faults(plant, plant.fault_names[1:]).plant
     if way == "balanced":

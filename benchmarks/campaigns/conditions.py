@@ -15,9 +15,9 @@ import numpy as np
 from benchmarks.campaigns.frame import Outcome
 
 import obsynth
-from obsynth.methods.fault_estimation_filter.central_filter import search_least_gain
-from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
+from obsynth.analysis.existence.wang2015 import examine_fault_filter
 from obsynth.methods.fault_estimation_filter.synthesis import _gains, centred, gain_problem
+from obsynth.numerics.central_filter import search_least_gain
 
 CASES = 50
 LIMIT = 60.0

@@ -15,7 +15,8 @@ import numpy as np
 from benchmarks.campaigns.frame import Outcome
 
 from obsynth import DescriptorSystem
-from obsynth.analysis.diagnosis.fault_columns import ExactQuestion, Question, Removal
+from obsynth.analysis.diagnosis.exact_fault_columns import ExactQuestion
+from obsynth.analysis.diagnosis.fault_columns import Question, Removal
 
 CASES = 500
 LIMIT = 60.0

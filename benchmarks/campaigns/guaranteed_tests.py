@@ -20,8 +20,8 @@ from scipy.linalg import block_diag
 import obsynth as ob
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
-from obsynth.methods.guaranteed_test.windows import noisy_as_bounded, rows_before, thresholds_over_tolerances, tracked
-from obsynth.tolerances.robustness import plant_at
+from obsynth.methods.guaranteed_test.tolerant import noisy_as_bounded, rows_before, thresholds_over_tolerances, tracked
+from obsynth.verification.over_tolerances.plants_of_the_box import plant_at
 
 CASES = 625
 LIMIT = 60.0  # s

@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.campaigns.frame import Outcome
 from scipy.signal import lfilter
 
-from obsynth.experiments.monitors.learned_levels import (
+from obsynth.monitoring.thresholds.learned_levels import (
     Statistics,
     conformal_levels,
     count_alarms,

@@ -26,8 +26,8 @@ from scipy.linalg import expm
 
 import obsynth
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
-from obsynth.experiments.alarm_proof import proved_alarm
-from obsynth.experiments.monitors.adaptive import adaptive_plan
+from obsynth.monitoring.alarms.proof_file import proved_alarm
+from obsynth.monitoring.thresholds.adaptive_monitor import adaptive_plan
 
 CASES = 400
 LIMIT = 300.0

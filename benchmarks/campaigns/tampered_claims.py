@@ -24,8 +24,8 @@ from benchmarks.campaigns._true_claims import raised
 from benchmarks.campaigns.frame import Outcome
 
 import obsynth as ob
-from obsynth.results.design import design_as_dict
-from obsynth.spec import load_spec
+from obsynth.results.gain_set_writing import design_as_dict
+from obsynth.specs.loader import load_spec
 
 CASES = 3_000
 LIMIT = 120.0  # s: a busy machine is no hang

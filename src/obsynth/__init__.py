@@ -24,67 +24,80 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from obsynth.extensions import provide
+from obsynth.results.registered import register
 from obsynth.version import __version__ as __version__
 
 #: What is public, by the module that holds it.  Imported when it is first used, so that ``import obsynth`` stays fast;
 #: ``__init__.pyi`` tells the types.
 _PUBLIC_NAMES = {
-    "analysis.diagnosis.fault_columns": "decouple",
-    "analysis.diagnosis.diagnosing": "diagnose",
     "analysis.dae_structure": "identifiability",
+    "analysis.diagnosis.decoupled": "decouple",
+    "analysis.diagnosis.diagnosing": "diagnose",
     "analysis.structure": "analyse_structure",
-    "analysis.transformations.linear_plants": "eliminate_algebraic_states discretise",
-    "analysis.transformations.linearisation": "linearise",
-    "analysis.transformations.noise": "with_noise",
-    "calibration.calibrating": "calibrate",
-    "calibration.validating": "validate",
-    "calibration.validity": "validity",
-    "comparison.certificates": "verify_certificate",
-    "comparison.comparing": "compare Comparison",
-    "comparison.sensor_sets": "sensor_sets",
-    "data.alarm_proof": "prove_alarm verify_alarm",
-    "data.online_monitor": "learn_thresholds online_monitor",
-    "data.run": "run_on_data smooth",
     "errors": "InfeasibleError ObsynthError PreconditionError SolverError SpecError VerificationError",
-    "experiments.monitors.learned": "load_thresholds",
-    "experiments.monitors.residual_monitor": "monitor",
-    "experiments.monte_carlo": "evaluate",
-    "experiments.tolerance_study": "tolerance_study",
-    "experiments.simulation": "simulate",
     "exporting.files": "export",
-    "importing.fmu": "from_fmu",
-    "importing.linear_models": (
-        "from_andes from_casadi from_control from_matlab from_modelica from_pandas from_scipy from_sympy"
-    ),
     "methods.designing": "check design design_from_gains",
     "methods.detection_filter.public": "detection_filter",
-    "methods.guaranteed_test.result": "GuaranteedTest guaranteed_test",
+    "observers.recursive.steady_filter": "steady_state_filter",
     "methods.functions": (
         "adaptive_observer dae_adaptive_observer descriptor_kalman "
         "fault_estimation_filter functional_filter pd_observer ui_pi_observer"
     ),
+    "methods.guaranteed_test.result": "GuaranteedTest guaranteed_test",
     "methods.pd_observer.public": "apply_adaptation_gain",
-    "methods.recursive.synthesis": "steady_state_filter",
-    "methods.ui_pi_observer.checks": "fault_response",
+    "methods.ui_pi_observer.fault_response": "fault_response",
     "methods.verifying": "verify",
+    "monitoring.alarms.certificates": "verify_alarm",
+    "monitoring.alarms.proving": "prove_alarm",
+    "monitoring.calibration.calibrating": "calibrate",
+    "monitoring.calibration.validating": "validate",
+    "monitoring.calibration.validity": "validity",
+    "monitoring.logs.run": "run_on_data",
+    "monitoring.logs.smoothing": "smooth",
+    "monitoring.thresholds.learned": "load_thresholds",
+    "monitoring.thresholds.learning": "learn_thresholds",
+    "monitoring.thresholds.online_monitor": "online_monitor",
+    "monitoring.thresholds.residual_monitor": "monitor",
     "observers.batches": "run_batch",
-    "observers.dae.observer": "DAEObserver",
-    "observers.decisions": "decide ParameterMonitor",
-    "observers.linear.observer": "LinearObserver sample_observer",
-    "observers.recursive.observer": "Adaptation RecursiveObserver",
+    "observers.decisions": "ParameterMonitor decide",
+    "observers.linear.derived": "sample_observer",
+    "observers.linear.observer": "LinearObserver",
+    "observers.nonlinear.observer": "DAEObserver",
+    "observers.recursive.observer": "RecursiveObserver",
+    "observers.recursive.settings": "Adaptation",
     "plants.dae": "DAEModel",
-    "plants.descriptor": "DescriptorSystem TimeVaryingDescriptorSystem",
-    "plants.fault_models": "fault_model FaultModel",
+    "plants.descriptor": "DescriptorSystem",
+    "plants.faults": "FaultModel fault_model",
+    "plants.importing.andes": "from_andes",
+    "plants.importing.casadi_models": "from_casadi",
+    "plants.importing.fmu": "from_fmu",
+    "plants.importing.model_files": "from_matlab from_modelica",
+    "plants.importing.python_objects": "from_control from_pandas from_scipy from_sympy",
+    "plants.time_varying": "TimeVaryingDescriptorSystem",
+    "plants.transformations.elimination": "eliminate_algebraic_states",
+    "plants.transformations.linearisation": "linearise",
+    "plants.transformations.noise_states": "with_noise",
+    "plants.transformations.sampling": "discretise",
     "plants.uncertain_system": "uncertain_system",
     "report.page": "html_report",
-    "results.design": "Certificate ObserverDesign VerificationReport load",
+    "results.design": "Certificate ObserverDesign",
+    "results.gain_sets": "load",
+    "results.verification_report": "VerificationReport",
     "simulation.dae": "simulate_dae",
     "simulation.linear": "simulate_time_varying",
-    "simulation.scenario": "Drift Gaussian Intermittent LostEffectiveness Ramp Scenario Sine Step Stuck Uniform",
-    "spec.loader": "load_spec Spec",
-    "sweeps.sweep": "run_fleet sweep",
-    "tolerances.robustness": "robustness",
+    "simulation.profiles": "Drift Gaussian Intermittent LostEffectiveness Ramp Sine Step Stuck Uniform",
+    "simulation.scenario": "Scenario",
+    "simulation.simulate": "simulate",
+    "specs.loader": "Spec load_spec",
+    "studies.certificates": "verify_certificate",
+    "studies.comparing": "compare",
+    "studies.comparison": "Comparison",
+    "studies.evaluate": "evaluate",
+    "studies.fleet": "run_fleet",
+    "studies.robustness": "robustness",
+    "studies.sensor_sets": "sensor_sets",
+    "studies.sweep": "sweep",
+    "studies.tolerance_study": "tolerance_study",
 }
 _PUBLIC_HOMES = {name: f"obsynth.{module}" for module, names in _PUBLIC_NAMES.items() for name in names.split()}
 #: Modules whose names are used through them, such as ``obsynth.plotting.plot_data``.
@@ -92,12 +105,37 @@ _PUBLIC_PACKAGES = ("conditions", "plotting", "types")
 
 __all__ = sorted(_PUBLIC_HOMES)
 
-provide(
-    {
-        "conditions of a design": "obsynth.conditions.own_terms:conditions_of",
-        "design summary": "obsynth.report.tables:summary",
-        "picture of a guaranteed test": "obsynth.plotting.estimates:plot_least_thresholds",
-    }
+
+def _conditions_of_design(design: Any) -> Any:
+    from obsynth.methods.engines.conditions_of_designs import conditions_of
+
+    return conditions_of(design)
+
+
+def _design_of_conditions(source: str, *given: Any) -> Any:
+    from obsynth.methods.engines.designs_of_conditions import design_of
+
+    return design_of(source, *given)
+
+
+def _summary_of_design(design: Any) -> Any:
+    from obsynth.report.summary import summary
+
+    return summary(design)
+
+
+def _plot_least_thresholds(test: Any, **options: Any) -> Any:
+    from obsynth.report.plots.guaranteed import plot_least_thresholds
+
+    return plot_least_thresholds(test, **options)
+
+
+# What methods of results and of conditions call in rooms above their own.
+register(
+    conditions_of_design=_conditions_of_design,
+    design_of_conditions=_design_of_conditions,
+    plot_least_thresholds=_plot_least_thresholds,
+    summary_of_design=_summary_of_design,
 )
 
 

@@ -10,9 +10,11 @@ from typing import Any
 import pytest
 
 from obsynth import ObserverDesign
-from obsynth.cli import commands, output
-from obsynth.report import page, tables
-from obsynth.results.design import gain_set_digest
+from obsynth.cli import output
+from obsynth.monitoring.verbs import logs
+from obsynth.report import designs as tables
+from obsynth.report import page
+from obsynth.results.gain_set_writing import gain_set_digest
 
 
 @pytest.fixture(scope="session")
@@ -34,7 +36,7 @@ def verified_again() -> Callable[[Path], Any]:
 @pytest.fixture(autouse=True)
 def _verified_once(verified_again: Callable[[Path], Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """The verbs that hand a gain set on remember; ``verify`` does not."""
-    for module in (output, commands):
+    for module in (output, logs):
         monkeypatch.setattr(module, "verified_again", verified_again)
 
 

@@ -598,7 +598,7 @@ def good_gains(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 def tampered(content: str, change: Callable[[dict[str, Any]], Any], *, mend_digest: bool = False) -> str:
     """Return a gain set with something changed, and its digest made to fit again if asked."""
-    from obsynth.results.design import digest_of
+    from obsynth.results.gain_set_writing import digest_of
 
     document = json.loads(content)
     change(document)

@@ -11,7 +11,8 @@ import pytest
 import obsynth
 from obsynth.cli.main import main
 from obsynth.plants.constants import constants_box
-from obsynth.results.design import box_row, calibration_text, digest_of, read_calibration, verify_calibration
+from obsynth.results.calibration_files import box_row, calibration_text, read_calibration, verify_calibration
+from obsynth.results.gain_set_writing import digest_of
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 SPEC, LOG = DESIGNS / "threetank" / "spec.yaml", DESIGNS / "threetank" / "log.csv"

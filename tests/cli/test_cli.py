@@ -14,7 +14,8 @@ import pytest
 
 import obsynth
 from obsynth.cli.main import design_command, main
-from obsynth.results.design import digest_of, load
+from obsynth.results.gain_set_writing import digest_of
+from obsynth.results.gain_sets import load
 
 ROOT = Path(__file__).parents[2]
 WANG = ROOT / "designs" / "wang2015" / "spec.yaml"

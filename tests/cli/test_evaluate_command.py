@@ -11,7 +11,7 @@ import pytest
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.spec import load_spec
+from obsynth.specs.loader import load_spec
 
 ROOT = Path(__file__).parents[2]
 WANG = str(ROOT / "designs" / "wang2015" / "spec.yaml")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from obsynth.cli.main import main
-from obsynth.results.design import digest_of
+from obsynth.results.gain_set_writing import digest_of
 
 ROOT = Path(__file__).parents[2]
 

@@ -147,7 +147,7 @@ class TestOtherFiles:
         assert not Path("o.c").exists()
 
     def test_the_folder_of_the_state_is_looked_for_before_work_begins(self, capsys, monkeypatch):
-        monkeypatch.setattr("obsynth.data.run.LogRun.take", lambda *_: pytest.fail("work has begun"))
+        monkeypatch.setattr("obsynth.monitoring.logs.log_run.LogRun.take", lambda *_: pytest.fail("work has begun"))
         assert main([*RUN, "o.csv", "--state", "missing/state.json"]) == 2
         assert "The folder missing does not exist" in capsys.readouterr().err
         assert not Path("o.csv").exists()
@@ -427,7 +427,7 @@ class TestFoldersOfResults:
 
 def test_a_named_pipe_is_no_log_of_a_calibration():
     from obsynth import SpecError
-    from obsynth.calibration.logs import read_log
+    from obsynth.monitoring.calibration.logs import read_log
 
     os.mkfifo("pipe.csv")
     with pytest.raises(SpecError, match="named pipe"):
@@ -438,7 +438,7 @@ def test_a_named_pipe_is_no_log_of_a_calibration():
 def test_numbers_beyond_any_memory_are_refused(runs):
     from obsynth import SpecError, functional_filter
     from obsynth.numerics.arguments import Count, checked_value, is_finite_number
-    from obsynth.spec import load_spec
+    from obsynth.specs.loader import load_spec
 
     assert is_finite_number(runs) == (runs < 10**300)
     with pytest.raises(SpecError, match="whole number"):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from obsynth.cli.main import main
-from obsynth.spec.loader import read_yaml
+from obsynth.specs.documents import read_yaml
 
 pytestmark = pytest.mark.long
 

@@ -141,7 +141,7 @@ def kind(request: pytest.FixtureRequest) -> str:
 def test_run_thresholds_validate_and_smoothing_take_each_flaw(
     folder: Path, tmp_path: Path, kind: str, flaw: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Those of linear designs, by method, are in tests/unit/test_flaws_of_logs.py."""
+    """Those of linear designs, by method, are in tests/monitoring/test_flaws_of_logs.py."""
     gains, log, out = folder / f"{kind}.gains.json", tmp_path / "log.csv", tmp_path / "out.csv"
     data = flawed(clean(kind), flaw)
     data.to_csv(log, index=False)

@@ -109,7 +109,7 @@ def test_every_method_is_in_the_table():
 
 
 def test_the_example_spec_has_only_keys_that_exist(tmp_path):
-    from obsynth.spec import load_spec
+    from obsynth.specs.loader import load_spec
 
     (text,) = blocks("yaml")
     (tmp_path / "spec.yaml").write_text(text, encoding="utf-8")

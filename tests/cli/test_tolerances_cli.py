@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 
 from obsynth.cli.main import main
-from obsynth.results.design import load
-from obsynth.tolerances.robustness import plant_at
+from obsynth.results.gain_sets import load
+from obsynth.verification.over_tolerances.plants_of_the_box import plant_at
 
 DRIVE = Path(__file__).parents[2] / "designs" / "drive" / "spec.yaml"
 MONITOR = ["--disturbance", "load torque=0.2", "--noise-bound", "1.7320508",

@@ -78,7 +78,7 @@ def test_failing_gains_are_refused_or_marked(folder: Path, line: str, capsys: py
 
 def test_a_report_edited_to_pass_changes_nothing(folder: Path) -> None:
     """The stored report is no signature: every row of it may be edited, and the digest made to fit."""
-    from obsynth.results.design import digest_of
+    from obsynth.results.gain_set_writing import digest_of
 
     content = json.loads((folder / "wrong.gains.json").read_text())
     report = content["design"]["report"]
@@ -124,7 +124,7 @@ def test_proved_never_stands_beside_fails(folder: Path, capsys: pytest.CaptureFi
 
 def test_a_file_that_has_changed_is_verified_afresh(folder: Path) -> None:
     """Under the same name, after it was found to hold: with other gains, and with a single number changed."""
-    from obsynth.results.design import digest_of
+    from obsynth.results.gain_set_writing import digest_of
 
     words = ["export", "--gains", "wrong.gains.json", "--to", "out.npz", "--force"]
     obsynth.fault_estimation_filter(failing().plant).save("wrong.gains.json")

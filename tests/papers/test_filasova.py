@@ -11,8 +11,8 @@ from scipy.linalg import expm, solve_continuous_are
 import obsynth
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.methods.pd_observer.realisation import with_faults_as_states
-from obsynth.spec import load_spec
-from obsynth.spec.loader import read_yaml
+from obsynth.specs.documents import read_yaml
+from obsynth.specs.loader import load_spec
 
 FOLDER = Path(__file__).parents[2] / "designs" / "filasova"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")

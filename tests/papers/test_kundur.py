@@ -10,12 +10,12 @@ import pytest
 from exact_runs import Together, ramp_and_sine
 
 import obsynth
+from obsynth.analysis.existence.sharepasand import decoupling_rank, existence
 from obsynth.analysis.existence.statements import Evaluator
-from obsynth.methods.ui_pi_observer.conditions import decoupling_rank, existence
-from obsynth.plants.fault_models import exosystem
-from obsynth.simulation import simulate_plant
-from obsynth.spec import load_spec
-from obsynth.spec.loader import read_yaml
+from obsynth.plants.faults import exosystem
+from obsynth.simulation.linear import simulate_plant
+from obsynth.specs.documents import read_yaml
+from obsynth.specs.loader import load_spec
 
 FOLDER = Path(__file__).parents[2] / "designs" / "kundur"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")

@@ -12,8 +12,8 @@ import obsynth
 from obsynth.cli.main import main
 from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.simulation.linear import simulate_time_varying
-from obsynth.spec import Spec, load_spec
-from obsynth.spec.loader import read_yaml
+from obsynth.specs.documents import read_yaml
+from obsynth.specs.loader import Spec, load_spec
 
 FOLDER = Path(__file__).parents[2] / "designs" / "moussaali2013_ltv"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")

@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 
 import obsynth
 from obsynth import ObserverDesign, simulate_dae
-from obsynth.spec import load_spec
+from obsynth.specs.loader import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 EXPECTED = YAML(typ="safe").load((DESIGNS / "moussaali2013_dae" / "expected.yaml").read_text(encoding="utf-8"))

@@ -9,13 +9,13 @@ import pytest
 from exact_runs import ONE, RAMP, Together, ramp_and_sine, sine
 
 import obsynth
-from obsynth.analysis.zeros import zeros_of_system
-from obsynth.methods.placement.region import place
-from obsynth.methods.ui_pi_observer.augmented_plant import paper_decoupling
+from obsynth.conditions.augmented_plant import paper_decoupling
+from obsynth.numerics.eigenstructure import place
+from obsynth.numerics.invariant_zeros import zeros_of_system
 from obsynth.numerics.spectra import spectrum_error
-from obsynth.simulation import simulate_plant
-from obsynth.spec import load_spec
-from obsynth.spec.loader import read_yaml
+from obsynth.simulation.linear import simulate_plant
+from obsynth.specs.documents import read_yaml
+from obsynth.specs.loader import load_spec
 
 FOLDER = Path(__file__).parents[2] / "designs" / "sharepasand"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")

@@ -10,9 +10,9 @@ import pytest
 import obsynth
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.numerics.norms import spectral_radius
-from obsynth.simulation import simulate_plant
-from obsynth.spec import load_spec
-from obsynth.spec.loader import read_yaml
+from obsynth.simulation.linear import simulate_plant
+from obsynth.specs.documents import read_yaml
+from obsynth.specs.loader import load_spec
 
 FOLDER = Path(__file__).parents[2] / "designs" / "smib"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")

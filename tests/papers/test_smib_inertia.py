@@ -13,8 +13,8 @@ from scipy.integrate import solve_ivp
 import obsynth
 from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.simulation.linear import varying_runs
-from obsynth.spec import load_spec
-from obsynth.spec.loader import read_yaml
+from obsynth.specs.documents import read_yaml
+from obsynth.specs.loader import load_spec
 
 FOLDER = Path(__file__).parents[2] / "designs" / "smib"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")["inertia"]

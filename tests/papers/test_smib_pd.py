@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.simulation import simulate_plant
-from obsynth.spec import load_spec
-from obsynth.spec.loader import read_yaml
+from obsynth.simulation.linear import simulate_plant
+from obsynth.specs.documents import read_yaml
+from obsynth.specs.loader import load_spec
 
 FOLDER = Path(__file__).parents[2] / "designs" / "smib"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")["pd_observer"]

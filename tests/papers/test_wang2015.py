@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 
 import obsynth
+from obsynth.analysis.existence.restricted_equivalent import prepare, restricted_equivalent_from
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import InfeasibleError
-from obsynth.methods.fault_estimation_filter.central_filter import search_least_gain
-from obsynth.methods.fault_estimation_filter.conditions import prepare, restricted_equivalent_from
 from obsynth.methods.fault_estimation_filter.synthesis import PrintedInequality, gain_problem
+from obsynth.numerics.central_filter import search_least_gain
 from obsynth.numerics.norms import hinf_norm, spectral_radius
-from obsynth.simulation import simulate_plant
-from obsynth.spec import load_spec
-from obsynth.spec.loader import read_yaml
+from obsynth.simulation.linear import simulate_plant
+from obsynth.specs.documents import read_yaml
+from obsynth.specs.loader import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 EXPECTED = read_yaml(DESIGNS / "wang2015" / "expected.yaml")

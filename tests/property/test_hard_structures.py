@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from plants import orthogonal
 from scipy.linalg import block_diag
 
 import obsynth
+from plants import orthogonal
 
 
 def described(rng: np.random.Generator, a: np.ndarray, *, ny: int, nf: int = 2, singular: int = 0) -> dict:

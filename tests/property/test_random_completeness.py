@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from plants import KnownPlant, Recipe, build, random_recipe
 
 import obsynth
+from plants import KnownPlant, Recipe, build, random_recipe
 
 #: Fields of the recipe that a family fixes; None means that `hidden_mode` is drawn for each plant.
 FAMILIES: Mapping[str, tuple[int, dict[str, Any]]] = {

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plants import Recipe, build, random_recipe, well_conditioned, with_conjugates
 
 import obsynth
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.methods.designing import check
 from obsynth.methods.registry import method_class
+from plants import Recipe, build, random_recipe, well_conditioned, with_conjugates
 
 SEEDS = st.integers(0, 2**32 - 1)
 METHOD = "fault-estimation-filter"

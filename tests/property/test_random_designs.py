@@ -3,10 +3,10 @@
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from plants import build, random_recipe
 from trajectories import fault_signals, matched_start, trajectory, transfer
 
 import obsynth
+from plants import build, random_recipe
 
 SEEDS = st.integers(0, 2**32 - 1)
 #: Kinds of plants that one seed is tried with.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.methods.fault_estimation_filter.conditions import prepare
+from obsynth.analysis.existence.restricted_equivalent import prepare
 from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
 
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from plants import build, random_recipe
 from reference_gain import ErrorProblem
 
 import obsynth
+from plants import build, random_recipe
 
 #: Gains below this share of the one with a fixed weight count as a decoupled disturbance: their digits mean nothing.
 NEGLIGIBLE = 1e-3

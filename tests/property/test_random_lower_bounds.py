@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.methods.fault_estimation_filter.central_filter import search_least_gain
-from obsynth.methods.fault_estimation_filter.conditions import prepare
-from obsynth.methods.fault_estimation_filter.gamma_lower_bound import _checked_bound, _DualProblem, proved_lower_bound
-from obsynth.methods.fault_estimation_filter.least_gain_proof import ALONE, LAST, LEAST_GAIN_PAIRS, InvisiblePairs
+from obsynth.analysis.existence.restricted_equivalent import prepare
+from obsynth.conditions.gamma_lower_bound import _checked_bound, _DualProblem, proved_lower_bound
 from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
+from obsynth.numerics.central_filter import search_least_gain
 from obsynth.proofs.exact_arithmetic import stored_matrix
+from obsynth.verification.least_gain_proof import ALONE, LAST, LEAST_GAIN_PAIRS, InvisiblePairs
 
 
 def random_plant(seed: int, units: float) -> obsynth.DescriptorSystem:

@@ -9,7 +9,7 @@ import pytest
 
 import obsynth
 from obsynth import PreconditionError, TimeVaryingDescriptorSystem
-from obsynth.methods.recursive.conditions import recursive_conditions
+from obsynth.analysis.existence.recursive import recursive_conditions
 
 STEPS = 60
 MODES = (0.5, 0.99, 1.0, -1.0, 1.05, 3.0)

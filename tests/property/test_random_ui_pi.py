@@ -12,8 +12,8 @@ import scipy.linalg
 from ui_pi_plants import KINDS, Case, brute_force, exosystem_of, random_case
 
 from obsynth import PreconditionError, SolverError, VerificationError, ui_pi_observer
-from obsynth.methods.ui_pi_observer.conditions import existence
-from obsynth.plants.fault_models import exosystem
+from obsynth.analysis.existence.sharepasand import existence
+from obsynth.plants.faults import exosystem
 
 BATCHES, SIZE = 16, 24
 Share = Callable[..., Sequence[Any]]

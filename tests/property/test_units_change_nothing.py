@@ -13,7 +13,7 @@ from obsynth import (
     pd_observer,
     ui_pi_observer,
 )
-from obsynth.spec import load_spec
+from obsynth.specs.loader import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 PLANTS = {

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition, require_all
+from obsynth.analysis.existence.condition import Condition, require_all
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Synthesis
 from obsynth.numerics.arguments import Positive

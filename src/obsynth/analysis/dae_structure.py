@@ -8,13 +8,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import FloatArray, arguments_checked, as_matrix, read_only, require_shape
+from obsynth.numerics.arguments import arguments_checked, require_shape
+from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.newton import ScaledMatrix
 from obsynth.numerics.ranks import IDENTIFIABLE_SHARE, NAMED_SHARE, SINGULAR_CONDITION, covariance_factor, is_definite
-from obsynth.plants.dae import DAEFunctions, DAEModel, ImplicitStep, checked_inputs, finite_vector, step_length
+from obsynth.plants.dae import DAEModel, checked_inputs, finite_vector, step_length
+from obsynth.plants.dae_functions import DAEFunctions
+from obsynth.plants.implicit_step import ImplicitStep
 
 #: A start and one step.
 FEWEST_SAMPLES = 2
+
+
+#: The step is shortened by these factors.  Short enough that dF/dx' rules, long enough that index 3 stays countable.
+SHORTENINGS = (1e-2, 1e-3)
+
+#: Equations and states with at least this share of the largest entry of a singular vector are named.
+LEADING_SHARE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,12 +201,6 @@ def _sensitivities(
         rows[:, free.shape[1] :] += L
         found.append(rows)
     return np.array(found), free
-
-
-#: The step is shortened by these factors.  Short enough that dF/dx' rules, long enough that index 3 stays countable.
-SHORTENINGS = (1e-2, 1e-3)
-#: Equations and states with at least this share of the largest entry of a singular vector are named.
-LEADING_SHARE = 0.1
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,13 +10,25 @@ from types import MappingProxyType
 import numpy as np
 
 from obsynth.analysis.existence.statements import Evaluator
-from obsynth.analysis.transformations.linear_plants import Transformation, linear_plant
-from obsynth.analysis.zeros import structure_of, unstable_poles
-from obsynth.numerics.arguments import ComplexArray, arguments_checked
+from obsynth.analysis.zeros import unstable_poles
+from obsynth.numerics.arguments import arguments_checked
+from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
-from obsynth.plants.descriptor import DescriptorSystem, listed
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.pencil import structure_of
+from obsynth.plants.signal_names import listed
+from obsynth.plants.transformations.recovery import Transformation, linear_plant
+
+#: A sampled plant with an eigenvalue this far from zero grows so fast that it is hardly one.
+_FAR_EIGENVALUE = 3.0
+
+#: Larger plants are not asked: their eigenvalues would take too long for a question.
+_MOST_STATES_FOR_QUESTIONS = 200
+
+#: Signals that a question lists.
+_MOST_QUESTIONED = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,14 +124,6 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
         rank_of_E=rank_e,
         decisions=MappingProxyType(decisions),
     )
-
-
-#: A sampled plant with an eigenvalue this far from zero grows so fast that it is hardly one.
-_FAR_EIGENVALUE = 3.0
-#: Larger plants are not asked: their eigenvalues would take too long for a question.
-_MOST_STATES_FOR_QUESTIONS = 200
-#: Signals that a question lists.
-_MOST_QUESTIONED = 5
 
 
 def questions(plant: DescriptorSystem) -> tuple[str, ...]:

@@ -8,13 +8,16 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.transformations.linear_plants import Transformation
-from obsynth.numerics.arguments import FloatArray, remembered, require_kind
+from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.ranks import RankDecision, decide_rank
-from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.recovery import Transformation
 
 #: Steps that are looked at where the plant has no horizon.
 STEPS_WITHOUT_HORIZON = 1000
+
 #: Condition numbers of H_k above this are worth a note: half the digits of double precision are left.
 WARN_MARKOV_CONDITION = 1e6
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any, NamedTuple, NoReturn
 
-from obsynth.cli.output import (
+from obsynth.cli.arguments import (
     CLUSTER,
     DATA_OPTIONS,
     FORCE,
@@ -46,25 +46,14 @@ from obsynth.cli.output import (
     digits,
     flag,
     option,
-    print_error,
-    print_json,
     read_settings,
     settings_of,
     verbose,
 )
+from obsynth.cli.output import print_error, print_json
 from obsynth.errors import ObsynthError, SolverError, SpecError
-from obsynth.files.outputs import protected_inputs
+from obsynth.files.inputs import protected_inputs
 from obsynth.version import __version__
-
-
-class Verb(NamedTuple):
-    """A verb: ``run`` is a module of `obsynth.cli` and a function, loaded when the verb is asked for."""
-
-    run: str
-    told: str
-    arguments: tuple[Argument | Group | Settings, ...]
-    epilog: str | None = None
-
 
 EXIT_CODES = """\
 exit codes:
@@ -75,11 +64,13 @@ exit codes:
   5  a solver gave up: inconclusive
   6  a check of the shipped gains failed
 """
+
 # Lines that end in a backslash go on: help is folded to the terminal.
 _SWEEP_DETAILS = """\
 A value list is a YAML list: --set gamma='[0.1, 0.2]' --set plant.transform.sample_time='[0.01, 0.02]' --set \
 plant.C.outputs='[[omega 1], [omega 1, omega 2]]'. A name that begins with no section of a spec is an option of \
 its method. The folder keeps every gain set and result: the same command continues a sweep that was interrupted."""
+
 _RUN_DETAILS = """\
 The data have a column 'time', in seconds or as dates and times (ISO 8601), and one for each known input and \
 output, by name. Columns of text are separated by commas, semicolons, tabs or bars; numbers may have a decimal \
@@ -112,14 +103,39 @@ The scenario of --system, or the options, state which disturbances and noise to 
 If --gains is a folder, every gain set in it is run on --data, which is a log or a folder of logs, on --jobs \
 processes or on a cluster; a log with the name of a gain set is for that gain set alone. --out is then a folder \
 for the estimates, table.csv and fleet.png; the same command continues a run that was interrupted."""
+
 _LOG = "text (.csv, .tsv), Parquet, TDMS or MDF file; - for text on standard input"
+
 _EXPECTED_SCENARIO = option(
     "--system", "FILE", "spec (YAML) whose scenario states the disturbances and noise to expect", type=Path
 )
 
+
+#: Verbs whose help lists the methods that are installed.
+_TELL_METHODS = ("design", "check", "compare")
+
+
+#: Exit code of a program whose reader has left, as shells give it.
+BROKEN_PIPE = 141
+
+
+#: New objects after which Python looks for cycles of garbage, of a few MB: with its own number, a tenth of a short
+#: command was looking through what imports have made.
+NEW_OBJECTS = 100_000
+
+
+class Verb(NamedTuple):
+    """A verb: ``run`` is a module of `obsynth.cli` and a function, loaded when the verb is asked for."""
+
+    run: str
+    told: str
+    arguments: tuple[Argument | Group | Settings, ...]
+    epilog: str | None = None
+
+
 VERBS = {
     "design": Verb(
-        "run_design",
+        "obsynth.cli.commands:run_design",
         "Design an observer from a spec, verify it, print a report and write the gain set.",
         (
             SYSTEM,
@@ -136,7 +152,7 @@ VERBS = {
         ),
     ),
     "check": Verb(
-        "run_check",
+        "obsynth.cli.commands:run_check",
         "Analyse the plant of a spec, and check for every method whether a design can exist.",
         (
             SYSTEM,
@@ -146,7 +162,7 @@ VERBS = {
         ),
     ),
     "sensors": Verb(
-        "run_sensors",
+        "obsynth.cli.commands:run_sensors",
         "Find the cheapest sensors to add, so that faults can be detected, isolated or estimated.",
         (
             SYSTEM,
@@ -176,7 +192,7 @@ VERBS = {
         ),
     ),
     "verify": Verb(
-        "run_verify",
+        "obsynth.cli.commands:run_verify",
         "Verify a saved gain set, or a certificate of any kind with all files that it refers to, again.",
         (
             Group(
@@ -222,7 +238,7 @@ VERBS = {
         ),
     ),
     "simulate": Verb(
-        "run_simulate",
+        "obsynth.studies.verbs.scenarios:run_simulate",
         "Design an observer from a spec, and simulate it on the spec's scenario.",
         (
             SYSTEM,
@@ -235,7 +251,7 @@ VERBS = {
         ),
     ),
     "compare": Verb(
-        "run_compare",
+        "obsynth.studies.verbs.scenarios:run_compare",
         "Design by every method that exists for a spec's plant, and compare them on its scenario.",
         (
             SYSTEM,
@@ -267,7 +283,7 @@ VERBS = {
         ),
     ),
     "evaluate": Verb(
-        "run_evaluate",
+        "obsynth.studies.verbs.scenarios:run_evaluate",
         "Design an observer from a spec, run the spec's scenario many times, and count alarms, delays and errors.",
         (
             SYSTEM,
@@ -306,7 +322,7 @@ VERBS = {
         ),
     ),
     "sweep": Verb(
-        "run_sweep",
+        "obsynth.studies.verbs.sweeps:run_sweep",
         "Design and verify for every combination of specs and values; a design that fails is a row of the table.",
         (
             option("--system", "FILE", "a spec (YAML), or several", type=Path, required=True, nargs="+"),
@@ -328,7 +344,7 @@ VERBS = {
         _SWEEP_DETAILS,
     ),
     "run": Verb(
-        "run_run",
+        "obsynth.monitoring.verbs.logs:run_run",
         "Run a design on measured data: a log, or a stream on standard input, with a row of estimates for each row.",
         (
             GAINS,
@@ -389,7 +405,7 @@ VERBS = {
         _RUN_DETAILS,
     ),
     "thresholds": Verb(
-        "run_thresholds",
+        "obsynth.monitoring.verbs.thresholds:run_thresholds",
         "Find thresholds of a design from a log without faults, for a rate of false alarms.",
         (
             GAINS,
@@ -421,7 +437,7 @@ VERBS = {
         ),
     ),
     "export": Verb(
-        "run_export",
+        "obsynth.monitoring.verbs.logs:run_export",
         "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h), or as a functional mock-up unit for "
         "co-simulation (.fmu). A recursive design for a time-invariant plant is written as its steady state.",
         (
@@ -469,7 +485,7 @@ VERBS = {
         ),
     ),
     "plot": Verb(
-        "run_plot",
+        "obsynth.monitoring.verbs.logs:run_plot",
         "Run a design on measured data and draw it: outputs, estimates, residuals, thresholds and alarms.",
         (
             GAINS,
@@ -494,7 +510,7 @@ VERBS = {
         ),
     ),
     "report": Verb(
-        "run_report",
+        "obsynth.monitoring.verbs.logs:run_report",
         "Verify a gain set again and write one self-contained HTML page about it.",
         (
             GAINS,
@@ -518,7 +534,7 @@ VERBS = {
         ),
     ),
     "linearise": Verb(
-        "run_linearise",
+        "obsynth.monitoring.verbs.calibration:run_linearise",
         "Linearise the nonlinear plant of a spec: exact matrices at an equilibrium (by default that of the spec's "
         "transform), or the reason why there is none.",
         (
@@ -567,7 +583,7 @@ VERBS = {
         ),
     ),
     "calibrate": Verb(
-        "run_calibrate",
+        "obsynth.monitoring.verbs.calibration:run_calibrate",
         "Fit constants and noise of a plant to a log without faults, with confidence intervals.",
         (
             SYSTEM,
@@ -597,7 +613,7 @@ VERBS = {
         ),
     ),
     "validate": Verb(
-        "run_validate",
+        "obsynth.monitoring.verbs.calibration:run_validate",
         "Test whether a log without faults agrees with a design.",
         (
             GAINS,
@@ -610,7 +626,7 @@ VERBS = {
         ),
     ),
     "prove-alarm": Verb(
-        "run_prove_alarm",
+        "obsynth.monitoring.verbs.logs:run_prove_alarm",
         "Prove that no plant within its tolerances explains the data up to a row without a fault.",
         (
             GAINS,
@@ -684,20 +700,12 @@ def _fill(name: str, parser: argparse.ArgumentParser) -> argparse.ArgumentParser
     return parser
 
 
-#: Verbs whose help lists the methods that are installed.
-_TELL_METHODS = ("design", "check", "compare")
-
-
 def _help_with_methods(parser: argparse.ArgumentParser) -> str:
     """Return the help of a parser with the ids of the methods."""
     from obsynth.methods.installed import REGISTRY
 
     told = fill(", ".join([*REGISTRY, "auto"]), width=78, initial_indent="  ", subsequent_indent="  ")
     return f"{argparse.ArgumentParser.format_help(parser)}\nmethods:\n{told}\n"
-
-
-#: Exit code of a program whose reader has left, as shells give it.
-BROKEN_PIPE = 141
 
 
 @contextmanager
@@ -771,11 +779,6 @@ def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> in
             return unwritable_output(error)
 
 
-#: New objects after which Python looks for cycles of garbage, of a few MB: with its own number, a tenth of a short
-#: command was looking through what imports have made.
-NEW_OBJECTS = 100_000
-
-
 @contextmanager
 def _collected_rarely() -> Iterator[None]:
     """Look for cycles of garbage less often than Python does by itself."""
@@ -817,9 +820,8 @@ def _outcome(options: argparse.Namespace) -> int:
         is_written = options.verb == "design" or any(getattr(options, name, None) not in (None, "-") for name in named)
         if getattr(options, "force", False) and not is_written:
             raise SpecError("--force replaces a file, and none is written here: give --out.", path="--force")
-        run: Callable[[argparse.Namespace], int] = getattr(
-            import_module("obsynth.cli.commands"), VERBS[options.verb].run
-        )
+        module, function = VERBS[options.verb].run.split(":")
+        run: Callable[[argparse.Namespace], int] = getattr(import_module(module), function)
         return run(options)
     except ObsynthError as error:
         told = error

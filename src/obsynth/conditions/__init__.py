@@ -5,13 +5,17 @@
 regions for the eigenvalues.
 """
 
-from obsynth.conditions.atoms import admissible, bounded_real, h2, region
-from obsynth.conditions.filasova import filasova_theorem1, filasova_theorem2
-from obsynth.conditions.kalman_gain import kalman
-from obsynth.conditions.problem import Conditions
-from obsynth.conditions.share_pasand import sharepasand
-from obsynth.conditions.wang import wang2015
-from obsynth.numerics.regions import LMIRegion, disk, half_plane, sector
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from obsynth.conditions.atoms import admissible, bounded_real, h2, region
+    from obsynth.conditions.filasova import filasova_theorem1, filasova_theorem2
+    from obsynth.conditions.kalman_gain import kalman
+    from obsynth.conditions.problem import Conditions
+    from obsynth.conditions.share_pasand import sharepasand
+    from obsynth.conditions.wang import wang2015
+    from obsynth.numerics.regions import LMIRegion, disk, half_plane, sector
 
 __all__ = [
     "Conditions",
@@ -29,3 +33,24 @@ __all__ = [
     "sharepasand",
     "wang2015",
 ]
+
+#: Where each name is: imported when it is first used, as what runs and verifies needs no cvxpy.
+_HOMES = {
+    name: f"obsynth.{module}"
+    for module, names in {
+        "conditions.atoms": "admissible bounded_real h2 region",
+        "conditions.filasova": "filasova_theorem1 filasova_theorem2",
+        "conditions.kalman_gain": "kalman",
+        "conditions.problem": "Conditions",
+        "conditions.share_pasand": "sharepasand",
+        "conditions.wang": "wang2015",
+        "numerics.regions": "LMIRegion disk half_plane sector",
+    }.items()
+    for name in names.split()
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

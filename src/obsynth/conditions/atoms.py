@@ -1,4 +1,4 @@
-r"""The inequalities of which all the papers' conditions are made, each with its lemma.
+"""The inequalities of which all the papers' conditions are made, each with its lemma.
 
 ``A, B, C, D`` are those of ``e+ = A e + B w``, ``z = C e + D w`` (``e+`` is e' for ``dt = 0``).  For a gain L that is
 still to be found, ``A - L Cy`` and ``B - L Dy``, give the variable ``Y = P L`` with ``Cy`` and ``Dy``: then P A stands
@@ -13,13 +13,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from obsynth.conditions import lmi
 from obsynth.errors import SpecError, a_kind
-from obsynth.methods.conic import lmi
-from obsynth.numerics.arguments import arguments_checked, real_array, real_number, require_no_overflow, require_shape
+from obsynth.numerics.arguments import arguments_checked, real_array, real_number, require_shape
+from obsynth.numerics.arrays import require_no_overflow
 from obsynth.numerics.regions import LMIRegion, checked_region
 
 if TYPE_CHECKING:
     import cvxpy
+
 
 #: How far inside the cone the inequalities hold by default.
 MARGIN = 1e-9

@@ -22,26 +22,26 @@ Beyond the paper: outputs that show faults directly, ``C_o = [C Df]``; algebraic
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.linear_plants import Transformation, linear_plant
-from obsynth.conditions.problem import Conditions, Values, require_data
+from obsynth.analysis.existence.filasova import explicit_form, pd_observer_conditions
+from obsynth.conditions import lazy_cvxpy as cp
+from obsynth.conditions import lmi
+from obsynth.conditions.problem import Conditions, Values, design_of, require_data
 from obsynth.errors import SpecError
-from obsynth.methods.conic import lazy_cvxpy as cp
-from obsynth.methods.conic import lmi
-from obsynth.methods.designing import design_from_gains
-from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
-from obsynth.methods.pd_observer.inequalities import PD_MARGIN
-from obsynth.numerics.arguments import FloatArray, arguments_checked, chosen, is_finite_number, shown
+from obsynth.numerics.arguments import arguments_checked, chosen, is_finite_number, shown
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.regions import LMIRegion, checked_region
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.design import ObserverDesign
+from obsynth.plants.transformations.recovery import Transformation, linear_plant
 
 #: Conditions whose failure leaves an inequality that no matrices satisfy.
 LEFT_TO_THE_PD_INEQUALITY = ("nf <= ny", "rank F", "detectability", "rank [A F; C Df]")
+
+#: How far inside the cone the inequalities must hold, with ``P3 + P3' >= 2 I`` as the scale.
+PD_MARGIN = 1e-3
 
 
 @arguments_checked
@@ -199,7 +199,7 @@ def _theorem(
         constraints,
         lambda: held,
         gains,
-        partial(_design, plant, float(decay)),
+        design_of("filasova", plant, float(decay)),
     )
 
 
@@ -239,10 +239,3 @@ def _augmented(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
     nf = plant.nf
     below = np.zeros((nf, plant.nx + nf))
     return np.vstack([np.hstack([plant.A, plant.Bf]), below]), np.hstack([plant.C, plant.Df])
-
-
-def _design(
-    plant: DescriptorSystem | Transformation, decay: float, gains: dict[str, FloatArray], name: str
-) -> ObserverDesign:
-    J, L, M, N = (gains[letter] for letter in "JLMN")
-    return design_from_gains(plant, "pd-observer", J=J, L=L, M=M, N=N, decay=decay, name=name)

@@ -19,29 +19,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.condition import Condition
+from obsynth.analysis.existence.kalman import kalman_conditions, with_stated_noise, without_unknown_inputs
 from obsynth.analysis.time_varying import as_time_varying
-from obsynth.analysis.transformations.linear_plants import Transformation, linear_plant
 from obsynth.conditions import atoms
-from obsynth.conditions.problem import Conditions, Values, require_data
-from obsynth.errors import ObsynthError, VerificationError
-from obsynth.methods.conic import lazy_cvxpy as cp
-from obsynth.methods.functions import descriptor_kalman
-from obsynth.methods.recursive.synthesis import (
-    kalman_conditions,
-    steady_state_filter,
-    with_stated_noise,
-    without_unknown_inputs,
-)
-from obsynth.numerics.arguments import SMALLEST, FloatArray, arguments_checked, as_matrix, require_shape
+from obsynth.conditions import lazy_cvxpy as cp
+from obsynth.conditions.problem import Conditions, Values, design_of, require_data
+from obsynth.errors import ObsynthError
+from obsynth.numerics.arguments import arguments_checked, require_shape
+from obsynth.numerics.arrays import SMALLEST, FloatArray, as_matrix
 from obsynth.numerics.norms import output_covariance
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, covariance_factor
-from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
+from obsynth.observers.recursive.steady_filter import steady_state_filter
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.recovery import Transformation, linear_plant
 from obsynth.results.design import ObserverDesign
-
-#: A gain of the inequality is that of the recursion when they differ by at most this share of their size: the minimum
-#: is flat, so that half the digits of a solver's optimum are those of its gain.
-SAME_GAIN = 1e-3
 
 
 @arguments_checked
@@ -94,19 +87,7 @@ def kalman(
     require_data(held, solvers=("detectability",))
     varying, process, sensor = _noisy_plant(own, Q, R)
 
-    def design(found: dict[str, FloatArray], name: str) -> ObserverDesign:
-        made = descriptor_kalman(plant, Q=Q, R=R, name=name)
-        steady = steady_state_filter(varying, Q=process, R=sensor)
-        for letter, wanted in (("L", steady.L), ("K", steady.K)):
-            miss = float(np.linalg.norm(found[letter] - wanted) / max(float(np.linalg.norm(wanted)), 1.0))
-            if not miss <= SAME_GAIN:
-                raise VerificationError(
-                    f"{letter} of the inequality differs from the steady gain of the recursion by {miss:.3g} of its "
-                    "size: with other constraints or another objective this is no Kalman filter.",
-                    report=made.report,
-                )
-        return made
-
+    design = design_of("kalman", plant, Q, R, (varying, process, sensor))
     return steady_gain(varying, process, sensor, margin=margin, held=held, design=design)
 
 

@@ -10,16 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.condition import Condition
+from obsynth.conditions import lazy_cvxpy as cp
 from obsynth.errors import SolverError, SpecError, VerificationError, a_kind
-from obsynth.methods.conic import lazy_cvxpy as cp
-from obsynth.methods.designing import failed_rows
-from obsynth.numerics.arguments import FloatArray, freeze, read_only, require_kind, shown
-from obsynth.results.design import ObserverDesign, VerificationReport
+from obsynth.numerics.arguments import require_kind, shown
+from obsynth.numerics.arrays import FloatArray, freeze, read_only
+from obsynth.results.design import ObserverDesign
+from obsynth.results.registered import registered
+from obsynth.results.verification_report import VerificationReport, failed_rows
 from obsynth.verification.plant import condition_rows
 
 if TYPE_CHECKING:
     import cvxpy
+
 
 #: Numbers by name, such as the values of variables.
 Values = Mapping[str, FloatArray]
@@ -186,6 +189,14 @@ class Conditions:
             f"Conditions of {self.source}\n  variables    {listed}\n  constraints  {', '.join(self.constraints)}"
             f"\n  data         {', '.join(self.data)}\n  status       {self.problem.status or 'not solved yet'}"
         )
+
+
+def design_of(source: str, *given: Any) -> Callable[[dict[str, FloatArray], str], ObserverDesign]:
+    """Return how gains of these conditions become a verified design: a function that `obsynth.methods` provides.
+
+    ``source`` names the conditions, and ``given`` is what their designs need beside the gains: the plant, first.
+    """
+    return lambda gains, name: registered("design_of_conditions")(source, *given, gains, name)
 
 
 def named_constraints(given: Any, count: int = 0) -> dict[str, Any]:

@@ -17,38 +17,36 @@ a U of full rank, unless E_sharp, C_sharp and G of (10), (11) are given; several
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.conditions import Condition
-from obsynth.analysis.transformations.linear_plants import Transformation, linear_plant
-from obsynth.conditions import atoms
-from obsynth.conditions.problem import Conditions, Values, require_data
-from obsynth.errors import SpecError
-from obsynth.methods.conic import lazy_cvxpy as cp
-from obsynth.methods.conic import lmi
-from obsynth.methods.designing import design_from_gains
-from obsynth.methods.placement.region import checked_poles, place
-from obsynth.methods.ui_pi_observer.augmented_plant import (
-    AugmentedPlant,
+from obsynth.analysis.existence.augmented_pencils import AugmentedPlant
+from obsynth.analysis.existence.condition import Condition
+from obsynth.analysis.existence.sharepasand import existence
+from obsynth.conditions import atoms, lmi
+from obsynth.conditions import lazy_cvxpy as cp
+from obsynth.conditions.augmented_plant import (
     Decoupled,
     combinations_seen,
     decouple,
     direct_part,
     paper_decoupling,
     realise,
+    with_faults,
 )
-from obsynth.methods.ui_pi_observer.conditions import existence
-from obsynth.methods.ui_pi_observer.placement_problem import with_faults
-from obsynth.numerics.arguments import FloatArray, arguments_checked, as_matrix
+from obsynth.conditions.problem import Conditions, Values, design_of, require_data
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import arguments_checked
+from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.doubling import is_positive
+from obsynth.numerics.eigenstructure import checked_poles, place
 from obsynth.numerics.matrix_equations import continuous_solution, discrete_solution
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.fault_models import Exosystem, exosystem
+from obsynth.plants.faults import Exosystem, exosystem
+from obsynth.plants.transformations.recovery import Transformation, linear_plant
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.results.design import ObserverDesign
 
@@ -124,7 +122,7 @@ def sharepasand(
         poles=poles,
         margin=margin,
         held=found.conditions,
-        design=partial(_design, target, fault_model),
+        design=design_of("sharepasand", target, fault_model),
     )
 
 
@@ -233,10 +231,3 @@ def _decoupling(plant: DescriptorSystem, E_sharp: Any, C_sharp: Any, G: Any) -> 
     _, u, d = paper_decoupling(plant, e_sharp=e_sharp, c_sharp=c_sharp, g=g)
     seen, injection, _ = direct_part(plant)
     return Decoupled(u, d, np.zeros((0, plant.nx)), np.zeros((0, plant.ny)), seen, injection)
-
-
-def _design(
-    plant: DescriptorSystem | Transformation, fault_model: Any, gains: dict[str, FloatArray], name: str
-) -> ObserverDesign:
-    U, D, K, F = (gains[letter] for letter in "UDKF")
-    return design_from_gains(plant, "ui-pi-observer", U=U, D=D, K=K, F=F, fault_model=fault_model, name=name)

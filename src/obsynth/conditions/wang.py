@@ -19,38 +19,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.conditions import Condition
-from obsynth.analysis.transformations.linear_plants import Transformation, linear_plant
-from obsynth.conditions import atoms
-from obsynth.conditions.atoms import MARGIN
-from obsynth.conditions.problem import Conditions, Values, require_data
-from obsynth.errors import SpecError
-from obsynth.methods.conic import lazy_cvxpy as cp
-from obsynth.methods.conic import lmi
-from obsynth.methods.designing import design_from_gains
-from obsynth.methods.fault_estimation_filter.central_filter import GainProblem, normalise, null_basis, search_least_gain
-from obsynth.methods.fault_estimation_filter.conditions import (
-    exact_indexes,
-    examine_fault_filter,
-    fault_detectability,
+from obsynth.analysis.existence.condition import Condition
+from obsynth.analysis.existence.detectability_indexes import exact_indexes, fault_detectability
+from obsynth.analysis.existence.restricted_equivalent import (
     prepare,
     restricted_equivalent_from,
     with_sensor_faults_as_states,
 )
-from obsynth.methods.fault_estimation_filter.gamma_lower_bound import proved_lower_bound
-from obsynth.numerics.arguments import (
-    FloatArray,
-    arguments_checked,
-    as_matrix,
-    chosen,
-    real_number,
-    require_no_overflow,
-    require_shape,
-)
+from obsynth.analysis.existence.wang2015 import examine_fault_filter
+from obsynth.conditions import atoms, lmi
+from obsynth.conditions import lazy_cvxpy as cp
+from obsynth.conditions.atoms import MARGIN
+from obsynth.conditions.gamma_lower_bound import proved_lower_bound
+from obsynth.conditions.problem import Conditions, Values, design_of, require_data
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import arguments_checked, chosen, real_number, require_shape
+from obsynth.numerics.arrays import FloatArray, as_matrix, require_no_overflow
+from obsynth.numerics.central_filter import search_least_gain
+from obsynth.numerics.injection_problem import GainProblem, normalise, null_basis
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.design import ObserverDesign
+from obsynth.plants.transformations.recovery import Transformation, linear_plant
 
 #: What a design claims above the true norm of its filter, tried in turn until the proof goes through.
 CLAIMED_ABOVE_NORM = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
@@ -194,7 +184,7 @@ def wang2015(
         constraints,
         partial(_existence, held, convex, gamma),
         gains,
-        partial(_design, plant, convex),
+        design_of("wang2015", plant, convex),
         weight=Wx if free else None,
     )
 
@@ -276,24 +266,6 @@ def _existence(held: Sequence[Condition], convex: GainProblem, gamma: float | No
     source = "dual of (45), checked without the solver"
     claim = "gamma is not below the least gain for this T, N and W"
     return [*found, Condition("gamma", claim, holds, gamma, bound, source, detail)]
-
-
-def _design(
-    plant: DescriptorSystem | Transformation, convex: GainProblem, gains: dict[str, FloatArray], name: str
-) -> ObserverDesign:
-    """Return the design of gains, claiming as little above its true norm as can be proved."""
-    given: dict[str, Any] = {letter: gains[letter] for letter in "TNLW"}
-    if not convex.disturbances:
-        return design_from_gains(plant, "fault-estimation-filter", **given, name=name)
-    norm = error_norm(linear_plant(plant).dense(), gains)
-    if not np.isfinite(norm):
-        return design_from_gains(plant, "fault-estimation-filter", **given, gamma=1.0, name=name)
-    size = max(norm, float(np.finfo(np.float64).eps) * convex.disturbance_size, float(np.finfo(np.float64).tiny))
-    for room in CLAIMED_ABOVE_NORM:
-        found = design_from_gains(plant, "fault-estimation-filter", **given, gamma=(1.0 + room) * size, name=name)
-        if found.report.passed:
-            break
-    return found
 
 
 def noise_paths(

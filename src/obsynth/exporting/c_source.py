@@ -1,313 +1,22 @@
-"""What every export holds: one discrete- or continuous-time realisation, its names, and the digest of the gain set.
-
-Alarms of an exported observer: levels of its outputs, and a monitor that was learned from rows without faults.
-
-A sampled observer as C99: one header, one source, no allocation, no library; thresholds over tolerances beside it.
-
-Observers of nonlinear DAEs are templates filled with sizes and tables: CasADi writes the equations, and the loop of
-Newton around them, its damping and its homotopy are those of `obsynth.observers.dae.observer`. What the header of one
-in single precision says of its error is measured, as steps are solved and no bound follows from the design alone: the C
-runs beside the observer in double precision over records that are simulated from the design, with missing samples.
-"""
+"""A sampled observer as C99: one header, one source, no allocation, no library."""
 
 from __future__ import annotations
 
-import ctypes
 import json
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
 from importlib.resources import files
-from pathlib import Path
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from obsynth.data.log_observers import GAP_LEFT_SHARE, LEAST_SHOWN, SETTLING_SLACK, LinearLogObserver
-from obsynth.errors import ObsynthError, SpecError
-from obsynth.experiments.monitors.learned import LearnedThresholds, as_learned, watched_names
-from obsynth.experiments.monitors.learned_levels import (
-    AGES,
-    DISTINGUISHED,
-    FORGETTING,
-    HOLD,
-    LEAST_ADDED,
-    MODEL_SHARE,
-    parameter_walk,
-)
-from obsynth.files.outputs import working_folder, write_together
-from obsynth.numerics.arguments import SMALLEST, FloatArray, real_number, require_mapping
-from obsynth.numerics.continuous import first_order_hold
-from obsynth.observers.dae.observer import (
-    FLAGS,
-    DAEObserver,
-    compiler,
-    in_lines,
-    observer_code,
-    observer_struct,
-    shared_library,
-)
-from obsynth.observers.linear.observer import LinearObserver, checked_warm_up, sample_observer, transient
-from obsynth.observers.recursive.gain_schedule import steady_observer
-from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.running import Estimates, as_run
-from obsynth.plants.dae import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
-from obsynth.results.design import ObserverDesign, gain_set_digest, unverified_mark
-from obsynth.simulation.dae import simulate_dae
-from obsynth.verification.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
-
-#: What a file says about the steady state of a recursion.
-STEADY = (
-    "The steady state of a recursive design: its estimates are those of the recursion once the covariances have "
-    "settled, and where a sample is missing the model alone is used."
-)
-
-
-class GapTables(NamedTuple):
-    """What stands in for the sensors where a sample is missing: the model of the plant, as runs have it."""
-
-    faults: int  # of the plant
-    told: tuple[int, ...]  # which of them the observer estimates
-    kept_inputs: int = 1
-    states: int = 0
-    seen: int = 0
-    exists: bool = False
-    solved: bool = False
-    tables: Mapping[str, FloatArray] = MappingProxyType({})
-    left_share: float = 0.0
-    least_shown: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Realisation:
-    """The observer of a design, sampled if that was asked for, or the steady state of its recursion; from ``z(0)``."""
-
-    design: ObserverDesign
-    observer: LinearObserver
-    digest: str
-    start: FloatArray
-    note: str = ""
-    precision: str = "double"
-
-    @classmethod
-    def of(cls, design: ObserverDesign, sample_time: float | None, precision: str = "double") -> Realisation:
-        """Return the realisation of a design."""
-        digest = gain_set_digest(design)
-        if isinstance(design.observer, RecursiveObserver):
-            if design.observer.outliers != "none":
-                raise SpecError(
-                    f"Design {design.name!r} uses the option 'outliers', which exported code does not know: design it "
-                    "without, or run it with obsynth run.",
-                    path="outliers",
-                )
-            found = steady_observer(design.observer)
-            if sample_time is not None:
-                raise SpecError("A recursive design is sampled already: leave the sample time out.", path="sample_time")
-            return cls(design, found.observer, digest, found.start, STEADY, precision)
-        if isinstance(design.observer, DAEObserver):
-            raise SpecError(
-                f"Design {design.name!r} is for a nonlinear plant: it has no constant gains to write. Run it with "
-                "obsynth run, or with observer.step.",
-                path="observer",
-            )
-        _, observer = design.linear
-        if sample_time is not None:
-            if observer.dt > 0.0:
-                raise SpecError(
-                    f"The design is sampled already (dt = {observer.dt:g} s): leave the sample time out.",
-                    path="sample_time",
-                )
-            observer = sample_observer(observer, sample_time)
-        return cls(design, observer, digest, np.zeros(observer.order), precision=precision)
-
-    @property
-    def straight(self) -> bool:
-        """Whether signals are taken as straight lines between samples, as the design is continuous in time."""
-        return isinstance(self.design.observer, LinearObserver) and self.design.observer.dt == 0.0 < self.observer.dt
-
-    @property
-    def running(self) -> LinearObserver:
-        """The observer whose rows are said: a continuous one as it is, whose state a run starts at zero."""
-        return self.design.linear[1] if self.straight else self.observer
-
-    @cached_property
-    def transition(self) -> dict[str, FloatArray]:
-        """What makes z of a sample from that of the one before: of inputs and outputs there, or of these before and
-        their rise, where lines between them are straight."""
-        if not self.straight:
-            return {"z": self.observer.Az, "u": self.observer.Bu, "y": self.observer.By}
-        driven = np.hstack([self.running.Bu, self.running.By])
-        return dict(
-            zip(("z", "before", "rise"), first_order_hold(self.running.Az, driven, self.observer.dt), strict=True)
-        )
-
-    @cached_property
-    def gap(self) -> GapTables:
-        """The model that goes on where a sample is missing; without one the observer starts again."""
-        observer, plant = self.observer, _constant_plant(self.design.plant)
-        nothing = GapTables(len(observer.fault_names), tuple(range(len(observer.fault_names))))
-        signals = observer.input_names, observer.output_names
-        if plant is None or (plant.input_names, plant.output_names) != signals:
-            return nothing
-        if not set(observer.fault_names) <= set(plant.fault_names):
-            return nothing
-        running = LinearLogObserver(self.design.replace(plant=plant, observer=self.running))
-        model = running.gap_model
-        told = tuple(running.told_faults)
-        if model is None:
-            return GapTables(plant.nf, told)
-        moving = model.plant
-        if self.straight:
-            held = first_order_hold(moving.A, np.hstack([moving.B, moving.Bf]), observer.dt)
-            moves: tuple[FloatArray, ...] = (
-                held[0],
-                held[1][:, : moving.nu],
-                held[1][:, moving.nu :],
-                held[2][:, : moving.nu],
-            )
-        else:
-            moves = (moving.A, moving.B, moving.Bf)
-        tables = dict(zip(("model_A", "model_B", "model_F", "model_R"), moves, strict=False))
-        tables |= {"model_C": moving.C, "model_D": moving.D, "model_Df": moving.Df, "model_into": model.into}
-        tables |= {"noise_variances": running.noise[None]}
-        if running.solver is not None:
-            tables |= {"source_D": plant.D, "source_Df": plant.Df, "model_solver": running.solver}
-        kept = running.kept_inputs
-        return GapTables(
-            plant.nf, told, kept, moving.nx, len(running.seen), True, running.solver is not None, tables,
-            GAP_LEFT_SHARE, LEAST_SHOWN,
-        )  # fmt: skip
-
-    @property
-    def mark(self) -> str:
-        """What every file says of a design that fails its verification; empty where it holds."""
-        return unverified_mark(self.design.report)
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs: known inputs, then outputs of the plant."""
-        return self.observer.input_names + self.observer.output_names
-
-    @property
-    def operating_point(self) -> tuple[FloatArray, FloatArray]:
-        """The operating point of inputs and of outputs: inputs are deviations from it, outputs as well."""
-        plant = self.design.plant
-        point = {} if isinstance(plant, DAEModel) else plant.operating_point
-        biases = getattr(plant, "sensor_faults", ())
-        after = [point.get(name, 0.0) for name in self.observer.state_names]
-        after += [0.0 if name in biases else point.get(name, 0.0) for name in self.observer.fault_names]
-        after += [0.0] * len(self.observer.residual_names)
-        return np.array([point.get(name, 0.0) for name in self.inputs]), np.array(after)
-
-    def as_arrays(self) -> dict[str, Any]:
-        """Return ``A, B, C, D, x0, Ts`` and everything else by name."""
-        observer = self.observer
-        before, after = self.operating_point
-        return {
-            "A": observer.Az,
-            "B": np.hstack([observer.Bu, observer.By]),
-            "C": observer.Cz,
-            "D": np.hstack([observer.Du, observer.Dy]),
-            "x0": self.start.reshape(-1, 1),
-            "Ts": observer.dt,
-            "input_point": before,
-            "output_point": after,
-            "delays": np.array([*observer.state_delays, *observer.fault_delays], dtype=np.float64),
-            "input_names": list(self.inputs),
-            "output_names": list(observer.row_names),
-            "name": self.design.name,
-            "method": self.design.method,
-            "sha256": self.digest,
-            **({"unverified": self.mark} if self.mark else {}),
-        }
-
-
-def verification_words(design: ObserverDesign) -> str:
-    """Return the status of a design's verification, in a sentence."""
-    mark = unverified_mark(design.report)
-    return mark or f"Verified: all {len(design.report.checks)} checks of obsynth hold."
-
-
-def _constant_plant(plant: Any) -> DescriptorSystem | None:
-    """Return the plant of a linear observer; that of a recursion, if it is one that changes with nothing."""
-    if isinstance(plant, DescriptorSystem):
-        return plant
-    if not isinstance(plant, TimeVaryingDescriptorSystem) or not plant.is_time_invariant:
-        return None
-    parts = {name: sequence.at(1) for name, sequence in plant.matrices.items()}
-    names = ("state_names", "input_names", "output_names", "operating_point", "units")
-    try:
-        return DescriptorSystem(
-            parts["E"], parts["A"], B=parts["B"], C=parts["C"], Bf=parts["Phi"], Df=parts["Psi"], dt=plant.dt,
-            fault_names=plant.parameter_names, **{name: getattr(plant, name) for name in names},
-        )  # fmt: skip
-    except SpecError:
-        # More or fewer equations than states.
-        return None
-
-
-#: What the largest statistic of a learned monitor is called, in units of its level.
-STATISTIC = "statistic"
-#: Seconds, about thirty years.
-_NEVER = 1e9
-
-
-@dataclass(frozen=True, eq=False)
-class Alarms:
-    """What raises an alarm: ``levels`` by watched output, 0 for none; ``columns``: all outputs that a learned monitor
-    may take, fault estimates first; ``warm_up`` in seconds; ``walk (nf, nf)``: by which faults walk between samples."""
-
-    levels: Mapping[str, float]
-    columns: tuple[str, ...]
-    fault_names: tuple[str, ...]
-    warm_up: float
-    learned: LearnedThresholds | None = None
-    walk: FloatArray | None = None
-
-    @classmethod
-    def of(
-        cls,
-        columns: Sequence[str],
-        fault_names: Sequence[str],
-        thresholds: Mapping[str, float] | None,
-        warm_up: float,
-        learned: LearnedThresholds | None,
-        more: Sequence[str] = (),
-    ) -> Alarms:
-        """Return alarms; ``more``: what may be watched besides the columns.  Raise `SpecError` for another name."""
-        require_mapping(thresholds, "thresholds")
-        watched = [*columns, *more]
-        for name, level in (thresholds or {}).items():
-            if name not in watched:
-                raise SpecError(
-                    f"There is no output {name!r} to monitor: there are {', '.join(watched)}.", path="thresholds"
-                )
-            real_number(level, f"The threshold of {name!r}", "a positive number", above=0.0, path="thresholds")
-        levels = {name: float((thresholds or {}).get(name, 0.0)) for name in watched}
-        if learned is not None:
-            levels[STATISTIC] = 1.0
-        return cls(levels, tuple(columns), tuple(fault_names), warm_up, learned)
-
-
-def linear_alarms(
-    found: Realisation,
-    thresholds: Mapping[str, float] | None,
-    warm_up: float | None,
-    learned: LearnedThresholds | None,
-) -> Alarms:
-    """Return the alarms of a linear observer."""
-    observer = found.observer
-    columns = (*observer.row_names[observer.fault_rows], *observer.row_names[observer.residual_rows])
-    # That of the design itself, as runs have it: sampling changes no mode.
-    seconds = checked_warm_up(warm_up, transient(found.running))
-    # A file may hold finite numbers alone: an observer that never settles raises no alarm.
-    seconds = seconds if math.isfinite(seconds) else _NEVER
-    return Alarms.of(columns, observer.fault_names, thresholds, seconds, learned)
-
+from obsynth.exporting.alarms import Alarms
+from obsynth.exporting.realisation import Realisation, verification_words
+from obsynth.monitoring.logs.log_observer import SETTLING_SLACK
+from obsynth.monitoring.thresholds.learned_levels import AGES, FORGETTING, HOLD
+from obsynth.monitoring.thresholds.parameter_scores import DISTINGUISHED, LEAST_ADDED, MODEL_SHARE
+from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.observers.nonlinear.c_code import in_lines
 
 _KEYWORDS = frozenset(
     {
@@ -349,6 +58,31 @@ _KEYWORDS = frozenset(
 )
 
 
+#: What stands around declarations so that C++ calls functions by their names in C.
+_OPENED = '\n\n#ifdef __cplusplus\nextern "C" {\n#endif\n'
+
+_CLOSED = "#ifdef __cplusplus\n}\n#endif\n\n"
+
+
+#: Matrices with fewer entries are multiplied row by row: nothing is gained by more.
+LARGE_TABLE = 1024
+
+#: At most this share of entries that are not zero makes a matrix sparse.
+SPARSE_C_SHARE = 0.25
+
+#: Forms of tables, by the names of the macros that add them.
+PLAIN, ENTRIES, COLUMNS_MACRO = "plain", "entries", "columns"
+
+ADVICE = (
+    "Compile with -O3, and with -march=native where it runs on the same machine: the products are written so that rows "
+    "are independent, and sums keep their order."
+)
+
+
+#: What a row is called in C, as runs call it.
+ROW_STATUSES = ("OK", "WARM_UP", "GAP", "RECOVERING", "PARTIAL")
+
+
 def c_identifier(text: str) -> str:
     """Return a C identifier made of ``text``; one that C reserves, or that begins with a digit, gets a prefix."""
     name = re.sub(r"\W", "_", text, flags=re.ASCII)
@@ -370,32 +104,11 @@ def comment(text: str) -> str:
     return f"/* {text} */"
 
 
-#: What stands around declarations so that C++ calls functions by their names in C.
-_OPENED = '\n\n#ifdef __cplusplus\nextern "C" {\n#endif\n'
-_CLOSED = "#ifdef __cplusplus\n}\n#endif\n\n"
-
-
 def with_c_linkage(header: str, prefix: str) -> str:
     """Return a header, guard and all, that C++ may include too."""
     head, body = header.split(f"#define {prefix.upper()}_H\n", 1)
     declared, end = body.rsplit("#endif", 1)
     return f"{head}#define {prefix.upper()}_H{_OPENED}{declared}{_CLOSED}#endif{end}"
-
-
-#: Matrices with fewer entries are multiplied row by row: nothing is gained by more.
-LARGE_TABLE = 1024
-#: At most this share of entries that are not zero makes a matrix sparse.
-SPARSE_C_SHARE = 0.25
-#: Forms of tables, by the names of the macros that add them.
-PLAIN, ENTRIES, COLUMNS_MACRO = "plain", "entries", "columns"
-ADVICE = (
-    "Compile with -O3, and with -march=native where it runs on the same machine: the products are written so that rows "
-    "are independent, and sums keep their order."
-)
-
-
-#: What a row is called in C, as runs call it.
-ROW_STATUSES = ("OK", "WARM_UP", "GAP", "RECOVERING", "PARTIAL")
 
 
 def status_lines(prefix: str) -> list[str]:
@@ -439,13 +152,13 @@ def header_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
         comment("Take one sample of each signal, write the estimates at that sample, and advance."),
         comment("Signals are deviations from the operating point; a missing one is NaN. Returns 0; or 1 if a sample"),
         comment("is missing: the model of the plant replaces it, fault estimates are held, and residuals are NaN."),
-        *_signal_comments("u", "", found.inputs[: len(observer.input_names)], before, units),
-        *_signal_comments("y", "", observer.output_names, before[len(observer.input_names) :], units),
-        *_signal_comments("states", "xhat", observer.state_names, after, units, observer.state_delays),
-        *_signal_comments(
+        *signal_comments("u", "", found.inputs[: len(observer.input_names)], before, units),
+        *signal_comments("y", "", observer.output_names, before[len(observer.input_names) :], units),
+        *signal_comments("states", "xhat", observer.state_names, after, units, observer.state_delays),
+        *signal_comments(
             "faults", "fhat", observer.fault_names, after[len(observer.state_names) :], units, observer.fault_delays
         ),
-        *_signal_comments("residuals", "r", observer.residual_names, None, units),
+        *signal_comments("residuals", "r", observer.residual_names, None, units),
         f"{_step_signature(found, prefix)};",
         "",
         comment("The same with signals and estimates as they are, not as deviations."),
@@ -795,7 +508,7 @@ def _step_signature(found: Realisation, prefix: str, name: str = "step") -> str:
     return f"int {prefix}_{name}({', '.join(_step_arguments(found, prefix))})"
 
 
-def _signal_comments(
+def signal_comments(
     array: str,
     column: str,
     names: Sequence[str],
@@ -803,6 +516,7 @@ def _signal_comments(
     units: Mapping[str, str],
     delays: Sequence[int] = (),
 ) -> Iterator[str]:
+    """Return the comments that name the signals of an array."""
     for i, name in enumerate(names):
         at = f", operating point {float(point[i])!r}" if point is not None and point[i] else ""
         late = f", delayed by {delays[i]} sample(s)" if delays and delays[i] else ""
@@ -834,388 +548,3 @@ def filled_template(name: str, prefix: str, words: Mapping[str, str]) -> str:
         text = re.sub(rf"^ *{word}\n", "", text, flags=re.MULTILINE)
     known = {**words, "PREFIX": prefix, "UPPER": prefix.upper()}
     return re.sub("|".join(sorted(known, key=len, reverse=True)), lambda found: known[found.group()], text)
-
-
-#: A number of a table, or of a line that a macro names.
-_WRITTEN_NUMBER = re.compile(r"(?<![\w.\"])-?\d+(?:\.\d+(?:e[+-]?\d+)?|e[+-]?\d+)(?![\w.\"])")
-
-
-def in_precision(text: str, precision: str) -> str:
-    """Return C in which numbers of signals are doubles, or floats as near to these as they can be."""
-    if precision == "double":
-        return re.sub(r"\bREAL\b", "double", text)
-    rounded = []
-    for line in re.sub(r"\bREAL\b", "float", text).split("\n"):
-        plain = line.startswith(("#define", "/*", " *"))
-        rounded.append(line if plain else _WRITTEN_NUMBER.sub(_as_float, line))
-    return "\n".join(rounded)
-
-
-def _as_float(found: re.Match[str]) -> str:
-    value = np.float32(found.group())
-    if not np.isfinite(value):
-        raise SpecError(
-            f"{found.group()} is beyond the largest number of precision 'float': scale the signals, or export doubles.",
-            path="precision",
-        )
-    return f"{value}f"
-
-
-def write_dae_c(
-    design: ObserverDesign,
-    target: Path,
-    sample_time: float | None,
-    alarms: Alarms,
-    precision: str,
-    outliers: str | None,
-) -> tuple[Path, ...]:
-    """Write source and header."""
-    if target.suffix.lower() != ".c":
-        raise SpecError(
-            f"{target}: the observer of a nonlinear plant is no matrices; it is exported as C (.c).", path=str(target)
-        )
-    require_no_sample_time(design, sample_time)
-    prefix, header = c_identifier(target.stem), target.with_suffix(".h")
-    source, declarations, _ = dae_c_texts(design, prefix, header.name, alarms, outliers)
-    if precision == "float":
-        source, declarations = in_floats(source), in_floats(declarations)
-        said = float_error(design, prefix, source, declarations)
-        declarations = f"{comment(quoted(said))}\n{declarations}"
-    return write_together({target: source, header: with_c_linkage(declarations, prefix)})
-
-
-def require_no_sample_time(design: ObserverDesign, sample_time: float | None) -> None:
-    """Raise `SpecError` where a sample time is given for an observer that is sampled."""
-    if sample_time is not None:
-        dt = design.nonlinear[1].dt
-        raise SpecError(
-            f"The design is sampled already (dt = {dt:g} s): leave the sample time out.", path="sample_time"
-        )
-
-
-def dae_alarms(
-    design: ObserverDesign,
-    thresholds: Mapping[str, float] | None,
-    warm_up: float | None,
-    learned: LearnedThresholds | None,
-) -> Alarms:
-    """Return the alarms of a nonlinear design."""
-    model, observer = design.nonlinear
-    columns = (*(f"fhat[{name}]" for name in model.parameter_names), *(f"r[{name}]" for name in model.output_names))
-    seconds = checked_warm_up(warm_up, 0.0)
-    found = Alarms.of(columns, model.parameter_names, thresholds, seconds, learned, more=("nis",))
-    if learned is not None:
-        # A run numbers innovations of any kind.
-        found = replace(found, columns=watched_names(design), walk=parameter_walk(observer))
-    return found
-
-
-def dae_c_texts(
-    design: ObserverDesign, prefix: str, header: str, alarms: Alarms, outliers: str | None = None
-) -> tuple[str, str, str]:
-    """Return source, header and the digest of the gain set. Outliers are left out where neither the design nor
-    ``outliers`` says anything of them, as `run` leaves them out."""
-    model, observer = design.nonlinear
-    digest = gain_set_digest(design)
-    observer = as_run(observer, outliers)
-    if alarms.learned is not None:
-        observer = as_learned(observer, alarms.learned)
-    inner = f"{prefix}_observer" if observer.timing.is_plain else f"{prefix}_observer_memory"
-    source = "\n".join(
-        [
-            comment(f"sha256 of the gain set: {digest}"),
-            f'#include "{included(header)}"',
-            "",
-            f"#define observer {inner}",
-            *([f"#define waiting {prefix}_observer"] if inner != f"{prefix}_observer" else []),
-            f"#define WARM_UP_SECONDS {alarms.warm_up!r}",
-            f"#define SETTLING_SLACK {SETTLING_SLACK!r}",
-            "",
-            observer_code(observer.steps),
-            "#include <stddef.h>",
-            "#define ABS fabs",
-            *table_lines("levels", np.array([list(alarms.levels.values())])),
-            monitor_source(alarms, prefix),
-            _dae_step_text(prefix, model, alarms),
-        ]
-    )
-    declared = _dae_header(design, prefix, digest, alarms)
-    return in_precision(source, "double"), in_precision(declared, "double"), digest
-
-
-def _dae_step_text(prefix: str, model: DAEModel, alarms: Alarms) -> str:
-    """Return the two functions of the header; without inputs, C has no array for them."""
-    learned = alarms.learned is not None
-    waiting = (
-        f"double shown[{prefix.upper()}_WATCHED];\n"
-        f"    for (i = 0; i < {prefix.upper()}_WATCHED; i++) {{\n"
-        "        shown[i] = NAN;\n"
-        "    }\n"
-        "    monitor_take(&s->monitor, shown, NULL, 0, -1);"
-    )
-    taking = (
-        "monitor_take(&s->monitor, shown, MONITOR_ESTIMATES > 0 ? after + AT_SPREAD : NULL, is_deciding,\n"
-        "                 sqrt(estimates->nis));\n"
-        "    shown[NQ + NY + 1] = s->monitor.statistic;"
-    )
-    return filled_template(
-        "dae_step.c",
-        prefix,
-        {
-            "ARGUMENTS": "const double u[NU], " if model.nu else "",
-            "INPUT": "u" if model.nu else "s->u",
-            "MONITOR_RESET": "monitor_reset(&s->monitor);" if learned else "",
-            "WAITING_STEP": waiting if learned else "",
-            "MONITOR_STEP": taking if learned else "",
-        },
-    )
-
-
-def _dae_header(design: ObserverDesign, prefix: str, digest: str, alarms: Alarms) -> str:
-    """Return the header of the observer of a nonlinear plant."""
-    model, observer = design.nonlinear
-    signals = (
-        ("u", "", model.input_names),
-        ("y", "", model.output_names),
-        ("states", "xhat", model.state_names),
-        ("faults", "fhat", model.parameter_names),
-        ("state_deviations", "sd xhat", model.state_names),
-        ("fault_deviations", "sd fhat", model.parameter_names),
-        ("residuals", "r", model.output_names),
-    )
-    listed = [
-        line for array, column, names in signals for line in _signal_comments(array, column, names, None, model.units)
-    ]
-    structs = [*observer_struct(observer.steps, f"{prefix}_observer"), *monitor_struct(alarms, prefix)]
-    words = {
-        "OBSERVER": f"Observer {quoted(design.name)} by {quoted(design.method)}, written by obsynth.",
-        "VERIFIED": quoted(verification_words(design)),
-        "ALARMS": "\n".join(map(comment, alarm_comments(alarms))),
-        "DIGEST": digest,
-        "SECONDS": repr(observer.dt),
-        "COUNT_OF_LEVELS": str(len(alarms.levels)),
-        "SOME_LEVELS": str(max(len(alarms.levels), 1)),
-        "STATUSES": "\n".join(status_lines(prefix)),
-        "STRUCTS": "\n".join(structs),
-        "MONITOR": f"{prefix}_monitor monitor;" if alarms.learned is not None else "",
-        "INPUTS": f"const double u[{model.nu}], " if model.nu else "",
-        "SIGNALS": "\n".join(listed),
-        **{word: str(size) for word, size in (("NX", model.nx), ("NY", model.ny))},
-        **{word: str(max(size, 1)) for word, size in (("SOME_NU", model.nu), ("SOME_NQ", model.nq))},
-    }
-    return filled_template("dae.h", prefix, words)
-
-
-def threshold_header(bound: AdaptiveBound, prefix: str) -> str:
-    """Return the declarations, for the end of the header."""
-    p, nz, *_ = bound.counts
-    no = bound.counts[4]
-    sizes = (max(p * nz, 1), bound.length * bound.width, bound.length * nz, bound.rounding.shape[1])
-    lines = [
-        comment("Thresholds over the tolerances of the plant: of the faults, then of the residuals."),
-        "typedef struct {",
-        *(f"    double {name}[{size}];" for name, size in zip(("psi", "ring", "eps", "largest"), sizes, strict=True)),
-        "    int at;",
-        "    long k;",
-        f"}} {prefix}_thresholds;",
-        "",
-        f"void {prefix}_thresholds_reset({prefix}_thresholds *state);",
-        "",
-        comment("After each step of the observer: u, y, and its states, faults and residuals one after the other;"),
-        comment(f"total gets {no} numbers."),
-        f"void {prefix}_thresholds_step({prefix}_thresholds *state, const double *u, const double *y,",
-        "                               const double *rows, double *total);",
-        "",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def threshold_source(bound: AdaptiveBound, prefix: str) -> str:
-    """Return tables and functions, for the end of the source; `SpecError` for constants that vary."""
-    if bound.varying:
-        raise SpecError(
-            "Thresholds are written as C for constants that stay the same (variation: constant).", path="monitor"
-        )
-    p, nz, rows, m, no = bound.counts
-    structure = bound.structure
-    n, out = structure.reading.shape
-    nv = bound.drive.shape[2]
-    ny = bound.rounding.shape[1] - 1 - nv
-    theta, later = bound.start_later
-    sizes = {
-        "P": p,
-        "NZ": nz,
-        "ROWS": rows,
-        "M": m,
-        "NO": no,
-        "N": n,
-        "NU": nv - n,
-        "NY": ny,
-        "NV": nv,
-        "OUT": out,
-        "W": bound.width,
-        "L": bound.length,
-        "NR": bound.rounding.shape[1],
-        "SINGLE": structure.single,
-        "OWN": len(structure.owner),
-        "DRIVEN": len(bound.remainder_inputs),
-        "START": len(bound.start),
-    }
-    tables = {
-        "Az": structure.Az,
-        "reading": structure.reading,
-        "drive": bound.drive.reshape(-1, nv),
-        "shown": bound.shown,
-        "offsets": structure.offsets[None],
-        "channels": structure.channel_rows,
-        "kernels": bound.kernels,
-        "same": bound.same,
-        "solved": bound.solved,
-        "tail": bound.tail,
-        "nominal": bound.nominal[None],
-        "rounding": bound.rounding,
-        "start": bound.start,
-        "later": later[None],
-        "driven": np.array([bound.remainder_inputs], dtype=np.float64),
-    }
-    enumerated = ", ".join(f"{name} = {value}" for name, value in sizes.items())
-    lines = [
-        "",
-        f"enum {{ {enumerated} }};",
-        f"static const double THETA = {theta!r};",
-        f"static const double ROUNDED = {THRESHOLD_ROUNDING!r};",
-        "",
-        *(line for name, table in tables.items() for line in table_lines(f"thresholds_{name}", filled_table(table))),
-    ]
-    return in_precision("\n".join(lines) + "\n" + filled_template("adaptive_threshold.c", prefix, {}), "double")
-
-
-#: Newton in floats: a last step whose square is rounding, and a residual of some roundings of its terms.
-FLOAT_LAST_STEP, FLOAT_RESIDUAL = 3e-4, 1e-5
-#: A projection that moves no state by more than rounding moves none, and bounds that dependent rows miss are kept.
-FLOAT_PROJECTION_NOTICE, FLOAT_DEPENDENT, FLOAT_SLACK = 1e-4, 1e-5, 1e-4
-#: What a sample adds to the information on faults is a difference of inverses of covariances.
-FLOAT_LEAST_ADDED = 1e-5
-#: What is larger has no square in a float.
-FLOAT_OVERFLOW = 1e18
-#: Samples of each record that errors are measured on, their seeds, and the samples without outputs.
-RECORD_SAMPLES, SEEDS = 400, (1, 2)
-MISSING_SAMPLES = slice(200, 205)
-#: Errors beyond this share of an estimate's own deviation: single precision does not carry the observer.
-LARGEST_ERROR_SHARE = 0.5
-_FLOAT_CONSTANTS = {
-    "LAST_STEP": FLOAT_LAST_STEP,
-    "LARGEST_RESIDUAL": FLOAT_RESIDUAL,
-    "PROJECTION_NOTICE": FLOAT_PROJECTION_NOTICE,
-    "DEPENDENT": FLOAT_DEPENDENT,
-    "SLACK": FLOAT_SLACK,
-    "OVERFLOW_LIMIT": FLOAT_OVERFLOW,
-    "MONITOR_LEAST": FLOAT_LEAST_ADDED,
-}
-
-
-def in_floats(text: str) -> str:
-    """Return C with floats in place of doubles; seconds stay doubles, as they are counted up."""
-    for name, value in _FLOAT_CONSTANTS.items():
-        text = re.sub(rf"^#define {name} .*$", f"#define {name} {value!r}f", text, flags=re.MULTILINE)
-    lines = [
-        line if re.search(r"\b(time|warm_up)\b", line) else re.sub(r"\bdouble\b", "float", line)
-        for line in text.split("\n")
-    ]
-    return in_precision("\n".join(lines), "float")
-
-
-def float_error(design: ObserverDesign, prefix: str, source: str, declared: str) -> str:
-    """Return what the header of an export in floats says of its error; raise `SpecError` where it is too large."""
-    model = design.nonlinear[0]
-    names = [*(f"xhat[{name}]" for name in model.state_names), *(f"fhat[{name}]" for name in model.parameter_names)]
-    worst, shares = np.zeros(len(names)), np.zeros(len(names))
-    with working_folder() as folder:
-        library = _compiled(folder, prefix, source, declared, model.nu, model.ny, (model.nx, model.nq))
-        for seed in SEEDS:
-            u, y, expected = _record(design, seed)
-            wanted = np.hstack([expected.states, expected.faults])
-            deviations = np.hstack([expected.state_deviations, expected.fault_deviations])
-            found = _taken(library, u, y, wanted.shape[1])
-            error = np.abs(found - wanted)
-            worst = np.maximum(worst, error.max(axis=0))
-            with np.errstate(divide="ignore", invalid="ignore"):
-                share = np.where(error > 0.0, error / deviations, 0.0)[1:]
-            shares = np.maximum(shares, share.max(axis=0))
-    if not (np.isfinite(worst).all() and (shares <= LARGEST_ERROR_SHARE).all()):
-        at = int(np.argmax(np.where(np.isfinite(shares), shares, np.inf)))
-        raise SpecError(
-            f"Single precision does not carry this observer: {names[at]} is off by {worst[at]:.2g}, "
-            f"{shares[at]:.2g} of its own standard deviation. Leave precision at double.",
-            path="precision",
-        )
-    listed = ", ".join(f"{name} {error:.2g}" for name, error in zip(names, worst, strict=True))
-    return (
-        f"Floats: measured, not proved: the largest error against double precision in {len(SEEDS)} records of "
-        f"{RECORD_SAMPLES} samples simulated from the design (5 of them missing): {listed}; at most "
-        f"{shares.max(initial=0.0):.2g} of an estimate's own standard deviation"
-    )
-
-
-def _record(design: ObserverDesign, seed: int) -> tuple[FloatArray, FloatArray, Estimates]:
-    """Return inputs and outputs, as floats hold them, of the plant with the noise that the observer assumes, and what
-    the observer says of them in doubles."""
-    model, observer = design.nonlinear
-    u = np.tile(model.nominal_input, (RECORD_SAMPLES, 1)).reshape(RECORD_SAMPLES, model.nu)
-    try:
-        found = simulate_dae(
-            model,
-            u,
-            dt=observer.dt,
-            parameters=observer.initial_parameters,
-            initial_state=observer.initial_state,
-            Q=observer.Q,
-            R=observer.R,
-            integration=observer.integration,
-            seed=seed,
-        )
-        y = np.array(found.outputs)
-        y[MISSING_SAMPLES] = np.nan
-        u, y = (given.astype(np.float32).astype(np.float64) for given in (u, y))
-        return u, y, observer.run(y, u)
-    except ObsynthError as error:
-        raise SpecError(
-            "The error of single precision is measured on a record that is simulated from the design, which fails: "
-            f"{error} Leave precision at double.",
-            path="precision",
-        ) from error
-
-
-def _compiled(
-    folder: Path, prefix: str, source: str, declared: str, nu: int, ny: int, counts: tuple[int, int]
-) -> ctypes.CDLL:
-    command = compiler()
-    if command is None:
-        raise SpecError(
-            "The error of a nonlinear observer in floats is measured by running it: this needs a C compiler (cc, gcc "
-            "or clang, or what CC in the environment names). Install one, or leave precision at double.",
-            path="precision",
-        )
-    given = f"in, in + {nu}" if nu else "in"
-    sizes = {"STATES": str(counts[0]), "FAULTS": str(counts[1]), "TAKEN": str(nu + ny)}
-    harness = filled_template("run_floats.c", prefix, {"ARGUMENTS": given, **sizes})
-    own = re.sub(r'^#include ".*"$', '#include "observer.h"', source, count=1, flags=re.MULTILINE)
-    texts = {"observer.h": declared, "observer.c": own, "run.c": harness}
-    return ctypes.CDLL(str(shared_library(folder, texts, [*command, *FLAGS], path="precision")))
-
-
-def _taken(library: ctypes.CDLL, u: FloatArray, y: FloatArray, width: int) -> FloatArray:
-    given = np.ascontiguousarray(np.hstack([u, y]), dtype=np.float32)
-    out = np.zeros((len(y), width))
-    count = library.run(
-        given.ctypes.data_as(ctypes.POINTER(ctypes.c_float)),
-        out.ctypes.data_as(ctypes.POINTER(ctypes.c_double)),
-        len(y),
-    )
-    if count < len(y):
-        raise SpecError(
-            f"Single precision does not carry this observer: its step {count} has no solution there. Leave precision "
-            "at double.",
-            path="precision",
-        )
-    return out

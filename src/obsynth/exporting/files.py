@@ -1,9 +1,4 @@
-"""Writing a gain set for other programs.
-
-How far an observer in single precision may be from the one in double precision.
-
-Guaranteed tests as C99: a window of samples, a dot product for each test, and its threshold.
-"""
+"""Writing a gain set for other programs."""
 
 from __future__ import annotations
 
@@ -16,219 +11,30 @@ from typing import Literal
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.monitors.learned import LearnedRule, LearnedThresholds
-from obsynth.experiments.monitors.monitor import Monitor
-from obsynth.exporting.c_source import (
-    Alarms,
-    Realisation,
-    c_identifier,
-    comment,
-    dae_alarms,
-    filled_template,
-    header_text,
-    in_precision,
-    included,
-    linear_alarms,
-    quoted,
-    source_text,
-    table_lines,
-    threshold_header,
-    threshold_source,
-    with_c_linkage,
-    write_dae_c,
-)
+from obsynth.exporting.alarms import Alarms, linear_alarms
+from obsynth.exporting.c_source import c_identifier, comment, header_text, quoted, source_text, with_c_linkage
+from obsynth.exporting.c_window import is_window, require_fixed, window_c_texts
+from obsynth.exporting.dae_c_source import dae_alarms, threshold_header, threshold_source, write_dae_c
+from obsynth.exporting.dae_float import in_precision
+from obsynth.exporting.float_error import float_error
+from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import FileKind, write_atomically, write_together
-from obsynth.methods.guaranteed_test.checks import groups_of, is_bank
-from obsynth.methods.guaranteed_test.method import is_guaranteed
-from obsynth.methods.guaranteed_test.result import GuaranteedTest
-from obsynth.numerics.arguments import FloatArray, arguments_checked
-from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.observer import WindowObserver
+from obsynth.monitoring.thresholds.learned import LearnedRule, LearnedThresholds
+from obsynth.monitoring.thresholds.monitor import Monitor
+from obsynth.numerics.arguments import arguments_checked
+from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.outliers import Outliers
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.running import require_plain
-from obsynth.results.design import ObserverDesign, gain_set_digest, require_verified
-from obsynth.verification.adaptive_bound import AdaptiveBound
-
-#: Relative rounding of a float, and of a double.
-UNIT = 2.0**-24
-#: Samples whose effects are summed up at most, and what is left of an effect that is over.
-MOST_SUMMED_SAMPLES, OVER = 100_000, 1e-9
-#: Rounds in which an error that feeds on itself has to settle, and by how much it may still grow.
-MOST_ROUNDS, SETTLED_ERROR = 100, 1e-3
-
-
-def float_bounds(found: Realisation) -> FloatArray | None:
-    """Return a bound on the error of each row of estimates ``(rows,)``, for inputs and outputs whose deviations stay
-    within one unit, and samples that are complete; `None` where none is found.
-
-    Rounding of n products and of the coefficients is at most ``(n + 2) u`` of the sum of their sizes (Higham 2002,
-    lemma 3.1); errors of the state are carried on by ``sum |Az^k|``.
-    """
-    observer = found.observer
-    driven = np.abs(np.hstack(list(found.transition.values())[1:])).sum(axis=1)
-    if found.straight:
-        # A rise between samples is at most two units.
-        driven = driven + np.abs(found.transition["rise"]).sum(axis=1)
-    transition, rows = found.transition["z"], np.abs(found.running.Cz)
-    through = np.abs(np.hstack([found.running.Du, found.running.Dy])).sum(axis=1)
-    gathered = _sum_of_powers(transition)
-    if gathered is None:
-        return None
-    # A sum that is not known of all samples is rounded up.
-    size, count = gathered @ driven, observer.order + 2 * len(found.inputs) + 2
-    unit = count * UNIT / (1.0 - count * UNIT)
-    error = np.zeros(observer.order)
-    for _ in range(MOST_ROUNDS):
-        local = unit * (np.abs(transition) @ (size + error) + driven)
-        after = gathered @ local
-        if np.all(after <= error * (1.0 + SETTLED_ERROR)):
-            return np.asarray((1.0 + SETTLED_ERROR) * (rows @ error + unit * (rows @ (size + error) + through)))
-        error = np.maximum(after, error) * (1.0 + SETTLED_ERROR)
-    return None
-
-
-def _sum_of_powers(matrix: FloatArray) -> FloatArray | None:
-    """Return ``sum |A^k|`` over all k >= 0, from above but for rounding; `None` where it does not end."""
-    power, total = np.eye(len(matrix)), np.zeros_like(matrix)
-    for _ in range(MOST_SUMMED_SAMPLES):
-        with np.errstate(over="ignore", invalid="ignore"):  # an observer that is not stable
-            total += np.abs(power)
-            power = power @ matrix
-        left = float(np.abs(power).sum(axis=1).max(initial=0.0))
-        if not np.isfinite(left):
-            return None
-        if left <= OVER:
-            # What is left: |A^K| sum |A^k|, which is less than a share OVER of the sum.
-            return np.asarray(total * (1.0 + OVER) / (1.0 - OVER) + OVER * np.abs(total).sum())
-    return None
-
-
-def float_error(found: Realisation) -> str:
-    """Return what the header of an export in floats says of its error."""
-    bounds = float_bounds(found)
-    if bounds is None:
-        return "Floats: no bound on the error of single precision was found, as its errors decay too slowly."
-    names = found.observer.row_names
-    listed = ", ".join(f"{name} {bound:.2g}" for name, bound in zip(names, bounds, strict=True))
-    return (
-        "Floats: a derived bound on the error against double precision, for complete samples whose deviations stay "
-        f"within 1 unit each (n times as much for n units): {listed}"
-    )
-
-
-def require_fixed(design: ObserverDesign, suffix: str) -> None:
-    """Raise `SpecError` for tests that solve programmes at each row, which no export holds."""
-    if not is_guaranteed(design):
-        return
-    if isinstance(design.observer, WindowObserver):
-        raise SpecError(
-            f"Design {design.name!r} is for a plant that changes with k: its weights change from row to row, which no "
-            "export holds. Run it with obsynth run, or with observer.step; gains and thresholds by row are in the gain "
-            "set.",
-            path="observer",
-        )
-    if (not is_window(design) or suffix != ".c") and design.linear[1].constant is not None:
-        # Other formats have no place for the middle of such bounds.
-        raise SpecError(
-            f"Design {design.name!r} has bounds that do not lie about zero, so that its row has a constant part, which "
-            "is exported as C (.c) only, without tolerances.",
-            path="disturbance_bounds",
-        )
-    for name, asked in (("exact", design.options.get("exact")), ("missing", design.options.get("missing") == "solve")):
-        if asked:
-            raise SpecError(
-                f"Design {design.name!r} has the option {name!r}: it solves linear programmes at each row, which "
-                "exported code does not. Design it without: the fixed test, with its weights and thresholds, can be "
-                "exported.",
-                path=name,
-            )
-
-
-def is_window(design: ObserverDesign) -> bool:
-    """Whether a design is nothing but tests on windows, without an observer of the state beside."""
-    return is_guaranteed(design) and not design.linear[1].state_names
-
-
-def window_c_texts(found: Realisation, prefix: str, header: str) -> tuple[str, str]:
-    """Return source and header."""
-    test = GuaranteedTest.of(found.design)
-    observer, count = found.observer, len(test.tests)
-    length = observer.order // count + 1
-    nu, ny = len(observer.input_names), len(observer.output_names)
-    sizes = {"TESTS": count, "LENGTH": length, "WIDTH": nu + ny, "NU": nu}
-    tables = {
-        "weights": _weights(found, count, length),
-        "limits": np.array([[one.threshold for one in test.tests]]),
-        "constants": observer.added[None],
-        "rounding": np.array([one.certificate.matrices["rounding"].ravel() for one in test.tests]),
-    }
-    taken = ([f"const double u[{nu}]"] if nu else []) + [f"const double y[{ny}]"]
-    arguments = [f"{prefix}_state *state", *taken, f"double values[{count}]", f"double thresholds[{count}]"]
-    signature = f"int {prefix}_step({', '.join(arguments)})"
-    upper = prefix.upper()
-    names, groups = found.design.linear[0].fault_names, groups_of(test) if is_bank(test) else None
-    told = [test.fault] if groups is None else [" or ".join(names[k] for k in group) for group in groups]
-    declared = [
-        comment(f"Test {quoted(test.name)} by {quoted(test.method)}, written by obsynth."),
-        *([comment(quoted(found.mark))] if found.mark else []),
-        f"#ifndef {upper}_H",
-        f"#define {upper}_H",
-        "",
-        comment("sha256 of the gain set"),
-        f'#define {upper}_SHA256 "{found.digest}"',
-        comment("seconds between samples; samples of a window"),
-        f"#define {upper}_DT {observer.dt!r}",
-        f"#define {upper}_LENGTH {length}",
-        "",
-        "typedef struct {",
-        f"    double window[{length}][{nu + ny}];",
-        f"    double largest[{nu + ny}];",
-        "    int at;",
-        "    int rows;",
-        f"}} {prefix}_state;",
-        "",
-        f"void {prefix}_reset({prefix}_state *state);",
-        "",
-        comment("Take one sample: deviations from the operating point, NaN where one is missing. A window that is not"),
-        comment("complete has no verdict: its values are NaN. Returns the number, from 1, of the test that stands out"),
-        comment("above its threshold, or 0. An alarm of a test means, while all bounds hold:"),
-        *(comment(f"{number}: {quoted(name)}") for number, name in enumerate(told, 1)),
-        *(comment(f"u[{k}]: {quoted(name)}") for k, name in enumerate(observer.input_names)),
-        *(comment(f"y[{k}]: {quoted(name)}") for k, name in enumerate(observer.output_names)),
-        f"{signature};",
-        "",
-        "#endif",
-    ]
-    copied = "for (i = 0; i < NU; i++) {\n        newest[i] = u[i];\n    }" if nu else ""
-    body = filled_template("window_test.c", prefix, {"SIGNATURE": signature, "COPY_INPUTS": copied})
-    source = [
-        comment(f"sha256 of the gain set: {found.digest}"),
-        *([comment(quoted(found.mark))] if found.mark else []),
-        f'#include "{included(header)}"',
-        "",
-        "#include <math.h>",
-        "",
-        "enum { " + ", ".join(f"{name} = {size}" for name, size in sizes.items()) + " };",
-        "",
-        comment("by test: weights of inputs and outputs, the newest sample first"),
-        *(line for name, table in tables.items() for line in table_lines(name, table)),
-    ]
-    return "\n".join([*source, "", body]), "\n".join(declared) + "\n"
-
-
-def _weights(found: Realisation, count: int, length: int) -> FloatArray:
-    """Return a row for each test: its weights of inputs and outputs at each sample of the window, newest first."""
-    observer = found.observer
-    newest, older = np.hstack([observer.Du, observer.Dy]), np.hstack([observer.Bu, observer.By])
-    each = [np.vstack([newest[[k]], older[k * (length - 1) : (k + 1) * (length - 1)]]) for k in range(count)]
-    return np.array([weights.ravel() for weights in each])
-
+from obsynth.observers.sensor_timing import require_plain
+from obsynth.results.design import ObserverDesign, require_verified
+from obsynth.results.gain_set_writing import gain_set_digest
+from obsynth.verification.over_tolerances.adaptive_bound import AdaptiveBound
 
 EXPORT_SUFFIXES = (".mat", ".npz", ".c", ".fmu")
 
 #: What an existing file has to be for another export to take its place.
 _C_FILE = FileKind("C code that obsynth has exported", rb"sha256 of the gain set")
+
 EXPORTED = {
     ".mat": FileKind("an observer that obsynth has exported", rb"\AMATLAB 5.0 MAT-file(?s:.*)sha256"),
     ".npz": FileKind("an observer that obsynth has exported", rb"\APK(?s:.*)sha256\.npy"),

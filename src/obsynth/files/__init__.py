@@ -1,1 +1,6 @@
-"""Files: how they are read, and the one writer of everything that obsynth writes."""
+"""Reading and writing files: whole or not at all, protected inputs, digests, tables.
+
+What the bytes mean stands in the room that knows: `specs`, `results`, `monitoring.logs`, `export`.
+
+Main names: `read_document`, `write_atomically`, `output_file`, `protect`.
+"""

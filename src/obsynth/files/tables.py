@@ -11,6 +11,12 @@ from html import escape
 from importlib.resources import files
 from typing import Any, TextIO
 
+#: A text that begins so is taken for a formula by spreadsheets; the last four are the full-width forms.
+_FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")
+
+#: Marks a cell as text in spreadsheets.
+_MARK = "'"
+
 
 def standing_page(title: str, body: Iterable[str], *, generator: str = "obsynth") -> str:
     """Return a page that stands alone, in the style of the reports; title and lines of the body are HTML."""
@@ -32,12 +38,6 @@ def standing_page(title: str, body: Iterable[str], *, generator: str = "obsynth"
         "</html>",
     ]
     return "\n".join(parts) + "\n"
-
-
-#: A text that begins so is taken for a formula by spreadsheets; the last four are the full-width forms.
-_FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")
-#: Marks a cell as text in spreadsheets.
-_MARK = "'"
 
 
 def table_writer(stream: TextIO, header: Iterable[str]) -> Callable[[Iterable[Sequence[Any]]], None]:

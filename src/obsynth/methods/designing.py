@@ -11,14 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition
-from obsynth.analysis.transformations.linear_plants import (
-    MANY_VARIABLES,
-    StateRecovery,
-    Transformation,
-    eliminate_algebraic_states,
-    plant_and_recovery,
-)
+from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.methods.method import Method, Synthesis, silent
 from obsynth.methods.refusals import require_above_rounding, with_advice
@@ -27,13 +20,21 @@ from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import arguments_checked, field_types
 from obsynth.numerics.libraries import failed_computations, failure_of, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.plants.constants import UNCERTAIN_MATRICES
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.design import Certificate, ObserverDesign, VerificationReport, source_of
+from obsynth.plants.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
+from obsynth.plants.transformations.recovery import StateRecovery, Transformation, plant_and_recovery
+from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
+from obsynth.results.design import Certificate, ObserverDesign
+from obsynth.results.plant_source import source_of
+from obsynth.results.verification_report import VerificationReport, failed_rows
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.claims import before_the_mean
 from obsynth.verification.plant import condition_rows
 from obsynth.verification.stored_numbers import StoredErrors
+
+#: Two plants are one where the entries of each matrix agree to this share of its largest: rounding of an elimination in
+#: units of its own, or of a sampling that is done again.
+SAME_PLANT = 1e-9
 
 
 @arguments_checked
@@ -306,11 +307,6 @@ def verified(
     return draft.replace(report=report, notes=(*draft.notes, *notes))
 
 
-def failed_rows(report: VerificationReport) -> str:
-    """Return the rows that fail as a text."""
-    return "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
-
-
 @arguments_checked
 def design_from_gains(
     plant: Plant | Transformation, method: str, *, name: str = "design from gains", **gains: Any
@@ -375,11 +371,6 @@ def design_from_gains(
         raise SpecError(message, path="gains") from None
     draft = draft_of(own, method, known.from_gains(own, **gains), name=name, recovery=recovery)
     return draft.replace(report=verify(draft))
-
-
-#: Two plants are one where the entries of each matrix agree to this share of its largest: rounding of an elimination in
-#: units of its own, or of a sampling that is done again.
-SAME_PLANT = 1e-9
 
 
 def _with_tolerances_of(given: Plant, shipped: Any) -> Any:

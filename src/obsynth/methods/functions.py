@@ -7,11 +7,11 @@ from dataclasses import fields
 from inspect import Parameter, Signature, getdoc
 from typing import Any, TypeVar
 
-from obsynth.analysis.transformations.linear_plants import Transformation
 from obsynth.errors import SpecError
 from obsynth.methods.designing import design
 from obsynth.methods.method import Method
 from obsynth.methods.registry import method_class
+from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.design import ObserverDesign
 
 Made = TypeVar("Made", bound=ObserverDesign)
@@ -57,9 +57,15 @@ def design_function(
 
 
 fault_estimation_filter = design_function(method_class("fault-estimation-filter"))
+
 pd_observer = design_function(method_class("pd-observer"))
+
 ui_pi_observer = design_function(method_class("ui-pi-observer"))
+
 functional_filter = design_function(method_class("functional-filter"))
+
 descriptor_kalman = design_function(method_class("descriptor-kalman"))
+
 adaptive_observer = design_function(method_class("adaptive-observer"))
+
 dae_adaptive_observer = design_function(method_class("dae-adaptive-observer"))

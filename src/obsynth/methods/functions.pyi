@@ -1,10 +1,10 @@
-# Written by tests/unit/test_method_types.py from the classes of the methods.
+# Written by tests/methods/test_method_types.py from the classes of the methods.
 from collections.abc import Callable
 from typing import Any, Literal, TypeVar
 
-from obsynth.analysis.transformations.linear_plants import Transformation
 from obsynth.methods.method import Method
 from obsynth.methods.registry import Plant
+from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.design import ObserverDesign
 
 Made = TypeVar("Made", bound=ObserverDesign)

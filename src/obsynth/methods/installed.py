@@ -12,6 +12,7 @@ from obsynth.errors import SpecError
 
 #: The group of entry points, and what it holds: ``id = "module:Class"``, a class derived from `Method`.
 GROUP = "obsynth.methods"
+
 #: Method id -> its class, ``module:name``; a method is its own folder and a line here.
 OWN = {
     "fault-estimation-filter": "obsynth.methods.fault_estimation_filter.method:FaultEstimationFilter",

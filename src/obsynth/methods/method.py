@@ -1,9 +1,4 @@
-"""Options by which a researcher changes the inequality of a method: constraints, objective, region, solver.
-
-The inequality itself, with these in it, is `obsynth.conditions`; methods ask for it by name.
-
-What a method is: one frozen class whose fields are its options; and what it hands to the pipeline.
-"""
+"""What a method is: one frozen class whose fields are its options; and what it hands to the pipeline."""
 
 from __future__ import annotations
 
@@ -11,96 +6,37 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition
-from obsynth.analysis.transformations.linear_plants import Transformation
+from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import FloatArray, WrittenAs, field_types, problem_with, shown
+from obsynth.numerics.arguments import field_types, problem_with
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.regions import LMIRegion
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
-from obsynth.plants.fault_models import FaultModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.faults import FaultModel
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.checks import Check
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 
 if TYPE_CHECKING:
-    from obsynth.observers.dae.observer import DAEObserver
-    from obsynth.observers.linear.observer import WindowObserver
+    from obsynth.observers.nonlinear.observer import DAEObserver
     from obsynth.observers.recursive.observer import RecursiveObserver
-
-
-#: A function of the variables by name that returns cvxpy constraints.
-OwnConstraints: TypeAlias = Annotated[Any, WrittenAs("function")]
-#: Where all eigenvalues must lie: an `LMIRegion`, or as a document writes it.
-OwnRegion: TypeAlias = Annotated[Any, WrittenAs("region")]
-#: Name of a solver, and its settings.
-SolverName: TypeAlias = Annotated[Any, WrittenAs("solver")]
-SolverOptions: TypeAlias = Annotated[Any, WrittenAs("solver options")]
-
-
-def own_terms(method: Any) -> tuple[str, ...]:
-    """Return the names of the options that put something of one's own into the inequality."""
-    found = []
-    for name in ("constraints", "objective", "region"):
-        value = getattr(method, name)
-        own = callable(value) if name != "region" else isinstance(value, (LMIRegion, list, tuple))
-        if own or (name == "objective" and isinstance(value, str) and value == "h2"):
-            found.append(name)
-    return tuple(found)
-
-
-def own_term_conflicts(method: Any, *, beside: tuple[str, ...], engines: tuple[str, ...] = ()) -> Iterator[str]:
-    """Yield what is wrong with these options; ``beside``: options that the plain inequality knows nothing of."""
-    if method.constraints is not None and not callable(method.constraints):
-        yield (
-            f"constraints is {shown(method.constraints)}: give a function of the variables that returns a list of "
-            "cvxpy constraints, such as lambda v: [v['P'] << 10 * numpy.eye(4)]."
-        )
-    if not isinstance(method.solver, str):
-        yield f"solver is {shown(method.solver)}: give the name of one of cvxpy.installed_solvers()."
-    if method.solver_options is not None and not (
-        isinstance(method.solver_options, Mapping) and all(isinstance(key, str) for key in method.solver_options)
-    ):
-        yield f"solver_options is {shown(method.solver_options)}: give the solver's settings by name."
-    terms = own_terms(method)
-    if not terms:
-        return
-    listed = " and ".join(terms)
-    if getattr(method, "engine", None) in engines:
-        yield (
-            f"engine {method.engine!r} solves no inequality that {listed} could be put into: leave engine out, or take "
-            "'lmi'."
-        )
-    clash = [name for name in beside if getattr(method, name) not in (None, False)]
-    if clash:
-        yield f"{listed} cannot be combined with {', '.join(clash)}: leave it out, or write it as a constraint."
-
-
-class ChosenSolver(str):
-    """The name of a solver that knows its settings."""
-
-    options: Mapping[str, Any]
-
-    def __new__(cls, name: str, options: Mapping[str, Any] | None = None) -> ChosenSolver:
-        """Return the name, with settings of the solver by name."""
-        made = super().__new__(cls, name)
-        made.options = dict(options or {})
-        return made
+    from obsynth.observers.window.observer import WindowObserver
 
 
 PlantKind: TypeAlias = Literal["time-invariant", "time-varying", "nonlinear"]
+
 #: What the choice by default (`auto`) takes a method for.
 Purpose: TypeAlias = Literal[
     "faults", "faults under the weakest conditions", "state despite unknown inputs", "state despite noise", "parameters"
 ]
 
-
-#: Where errors say that options are.
-OPTIONS_PATH = "method.options"
 #: Gains from fast errors of a measurement to a fault estimate above this are worth a note.
 WARN_AMPLIFICATION = 50.0
 

@@ -12,11 +12,11 @@ from fractions import Fraction
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition
-from obsynth.analysis.existence.named_pencils import EntryChange, Unclear, Witness
+from obsynth.analysis.existence.condition import Condition
+from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.method import Method
-from obsynth.numerics.arguments import ComplexArray, FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.spectra import pole_text
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -24,8 +24,22 @@ from obsynth.proofs.balls import UNIT_ROUNDOFF
 
 #: Plants with more states are not searched for pairs, and those with more still not at all.
 MOST_FOR_PAIRS, MOST_FOR_ONE = 16, 48
+
 #: Conditions on the kind of plant, whose messages say what to do: no sensor changes it.
 OF_THE_KIND = ("continuous time", "discrete time", "plant of this kind")
+
+
+#: Share of a unit fault that rounding of the outputs may be of its estimate.
+LARGEST_ROUNDED_SHARE = 0.1
+
+#: Share of a unit fault from which on rounding of the observer's own numbers is told.
+TOLD_ROUNDING = 1e-6
+
+#: Observers of more states are not examined: their certificates bound what rounding of their numbers does.
+MOST_OBSERVER_STATES = 150
+
+#: Points at which that is judged, in continuous time in units of the plant's own rate.
+ROUNDING_POINTS = (0.0, 1e-2, 1e-1, 1.0)
 
 
 def require_all_told(conditions: Iterable[Condition]) -> None:
@@ -51,7 +65,7 @@ def require_all_told(conditions: Iterable[Condition]) -> None:
 
 def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method) -> PreconditionError:
     """Return the refusal with what would help at its end; as it is where the existence conditions hold."""
-    from obsynth.analysis.diagnosis.fault_columns import least_additions, listed_sets, state_sensors
+    from obsynth.analysis.diagnosis.explanations import least_additions, listed_sets, state_sensors
 
     def holds(plant: DescriptorSystem) -> bool:
         # What would help is told to be tried, not proved: the tried plant is decided exactly then.
@@ -102,16 +116,6 @@ def _nothing(plant: DescriptorSystem) -> str:
     if plant.nx > MOST_FOR_ONE:
         return f"With {plant.nx} states, ask obsynth.sensor_sets which sensors would help."
     return "Neither one more measured state nor one unknown input or fault less would help."
-
-
-#: Share of a unit fault that rounding of the outputs may be of its estimate.
-LARGEST_ROUNDED_SHARE = 0.1
-#: Share of a unit fault from which on rounding of the observer's own numbers is told.
-TOLD_ROUNDING = 1e-6
-#: Observers of more states are not examined: their certificates bound what rounding of their numbers does.
-MOST_OBSERVER_STATES = 150
-#: Points at which that is judged, in continuous time in units of the plant's own rate.
-ROUNDING_POINTS = (0.0, 1e-2, 1e-1, 1.0)
 
 
 def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> tuple[str, ...]:

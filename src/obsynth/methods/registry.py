@@ -6,14 +6,27 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any, TypeAlias
 
-from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import SpecError, a_kind
 from obsynth.methods.installed import OWN, REGISTRY, not_loadable
 from obsynth.methods.method import Method, PlantKind
 from obsynth.plants.dae import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
+
+#: What a spec and `obsynth.design` call the choice between all methods that exist.
+AUTO = "auto"
+
+Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
+
+_PLANT_KINDS: Mapping[PlantKind, tuple[type, str]] = {
+    "time-invariant": (DescriptorSystem, "a linear plant with constant matrices"),
+    "time-varying": (TimeVaryingDescriptorSystem, "a linear plant whose matrices change with k"),
+    "nonlinear": (DAEModel, "a nonlinear DAEModel"),
+}
+
 
 __all__ = [
     "AUTO",
@@ -24,15 +37,6 @@ __all__ = [
     "method_class",
     "methods_for",
 ]
-
-#: What a spec and `obsynth.design` call the choice between all methods that exist.
-AUTO = "auto"
-Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
-_PLANT_KINDS: Mapping[PlantKind, tuple[type, str]] = {
-    "time-invariant": (DescriptorSystem, "a linear plant with constant matrices"),
-    "time-varying": (TimeVaryingDescriptorSystem, "a linear plant whose matrices change with k"),
-    "nonlinear": (DAEModel, "a nonlinear DAEModel"),
-}
 
 
 def method_class(method: str) -> type[Method]:

@@ -1,63 +1,21 @@
-"""What states of its plant a linear observer follows, of any method that has an error model.
-
-Verification: every claim recomputed from the plant and the shipped realisation, without synthesis or solvers.
-"""
+"""Verification: every claim recomputed from the plant and the shipped realisation, without synthesis or solvers."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from obsynth.analysis.transformations.uncertain_plant import AffinePlant
-from obsynth.errors import PreconditionError, SpecError
-from obsynth.methods.registry import REGISTRY, error_model, method_class
-from obsynth.numerics.arguments import FloatArray, arguments_checked, is_whole, shown
+from obsynth.errors import SpecError
+from obsynth.methods.registry import REGISTRY, method_class
+from obsynth.numerics.arguments import arguments_checked, is_whole, shown
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.results.design import ObserverDesign, VerificationReport
+from obsynth.results.design import ObserverDesign
+from obsynth.results.verification_report import VerificationReport
 from obsynth.verification.claims import before_the_mean, closed_claims, mean_noise_rows
-from obsynth.verification.error_structure import Tracking
-from obsynth.verification.error_system import IDENTITY_SHARE, error_model_row
-from obsynth.verification.plant import derivation_rows, stored_twice_rows, tolerance_rows
+from obsynth.verification.error_system import error_model_row
+from obsynth.verification.over_tolerances.rows import tolerance_rows
+from obsynth.verification.plant import derivation_rows, stored_twice_rows
 from obsynth.verification.stored_numbers import stored_number_rows
-
-
-def tracking_of(design: ObserverDesign, affine: AffinePlant) -> Tracking:
-    """Return T and T0 of a linear design; `PreconditionError` where it estimates no full state, or they do not hold."""
-    plant, observer = design.linear
-    if any(observer.state_delays):
-        raise PreconditionError(
-            "The state estimate has a delay: it does not determine the effect of a tolerance, or of a start "
-            "(initial_set), on newer states, so that no bound exists. Use a design whose estimate has no delay "
-            "(detectability indexes of 1), or state neither.",
-            condition="full state estimate",
-        )
-    if observer.state_names != plant.state_names:
-        raise PreconditionError(
-            "The design does not estimate the full state, which a bound over tolerances, or from a start "
-            "(initial_set), needs: take a fault-estimation-filter or a ui-pi-observer, or state neither.",
-            condition="full state estimate",
-        )
-    model = error_model(design)
-    t0 = _algebraic_rows(observer, plant.E, model.own, affine) if model.T0 is None else model.T0[:, : plant.nx]
-    return Tracking(model.own, t0)
-
-
-def _algebraic_rows(observer: LinearObserver, e: FloatArray, t: FloatArray, affine: AffinePlant) -> FloatArray:
-    """Return T0: zero, unless the outputs use algebraic rows of the plant."""
-    plant = affine.plant
-    rows = len(observer.Cz)
-    target = np.zeros((rows, plant.nx))
-    target[observer.state_rows] = np.eye(plant.nx)
-    missed = target - observer.Cz @ t @ e - observer.Dy @ plant.C
-    size = np.abs(target) + np.abs(observer.Cz) @ np.abs(t @ e) + np.abs(observer.Dy) @ np.abs(plant.C)
-    algebraic = ~e.any(axis=1)
-    if not algebraic.any() or not np.any(np.abs(missed) > IDENTITY_SHARE * size.max(axis=1, keepdims=True)):
-        return np.zeros((rows, plant.nx))
-    found = np.zeros((rows, plant.nx))
-    both = np.hstack([plant.A, plant.B])[algebraic]
-    wanted = np.hstack([missed, -(observer.Du + observer.Dy @ plant.D)])
-    found[:, algebraic] = np.linalg.lstsq(both.T, wanted.T, rcond=None)[0].T
-    return found
 
 
 @arguments_checked

@@ -1,4 +1,4 @@
-"""What a caller gives, checked: never a raw TypeError, always the name of the argument; arrays are made read-only.
+"""What a caller gives, checked: never a raw TypeError, always the name of the argument.
 
 Types of option values with their ranges: stated once, read by constructors, by options and by the spec's schema.
 """
@@ -11,170 +11,95 @@ import types
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from functools import cache, wraps
-from inspect import Parameter, signature, unwrap
+from inspect import signature, unwrap
 from pathlib import Path
-from types import MappingProxyType
-from typing import (
-    Annotated,
-    Any,
-    Concatenate,
-    Literal,
-    ParamSpec,
-    TextIO,
-    TypeAlias,
-    TypeVar,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
-from weakref import WeakKeyDictionary
+from typing import Annotated, Any, Literal, TextIO, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
-from numpy.typing import NDArray
 
 from obsynth.errors import SpecError, a_kind
+from obsynth.numerics.arrays import FloatArray, Given, as_given, holds_truth
 
-FloatArray: TypeAlias = NDArray[np.float64]
-ComplexArray: TypeAlias = NDArray[np.complex128]
-
-#: Stands for a size that may be zero, where something is divided by it.
-SMALLEST = 1e-300
-#: Numbers of plants and scenarios are at most this: products of three of them, as in gains, norms and covariances of
-#: what was scaled, stay within double precision.
-LARGEST = 1e100
-KEYWORD = Parameter.KEYWORD_ONLY
-Given = ParamSpec("Given")
-Made = TypeVar("Made")
+#: Whole numbers beyond this are told by their length.
+LONGEST_SHOWN = 10**30
 
 
-def remembered(make: Callable[Concatenate[Any, Given], Made]) -> Callable[Concatenate[Any, Given], Made]:
-    """Make something of an object that never changes once, for as long as it lives; it must not hold the object.
-    What else is given says what is made, and can be hashed."""
-    known: WeakKeyDictionary[Any, dict[object, Made]] = WeakKeyDictionary()
-    usual = {name: option.default for name, option in signature(make).parameters.items() if option.kind == KEYWORD}
+Positive = Annotated[float, Gt(0.0)]
 
-    @wraps(make)
-    def once(item: Any, /, *given: Given.args, **named: Given.kwargs) -> Made:
-        kept, key = known.setdefault(item, {}), (given, frozenset((usual | named).items()))
-        if key not in kept:
-            kept[key] = make(item, *given, **named)
-        return kept[key]
+NonNegative = Annotated[float, Ge(0.0)]
 
-    return once
+#: lambda: 1 weighs all samples alike.
+ForgettingFactor = Annotated[float, Gt(0.0), Le(1.0)]
 
+#: Per sample; 0 never.
+Probability = Annotated[float, Ge(0.0), Lt(1.0)]
 
-def read_only(array: NDArray[Any], dtype: Any = np.float64) -> NDArray[Any]:
-    """Return a private copy of ``array`` that nobody can write to."""
-    copy = np.array(array, dtype=dtype, order="C", copy=True)
-    copy.setflags(write=False)
-    return copy
+#: Of random numbers.
+Seed = Annotated[int, Ge(0)]
 
+OpenUnitInterval = Annotated[float, Gt(0.0), Lt(1.0)]
 
-def freeze(record: Any, *names: str, **values: Any) -> None:
-    """Make arrays and mappings of a frozen record private and read-only: its own ones by name, or others given."""
-    for name, value in ({name: getattr(record, name) for name in names} | values).items():
-        kept = MappingProxyType(dict(value)) if isinstance(value, Mapping) else read_only(value)
-        object.__setattr__(record, name, kept)
+#: More than the upper ends is a mistake that would fill the memory.
+Count = Annotated[int, Ge(1), Le(1_000_000)]
 
+#: Samples that are kept as states.
+FewSamples = Annotated[int, Ge(0), Le(1000)]
 
-def largest_singular_value(matrix: NDArray[Any]) -> float:
-    """Return the spectral norm; zero of an empty matrix."""
-    # `numpy.linalg.norm` takes the same decomposition and half of its time again.
-    return float(np.linalg.svd(matrix, compute_uv=False)[0]) if matrix.size else 0.0
+#: Mark -> its attribute, the comparison it stands for, and how a message says it.
+_BOUNDS: Mapping[type, tuple[str, Callable[[Any, Any], bool], str]] = {
+    Gt: ("gt", operator.gt, "above"),
+    Ge: ("ge", operator.ge, "at least"),
+    Lt: ("lt", operator.lt, "below"),
+    Le: ("le", operator.le, "at most"),
+}
 
 
-def all_finite(vector: FloatArray) -> bool:
-    """Whether every entry of a short vector ``(n,)`` is finite; what is not is left in a sum of them."""
-    return math.isfinite(sum(vector.tolist())) or bool(np.isfinite(vector).all())
+#: How a message asks for what an annotation says, by name; what is not here is called by its own name.
+_WORDS: Mapping[str, str] = {
+    "bool": "True or False",
+    "int": "a whole number",
+    "float": "a number",
+    "str": "a text",
+    "Path": "the name of a file",
+    "TextIO": "a text stream",
+    "Mapping": "a mapping from names, such as {'speed': 1.0}",
+    "Sequence": "a list",
+    "Iterable": "a list",
+    "Callable": "a function",
+    "_Numbers": "real numbers",
+    "ObserverDesign": "an ObserverDesign, such as obsynth.load(path)",
+    "Scenario": "an obsynth.Scenario",
+    "DescriptorSystem": "an obsynth.DescriptorSystem",
+    "Monitor": "what obsynth.online_monitor returns",
+    "DataRun": "what obsynth.run_on_data returns",
+    "Simulation": "what obsynth.simulate returns for a design",
+    "Estimates": "the Estimates of a whole run, such as observer.run(y, u)",
+    "Detection": "what a monitor's watch returns",
+    "Decision": "what obsynth.decide returns",
+    "ToleranceStudy": "what obsynth.tolerance_study returns",
+    "LinearObserver": "design.observer of a linear design",
+    "RecursiveObserver": "design.observer of a recursive design",
+    "DAEObserver": "design.observer of a nonlinear design",
+    "VerificationReport": "what obsynth.verify returns",
+    "LMIRegion": "a region, such as obsynth.conditions.disk(0.0, 0.9)",
+    "Executor": "an executor of concurrent.futures",
+    "Axes": "axes of matplotlib",
+}
 
 
-def unmasked(value: Any) -> Any:
-    """Return masked numbers with NaN for what lies under the mask, and anything else as it is."""
-    # Asked first, since numpy loads its masked arrays when they are named.
-    if not hasattr(value, "mask") or not np.ma.isMaskedArray(value) or value.dtype.kind not in "fiu":
-        return value
-    return np.where(np.ma.getmaskarray(value), np.nan, np.ma.getdata(value))
+#: What an option is that is written as some kind, and the Python types of it.
+_LISTS: Mapping[str, tuple[str, tuple[type, ...]]] = {
+    "poles": ("a list of poles", (list, tuple, np.ndarray)),
+    "texts": ("a list of names", (str, list, tuple)),
+    "fault sets": ("'detect', 'isolate' or lists of names", (str, list, tuple)),
+    "named bounds": ("a number, 0 or more, or one for each name", (int, float, np.integer, np.floating, Mapping)),
+    "free faults": ("'others', 'none' or a list of names", (str, list, tuple)),
+    "text": ("a text", (str,)),
+}
 
 
-def holds_truth(value: Any) -> bool:
-    """Whether a list has True or False among its entries, which numpy would take for 1 and 0 beside numbers."""
-    return isinstance(value, (bool, np.bool_)) or (isinstance(value, (list, tuple)) and any(map(holds_truth, value)))
-
-
-def kind_of_entries(dtype: np.dtype[Any]) -> str:
-    """Return what an array holds that does not hold real numbers, for a message."""
-    return {"b": "booleans", "c": "complex numbers", "U": "text"}.get(dtype.kind, "entries that are no numbers")
-
-
-def require_no_overflow(numbers: Any, what: str, path: str) -> None:
-    """Raise `SpecError` where one of some finite numbers is beyond `LARGEST`; ``what`` has it, as a message says."""
-    given = np.ravel(np.asarray(numbers, dtype=np.float64))
-    if given.size and np.abs(given).max() > LARGEST:
-        raise SpecError(
-            f"{what} {'has' if np.ndim(numbers) else 'is'} {given[int(np.argmax(np.abs(given)))]:.3g}, but numbers "
-            f"beyond {LARGEST:g} overflow where they are multiplied: give it in other units.",
-            path=path,
-        )
-
-
-def as_given(value: Any, name: str, ragged: str) -> NDArray[Any]:
-    """Return what a caller gives as an array of any kind; raise `SpecError` where it is none, ``ragged`` where its rows
-    have different lengths."""
-    try:
-        return np.asarray(unmasked(value))
-    except ValueError:
-        raise SpecError(ragged, path=name) from None
-    except (TypeError, RuntimeError) as error:
-        # Arrays of other libraries may refuse, with a reason of their own.
-        raise SpecError(f"{name} is a {type(value).__name__} that is no array: {error}.", path=name) from error
-
-
-#: More entries of matrices are not taken: of one in a file (of a sparse one, those that are stored), and along a
-#: horizon of all that change.
-MAXIMUM_ENTRIES = 50_000_000
-
-
-def require_readable(entries: float) -> None:
-    """Raise `ValueError` for more entries of a file than are read."""
-    if entries > MAXIMUM_ENTRIES:
-        raise ValueError(f"it is too large ({entries:.1e} entries)")
-
-
-def as_matrix(value: Any, name: str) -> FloatArray:
-    """Convert nested lists, an array or a scalar to a finite, read-only real matrix; raise `SpecError` naming it."""
-    raw = as_given(value, name, f"{name} has rows of different lengths: give a full matrix.")
-    truths = holds_truth(value)
-    if raw.dtype.kind not in "fiu" or truths:
-        if raw.size == 0:
-            raw = raw.astype(np.float64)
-        else:
-            kind = "booleans" if truths else kind_of_entries(raw.dtype)
-            raise SpecError(f"{name} holds {kind}: every entry must be a real number.", path=name)
-    if raw.ndim == 0:
-        raw = raw.reshape(1, 1)
-    if raw.ndim != 2:
-        raise SpecError(f"{name} has {raw.ndim} dimension(s): give a matrix (a list of rows).", path=name)
-    matrix = raw.astype(np.float64)
-    finite = np.isfinite(matrix)
-    if not finite.all():
-        row, column = (int(i) + 1 for i in np.argwhere(~finite)[0])
-        entry = matrix[row - 1, column - 1]
-        raise SpecError(f"{name} has {entry} in row {row}, column {column}: every entry must be finite.", path=name)
-    return read_only(matrix)
-
-
-def reachable(matrix: FloatArray) -> NDArray[np.bool_]:
-    """Return which entries some power of a matrix ``(n, n)`` may have, by its pattern alone; the power zero counts."""
-    found: NDArray[np.bool_] = np.eye(len(matrix), dtype=bool) | (matrix != 0.0)
-    while not found.all():
-        # Paths of twice the length.
-        further = found.astype(np.float64) @ found > 0.0
-        if np.array_equal(further, found):
-            break
-        found = further
-    return found
+Returned = TypeVar("Returned")
 
 
 def real_number(
@@ -295,10 +220,6 @@ def _as_float(value: Any) -> float:
         return math.inf
 
 
-#: Whole numbers beyond this are told by their length.
-LONGEST_SHOWN = 10**30
-
-
 def shown(value: Any) -> str:
     """Return a value as it may stand in a message: short, and on one line."""
     if value is None:
@@ -308,28 +229,6 @@ def shown(value: Any) -> str:
         return f"a whole number of about {int(int(value).bit_length() * math.log10(2.0)) + 1} digits"
     text = repr(value.item() if isinstance(value, np.generic) else value)
     return text if len(text) <= 60 and "\n" not in text else a_kind(value)
-
-
-Positive = Annotated[float, Gt(0.0)]
-NonNegative = Annotated[float, Ge(0.0)]
-#: lambda: 1 weighs all samples alike.
-ForgettingFactor = Annotated[float, Gt(0.0), Le(1.0)]
-#: Per sample; 0 never.
-Probability = Annotated[float, Ge(0.0), Lt(1.0)]
-#: Of random numbers.
-Seed = Annotated[int, Ge(0)]
-OpenUnitInterval = Annotated[float, Gt(0.0), Lt(1.0)]
-#: More than the upper ends is a mistake that would fill the memory.
-Count = Annotated[int, Ge(1), Le(1_000_000)]
-#: Samples that are kept as states.
-FewSamples = Annotated[int, Ge(0), Le(1000)]
-#: Mark -> its attribute, the comparison it stands for, and how a message says it.
-_BOUNDS: Mapping[type, tuple[str, Callable[[Any, Any], bool], str]] = {
-    Gt: ("gt", operator.gt, "above"),
-    Ge: ("ge", operator.ge, "at least"),
-    Lt: ("lt", operator.lt, "below"),
-    Le: ("le", operator.le, "at most"),
-}
 
 
 class WrittenAs:
@@ -345,39 +244,6 @@ class _Numbers:
 
 class _ByName:
     """Base class of what stands for a class that the module of an annotation imports for types only."""
-
-
-#: How a message asks for what an annotation says, by name; what is not here is called by its own name.
-_WORDS: Mapping[str, str] = {
-    "bool": "True or False",
-    "int": "a whole number",
-    "float": "a number",
-    "str": "a text",
-    "Path": "the name of a file",
-    "TextIO": "a text stream",
-    "Mapping": "a mapping from names, such as {'speed': 1.0}",
-    "Sequence": "a list",
-    "Iterable": "a list",
-    "Callable": "a function",
-    "_Numbers": "real numbers",
-    "ObserverDesign": "an ObserverDesign, such as obsynth.load(path)",
-    "Scenario": "an obsynth.Scenario",
-    "DescriptorSystem": "an obsynth.DescriptorSystem",
-    "Monitor": "what obsynth.online_monitor returns",
-    "DataRun": "what obsynth.run_on_data returns",
-    "Simulation": "what obsynth.simulate returns for a design",
-    "Estimates": "the Estimates of a whole run, such as observer.run(y, u)",
-    "Detection": "what a monitor's watch returns",
-    "Decision": "what obsynth.decide returns",
-    "ToleranceStudy": "what obsynth.tolerance_study returns",
-    "LinearObserver": "design.observer of a linear design",
-    "RecursiveObserver": "design.observer of a recursive design",
-    "DAEObserver": "design.observer of a nonlinear design",
-    "VerificationReport": "what obsynth.verify returns",
-    "LMIRegion": "a region, such as obsynth.conditions.disk(0.0, 0.9)",
-    "Executor": "an executor of concurrent.futures",
-    "Axes": "axes of matplotlib",
-}
 
 
 def _is_one_of(value: Any, kind: Any) -> bool:
@@ -455,17 +321,6 @@ def problem_with(value: Any, name: str, kind: Any) -> str | None:
     return f"{name} is {shown(value)}: give a {'whole ' if whole else ''}number{f' {bounds}' if bounds else ''}."
 
 
-#: What an option is that is written as some kind, and the Python types of it.
-_LISTS: Mapping[str, tuple[str, tuple[type, ...]]] = {
-    "poles": ("a list of poles", (list, tuple, np.ndarray)),
-    "texts": ("a list of names", (str, list, tuple)),
-    "fault sets": ("'detect', 'isolate' or lists of names", (str, list, tuple)),
-    "named bounds": ("a number, 0 or more, or one for each name", (int, float, np.integer, np.floating, Mapping)),
-    "free faults": ("'others', 'none' or a list of names", (str, list, tuple)),
-    "text": ("a text", (str,)),
-}
-
-
 def _problem_with_written(value: Any, name: str, kind: str) -> str | None:
     wanted, kinds = _LISTS.get(kind, ("numbers", ()))
     if kind == "samples":
@@ -498,9 +353,6 @@ def check_fields(made: Any, kind: Any) -> None:
         parts = get_args(stated) if get_origin(stated) in (Union, types.UnionType) else (stated,)
         if any(get_origin(part) in (Annotated, Literal) for part in parts):
             object.__setattr__(made, name, checked_value(getattr(made, name), name, stated))
-
-
-Returned = TypeVar("Returned")
 
 
 @cache

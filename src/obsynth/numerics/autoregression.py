@@ -11,14 +11,17 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.numerics.arguments import FloatArray, largest_singular_value, read_only
+from obsynth.numerics.arrays import FloatArray, largest_singular_value, read_only
 
 #: Longest memory that is tried, and rows that each coefficient of an equation needs.
 MOST_ORDER, ROWS_PER_COEFFICIENT = 12, 20
+
 #: A fit decays at least so fast: one that does not is shrunk by steps of the second number.
 SLOWEST_FIT, SHRINKING = 0.999, 0.99
+
 #: Shares of the mean variance that are added so that nothing is singular: to regressors, and to what is left.
 REGRESSOR_SHARE, NOISE_SHARE = 1e-10, 1e-12
+
 #: Share of what is new of a signal that the others of the same row must leave: of less, the most is what no
 #: autoregression says (gains that change with inputs), and a single row of it is worth hundreds of deviations.
 LEAST_OWN = 0.01

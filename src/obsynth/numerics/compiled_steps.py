@@ -13,18 +13,20 @@ from typing import Any, TypeVar, cast
 import numba
 import numpy as np
 
-from obsynth.numerics.arguments import FloatArray
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.square_root_estimation import OUTGROWN
 
 #: A factorisation that changes by no more than this, relative to each column, and so many times in a row, has settled:
 #: what it would change from then on is what rounding does at every step.
 SETTLED_FACTOR = 4.0 * np.finfo(np.float64).eps
+
 SETTLED_STEPS = 3
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
 #: Types of `square_root_steps`, so that it is compiled once for all sizes.
 VECTOR, MATRIX_TYPE, STACK_TYPE = "float64[::1]", "float64[:, ::1]", "float64[:, :, ::1]"
+
 SIGNATURE = f"int64({', '.join([VECTOR, MATRIX_TYPE, *[STACK_TYPE] * 3, *[MATRIX_TYPE] * 4, STACK_TYPE, 'float64'])})"
 
 

@@ -15,12 +15,24 @@ import numpy as np
 import scipy
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import FloatArray, largest_singular_value, reachable
+from obsynth.numerics.arrays import FloatArray, largest_singular_value, reachable
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import HinfNorm, hinf_norm
 from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
 from obsynth.numerics.spectra import abscissa
+
+#: Intervals of each length; the length doubles after them, as fast modes have decayed by then.
+INTERVALS_PER_LENGTH = 64
+
+#: First length, in units of one over the norm of A.
+FIRST_LENGTH = 0.02
+
+#: The intervals end when no more than this share of the response can be left.
+RESPONSE_LEFT_SHARE = 1e-4
+
+#: Doublings of the length before the response is held to have ended.
+MOST_LENGTHS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,16 +85,6 @@ class ContinuousNorms:
         )
         frequency = np.inf if found.frequency >= np.pi else w * float(np.tan(0.5 * found.frequency))
         return HinfNorm(found.value, found.upper, float(frequency))
-
-
-#: Intervals of each length; the length doubles after them, as fast modes have decayed by then.
-INTERVALS_PER_LENGTH = 64
-#: First length, in units of one over the norm of A.
-FIRST_LENGTH = 0.02
-#: The intervals end when no more than this share of the response can be left.
-RESPONSE_LEFT_SHARE = 1e-4
-#: Doublings of the length before the response is held to have ended.
-MOST_LENGTHS = 60
 
 
 def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:

@@ -17,26 +17,68 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.numerics import lapack
-from obsynth.numerics.arguments import FloatArray, largest_singular_value
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.scaling import power_of_two_below
 
 #: Below so many states a whole step costs less than to look.
 FEWEST_STATES = 200
+
 #: The first power that is looked at.
 FIRST_POWER = 3
+
 #: Share of the directions that must be enough.
 SHARE = 0.5
+
 #: What they leave of a power, relative to it, that counts as rounding; its logarithm tells when to look
 #: again, since each squaring doubles it.
 POWER_ROUNDING = 4e-15
+
 #: Diagonal entries of a solution are taken to be at least this share of the largest when they set units.
 LEAST_SIZE = 1e-20
+
 #: Rows of a thin matrix, as a share of the states, up to which a step with them costs less than one with the matrix.
 THIN = 0.7
+
 #: Rows of blocks in which a symmetric product is formed: five eighths of the work of all.
 BLOCK_ROWS = 4
+
 #: Directions in which that is measured, beside those that make the basis.
 PROBES = 6
+
+
+#: Doubling stops when a step changes the solution by less than this, relative to it; each step squares the error.
+DOUBLING_TOLERANCE = 1e-14
+
+STAGNATION = 1e-9
+
+#: Below this change, that of the next step follows from the last two; and when it is far below rounding.
+SETTLED_CHANGE = 1e-8
+
+FAR_BELOW_ROUNDING = 1e-18
+
+#: Residual of a Riccati equation that counts as solved, relative to its terms.
+EQUATION_TOLERANCE = 1e-8
+
+MOST_DOUBLINGS = 60
+
+#: A change larger than the solution, after the first steps, is a jump through infinity: where a stabilising solution
+#: exists there was none (1,253 equations of random plants).
+FIRST_DOUBLINGS, LARGE_CHANGE, MOST_JUMPS = 8, 1.5, 1
+
+#: Eigenvalues that are smaller than the largest by more than this share do not set the rate of a Cayley transform.
+WIDEST_SPECTRUM = 1e-3
+
+#: Keeps that rate off an eigenvalue, which a single one would be.
+RATE_OFFSET = 1.3
+
+#: Share of the size of its terms by which a sign must be wrong.
+REFUTED = 1e-6
+
+#: Norm of the dynamics above which a level is not refuted by doubling.
+LARGEST_TRUSTED_NORM = 10.0
+
+#: Keeps a division by the size of a zero solution from failing.
+LEAST_POSITIVE = float(np.finfo(np.float64).tiny)
 
 
 class RankWatch:
@@ -166,30 +208,6 @@ class Lifts:
         for base, basis in reversed(self.steps):
             solution = base + basis.dot(solution).dot(basis.T)
         return solution if self.units is None else self.units[:, None] * solution * self.units
-
-
-#: Doubling stops when a step changes the solution by less than this, relative to it; each step squares the error.
-DOUBLING_TOLERANCE = 1e-14
-STAGNATION = 1e-9
-#: Below this change, that of the next step follows from the last two; and when it is far below rounding.
-SETTLED_CHANGE = 1e-8
-FAR_BELOW_ROUNDING = 1e-18
-#: Residual of a Riccati equation that counts as solved, relative to its terms.
-EQUATION_TOLERANCE = 1e-8
-MOST_DOUBLINGS = 60
-#: A change larger than the solution, after the first steps, is a jump through infinity: where a stabilising solution
-#: exists there was none (1,253 equations of random plants).
-FIRST_DOUBLINGS, LARGE_CHANGE, MOST_JUMPS = 8, 1.5, 1
-#: Eigenvalues that are smaller than the largest by more than this share do not set the rate of a Cayley transform.
-WIDEST_SPECTRUM = 1e-3
-#: Keeps that rate off an eigenvalue, which a single one would be.
-RATE_OFFSET = 1.3
-#: Share of the size of its terms by which a sign must be wrong.
-REFUTED = 1e-6
-#: Norm of the dynamics above which a level is not refuted by doubling.
-LARGEST_TRUSTED_NORM = 10.0
-#: Keeps a division by the size of a zero solution from failing.
-LEAST_POSITIVE = float(np.finfo(np.float64).tiny)
 
 
 def doubled_riccati_solution(

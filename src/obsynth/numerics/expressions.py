@@ -19,21 +19,53 @@ from obsynth.errors import SpecError
 
 #: Longer texts and deeper nestings are refused: nobody writes them by hand.
 MAXIMUM_LENGTH = 2000
+
 MAXIMUM_DEPTH = 50
 
 #: From an operation on numbers to the one that stands for it on other values, such as symbols.
 Translation: TypeAlias = Callable[[Callable[..., Any]], Callable[..., Any]]
+
 Evaluator: TypeAlias = Callable[[Mapping[str, Any], Translation], Any]
 
 #: How derivatives are often written.
 _DERIVATIVES = re.compile(r"\b(?:d|dt|ddt|dot|diff|deriv|derivative|Der|D)\(|'\s*(?:$|[-+*/=])")
+
 #: Names have a prefix where Python's grammar reads them, so that its own words may be names as well.
 _NAME_IN_TEXT = re.compile(r"(?<![\w.])[A-Za-z_]\w*", re.ASCII)
+
 _NUMBER_IN_TEXT = re.compile(r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+
 _NAME_PREFIX = "name_"
+
 _PREFIX_IN_TEXT = re.compile(rf"\b{_NAME_PREFIX}", re.ASCII)
+
 _LEADING_ZEROS = re.compile(r"(?<![\w.])0+(?=\d)", re.ASCII)
+
 _TOO_DEEP = f"it is nested more than {MAXIMUM_DEPTH} times"
+
+#: Functions of two arguments.
+FUNCTIONS_OF_TWO: Mapping[str, Callable[[Any, Any], Any]] = {"min": np.minimum, "max": np.maximum}
+
+NAMED_NUMBERS: Mapping[str, float] = {"pi": float(np.pi)}
+
+#: What may stand in the first place of ``where``.
+COMPARISONS: Mapping[type[ast.cmpop], Callable[[Any, Any], Any]] = {
+    ast.Lt: np.less,
+    ast.LtE: np.less_equal,
+    ast.Gt: np.greater,
+    ast.GtE: np.greater_equal,
+}
+
+ARITHMETIC: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = {
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: np.divide,
+    ast.Pow: np.power,
+}
+
+#: Words that other languages decide with; names of these would be read as mistakes.
+DECIDING_WORDS = frozenset({"if", "else", "and", "or", "not"})
 
 
 def step_function(value: Any) -> Any:
@@ -62,25 +94,6 @@ FUNCTIONS: Mapping[str, Callable[[Any], Any]] = {
     "ceil": np.ceil,
     "step": step_function,
 }
-#: Functions of two arguments.
-FUNCTIONS_OF_TWO: Mapping[str, Callable[[Any, Any], Any]] = {"min": np.minimum, "max": np.maximum}
-NAMED_NUMBERS: Mapping[str, float] = {"pi": float(np.pi)}
-#: What may stand in the first place of ``where``.
-COMPARISONS: Mapping[type[ast.cmpop], Callable[[Any, Any], Any]] = {
-    ast.Lt: np.less,
-    ast.LtE: np.less_equal,
-    ast.Gt: np.greater,
-    ast.GtE: np.greater_equal,
-}
-ARITHMETIC: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = {
-    ast.Add: np.add,
-    ast.Sub: np.subtract,
-    ast.Mult: np.multiply,
-    ast.Div: np.divide,
-    ast.Pow: np.power,
-}
-#: Words that other languages decide with; names of these would be read as mistakes.
-DECIDING_WORDS = frozenset({"if", "else", "and", "or", "not"})
 
 
 @dataclass(frozen=True)

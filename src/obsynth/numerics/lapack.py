@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.numerics.arguments import ComplexArray, FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray
 
 #: Columns that LAPACK turns at once: its room is so many times the columns.
 LAPACK_BLOCK = 64
+
 #: Where SciPy keeps its LAPACK: the same object that ``scipy.linalg.lapack`` shows.
 _PACKAGE, _EXTENSION = "scipy.linalg", "scipy.linalg._flapack"
 

@@ -26,6 +26,16 @@ if TYPE_CHECKING:
 _NUMERICAL_VALUE_ERRORS = ("infs or NaNs", "too far from generalized Schur form")
 
 
+#: Problems with fewer states than this run on one BLAS thread: two took more time wherever they were measured, up to
+#: twelve times as much at 100 states (``benchmarks/README.md``).
+STATES_WORTH_THREADS = 1000
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+#: Held by the block that has set the number of threads.
+_SETTING = threading.Lock()
+
+
 def failure_of(error: Exception) -> SolverError | None:
     """Return what the error of a library says of the numbers; `None` if it says nothing of them."""
     if isinstance(error, MemoryError):
@@ -66,14 +76,6 @@ def imported(module: str, *, extra: str | None, what: str = "This") -> Any:
         raise SpecError(
             f"{what} needs {package}, which is not installed: pip install {wanted}", path=package
         ) from error
-
-
-#: Problems with fewer states than this run on one BLAS thread: two took more time wherever they were measured, up to
-#: twelve times as much at 100 states (``benchmarks/README.md``).
-STATES_WORTH_THREADS = 1000
-_Function = TypeVar("_Function", bound=Callable[..., Any])
-#: Held by the block that has set the number of threads.
-_SETTING = threading.Lock()
 
 
 @lru_cache(maxsize=1)

@@ -14,9 +14,21 @@ from typing import Any
 import numpy as np
 import scipy
 
-from obsynth.numerics.arguments import FloatArray, largest_singular_value
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.doubling import REFUTED, doubled_riccati_solution, is_clearly_negative, is_positive
 from obsynth.numerics.norms import spectral_radius
+
+#: Process noise is taken to be at least this much, relative to the squared norm of A or one.
+LEAST_PROCESS = 1e-8
+
+#: Relative sizes of the fictitious process and measurement noise, tried in turn, that make the equation regular.
+REGULARISATIONS = (1e-6, 1e-4, 1e-2, 1.0)
+
+#: A starting filter with this spectral radius is fast enough.
+FAST_ENOUGH = 0.999
+
+#: Eigenvalues of a normalising matrix are kept above this fraction of the largest.
+CONDITION_LIMIT = 1e-20
 
 
 def continuous_lyapunov(a: FloatArray, weight: FloatArray) -> FloatArray:
@@ -42,16 +54,6 @@ def discrete_riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: FloatArray,
 def _by_rows(solve: Callable[..., Any], *matrices: FloatArray, **others: FloatArray | None) -> FloatArray:
     given = {name: None if matrix is None else np.ascontiguousarray(matrix) for name, matrix in others.items()}
     return np.asarray(solve(*map(np.ascontiguousarray, matrices), **given))
-
-
-#: Process noise is taken to be at least this much, relative to the squared norm of A or one.
-LEAST_PROCESS = 1e-8
-#: Relative sizes of the fictitious process and measurement noise, tried in turn, that make the equation regular.
-REGULARISATIONS = (1e-6, 1e-4, 1e-2, 1.0)
-#: A starting filter with this spectral radius is fast enough.
-FAST_ENOUGH = 0.999
-#: Eigenvalues of a normalising matrix are kept above this fraction of the largest.
-CONDITION_LIMIT = 1e-20
 
 
 def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c: FloatArray) -> FloatArray | None:

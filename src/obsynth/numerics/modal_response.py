@@ -16,21 +16,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics import lapack
-from obsynth.numerics.arguments import SMALLEST, ComplexArray, FloatArray
+from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
 
 #: Poles of at least this modulus may make a peak of their own.
 NEAR = 0.5
+
 #: How many peaks are refined, by how many points on either side, and how often.
 MOST_PEAKS = 3
+
 POINTS_BESIDE = 4
+
 MODE_REFINEMENTS = 3
+
 #: Rows or columns up to which the largest singular value has a formula.
 TWO = 2
+
 #: From so many states on, steps of power iteration take the place of eigenvalues.
 STATES_FOR_POWER_ITERATION = 60
+
 POWER_STEPS, ROUGH_STEPS = 8, 4
+
 #: Entries of the matrices (complex, 16 bytes each) that responses are computed with at once.
 MOST_ENTRIES_AT_ONCE = 2_000_000
+
+
+#: Eigenvalues of the symplectic pencil this close to the unit circle are looked at as crossings: a false one costs
+#: one more look, a missed one would cost the bound.
+CIRCLE_TOLERANCE = 1e-3
+
+#: Reciprocal condition number down to which a matrix may be inverted on the way to those eigenvalues.
+SAFE_RECIPROCAL_CONDITION = 1e-7
+
+
+#: From so many states on a decomposition takes less time than a factorisation at each of some tens of points.
+STATES_FOR_MODES = 200
+
+#: Corrections, each of which takes as many digits as eigenvectors are good for.
+MOST_CORRECTIONS = 5
+
+#: Residual, relative to the norms of what it is the rest of, that is left by a factorisation as well, in roundings.
+ROUNDINGS_LEFT = 1.0
 
 
 def pencils_at(e: FloatArray | None, a: FloatArray, points: ComplexArray) -> ComplexArray:
@@ -197,13 +222,6 @@ def _top(angles: list[float], sizes: list[float], step: float) -> float:
     return angles[best] + (0.5 * (high - low) / bend * step if bend > 0.0 else 0.0)
 
 
-#: Eigenvalues of the symplectic pencil this close to the unit circle are looked at as crossings: a false one costs
-#: one more look, a missed one would cost the bound.
-CIRCLE_TOLERANCE = 1e-3
-#: Reciprocal condition number down to which a matrix may be inverted on the way to those eigenvalues.
-SAFE_RECIPROCAL_CONDITION = 1e-7
-
-
 def level_crossings(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float) -> FloatArray:
     """Return the angles in [0, pi] at which a singular value equals ``level``.
 
@@ -244,14 +262,6 @@ def _pencil_eigenvalues(right: FloatArray, left: FloatArray) -> tuple[ComplexArr
             return np.asarray(sign * (1.0 + s), dtype=np.complex128), np.asarray(1.0 - s, dtype=np.complex128)
     alpha, size = pencil_eigenvalues(right, left)
     return alpha, size.astype(np.complex128)
-
-
-#: From so many states on a decomposition takes less time than a factorisation at each of some tens of points.
-STATES_FOR_MODES = 200
-#: Corrections, each of which takes as many digits as eigenvectors are good for.
-MOST_CORRECTIONS = 5
-#: Residual, relative to the norms of what it is the rest of, that is left by a factorisation as well, in roundings.
-ROUNDINGS_LEFT = 1.0
 
 
 @dataclass(frozen=True, eq=False)

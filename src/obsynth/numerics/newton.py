@@ -14,16 +14,27 @@ from typing import Any
 import numpy as np
 
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arguments import FloatArray
+from obsynth.numerics.arrays import FloatArray
 
 #: Iterations before we give up: a damped iteration that needs more is not converging.
 MOST_ITERATIONS = 25
+
 #: Convergence is quadratic, so that a step below this size is the last one: the error after it is about its square.
 LAST_STEP = 1e-8
+
 #: After the last step the scaled residual must be below this: rounding, with room for ill-conditioned equations.
 LARGEST_RESIDUAL = 1e-9
+
 #: A step is halved at most so often; 2^-12 of a Newton step that does not help is no progress.
 MOST_HALVINGS = 12
+
+
+#: Unknowns up to which elimination is unrolled.  Above, the pivots make so many scalar operations that the sparse
+#: factorisation is faster, and C compilers take ten times as long.
+SMALL = 8
+
+#: A pivot below this ends the factorisation, and the function with it; the caller is told and has no result.
+SINGULAR = 1e-16
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,13 +135,6 @@ def _damped(
         if np.isfinite(value).all() and np.abs(rows * value).max() < before:
             return tried, value, jacobian
     return None
-
-
-#: Unknowns up to which elimination is unrolled.  Above, the pivots make so many scalar operations that the sparse
-#: factorisation is faster, and C compilers take ten times as long.
-SMALL = 8
-#: A pivot below this ends the factorisation, and the function with it; the caller is told and has no result.
-SINGULAR = 1e-16
 
 
 def equilibrated(matrix: Any, columns: FloatArray) -> tuple[Any, Any]:

@@ -6,26 +6,34 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.numerics.arguments import ComplexArray, FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.doubling import compared_gain
 from obsynth.numerics.modal_response import ModalResponse, Modes, level_crossings, resolved
 from obsynth.numerics.scaling import balancing_factors
 
 #: Relative gap between the attained value and the certified level of an H-infinity norm.
 NORM_TOLERANCE = 1e-9
+
 #: Points of the starting frequency grid.
 GRID_POINTS = 33
+
 #: Relative difference of modal and true response from which modal coordinates are not believed.
 MODAL_ERROR = 1e-3
+
 #: Above so many states a Riccati equation takes the pencil's place, which takes no longer up to there and is exact:
 #: relative gaps at which it is asked, in turn, and points of the grid.
 STATES_OF_PENCIL = 80
+
 WIDER_TOLERANCES = (1e-4, 1e-3)
+
 MANY_GRID_POINTS = 257
+
 #: Each round at least squares the relative error near the peak; more than this means trouble.
 MAXIMUM_ROUNDS = 40
+
 #: Variance of a state in the rest of an infinite sum, relative to what is summed, below which the sum is complete.
 SUM_TOLERANCE = 1e-17
+
 #: Each doubles the number of terms of that sum.
 MAXIMUM_DOUBLINGS = 64
 

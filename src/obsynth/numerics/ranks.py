@@ -12,71 +12,101 @@ from typing import Any, Literal
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray, read_only
 
 #: Singular values below this fraction of the largest count as zero (data are balanced first).
 RANK_TOLERANCE = 1e-10
+
 #: A gap between kept and dropped singular values smaller than this is reported as unclear.
 CLEAR_GAP = 1e3
+
 #: Distance from the stability boundary below which an eigenvalue or zero counts as lying on it.
 BOUNDARY_TOLERANCE = 1e-8
+
 #: Singular value of a pair's observability pencil, relative to the pair, below which a known zero is a hidden mode.
 HIDDEN_MODE_TOLERANCE = 1e-9
+
 #: Relative size below which a Markov parameter of a fault counts as zero.
 MARKOV_TOLERANCE = 1e-9
+
 #: A chain ``(TA)^k T f`` that shrank below this fraction of its a-priori bound has decayed.
 DEAD_CHAIN_TOLERANCE = 1e-13
+
 #: An eigenvalue this close to the stability boundary is tested for lying on it (a multiple one scatters far).
 BOUNDARY_NEIGHBOURHOOD = 1e-2
+
 #: Singular value of a pencil, relative to its largest, below which rounding alone may have moved a zero away.
 BOUNDARY_RANK_TOLERANCE = 1e-13
+
 #: Zeros closer than this, relative to their size, are taken for one multiple zero when directions are assigned.
 CLUSTER_TOLERANCE = 1e-6
+
 #: Share of the input in a zero direction below which the zero is an unobservable mode.
 NEGLIGIBLE_INPUT = 1e-6
+
 #: Signals whose share in a null vector is at least this fraction of the largest share are named.
 NAMED_SHARE = 1e-3
+
 #: Result of a sum or product, relative to the sizes of its terms, below which it is only rounding.
 CANCELLATION_TOLERANCE = 1e-14
+
 #: Largest eigenvalue, relative to the norm of the balanced matrix, below which all of them are rounding errors of zero.
 NEGLIGIBLE_MODE = 1e-6
+
 #: Entries (i, j) and (j, i) of a covariance may differ by this much, relative to the standard deviations.
 SYMMETRY_TOLERANCE = 1e-10
+
 #: An eigenvalue of a correlation matrix above minus this is a rounded zero.
 DEFINITENESS_TOLERANCE = 1e-12
+
 #: Share of a diffuse direction below which a state is held to be determined: rounding of an orthonormal basis.
 UNDETERMINED_SHARE = 1e-8
+
 #: Singular values of a scaled exact Jacobian below this share of the largest are zero.
 JACOBIAN_RANK_TOLERANCE = 1e-9
+
 #: Directions of a Riccati solution below this share are not told from zero.
 NEGLIGIBLE_SHARE = 1e-12
+
 #: Singular values of a set of directions below this share of the largest are no direction of their own.
 DIRECTION_SHARE = 1e-9
+
 #: A zero nearer than this to the point at which a constant fault stands is that point.
 REST_TOLERANCE = 1e-6
+
 #: Singular values of a constant's effect below this share count as zero; what is left out goes into the remainder.
 EFFECT_RANK_SHARE = 1e-12
+
 #: Singular values below this share of the largest are zero: the sensitivities carry rounding of 1e-16 times
 #: the condition of (7), which stays below 1e5 in models that can be used.
 IDENTIFIABLE_SHARE = 1e-10
+
 #: Directions of the state that no constant touches are found down to this share of the others.
 UNTOUCHED_SHARE = 1e-7
+
 #: Eigenvalues of the variances' information below this share of the largest are left out.
 LEAST_INFORMATION = 1e-10
+
 #: Deviations below this share of the terms they are computed from are zero: rounding is seven orders smaller, so that
 #: what is kept has seven digits.
 KNOWN_SHARE = 1e-9
+
 #: What is zero but for rounding beside other terms ends at the rounding of these: this share of them counts among its
 #: own terms, so that bounds of 1e-9 to 1e-7 of its terms are above some hundred roundings of the others.
 ROUNDED_BESIDE = 1e-4
+
 #: Size of a fault's column in a decoupled plant, relative to before the reduction, below which it left no trace.
 TRACE_TOLERANCE = 1e-9
+
 #: Parity directions whose noise is below this share of the terms it is made of are free of noise: a few roundings.
 PERFECT_PARITY = 1e-14
+
 #: A matrix of (7) whose condition is above this is singular: three digits are left of sixteen.
 SINGULAR_CONDITION = 1e13
+
 #: A value below this share of the largest of its range is zero but for rounding.
 ROUNDED_ZERO = 1e-12
+
 #: Bounds of states whose moves differ by less than this share are dependent.
 DEPENDENT_BOUND = 1e-13
 

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import FloatArray, arguments_checked, freeze, real_number, shown
+from obsynth.numerics.arguments import arguments_checked, real_number, shown
+from obsynth.numerics.arrays import FloatArray, freeze
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,12 +12,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics import lapack
-from obsynth.numerics.arguments import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray, read_only
 
 #: Sweeps of the balancing; each one must improve on the last, so few are ever used.
 MOST_SWEEPS = 10
+
 #: Makes the factors unique where one group of signals does not touch another; too small to move them.
 SMALL_RIDGE = 1e-9
+
+
+#: Makes the factors unique where nothing determines them; too small to move them elsewhere.
+RIDGE = 1e-11
+
+#: Rounding of the largest weight may be this share of the ridge: corrections of the solution then gain two digits each.
+ROUNDED_RIDGE = 1.0 / 64.0
+
+#: Weight of a wish in units of the ridge: it decides only what the entries leave open.
+WISH_WEIGHT = 1e3
+
+#: An entry this many bits below one has half a say: what is far below is coupling that hardly counts, or rounding.
+HALF_SAY = 10.0
+
+#: Corrections by exact residuals, each of which takes four or five digits of rounding away.
+RESIDUAL_CORRECTIONS = 3
+
+#: Whole exponents need no further correction once the last is below this share of the distance to where they change.
+SETTLED_SHARE = 1e-2
+
+#: Passes in which small entries lose their say.
+PASSES = 3
+
+#: Bits after the point of what parts of sums are split into: of a million parts below 2^10 the sum of the first has 46
+#: bits, and those of the others have 50.
+PART_BITS = (16, 46, 76)
+
+#: From so many on a positive definite matrix is factored as one, in a third of the time.
+MANY_UNKNOWNS = 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,27 +197,6 @@ def _imbalance(peaks: FloatArray) -> float:
 
 def _row_peaks(matrix: FloatArray) -> FloatArray:
     return np.asarray(np.max(matrix, axis=1, initial=0.0))
-
-
-#: Makes the factors unique where nothing determines them; too small to move them elsewhere.
-RIDGE = 1e-11
-#: Rounding of the largest weight may be this share of the ridge: corrections of the solution then gain two digits each.
-ROUNDED_RIDGE = 1.0 / 64.0
-#: Weight of a wish in units of the ridge: it decides only what the entries leave open.
-WISH_WEIGHT = 1e3
-#: An entry this many bits below one has half a say: what is far below is coupling that hardly counts, or rounding.
-HALF_SAY = 10.0
-#: Corrections by exact residuals, each of which takes four or five digits of rounding away.
-RESIDUAL_CORRECTIONS = 3
-#: Whole exponents need no further correction once the last is below this share of the distance to where they change.
-SETTLED_SHARE = 1e-2
-#: Passes in which small entries lose their say.
-PASSES = 3
-#: Bits after the point of what parts of sums are split into: of a million parts below 2^10 the sum of the first has 46
-#: bits, and those of the others have 50.
-PART_BITS = (16, 46, 76)
-#: From so many on a positive definite matrix is factored as one, in a third of the time.
-MANY_UNKNOWNS = 500
 
 
 @dataclass(eq=False)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.numerics.arguments import ComplexArray, FloatArray, largest_singular_value
+from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import balanced_realisation, output_covariance
 from obsynth.numerics.scaling import balanced_matrix
@@ -16,15 +16,24 @@ from obsynth.numerics.scaling import balanced_matrix
 #: Wanted poles closer than this, relative to their size, are compared as a group: rounding scatters a multiple
 #: eigenvalue by a root of the unit roundoff, but hardly moves the mean of the group.
 SAME_POLE = 1e-3
+
 #: Modulus below which a discrete eigenvalue counts as zero: its mode decays in a few samples, and has no useful rate.
 DEAD_BEAT = 1e-6
+
 #: Significant digits with which gains are commonly printed in full, and those with which a double is kept as it is.
 PRINTED_DIGITS, DOUBLE_DIGITS = 9, 17
+
 #: Powers of ten that are doubles, and whole numbers up to which every one is.
 EXACT_POWERS = np.array([float(10**power) for power in range(23)])
+
 LARGEST_WHOLE = 2**53
+
 #: Computed eigenvalues are those of a matrix that is another by this, times its order and the unit roundoff, at most.
 ROUNDING_OF_EIGENVALUES = 10.0
+
+
+#: Modes slower than this share of the fastest, or of a rate that the plant has anyway, are integrators and rounding.
+STANDING = 1e-6
 
 
 def pole_text(value: complex, digits: int = 4, *, pair: bool = False) -> str:
@@ -197,10 +206,6 @@ def speeds(values: ComplexArray | Sequence[complex], dt: float) -> FloatArray:
     found = np.full(given.shape, np.inf)
     found[alive] = np.abs(np.log(given[alive])) / dt
     return found
-
-
-#: Modes slower than this share of the fastest, or of a rate that the plant has anyway, are integrators and rounding.
-STANDING = 1e-6
 
 
 def moving_speeds(values: ComplexArray | Sequence[complex], dt: float, rate: float) -> FloatArray:

@@ -19,28 +19,39 @@ from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics import lapack
-from obsynth.numerics.arguments import FloatArray
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import PERFECT_PARITY, RANK_TOLERANCE
 from obsynth.numerics.scaling import power_of_two_below
 
 #: Standard deviations above this outgrow double precision soon: their squares overflow at 1e154.
 OUTGROWN = 1e100
+
 #: A column of H that keeps less than this of its length beside the others goes to the rank-revealing step: far below
 #: what a condition number of 1e12 does, far above rounding.
 DEPENDENT_COLUMN = 1e-14
+
 #: The same where samples are missing, so that a rank is likely to be lost: more than rounding leaves of a column.
 SUSPECT_COLUMN = RANK_TOLERANCE
+
 #: The same for a row of the parity covariance, relative to the whole noise: the rank-revealing step then decides. It
 #: must lie above `PERFECT_PARITY`, or rounding passes for noise.
 SUSPECT_PARITY = 1e-12
+
 #: Rows of H that differ by no more than this in size cost a factorisation no digits.
 FAR_ROWS = 256.0
+
 #: Columns that LAPACK's ``tpqrt`` treats at once.
 TPQRT_BLOCK = 32
+
 #: Room for each column that LAPACK's factorisations are given: more than any of their blocks takes.
 WORK = 64
+
 #: Noise-free parity directions must vanish to this share of their terms; rounding of data in double precision.
 CONSISTENCY = 1e-9
+
+
+#: A direction is discounted only where new data bring at least this share of what forgetting takes away.
+WORTH_FORGETTING = 0.1
 
 
 class LeastSquaresStep(NamedTuple):
@@ -411,10 +422,6 @@ def nothing_later(width: int, unknown: int, columns: int) -> Gaussian:
     factor, diffuse = np.zeros((width + unknown, width)), np.zeros((width + unknown, unknown))
     factor[:width], diffuse[width:] = np.eye(width), np.eye(unknown)
     return Gaussian(np.zeros((width + unknown, columns)), factor, diffuse)
-
-
-#: A direction is discounted only where new data bring at least this share of what forgetting takes away.
-WORTH_FORGETTING = 0.1
 
 
 class ParameterState(NamedTuple):

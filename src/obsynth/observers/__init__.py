@@ -1,6 +1,7 @@
-"""Observers that run: a realisation from measured signals to estimates."""
+"""Observers that run: a realisation from measured signals to estimates, sample by sample.
 
-from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.running import Estimates, RunningObserver
+An observer is ``init() -> state`` and ``step(state, y, u) -> (state, estimates)``: `linear`, `window`, `recursive` and
+`nonlinear`; beside them smoothing, missing and delayed samples, outliers. Thresholds stand in `monitoring`.
 
-__all__ = ["Estimates", "LinearObserver", "RunningObserver"]
+Main names: `LinearObserver`, `WindowObserver`, `RecursiveObserver`, `DAEObserver`, `Estimates`.
+"""

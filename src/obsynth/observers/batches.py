@@ -13,18 +13,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arguments import FloatArray, arguments_worded, read_only
-from obsynth.observers.dae.estimates import DAERow
-from obsynth.observers.dae.observer import BATCH_PARTS, DAEObserver, advanced, compiler
+from obsynth.numerics.arguments import arguments_worded
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.nonlinear.c_code import BATCH_PARTS, compiler
+from obsynth.observers.nonlinear.estimates import DAERow
+from obsynth.observers.nonlinear.observer import DAEObserver, advanced
 from obsynth.observers.progress import shown_progress
 from obsynth.observers.records import batch_record
 from obsynth.observers.recursive import gain_schedule
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.running import Estimates, named_estimates
+from obsynth.observers.running import named_estimates
 
 #: Samples in one call of the library: a second or less, so that progress shows and an interrupt takes effect.
 BATCH_SAMPLES_PER_CALL = 100_000
+
 #: Steps from which it pays to compile unasked: compiling takes about a second, and the rest thirty microseconds a step.
 WORTH_COMPILING = 50_000
 

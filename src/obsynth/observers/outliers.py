@@ -17,31 +17,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arguments import FloatArray, read_only, real_number
+from obsynth.numerics.arguments import real_number
+from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.records import named_bounds, named_vector
 
 BoolArray = NDArray[np.bool_]
+
 Outliers = Literal["none", "gate", "huber"]
+
 #: Standard deviations: of a gate, so that no sample of a true model is left out in a million; and of Huber's weight.
 LIMITS = {"gate": 6.0, "huber": 3.0}
+
 #: What is larger has no square: it is no measurement, whatever the model says.
 NO_SQUARE = 1e150
+
 #: Samples of one sensor in a row that are left out where their sides change, or where its outliers are known to be far
 #: off, so that two may come together; else the second on one side is believed. So are those that follow it there,
 #: unless they are wild.
 LONGEST_LEFT_OUT = 2
+
 #: Share of its limit that the least size of a sensor's outliers must be so that of two in a row both are left out:
 #: where what inputs may have been widens the limit beyond that, the second is believed.
 FAR_OUT = 0.5
+
 #: How many times further off than the one before it a sample may be that is believed for it: at the onset of a fault
 #: that grows with the square of time the second is 4 times further off, and noise moves both.
 COMPARABLE = 5.0
+
 #: How many times further off than the limit a sample must be that nothing contradicts but the equations of the model;
 #: and what rounding makes of a prediction without noise.
 BLIND, PREDICTION_ROUNDING = 10.0, 1e-6
+
 #: Samples whose squared innovations are summed up before a reset.
 RESET_WINDOW = 20
+
 State = TypeVar("State", bound=Any)
+
 Row = TypeVar("Row", bound=Any)
 
 

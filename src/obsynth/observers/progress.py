@@ -14,10 +14,14 @@ from obsynth.errors import SpecError
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
+
 _Item = TypeVar("_Item")
+
 _Outcome = TypeVar("_Outcome")
+
 #: Called with the number of runs done and their total.
 RunsProgress = Callable[[int, int], None]
+
 #: Seconds after which a bar appears.
 PATIENCE = 2.0
 

@@ -1,336 +1,39 @@
-"""What every observer is: a first state, and a step from a state and a sample to the next state and the estimates.
-
-What it says: estimates with their names and delays, and how far they may be off where it knows.
-
-Sensors that are sampled every so many rows, and whose values are delayed.
-
-A delayed value is put where it belongs: the observer keeps its states of the latest samples, and takes those samples
-again from the one that the value is about.  What it then knows is what it would know if everything had come in order.
-"""
+"""What every observer is: a first state, and a step from a state and a sample to the next state and the estimates."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
 from functools import cached_property, partial
-from typing import Any, Generic, NamedTuple, Self, TypeAlias, TypeVar
+from typing import Any, Generic, Self, TypeAlias, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from obsynth.errors import SpecError
-from obsynth.numerics.arguments import FloatArray, check_fields, is_whole, read_only, require_kind
+from obsynth.numerics.arguments import check_fields, require_kind
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.outliers import Outliers, checked_limit, checked_sizes, checked_state_bounds
-from obsynth.plants.descriptor import index_of
+from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
 
-#: Rows that may be waited for: a delay in another unit is larger.
-LONGEST_DELAY = 10_000
-Inner = Callable[[Any, FloatArray, FloatArray], tuple[Any, Any]]
-
-
-def checked_sensors(value: Any, names: Sequence[str]) -> dict[str, dict[str, int]] | None:
-    """Return ``{sensor: {every, delay}}`` of the sensors that are not sampled at each row at once, or ``None``."""
-    if value is None:
-        return None
-    if not isinstance(value, Mapping):
-        raise SpecError("sensors must be a mapping by name, such as {y1: {every: 5, delay: 2}}.", path="sensors")
-    found: dict[str, dict[str, int]] = {}
-    for name, entry in value.items():
-        index_of(name, names, what="sensors")
-        if not isinstance(entry, Mapping) or not set(entry) <= {"every", "delay"}:
-            raise SpecError(
-                f"sensors.{name} is {entry!r}: give every (rows) and delay (rows), or one of them.",
-                path=f"sensors.{name}",
-            )
-        timing = {"every": entry.get("every", 1), "delay": entry.get("delay", 0)}
-        for key, least in (("every", 1), ("delay", 0)):
-            count = timing[key]
-            if not is_whole(count) or not least <= count <= LONGEST_DELAY:
-                raise SpecError(
-                    f"sensors.{name}.{key} is {count!r}: give a whole number of rows from {least} to {LONGEST_DELAY}.",
-                    path=f"sensors.{name}.{key}",
-                )
-            timing[key] = int(count)
-        if timing != {"every": 1, "delay": 0}:
-            found[str(name)] = timing
-    return found or None
-
-
-class WaitingState(NamedTuple):
-    """The state of an observer with delayed sensors."""
-
-    before: tuple[Any, ...]  # its states before each of the latest samples
-    latest: Any  # after the last one
-    outputs: FloatArray  # outputs, inputs: of these samples, as far as they have arrived
-    inputs: FloatArray
-
-    @property
-    def k(self) -> int:
-        """The next sample."""
-        return int(self.latest.k)
-
-    @property
-    def refused(self) -> FloatArray:
-        """Outliers in a row, and at all, ``(2, ny)``."""
-        return np.asarray(self.latest.refused)
-
-    def from_data(self, data: Mapping[str, Any], restored: Callable[[Any, Any], Any]) -> WaitingState:
-        """Return the state that data describe, by what restores that of an observer without delayed sensors."""
-        return WaitingState(
-            tuple(restored(self.latest, part) for part in data["before"]),
-            restored(self.latest, data["latest"]),
-            np.array(data["outputs"]),
-            np.array(data["inputs"]),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class SensorTiming:
-    """When each sensor is sampled, and by how much its values are delayed."""
-
-    every: NDArray[np.int64]  # every, delays: ``(ny,)``, in rows
-    delays: NDArray[np.int64]
-    inputs: int  # how many there are. A sensor is sampled at k = 0, every, 2 every,
-
-    @classmethod
-    def of(cls, sensors: Mapping[str, Mapping[str, int]] | None, names: Sequence[str], inputs: int) -> SensorTiming:
-        """Return the timing of outputs by name."""
-        entries = [(sensors or {}).get(name, {}) for name in names]
-        return cls(
-            np.array([entry.get("every", 1) for entry in entries], dtype=np.int64),
-            np.array([entry.get("delay", 0) for entry in entries], dtype=np.int64),
-            inputs,
-        )
-
-    @cached_property
-    def is_plain(self) -> bool:
-        """Whether every sensor is sampled at each row, at once."""
-        return bool((self.every == 1).all()) and not self.longest
-
-    @property
-    def longest(self) -> int:
-        """The longest delay in rows."""
-        return int(self.delays.max(initial=0))
-
-    def expected(self, k: int) -> NDArray[np.bool_]:
-        """Return which outputs ``(ny,)`` have a value in row k."""
-        taken = k - self.delays
-        return np.asarray((taken >= 0) & (taken % self.every == 0))
-
-    def arriving(self, y: FloatArray) -> FloatArray:
-        """Return rows as they arrive from outputs ``(..., samples, ny)`` at their own times; NaN where nothing does."""
-        found = np.full_like(y, np.nan)
-        for i, (every, delay) in enumerate(zip(self.every, self.delays, strict=True)):
-            taken = y[..., : max(y.shape[-2] - delay, 0) : every, i]
-            found[..., delay::every, i] = taken
-        return found
-
-    def in_order(self, y: FloatArray) -> FloatArray:
-        """Return outputs ``(samples, ny)`` at their own times from rows as they arrive."""
-        found = np.full_like(y, np.nan)
-        for i, (every, delay) in enumerate(zip(self.every, self.delays, strict=True)):
-            taken = y[delay::every, i]
-            found[: len(taken) * every : every, i] = taken
-        return found
-
-    def begun(self, first: Any) -> Any:
-        """Return the state before the first sample."""
-        if not self.longest:
-            return first
-        return WaitingState((), first, np.zeros((0, len(self.every))), np.zeros((0, self.inputs)))
-
-    def advance(self, inner: Inner, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
-        """Take a row as it arrives by the steps of an observer without delays (``y (ny,)``, ``u (nu,)``)."""
-        if self.is_plain:
-            return inner(state, y, u)
-        received = np.where(self.expected(state.k), y, np.nan)
-        if not self.longest:
-            return inner(state, received, u)
-        k, states = state.k, [*state.before, state.latest]
-        oldest = k - len(state.before)
-        outputs = np.vstack((state.outputs, np.where(self.delays == 0, received, np.nan)))
-        inputs, earliest = np.vstack((state.inputs, u)), k
-        for i in np.flatnonzero(self.delays):
-            taken = k - int(self.delays[i])
-            if taken >= oldest and not np.isnan(received[i]):
-                outputs[taken - oldest, i] = received[i]
-                earliest = min(earliest, taken)
-        row = None
-        for t in range(earliest - oldest, len(states)):
-            after, row = inner(states[t], outputs[t], inputs[t])
-            if t + 1 < len(states):
-                states[t + 1] = after
-        kept = slice(max(len(states) - self.longest, 0), None)
-        return WaitingState(tuple(states[kept]), after, outputs[kept], inputs[kept]), row
-
-
-def require_plain(observer: Any, what: str) -> None:
-    """Raise `SpecError` where an observer has sensors of their own times, or bounds on states."""
-    for option in ("sensors", "state_bounds"):
-        if getattr(observer, option) is not None:
-            raise SpecError(
-                f"{what} has no {option}: leave the option out of the design, or run it by obsynth run.", path=option
-            )
-
-
-State = TypeVar("State")
-Row = TypeVar("Row")
-SavedState = TypeVar("SavedState", bound=tuple[Any, ...])
-Robust = TypeVar("Robust", bound=Any)
-#: Takes the states before and after a sample, what is known at it, and its inputs.
-Kept: TypeAlias = Callable[[Any, Any, Any, FloatArray], None]
-#: Marks an array whose columns are contiguous: sums are rounded in another order there.
-BY_COLUMNS = "by columns"
-
-
-NO_NUMBERS = read_only(np.zeros(0))
-#: Standard deviations within which 95 % of a normal number lie: the width of bands, drawn or counted.
-BAND_WIDTH = 1.96
 #: The residual of an observer of a nonlinear plant: of its equations in each step.
 STEP_RESIDUAL = ("equations",)
 
 
-def nothing() -> FloatArray:
-    """Return an empty array: what an observer does not say."""
-    return NO_NUMBERS
+State = TypeVar("State")
 
+Row = TypeVar("Row")
 
-@dataclass(frozen=True, eq=False)
-class Estimates:
-    """What an observer says, one row per sample; of a batch there is an axis of trials before the samples.
+SavedState = TypeVar("SavedState", bound=tuple[Any, ...])
 
-    Every observer gives the first eight; recursive and nonlinear ones say besides how far their estimates may be off,
-    and what their innovations are.  Arrays that an observer does not know are empty, and deviations NaN.
+Robust = TypeVar("Robust", bound=Any)
 
-    Parameters
-    ----------
-    states : FloatArray
-        ``(samples, nx)``; column i estimates state i at ``k - state_delays[i]``.
-    faults : FloatArray
-        ``(samples, nf)``; column i estimates fault i at ``k - fault_delays[i]``.  The faults of a plant with parameters
-        are these: `parameters` is another name.
-    residuals : FloatArray
-        ``(samples, nr)``; of a nonlinear observer one column, the scaled residual of the equations in each step.
-    state_names, fault_names, residual_names : tuple of str
-        Names of the columns.
-    state_delays, fault_delays : tuple of int
-        Delays in samples.
-    state_deviations : FloatArray
-        ``(samples, nx)``: standard deviations; infinite where missing samples leave a state undetermined.
-    fault_covariances : FloatArray
-        ``(samples, nf, nf)``: the covariance of the estimates while the parameters are constant (or walk as stated).
-        S is none: with forgetting it says how much is still remembered.
-    state_covariances, cross_covariances : FloatArray
-        ``(samples, nx, nx)`` and ``(samples, nx, nf)``: of the states, and of states with faults, see
-        `joint_covariances`; recursive observers (but for the compiled kernel) and nonlinear ones (but for batches).
-    innovations : FloatArray
-        ``(samples, m)``.  Recursive observers: whitened parity innovations of the model without parameters; NaN where
-        there are fewer.  Nonlinear ones: in units of the outputs; NaN where a sample is missing.
-    regressors : FloatArray
-        ``(samples, m, nq)``, recursive observers: innovations minus regressors times the true parameters are white,
-        N(0, I).
-    scores, informations : FloatArray
-        ``(samples, nq)`` and ``(samples, nq, nq)``, nonlinear observers with a forgetting factor: what each sample says
-        of the parameters; to first order scores minus informations times the true parameters are white, N(0,
-        informations).
-    innovation_covariances : FloatArray
-        ``(samples, ny, ny)``, nonlinear observers: what is expected of the innovations; rows and columns of missing
-        samples are those of the identity.
-    nis, nis_degrees : FloatArray
-        ``(samples,)``: squared innovations in units of their covariance, at the parameters estimated one sample before,
-        and degrees of freedom, not counting the parameters.
-    excitation : FloatArray
-        ``(samples,)``: least eigenvalue of the information on the parameters in the last `window` samples, in parameter
-        units to the power -2 (nonlinear observers: in units of ``S_0^-1``, so that below one a window says less than
-        was known before); (26) asks that it stays above some alpha > 0.  Zero while the window fills; NaN for the
-        random walk of a recursive observer, which has no regressors (`certificate.claims` hold the least level).
-    conditions : FloatArray
-        ``(samples,)``, nonlinear observers: condition of (7).
-    contraction : FloatArray
-        ``(samples,)``, nonlinear observers: spectral radius of F (I - K H); an error of the state filter decays in
-        about ``-1 / log`` of it steps, which should not be longer than the window ``1 / (1 - lambda)``.
-    projection : FloatArray
-        ``(nx,)``, nonlinear observers: how far the initial state was moved onto its constraint.
-    received : numpy.ndarray
-        ``(samples, ny)``, of bool: which outputs were there; recursive and nonlinear observers.
-    """
+#: Takes the states before and after a sample, what is known at it, and its inputs.
+Kept: TypeAlias = Callable[[Any, Any, Any, FloatArray], None]
 
-    states: FloatArray
-    faults: FloatArray
-    residuals: FloatArray
-    state_names: tuple[str, ...]
-    fault_names: tuple[str, ...]
-    residual_names: tuple[str, ...]
-    state_delays: tuple[int, ...]
-    fault_delays: tuple[int, ...]
-    state_deviations: FloatArray = field(default_factory=nothing)
-    fault_covariances: FloatArray = field(default_factory=nothing)
-    state_covariances: FloatArray = field(default_factory=nothing)
-    cross_covariances: FloatArray = field(default_factory=nothing)
-    innovations: FloatArray = field(default_factory=nothing)
-    regressors: FloatArray = field(default_factory=nothing)
-    scores: FloatArray = field(default_factory=nothing)
-    informations: FloatArray = field(default_factory=nothing)
-    innovation_covariances: FloatArray = field(default_factory=nothing)
-    nis: FloatArray = field(default_factory=nothing)
-    nis_degrees: FloatArray = field(default_factory=nothing)
-    excitation: FloatArray = field(default_factory=nothing)
-    conditions: FloatArray = field(default_factory=nothing)
-    contraction: FloatArray = field(default_factory=nothing)
-    projection: FloatArray = field(default_factory=nothing)
-    received: NDArray[np.bool_] = field(default_factory=lambda: NO_NUMBERS.astype(bool))
-
-    def __post_init__(self) -> None:
-        nf = len(self.fault_names)
-        unknown = {"state_deviations": self.states.shape, "fault_covariances": (*self.faults.shape, nf)}
-        for name, shape in unknown.items():
-            if getattr(self, name) is NO_NUMBERS:
-                object.__setattr__(self, name, np.broadcast_to(np.nan, shape))
-
-    @property
-    def has_deviations(self) -> bool:
-        """Whether the observer says how far its estimates may be off."""
-        return not (np.isnan(self.state_deviations).all() and np.isnan(self.fault_covariances).all())
-
-    @property
-    def fault_deviations(self) -> FloatArray:
-        """Standard deviations of the fault estimates ``(samples, nf)``; NaN where the observer knows none."""
-        return np.asarray(np.sqrt(np.einsum("...ii->...i", self.fault_covariances)))
-
-    @property
-    def joint_covariances(self) -> FloatArray:
-        """Covariances of states and faults together ``(samples, nx + nf, nx + nf)``; empty where they are not known."""
-        if not self.state_covariances.size:
-            return NO_NUMBERS
-        across = self.cross_covariances
-        return np.concatenate(
-            [
-                np.concatenate([self.state_covariances, across], axis=-1),
-                np.concatenate([np.swapaxes(across, -1, -2), self.fault_covariances], axis=-1),
-            ],
-            axis=-2,
-        )
-
-    @property
-    def parameters(self) -> FloatArray:
-        """The estimates of the parameters ``(samples, nq)``: the same as `faults`."""
-        return self.faults
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """The same as `fault_names`."""
-        return self.fault_names
-
-    @property
-    def parameter_covariances(self) -> FloatArray:
-        """The same as `fault_covariances`, ``(samples, nq, nq)``."""
-        return self.fault_covariances
-
-    @property
-    def parameter_deviations(self) -> FloatArray:
-        """The same as `fault_deviations`, ``(samples, nq)``."""
-        return self.fault_deviations
+#: Marks an array whose columns are contiguous: sums are rounded in another order there.
+BY_COLUMNS = "by columns"
 
 
 class Observer(ABC, Generic[State, Row]):

@@ -18,26 +18,34 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import PreconditionError
-from obsynth.numerics.arguments import FloatArray, read_only, whole_number
+from obsynth.numerics.arguments import whole_number
+from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.numerics.square_root_estimation import Gaussian, SmootherGain, joint_step, nothing_later, stepped_back
-from obsynth.observers.dae.estimates import DAERow, GatheredRows
-from obsynth.observers.dae.observer import DAEObserver, DAEState, Steps
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.nonlinear.estimates import DAERow, GatheredRows
+from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.nonlinear.steps import DAEState, Steps
 from obsynth.observers.outliers import projected
-from obsynth.observers.records import measured_record, taken_inputs, whole_record
+from obsynth.observers.records import measured_record, whole_record
 from obsynth.observers.recursive.observer import (
     RawEstimate,
     Recursion,
     RecursiveObserver,
     RecursiveState,
-    StepMatrices,
     deviations_in,
     recursive_estimates,
-    right_side,
-    stacked_noise,
 )
-from obsynth.observers.running import Estimates
+from obsynth.observers.recursive.step_model import StepMatrices, right_side, stacked_noise
+from obsynth.observers.taken_inputs import taken_inputs
 from obsynth.plants.dae import checked_inputs
+
+#: What later samples say of constant parameters: weight and weighted data ``(any, nq + 1)``, and a square root of the
+#: covariance of the weighted sum ``(nq, any)``.
+Later: TypeAlias = tuple[FloatArray, FloatArray]
+
+
+SmoothedObserver = RecursiveObserver | DAEObserver
 
 
 class Lesson(NamedTuple):
@@ -71,11 +79,6 @@ class Smoothed(NamedTuple):
     theta: FloatArray  # ``(nq,)``
     # ``(nq, any)``: square root of their covariance; both empty where parameters are among the states
     spread: FloatArray
-
-
-#: What later samples say of constant parameters: weight and weighted data ``(any, nq + 1)``, and a square root of the
-#: covariance of the weighted sum ``(nq, any)``.
-Later: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 def with_lesson(later: Later, lesson: Lesson, forgetting: float) -> Later:
@@ -453,9 +456,6 @@ class _RecursiveLinks(Links):
             np.eye(len(row.innovation)),
             after.resets > before.resets,
         )
-
-
-SmoothedObserver = RecursiveObserver | DAEObserver
 
 
 def smoothed_estimates(observer: SmoothedObserver, rows: list[Any], found: list[Smoothed]) -> Estimates:

@@ -9,24 +9,21 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import FloatArray, arguments_checked, require_mapping
+from obsynth.numerics.arguments import arguments_checked, require_mapping
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import parse_expression
-from obsynth.plants.constants import (
+from obsynth.plants.calibrated_box import CalibratedBox
+from obsynth.plants.constants import Constant, ConstantsBox, constant_of, constants_box, tolerance_share
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.uncertainty import (
     SAME_EXPRESSION_VALUE,
     UNCERTAIN_MATRICES,
-    CalibratedBox,
-    Constant,
-    ConstantsBox,
     Entry,
     Uncertainty,
     as_written,
-    constant_of,
-    constants_box,
     expressions_in,
     matrices_of,
-    tolerance_share,
 )
-from obsynth.plants.descriptor import DescriptorSystem
 
 
 def stated_box(given: Any, variation: str | None = None) -> Any:

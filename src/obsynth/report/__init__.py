@@ -1,1 +1,4 @@
-"""Readable reports: tables of a design, its checks, and the structure of a plant."""
+"""What people read: tables, the HTML page, and the pictures in `plots`.
+
+Main names: `summary`, `html_report`, `check_report`; pictures are public as ``obsynth.plotting``.
+"""

@@ -3,54 +3,35 @@
 Sections of a page about a recorded log: what a design says of it, and whether the two agree.
 
 Tables of the page: facts, checks in the order of the argument, matrices; every text is escaped.
-
-Pictures of a design for a page: drawn without a window, held as text.
-
-A scenario that shows what a design does, made from the design alone: each fault in turn.
 """
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from html import escape
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from obsynth.analysis.transformations.linear_plants import eliminate_algebraic_states
-from obsynth.calibration.diagnostics import Validation, draw_validation
-from obsynth.calibration.validating import states_innovations, validate
-from obsynth.data.alarm_events import NO_ALARM, alarm_notes, alarm_rows, silence
-from obsynth.data.log_observers import DECIDING
-from obsynth.data.run import DataRun
-from obsynth.errors import ObsynthError, SpecError
-from obsynth.experiments.monitors.monitor import Detection
-from obsynth.experiments.monitors.residual_monitor import monitor
-from obsynth.experiments.simulation import Simulation, simulate
+from obsynth.errors import ObsynthError
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.files.tables import standing_page
-from obsynth.methods.automatic import HELD_GROWTH
-from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
-from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.registry import REGISTRY, method_class
-from obsynth.numerics.arguments import FloatArray, arguments_checked
-from obsynth.numerics.spectra import decay_rates, eigenvalues
-from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.decisions import Decision, decide
-from obsynth.observers.linear.observer import LinearObserver, WindowObserver
-from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plotting.estimates import panel_count, plot_data, plot_hidden_course, plot_simulation, plot_states
-from obsynth.plotting.panels import data_url, image_of
-from obsynth.plotting.trade_off import plot_gains, plot_poles
-from obsynth.report.tables import (
+from obsynth.monitoring.alarms.events import NO_ALARM, alarm_notes, alarm_rows, silence
+from obsynth.monitoring.calibration.diagnostics import Validation, draw_validation
+from obsynth.monitoring.calibration.validating import states_innovations, validate
+from obsynth.monitoring.logs.log_observer import DECIDING
+from obsynth.monitoring.logs.run import DataRun
+from obsynth.monitoring.plots.data import panel_count, plot_data
+from obsynth.numerics.arguments import arguments_checked
+from obsynth.numerics.arrays import FloatArray
+from obsynth.report.designs import (
     delay_curves,
     delay_table,
     fault_estimates,
@@ -58,262 +39,26 @@ from obsynth.report.tables import (
     plant_facts,
     promises,
     recovered_states,
-    summary,
     tolerance_facts,
 )
+from obsynth.report.pictures import pictures_of, stacked
+from obsynth.report.summary import summary
 from obsynth.results.checks import FITS, Check, CheckKind, Status
-from obsynth.results.design import ObserverDesign, VerificationReport, gain_set_digest
+from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_set_writing import gain_set_digest
 from obsynth.results.layout import headed_table, number, verdict, verdict_line, worth
-from obsynth.simulation.scenario import Scenario, Step
+from obsynth.results.verification_report import VerificationReport
+from obsynth.simulation.scenario import Scenario
 from obsynth.version import __version__
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
-#: A segment lasts as long as the slowest error needs to shrink by this factor, and more.
-SEGMENT_LEFT = 0.005
-#: Samples in a segment, at least and at most; those of a continuous observer are chosen.
-SHORTEST_SEGMENT, LONGEST_SEGMENT, CHOSEN = 12, 1500, 150
-#: An observer with this forgetting factor or more, or none, is shown for as long as one with this.
-LONG_MEMORY = 0.99
-
-
-def demonstration_scenario(design: ObserverDesign) -> Scenario | None:
-    """Return a scenario with each fault on for a while, one after another, or each parameter changed for good."""
-    observer = design.observer
-    if isinstance(observer, LinearObserver):
-        return _of_linear(design.linear[0], observer) if observer.fault_names else None
-    return None if isinstance(observer, WindowObserver) else _of_recursive(observer)
-
-
-def _of_linear(plant: DescriptorSystem, observer: LinearObserver) -> Scenario:
-    slowest = float(np.min(decay_rates(eigenvalues(observer.Az), observer.dt), initial=np.inf))
-    settling = -np.log(SEGMENT_LEFT) / slowest if slowest > 0.0 else 0.0
-    if observer.dt > 0.0:
-        step = observer.dt
-        samples = int(np.clip(np.ceil(settling / step), SHORTEST_SEGMENT, LONGEST_SEGMENT)) + max(observer.fault_delays)
-    else:
-        samples = CHOSEN
-        step = (settling or 1.0) / samples
-    segment = samples * step
-    count = 2 * len(observer.fault_names) + 1
-    faults = {
-        name: Step(size=1.0, start=(2 * i + 1) * segment, end=(2 * i + 2) * segment)
-        for i, name in enumerate(observer.fault_names)
-    }
-    growth = _growth(plant, count * segment)
-    return Scenario(
-        horizon=count * segment,
-        sample_time=None if plant.is_discrete else step,
-        faults=faults,
-        stabilise=growth > np.log(HELD_GROWTH),
-    )
-
-
-def _growth(plant: DescriptorSystem, horizon: float) -> float:
-    """Return the logarithm of what the fastest unstable mode grows by."""
-    modes = eigenvalues(eliminate_algebraic_states(plant).plant.A)
-    if plant.is_discrete:
-        return float(np.log(max(np.max(np.abs(modes)), 1.0))) * horizon / plant.dt
-    return max(float(np.max(modes.real)), 0.0) * horizon
-
-
-def _of_recursive(observer: RecursiveObserver | DAEObserver) -> Scenario | None:
-    if isinstance(observer, DAEObserver):
-        spread, forgetting = observer.initial_parameter_covariance, observer.forgetting
-        longest, discounts = None, observer.form == "forgetting"
-    else:
-        adaptation, longest = observer.adaptation, observer.plant.horizon
-        # A Kalman filter has noise to show, and nothing else.
-        spread, forgetting, discounts = np.zeros((0, 0)), 1.0, False
-        if adaptation is not None:
-            spread, forgetting = adaptation.initial_covariance, adaptation.forgetting
-            discounts = adaptation.form != "random-walk"
-    memory = min(forgetting, LONG_MEMORY) if discounts else LONG_MEMORY
-    samples = int(np.clip(np.log(SEGMENT_LEFT) / np.log(memory), SHORTEST_SEGMENT, LONGEST_SEGMENT))
-    count = len(observer.fault_names) + 1
-    if longest is not None:
-        samples = min(samples, (longest - 1) // count)
-    if samples < SHORTEST_SEGMENT:
-        return None
-    deviations = np.sqrt(np.diag(spread))
-    faults = {
-        name: Step(size=float(size), start=(i + 1) * samples * observer.dt)
-        for i, (name, size) in enumerate(zip(observer.fault_names, deviations, strict=True))
-    }
-    return Scenario(horizon=count * samples * observer.dt, faults=faults, noise=1.0)
-
-
-#: Inches: a picture beside another one, and one of a row of its own; small, so that texts stay readable on a phone.
-HALF_WIDTH, WIDE = 5.6, 6.6
-#: Inches: a panel of several, and what the axis of time takes.
-PANEL, EDGE = 1.5, 0.6
-#: More states than this are not drawn.
-MOST_DRAWN_STATES = 6
-
-
-class Picture(NamedTuple):
-    """A picture in a page: what it shows, in words for who cannot see it and as a caption, and a data URL."""
-
-    title: str
-    text: str
-    source: str
-    wide: bool = False
-
-    def html(self) -> str:
-        """Return the picture as a figure; a wide one takes a row of its own."""
-        title = f"<h3>{escape(self.title)}</h3>" if self.title else ""
-        return (
-            f'<figure class="{"wide" if self.wide else "half"}">{title}<img alt="{escape(self.text)}" '
-            f'src="{self.source}"><figcaption>{escape(self.text)}</figcaption></figure>'
-        )
-
-
-def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> Iterator[Picture]:
-    """Yield the pictures of a design."""
-    yield from _at_work(design, scenario)
-    if design.method == GuaranteedTestMethod.id:
-        yield from _hidden(GuaranteedTest.of(design))
-    if not isinstance(design.observer, LinearObserver):
-        return
-    sampled = design.observer.dt > 0.0
-    if design.observer.order:
-        region = "inside the circle" if sampled else "left of the dashed line"
-        yield Picture(
-            "Spectrum",
-            f"Eigenvalues of the observer: its initial-condition response decays where all are {region}.",
-            drawn((HALF_WIDTH, 5.4 if sampled else 4.2), 1, lambda axes: plot_poles(design, axes=axes[0])),
-        )
-    if design.observer.fault_names:
-        yield _gains_picture(
-            design,
-            "faults",
-            "Gains to the fault estimates",
-            "Singular values over the frequency: from the faults, where 1 is ideal, and from disturbances and noise, "
-            "where small values are better.",
-        )
-    if design.observer.state_names:
-        yield _gains_picture(
-            design,
-            "states",
-            "Gains to the errors of the state estimates",
-            "Largest singular values over the frequency, to the errors of the states: small values are better.",
-        )
-
-
-def _hidden(test: GuaranteedTest) -> Iterator[Picture]:
-    """Yield how small a fault so many samples tell, and the courses that hide a fault from every test."""
-    if len(test.tests) == 1:
-        if len(test.trade_off) > 1:
-            text = "The least threshold of all tests against the duration of their samples; the marked one is proved."
-            yield Picture("Least threshold", text, drawn((HALF_WIDTH, 4.2), 1, lambda axes: test.plot(axes=axes[0])))
-        if test.least > 0.0:
-            yield Picture(
-                "Why there is no smaller one",
-                f"This time course of {test.fault} with these disturbances, and the opposite of all of them, give the "
-                "same samples: every equation and all bounds hold.",
-                drawn((HALF_WIDTH, 4.2), 1, lambda axes: plot_hidden_course(test, axes=axes[0])),
-            )
-        return
-    for own, group in zip(test.tests, test.groups, strict=True):
-        if len(group) > 1:
-            yield Picture(
-                f"Why {own.fault} is not isolated",
-                "Together these time courses change no output: every equation holds, without disturbance and noise.",
-                drawn((HALF_WIDTH, 4.2), 1, partial(_draw_hidden, test, own.fault)),
-            )
-
-
-def _draw_hidden(test: GuaranteedTest, fault: str, axes: Sequence[Axes]) -> None:
-    plot_hidden_course(test, fault=fault, axes=axes[0])
-
-
-def _gains_picture(design: ObserverDesign, to: str, title: str, text: str) -> Picture:
-    return Picture(title, text, drawn((HALF_WIDTH, 4.2), 1, lambda axes: plot_gains(design, to=to, axes=axes[0])))
-
-
-def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Picture]:
-    """Yield faults and states beside their estimates; nothing where the plant has no demonstration."""
-    shown, given = scenario, scenario is not None
-    try:
-        shown = scenario if given else demonstration_scenario(design)
-        simulation = None if shown is None else simulate(design, shown)
-    except ObsynthError:
-        # Without a scenario of its own, a page is whole without this picture.
-        if given:
-            raise
-        return
-    if simulation is None or shown is None:
-        return
-    linear = isinstance(design.observer, LinearObserver)
-    what = "On the scenario" if given else "Each fault in turn" if linear else "Each parameter in turn"
-    text = f"{what}: {_story(shown, given=given, linear=linear)}"
-    faults, states = len(design.observer.fault_names), simulation.estimates.state_names
-    units, dt = design.plant.units, float(simulation.time[1]) if len(simulation.time) > 1 else 1.0
-    seen = [*_watched(design, shown, simulation)] if given else []
-    if faults or seen:
-        yield stacked(
-            "The design at work",
-            text,
-            faults + len(seen),
-            lambda axes: plot_simulation(simulation, detections=seen, units=units, axes=axes),
-        )
-    if 0 < len(states) <= MOST_DRAWN_STATES:
-        run = "in the same run" if faults or seen else "in a run with the stated noise"
-        bands = "" if linear else ", with 95 % bands"
-        yield stacked(
-            "States",
-            f"States {run}, and their estimates{bands}.",
-            len(states),
-            lambda axes: plot_states(simulation.estimates, states=simulation.states, dt=dt, units=units, axes=axes),
-        )
-
-
-def _watched(design: ObserverDesign, scenario: Scenario, simulation: Simulation) -> Iterator[Detection | Decision]:
-    """Yield what the first monitor sees that this design and this scenario have; nothing where they have none."""
-    if isinstance(design.observer, LinearObserver):
-        for kind in ("pointwise", "chi-square"):
-            try:
-                yield monitor(design, scenario, kind).watch(simulation.estimates)
-            except SpecError:
-                # A signal without a bound, or without a covariance; a continuous design has neither threshold.
-                continue
-            return
-    elif isinstance(design.observer, RecursiveObserver) and design.observer.fault_names:
-        yield decide(design.observer, simulation.estimates)
-
-
-def _story(scenario: Scenario, *, given: bool, linear: bool) -> str:
-    if given:
-        return f"{scenario.horizon:g} s, seed {scenario.seed}."
-    if not linear:
-        return (
-            "a step of one initial standard deviation, with the stated noise. The 95 % bands hold while the "
-            "parameters are constant."
-        )
-    closed = " A stabilising state feedback was added, as the plant is unstable." if scenario.stabilise else ""
-    return (
-        "a unit step, from zero and without noise. It shows how fast each estimate follows its fault, and its gain "
-        f"from the other faults.{closed}"
-    )
-
-
-def stacked(title: str, text: str, panels: int, draw: Callable[[Sequence[Axes]], Any]) -> Picture:
-    """Return a wide picture of so many panels."""
-    return Picture(title, text, drawn((WIDE, PANEL * panels + EDGE), panels, draw), wide=True)
-
-
-def drawn(size: tuple[float, float], panels: int, draw: Callable[[Sequence[Axes]], Any]) -> str:
-    """Return what ``draw`` puts on panels one above the other, as a data URL."""
-    return data_url(image_of(panels, draw, size=size))
-
 
 #: Prefix of a check's name -> heading of its group; the others are about the shipped observer.
 _CHECK_GROUPS = {"plant": "The plant", "exists": "Does such an observer exist?"}
+
 _SHIPPED = "The shipped observer"
+
 #: Characters of an option; a solver's log may be long.
 LONGEST_VALUE = 400
+
 #: What each kind of check means.
 CHECK_KINDS: dict[CheckKind, str] = {
     "proved": "an inequality that was proved, with bounds on every rounding error",
@@ -322,6 +67,7 @@ CHECK_KINDS: dict[CheckKind, str] = {
     "computed": "a number that was computed again by a second route",
     "information": "information that no verdict depends on",
 }
+
 #: What each row is worth, whatever its kind.
 CHECK_STATUSES: dict[Status, str] = {
     "proved": "outward rounding, on the numbers that are stored",
@@ -329,6 +75,19 @@ CHECK_STATUSES: dict[Status, str] = {
     "estimated": "statistics, with the interval in which chance alone puts the number",
     "assumed": "stated in the gain set, and not checked",
 }
+
+
+_TEXT = (
+    "Measured and predicted signals, innovations in a band of two deviations as the design expects them, and "
+    "estimates in bands of two deviations."
+)
+
+
+#: A page that `html_report` has written.
+PAGE = FileKind("a report of obsynth", rb'name="generator" content="obsynth"', suffix=".html")
+
+#: Gains with more entries are not printed: the gain set has them.
+MOST_ENTRIES = 900
 
 
 def fact_rows(rows: Iterable[Sequence[str]]) -> Iterator[str]:
@@ -448,12 +207,6 @@ def _text(value: Any) -> str:
     return str(value)
 
 
-_TEXT = (
-    "Measured and predicted signals, innovations in a band of two deviations as the design expects them, and "
-    "estimates in bands of two deviations."
-)
-
-
 def agreement_section(design: ObserverDesign, run: DataRun, rows: str | None) -> Iterator[str]:
     """Yield verdict, table by sensor and picture of a run's log; nothing for designs without expected innovations."""
     if run.measured is None or not states_innovations(design):
@@ -559,12 +312,6 @@ def _statistics(design: ObserverDesign, run: DataRun) -> Iterator[str]:
             table.add_row(Text(name), unit, *found)
     yield "<h3>Statistics</h3>"
     yield from copied_table(table)
-
-
-#: A page that `html_report` has written.
-PAGE = FileKind("a report of obsynth", rb'name="generator" content="obsynth"', suffix=".html")
-#: Gains with more entries are not printed: the gain set has them.
-MOST_ENTRIES = 900
 
 
 @arguments_checked

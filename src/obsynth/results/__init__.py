@@ -1,6 +1,4 @@
-"""Results: the design, its report, and files of them."""
+"""What a design is: the design, its certificate and report, and the gain set as a file.
 
-from obsynth.results.checks import Check
-from obsynth.results.design import Certificate, ObserverDesign, VerificationReport
-
-__all__ = ["Certificate", "Check", "ObserverDesign", "VerificationReport"]
+Main names: `ObserverDesign`, `Certificate`, `VerificationReport`, `Check`, `load`.
+"""

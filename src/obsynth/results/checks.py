@@ -8,7 +8,12 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 CheckKind = Literal["proved", "equality", "computed", "condition", "information"]
+
 Status = Literal["proved", "computed twice", "estimated", "assumed"]
+
+
+#: The check without which observer and plant say nothing of one another.
+FITS = "fits the plant"
 
 
 @dataclass(frozen=True)
@@ -75,10 +80,6 @@ def upper_bound_check(
     return Check(
         name, claim, float(value), float(bound), float(bound - value), bool(value <= bound), source, kind, detail
     )
-
-
-#: The check without which observer and plant say nothing of one another.
-FITS = "fits the plant"
 
 
 def fitting_check(

@@ -21,8 +21,23 @@ from obsynth.results.checks import Check, all_hold
 
 #: Two values this near to each other, relative to their size or one, are shown as conjugates.
 SAME_NUMBER = 1e-9
+
 #: Values that are listed; the others are counted.
 MOST_LISTED_VALUES = 8
+
+
+#: On narrower terminals the claim stands below the numbers, over the whole width.
+WIDE_ENOUGH = 110
+
+#: Of a report as text.
+TEXT_WIDTH = 120
+
+_HEADINGS = ("check", "claim", "value", "bound", "margin", "verdict", "kind")
+
+_NUMBER_WIDTH = 10
+
+#: As wide as "computed twice".
+_KIND_WIDTH = 14
 
 
 def number(value: float, *, digits: int = 4) -> str:
@@ -94,17 +109,6 @@ def facts_table(rows: Iterable[Sequence[str]], *, headings: Sequence[str] = ()) 
     for row in listed:
         table.add_row(*(Text(cell) for cell in row))
     return table
-
-
-#: On narrower terminals the claim stands below the numbers, over the whole width.
-WIDE_ENOUGH = 110
-#: Of a report as text.
-TEXT_WIDTH = 120
-
-_HEADINGS = ("check", "claim", "value", "bound", "margin", "verdict", "kind")
-_NUMBER_WIDTH = 10
-#: As wide as "computed twice".
-_KIND_WIDTH = 14
 
 
 def checks_table(checks: Sequence[Check], *, width: int) -> RenderableType:

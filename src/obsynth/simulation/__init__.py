@@ -1,6 +1,4 @@
-"""Simulated plants: exact recursions of discrete descriptor systems."""
+"""Simulated plants: scenarios and signals, plants in time, and a design on a scenario.
 
-from obsynth.simulation.linear import simulate_plant
-from obsynth.simulation.scenario import Trajectory
-
-__all__ = ["Trajectory", "simulate_plant"]
+Main names: `Scenario`, `simulate`, `simulate_dae`, `simulate_time_varying`, `Step`, `Drift`, `Stuck`.
+"""

@@ -10,20 +10,13 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.arguments import FloatArray, Seed, arguments_checked, as_given, as_matrix, require_shape
+from obsynth.numerics.arguments import Seed, arguments_checked, require_shape
+from obsynth.numerics.arrays import FloatArray, as_given, as_matrix
 from obsynth.numerics.ranks import covariance_factor
-from obsynth.plants.dae import (
-    Compiled,
-    DAEFunctions,
-    DAEModel,
-    ImplicitStep,
-    checked_inputs,
-    finite_vector,
-    onto_constraint,
-    step_length,
-    take_samples,
-)
-from obsynth.simulation.scenario import Trajectory
+from obsynth.plants.dae import DAEModel, checked_inputs, finite_vector, step_length
+from obsynth.plants.dae_functions import Compiled, DAEFunctions, take_samples
+from obsynth.plants.implicit_step import ImplicitStep, onto_constraint
+from obsynth.simulation.signals import Trajectory
 
 
 @arguments_checked

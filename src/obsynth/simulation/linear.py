@@ -14,15 +14,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.time_varying import algebraic_rows
-from obsynth.analysis.transformations.linear_plants import StateRecovery, discretise, eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arguments import FloatArray, arguments_checked, real_array, real_vector, whole_number
+from obsynth.numerics.arguments import arguments_checked, real_array, real_vector, whole_number
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.libraries import failed_computations
 from obsynth.numerics.matrix_equations import continuous_riccati, discrete_riccati
 from obsynth.numerics.ranks import decide_rank
-from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
-from obsynth.simulation.scenario import Scenario, ScenarioSignals, Trajectory, resolve, signal_of
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.elimination import eliminate_algebraic_states
+from obsynth.plants.transformations.recovery import StateRecovery
+from obsynth.plants.transformations.sampling import discretise
+from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.signals import ScenarioSignals, Trajectory, resolve, signal_of
+
+#: States, outputs as measured, inputs, faults and disturbances of several runs, ``(steps, runs, signals)`` each.
+PlantRuns: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 def simulate_plant(
@@ -158,10 +166,6 @@ def scenario_stepper(
     """Return what acts on a plant in a scenario, and the stepper for it from ``initial_state (nx,)``."""
     drive = resolve(plant, scenario)
     return drive, make_stepper(plant, drive, initial_state=initial_state, stabilise=scenario.stabilise)
-
-
-#: States, outputs as measured, inputs, faults and disturbances of several runs, ``(steps, runs, signals)`` each.
-PlantRuns: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 def scenario_runs(drive: ScenarioSignals, stepper: Stepper, parts: tuple[int, int], seeds: Sequence[int]) -> PlantRuns:

@@ -25,28 +25,37 @@ from typing import Any, Generic, TypeAlias
 import flint
 import numpy as np
 
-from obsynth.numerics.arguments import FloatArray, Made, remembered
+from obsynth.numerics.arrays import FloatArray, Made, remembered
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
-from obsynth.observers.linear.observer import LinearObserver, poles_of
+from obsynth.observers.linear.derived import poles_of
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import Ball, ExtendedBall, rounded_up
-from obsynth.proofs.contraction import Contraction, absolute_gains, prove_contraction
+from obsynth.proofs.balls import Ball, rounded_up
+from obsynth.proofs.contraction import Contraction, prove_contraction
+from obsynth.proofs.extended_balls import ExtendedBall
+from obsynth.proofs.peak_sums import absolute_gains
 from obsynth.proofs.products import as_ball
 from obsynth.results.checks import Check, upper_bound_check
 
 #: With more states of plant or observer the identities are evaluated in balls of double precision.
 MOST_EXACT_IDENTITIES = 300
+
 #: Digits, in bits, in which products of three stored numbers and their sums are all but exact.
 EXACT_BITS = 320
+
 #: How much wider a ball of double precision is than where another machine's may lie: both hold the same number.
 BOTH_BALLS = 3.0
+
 #: The identities of an error model hold to this share of their terms, whatever rounding of stored numbers does.
 IDENTITY_SHARE = 1e-7
+
 #: Gains that were printed to some decimals leave less than this of them; that is judged by the rows of the method.
 PRINTED_SHARE = 0.1
+
 #: Rows with terms below this share of the largest may be rounding of those: they are judged as if they were as
 #: large.
 LEAST_ROW = 1e-6
+
 Output: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 

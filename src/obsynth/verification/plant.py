@@ -1,37 +1,63 @@
-"""Rows about the plant: what it is, existence, elimination and sampling done again, and what is stored twice.
-
-A gain set stores tolerances and names more than once: they are held against the plant as written and the design.
-"""
+"""Rows about the plant: what it is, the existence conditions, and elimination and sampling done again as written."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition
-from obsynth.analysis.transformations.uncertain_plant import affine_plant
-from obsynth.analysis.zeros import structure_of, unstable_poles
+from obsynth.analysis.existence.condition import Condition
+from obsynth.analysis.zeros import unstable_poles
 from obsynth.errors import ObsynthError
-from obsynth.numerics.arguments import FloatArray
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import hinf_norm
-from obsynth.numerics.sparse import dense, same_matrix
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.plants.constants import ELIMINATED, SAMPLED, UNCERTAIN_MATRICES, Uncertainty, as_written
-from obsynth.plants.descriptor import DECISIVE, SIGNAL_NAMES, DescriptorSystem, ExactNumbers, listed
+from obsynth.plants.descriptor import DECISIVE, SIGNAL_NAMES, DescriptorSystem, ExactNumbers
+from obsynth.plants.pencil import structure_of
+from obsynth.plants.signal_names import listed
 from obsynth.proofs.balls import Ball
-from obsynth.proofs.contraction import column_norms, gathered, interval_pieces, peak_sums
+from obsynth.proofs.contraction import column_norms
+from obsynth.proofs.peak_sums import gathered, interval_pieces, peak_sums
 from obsynth.proofs.products import energy
 from obsynth.results.checks import Check, information, nothing_wrong, upper_bound_check
-from obsynth.results.design import ObserverDesign, PlantSource
+from obsynth.results.design import ObserverDesign
+from obsynth.results.plant_source import PlantSource
 from obsynth.verification.error_system import ErrorModel, contraction_of
 
 #: Imaginary parts below this are not shown.
 SHOWN_AS_REAL = 1e-12
+
 #: Eigenvalues that are listed; the others are counted.
 MOST_EIGENVALUES = 6
+
+
+#: Matrices found again may differ by this share of the largest entry of their row or column: another order of
+#: sums.
+DERIVED_TOLERANCE = 1e-9
+
+PLANT_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
+
+_STORED_MAPS = ("from_state", "from_input", "from_fault", "from_disturbance")
+
+_SOURCE = "the plant as written, eliminated and sampled again"
+
+
+_INTERVAL_PARTS = ("midpoint", "radius")
+
+
+#: Terms that are summed up for a row that only informs: the bound on all that follow is a little wider, and holds.
+STEPS_OF_INFORMATION = 8_192
+
+
+#: The middle plant of the family and the plant of the design differ by rounding: this share of their largest entries.
+FAMILY_TOLERANCE = 1e-9
+
+STORED_TWICE = "the gain set: what is stored twice is compared"
+
+
+#: What both plants say of the signals that neither elimination nor sampling touches.
+_KEPT_NAMES = tuple(name for name in SIGNAL_NAMES if name not in ("state_names", "noise_names"))
 
 
 def plant_information(plant: DescriptorSystem) -> Iterator[Check]:
@@ -79,14 +105,6 @@ def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:
             f"Unclear: {condition.detail}" if condition.unclear else condition.detail,
             unclear=bool(condition.unclear),
         )
-
-
-#: Matrices found again may differ by this share of the largest entry of their row or column: another order of
-#: sums.
-DERIVED_TOLERANCE = 1e-9
-PLANT_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
-_STORED_MAPS = ("from_state", "from_input", "from_fault", "from_disturbance")
-_SOURCE = "the plant as written, eliminated and sampled again"
 
 
 def derivation_rows(design: ObserverDesign, model: ErrorModel) -> Iterator[Check]:
@@ -161,10 +179,10 @@ def _doubles(numbers: ExactNumbers) -> SimpleNamespace:
 def _difference(first: object, second: object, names: tuple[str, ...]) -> float:
     """Return the largest relative difference between matrices of the same name; infinite for another shape."""
     pairs = [(np.asarray(getattr(first, name)), np.asarray(getattr(second, name))) for name in names]
-    return float(np.max([_relative_difference(one, other) for one, other in pairs]))
+    return float(np.max([relative_difference(one, other) for one, other in pairs]))
 
 
-def _relative_difference(one: FloatArray, other: FloatArray, radius: FloatArray | float = 0.0) -> float:
+def relative_difference(one: FloatArray, other: FloatArray, radius: FloatArray | float = 0.0) -> float:
     """Return by how much matrices differ beyond a radius, relative to the largest entry of row or column; infinite for
     another shape, NaN where a number is not finite."""
     if one.shape != other.shape:
@@ -222,13 +240,6 @@ def _sampling_rows(
     )
 
 
-_INTERVAL_PARTS = ("midpoint", "radius")
-
-
-#: Terms that are summed up for a row that only informs: the bound on all that follow is a little wider, and holds.
-STEPS_OF_INFORMATION = 8_192
-
-
 def _peak_gain(
     smooth: DescriptorSystem, dt: float, observer: LinearObserver, t: FloatArray, direct: FloatArray
 ) -> float:
@@ -245,111 +256,6 @@ def _peak_gain(
     _, sums = peak_sums(az, rows, both, contraction, most=STEPS_OF_INFORMATION)
     between, sampled = gathered(pieces, sums[..., :count], smooth.nd), sums[..., count:]
     return float(np.sum(between + sampled + column_norms(Ball.exact(direct))))
-
-
-#: The middle plant of the family and the plant of the design differ by rounding: this share of their largest entries.
-FAMILY_TOLERANCE = 1e-9
-_STORED = "the gain set: what is stored twice is compared"
-
-
-def tolerance_rows(design: ObserverDesign) -> Iterator[Check]:
-    """Yield the rows on the tolerances of a linear plant: they are those of the plant that the design is for."""
-    plant, source = design.plant, design.source
-    uncertain = plant.uncertainty if isinstance(plant, DescriptorSystem) else None
-    if not isinstance(plant, DescriptorSystem) or uncertain is None:
-        return
-    if uncertain.lost:
-        yield information(
-            "tolerances",
-            f"not carried over ({uncertain.lost}): the design is for the nominal plant, and whatever would use them "
-            "refuses",
-            np.nan,
-            source="the plant",
-            status="assumed",
-        )
-        return
-    wrong = [*_not_nominal(plant, uncertain), *(_not_of(uncertain, source) if source is not None else ())]
-    if any(kind not in (ELIMINATED, SAMPLED) for kind, _ in uncertain.steps):
-        wrong.append("steps")
-    yield nothing_wrong(
-        "tolerances as written",
-        "the entries at nominal values are those of the plant as written, and the steps since "
-        "are those of the design's plant",
-        wrong,
-        source=_STORED,
-    )
-    if wrong:
-        return
-    if uncertain.box.source == "calibrated":
-        yield information(
-            "calibration", f"the box is the {uncertain.box.origin}, of the calibration file "
-            f"{uncertain.box.calibration[:12] or 'that is not named'}: assumed, unless it is given (--calibration)",
-            np.nan, source="the plant", status="assumed",
-        )  # fmt: skip
-    try:
-        missed = _family_difference(plant, uncertain)
-        detail = ""
-    except ObsynthError as error:
-        # No bound over the box exists: who asks for one is told so.  The nominal plant alone is compared.
-        missed, detail = 0.0, f"no family over the box: {error}"
-    yield upper_bound_check(
-        "tolerances of the plant",
-        "eliminated and sampled over the box, the plant as written contains the plant of the design",
-        missed,
-        FAMILY_TOLERANCE,
-        source=_STORED,
-        kind="equality",
-        detail=detail,
-    )
-
-
-def _not_nominal(plant: DescriptorSystem, uncertain: Uncertainty) -> Iterator[str]:
-    """Yield matrices whose entries are not what their texts say at the nominal values."""
-    written = as_written(plant, uncertain)
-    values = {name: item.nominal for name, item in uncertain.box.constants.items()}
-    try:
-        filled = uncertain.filled(written, values)
-    except (IndexError, ArithmeticError, ValueError, ObsynthError):
-        yield "entries"
-        return
-    for name in UNCERTAIN_MATRICES:
-        if not same_matrix(filled[name], written[name]):
-            yield f"{name} at nominal values"
-    if (uncertain.written is None) != (not uncertain.steps):
-        yield "steps"
-
-
-def _not_of(uncertain: Uncertainty, source: PlantSource) -> Iterator[str]:
-    """Yield what differs between tolerances and the plant as written beside them."""
-    sampled = [size for kind, size in uncertain.steps if kind == SAMPLED]
-    if uncertain.written is None:
-        return
-    for name in UNCERTAIN_MATRICES:
-        if not np.array_equal(
-            np.asarray(dense(uncertain.written[name])), np.asarray(dense(getattr(source.plant, name)))
-        ):
-            yield f"{name} as written"
-    if sampled != ([] if source.sample_time is None else [source.sample_time]):
-        yield "sample time"
-
-
-def _family_difference(plant: DescriptorSystem, uncertain: Uncertainty) -> float:
-    """Return by how much the nominal plant of the family differs from the plant, beyond the family's remainders."""
-    box = uncertain.box
-    alone = {name: replace(item, low=item.nominal, high=item.nominal) for name, item in box.constants.items()}
-    family = affine_plant(plant, replace(box, constants=alone))
-    if len(family.coordinates) != plant.nx:
-        return float("inf")
-    found = []
-    for name in UNCERTAIN_MATRICES:
-        stored, middle = np.asarray(dense(getattr(plant, name))), family.matrices[name]
-        wanted = stored @ family.coordinates if name in ("E", "A", "C") else stored
-        found.append(_relative_difference(wanted, middle.center, middle.radius))
-    return float(np.max(found))
-
-
-#: What both plants say of the signals that neither elimination nor sampling touches.
-_KEPT_NAMES = tuple(name for name in SIGNAL_NAMES if name not in ("state_names", "noise_names"))
 
 
 def stored_twice_rows(design: ObserverDesign) -> Iterator[Check]:
@@ -379,7 +285,7 @@ def stored_twice_rows(design: ObserverDesign) -> Iterator[Check]:
         "stored twice",
         "names, units, operating point, sample time and noise agree wherever they are stored",
         wrong,
-        source=_STORED,
+        source=STORED_TWICE,
     )
 
 

@@ -12,49 +12,56 @@ from functools import cached_property
 
 import numpy as np
 
-from obsynth.analysis.zeros import structure_of
-from obsynth.numerics.arguments import SMALLEST, ComplexArray, FloatArray, remembered
+from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, remembered
 from obsynth.numerics.modal_response import MOST_ENTRIES_AT_ONCE, STATES_FOR_MODES, ModalSolves, pencils_at, resolved
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.numerics.spectra import boundary_points
-from obsynth.observers.linear.observer import LinearObserver, modes_of, poles_of
+from obsynth.observers.linear.derived import modes_of, poles_of
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.pencil import structure_of
 from obsynth.proofs.balls import rounded_up
 from obsynth.proofs.contraction import LEFT_OF_SUM, proved_contractions
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.error_system import (
-    BOTH_BALLS,
-    ByNumbers,
-    ErrorModel,
-    RemainderChannel,
-    contraction_of,
-)
+from obsynth.verification.error_system import BOTH_BALLS, ByNumbers, ErrorModel, RemainderChannel, contraction_of
 
 #: Claimed bounds have room for what rounding of the contraction can do on another machine; at most this share of them.
 MOST_ROOM = 1.0
+
 #: Up to so many states each bound is found by a sum of its own where another machine's is to be found again.
 MOST_STATES_CLOSELY = 40
+
 #: A gain is claimed for disturbances that last up to one over this, rad per sample: slower ones are reported.
 SLOWEST_CLAIMED, CLAIM_POINTS = 1e-7, 120
+
 #: With more states, of plant and observer together, fewer are looked at.
 MANY_JOINT_STATES, FEWER_POINTS = 300, 40
+
 #: A point is outside of all poles where its modulus is so many times the largest.
 OUTSIDE = 1.5
+
 #: Frequencies beyond that at which the time is looked for after which stored numbers matter, rad per sample.
 SLOWER = tuple(10.0**-k for k in range(8, 17))
+
 #: Multiple poles scatter; those this close to the boundary may be on it, and this far apart they are different ones.
 ABOUT_THE_BOUNDARY, APART, MOST_ANGLES = 1e-2, 1e-2, 8
+
 #: Beyond this distance (rad per sample) from such poles a gain is none that takes long to build up.
 MOST_DISTANCE = 0.1
+
 #: What rounding of the stored numbers leaves of an identity, relative to its terms.
 IDENTITY_ROUNDING = 1e-11
+
 #: Without a claimed gain stored numbers matter when they turn a unit disturbance into this error.
 NOTICED = 1e-3
+
 #: Tolerance of the comparison of gains found in double precision.
 GAIN_TOLERANCE = 1e-9
 
 _ON_THE_BOUNDARY = "the plant has a pole on the boundary of stability: no finite gain exists for stored numbers"
+
 _WITNESS_SIGNALS = ("states", "inputs", "disturbances")
+
 _ERROR_WITNESSES = ("state_error", "input_error", "disturbance_error")
 
 

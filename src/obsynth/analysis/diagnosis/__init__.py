@@ -1,1 +1,1 @@
-"""What can be diagnosed on a plant: detected, distinguished, estimated, and with which sensors."""
+"""What can be diagnosed on a plant: which faults are detectable and isolable, and with which sensors."""

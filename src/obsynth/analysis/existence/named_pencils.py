@@ -1,40 +1,39 @@
-"""Pencils whose entries know where in the plant they stand, how far they are from losing rank, and the nearest that do.
+"""Pencils whose entries know where in the plant they stand, and the nearest plants for which they lose rank.
 
 For v with ``M v`` small, rounded to a few digits, one entry (two if v is complex) in each row of M is changed in
 rational arithmetic so that ``M v = 0``: the changed matrix loses rank exactly, and the changed entries are named.
-
-How far a pencil is from losing rank in the closed unstable region is its least singular value there, in scaled units.
-Estimated, not proved: the least that is found on the boundary, near all zeros and, for tall pencils, at the unstable
-points where a random compression of the rows loses rank, which are close to where the pencil nearly does.
-
-Unclear answers: the tolerance, a plant within it for which the answer is another one, and what would decide it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from math import isqrt, lcm
-from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from obsynth.analysis.plant_units import PlantUnits, sized_plant
-from obsynth.analysis.zeros import equilibrated_at, size_of_point
-from obsynth.numerics.arguments import ComplexArray, FloatArray
-from obsynth.numerics.lapack import eigenvalues
-from obsynth.numerics.modal_response import MOST_ENTRIES_AT_ONCE
+from obsynth.analysis.existence.witnesses import (
+    EntryChange,
+    Rational,
+    Witness,
+    as_array,
+    nearest,
+    rational,
+    rational_matrices,
+)
+from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil
-from obsynth.plants.descriptor import DECISIVE, DescriptorSystem, ExactNumbers
-from obsynth.plants.fault_models import Exosystem
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.faults import Exosystem
+from obsynth.plants.plant_units import PlantUnits, sized_plant
 from obsynth.proofs.exact_arithmetic import written_fraction
 
 #: Digits to which the direction of a witness is rounded, until the plant is within the tolerance.
 WITNESS_DIGITS = (1, 2, 3, 5, 8, 11, 14, 17)
+
 #: How much rather an entry is changed that is not zero, and one of E, whose ones are structure rather than data.
 KNOWN_ENTRY, STRUCTURE = 8.0, 1e-2
 
@@ -324,274 +323,3 @@ def _owned(name: Cell, height: int, columns: Sequence[int]) -> Rational:
             for place, j in enumerate(columns):
                 found[i, place] = (name, i, j)
     return found
-
-
-#: Below this distance, relative to the data, rounding of the data is as large as what a unit fault moves: gains of its
-#: inverse would be needed, which is below rounding in double precision.
-ROUNDING_LEVEL = 2e-14
-#: Zeros closer than this, relative to their size, may be one that rounding has moved.
-SAME_ZERO_DISTANCE = 1e-3
-#: Points on the stability boundary; in continuous time between these magnitudes of the own rates.
-BOUNDARY_POINTS = 33
-#: Further out a pencil is close to what it is at infinity, where other conditions decide.
-FARTHEST_OUT, FASTEST = 1e-3, 1e3
-#: Compressions of a tall pencil, at most so many points of each.
-COMPRESSIONS = 2
-MOST_POINTS = 40
-
-
-def distance_to_loss(
-    E: FloatArray,
-    A: FloatArray,
-    *,
-    nx: int,
-    discrete: bool,
-    zeros: tuple[complex, ...] = (),
-    sizes: FloatArray | None = None,
-) -> tuple[float, complex]:
-    """Return how far ``A - s E (m, n)`` is from losing column rank on or outside the stability boundary: the least
-    singular value found, relative to the largest, and where.
-    ``sizes (m, n)`` of the terms of A: what rounding of the data behind it may change is relative to those."""
-    candidates = [*_boundary(E, A, discrete), *(_to_boundary(zero, discrete) for zero in zeros)]
-    if A.shape[0] > A.shape[1]:
-        candidates += _compressed_points(E, A, discrete)
-    values = relative_singular_values(E, A, candidates, nx=nx)
-    if sizes is not None:
-        values = np.minimum(values, relative_singular_values(E, A, candidates, nx=nx, sizes=sizes))
-    least = int(np.argmin(values))
-    return float(values[least]), candidates[least]
-
-
-def zeros_at_rounding_level(
-    E: FloatArray, A: FloatArray, found: Iterable[complex], exact: Sequence[complex], *, nx: int
-) -> list[complex]:
-    """Return those zeros found in floating point that the exact ones lack only by rounding of the data."""
-    return [
-        value
-        for value in map(complex, found)
-        if not any(abs(value - other) <= SAME_ZERO_DISTANCE * max(1.0, abs(other)) for other in exact)
-        and relative_singular_values(E, A, [value], nx=nx)[0] <= ROUNDING_LEVEL
-    ]
-
-
-def relative_singular_values(
-    E: FloatArray, A: FloatArray, points: Sequence[complex], *, nx: int, sizes: FloatArray | None = None
-) -> FloatArray:
-    """Return the least singular value over the largest at each point, in units of A or of ``sizes`` of its terms."""
-    found = np.full(len(points), 0.0 if A.shape[1] else np.inf)
-    if A.shape[0] < A.shape[1] or not A.size:
-        return found
-    groups: dict[tuple[float, bool], list[int]] = {}
-    for place, point in enumerate(points):
-        groups.setdefault((size_of_point(point), point.imag != 0.0), []).append(place)
-    at_once = max(1, MOST_ENTRIES_AT_ONCE // A.size)
-    for (size, turning), places in groups.items():
-        pencil = equilibrated_at(E, A if sizes is None else sizes, complex(size), nx=nx)
-        scaled = pencil.A if sizes is None else pencil.rows[:, None] * A * pencil.columns
-        for start in range(0, len(places), at_once):
-            some = places[start : start + at_once]
-            chosen = np.array([points[place] for place in some])[:, None, None]
-            matrices: NDArray[Any] = scaled - (chosen if turning else chosen.real) * pencil.E
-            values = np.linalg.svd(matrices, compute_uv=False)
-            largest = values[:, 0]
-            if sizes is not None:
-                largest = np.linalg.norm(pencil.A + np.abs(chosen) * np.abs(pencil.E), 2, axis=(1, 2))
-            seen = values[:, 0] > 0.0
-            found[some] = np.where(seen, values[:, -1] / np.where(seen, largest, 1.0), 0.0)
-    return found
-
-
-def least_share(matrix: NDArray[Any], sizes: FloatArray, *, rank: int | None = None) -> float:
-    """Return the last singular value of a matrix ``(m, n)`` of a rank (full) relative to the terms of its entries."""
-    pencil = equilibrate_pencil(np.zeros_like(sizes), sizes)
-    values = np.linalg.svd(pencil.rows[:, None] * matrix * pencil.columns, compute_uv=False)
-    rank = matrix.shape[1] if rank is None else rank
-    if not 0 < rank <= len(values):
-        return 0.0 if rank else np.inf
-    return float(values[rank - 1] / (np.linalg.norm(pencil.A, 2) or 1.0))
-
-
-def _boundary(E: FloatArray, A: FloatArray, discrete: bool) -> list[complex]:
-    if discrete:
-        return [complex(np.exp(1j * angle)) for angle in np.linspace(0.0, np.pi, BOUNDARY_POINTS)]
-    rate = _typical_rate(E, A)
-    return [0j, *(complex(0.0, rate * size) for size in np.geomspace(FARTHEST_OUT, FASTEST, BOUNDARY_POINTS))]
-
-
-def _typical_rate(E: FloatArray, A: FloatArray) -> float:
-    """Return the size of s at which both matrices weigh the same."""
-    left, right = float(np.linalg.norm(E)), float(np.linalg.norm(A))
-    return right / left if left > 0.0 and right > 0.0 else 1.0
-
-
-def _to_boundary(value: complex, discrete: bool) -> complex:
-    if discrete:
-        return value / abs(value) if value else 1.0 + 0j
-    return complex(max(value.real, 0.0), abs(value.imag))
-
-
-def _compressed_points(E: FloatArray, A: FloatArray, discrete: bool) -> list[complex]:
-    rng, found = np.random.default_rng(1), list[complex]()
-    for _ in range(COMPRESSIONS):
-        left = rng.standard_normal((A.shape[1], A.shape[0]))
-        # LAPACK gives up on a few pencils: their points are left out.
-        try:
-            values = eigenvalues(left @ A, left @ E)
-        except np.linalg.LinAlgError:
-            continue
-        finite = values[np.abs(values) <= FASTEST * (1.0 if discrete else _typical_rate(E, A))]
-        outside = finite[np.abs(finite) >= 1.0] if discrete else finite[finite.real >= 0.0]
-        upper = outside[outside.imag >= 0.0]
-        found += [complex(value) for value in upper[np.argsort(np.abs(upper))][:MOST_POINTS]]
-    return found
-
-
-#: At most so many changes are listed.
-LISTED_CHANGES = 4
-
-#: Rational matrices, as arrays of fractions.
-Rational: TypeAlias = NDArray[Any]
-
-
-@dataclass(frozen=True)
-class EntryChange:
-    """One entry of a matrix and its change; ``Phi`` is that of the fault model, ``By`` and ``Dy`` the observer's."""
-
-    matrix: str
-    row: int
-    column: int
-    before: Fraction
-    after: Fraction
-
-    def described(self, plant: DescriptorSystem, *, parameters: bool = False) -> str:
-        """Return the change in words; with ``parameters`` Bf and Df are called Phi and Psi."""
-        sides = {
-            "E": ("equation", "state"),
-            "A": ("equation", "state"),
-            "C": ("output", "state"),
-            "Bf": ("equation", "fault"),
-            "Df": ("output", "fault"),
-            "Bd": ("equation", "unknown input"),
-            "Dd": ("output", "unknown input"),
-        }.get(self.matrix)
-        names = {
-            "state": plant.state_names,
-            "output": plant.output_names,
-            "fault": plant.fault_names,
-            "unknown input": plant.disturbance_names,
-        }
-        called = {"Bf": "Phi", "Df": "Psi"}.get(self.matrix, self.matrix) if parameters else self.matrix
-        place = f"entry ({self.row + 1}, {self.column + 1}) of {called}"
-        if sides is None:
-            place += " of the fault model" if self.matrix == "Phi" else " of the observer"
-        else:
-            said = [
-                f"{kind} {names[kind][number]!r}" if kind in names else f"{kind} {number + 1}"
-                for kind, number in zip(sides, (self.row, self.column), strict=True)
-            ]
-            place += f" ({', '.join(said)})"
-            place = place.replace("fault ", "parameter ") if parameters else place
-        return f"{place} from {_number(self.before)} to {_after(self.before, self.after)}"
-
-
-@dataclass(frozen=True)
-class Witness:
-    """Changes of entries after which the answer is another one."""
-
-    changes: tuple[EntryChange, ...]
-    size: float  # of the largest change, beside scaled entries
-    point: complex | None = None  # where the changed pencil loses rank; ``None`` for a matrix without s
-
-    def described(self, plant: DescriptorSystem, *, parameters: bool = False) -> str:
-        """Return the changes in words."""
-        texts = [change.described(plant, parameters=parameters) for change in self.changes[:LISTED_CHANGES]]
-        more = len(self.changes) - len(texts)
-        return "; ".join(texts) + (f"; and {more} more like these" if more > 0 else "")
-
-    def plant(self, plant: DescriptorSystem) -> DescriptorSystem:
-        """Return the changed plant: its exact numbers decide, whatever its doubles are rounded to."""
-        exact = rational_matrices(plant)
-        for change in self.changes:
-            if change.matrix in exact:
-                exact[change.matrix][change.row, change.column] = change.after
-        doubles = {name: nearest(matrix) for name, matrix in exact.items()}
-        rows = {name: tuple(map(tuple, matrix.tolist())) for name, matrix in exact.items()}
-        return plant.replace(**doubles, exact=ExactNumbers(rows))
-
-    def model(self, model: Exosystem) -> Exosystem:
-        """Return the changed fault model, rounded."""
-        phi = np.array(model.Phi)
-        for change in self.changes:
-            if change.matrix == "Phi":
-                phi[change.row, change.column] = float(change.after)
-        return replace(model, Phi=phi)
-
-
-@dataclass(frozen=True)
-class Unclear:
-    """Why rounding of the data could change an answer."""
-
-    tolerance: float  # what the data are known to, relative to the largest scaled entry
-    witness: Witness | None  # a plant within it that has the other answer, where one was found
-    other: str  # what that plant is, in words
-    decider: str  # what would decide it
-    parameters: bool = False  # whether what stands as faults are parameters, in Phi and Psi
-
-    def described(self, plant: DescriptorSystem) -> str:
-        """Return all of it in words."""
-        if self.witness is None:
-            shown = f"{self.other}; no single entries were found that do it."
-        elif not self.witness.changes:
-            shown = f"the {_kind(plant)} as it is rounded to double precision {self.other}."
-        else:
-            shown = f"the {_kind(plant)} with {self.witness.described(plant, parameters=self.parameters)} {self.other}."
-        return f"Tolerance: {self.tolerance:.1g} of the largest scaled entry. Witness: {shown} {self.decider}"
-
-
-def _kind(plant: DescriptorSystem) -> str:
-    exact = plant.exact
-    if exact is None:
-        return "plant"
-    if exact.sample_time is not None:
-        return "sampled plant"
-    return "plant without its algebraic states" if plant.nx < exact.states else "plant"
-
-
-def rational_matrices(plant: DescriptorSystem) -> dict[str, Rational]:
-    """Return the decisive matrices of a plant in its own coordinates, as written, or as they were rounded."""
-    exact = plant.exact
-    if exact is not None and exact.sample_time is None and exact.own:
-        return {name: as_array(exact.matrices[name], getattr(plant, name).shape) for name in DECISIVE}
-    return {name: rational(getattr(plant, name)) for name in DECISIVE}
-
-
-def rational(matrix: FloatArray) -> Rational:
-    """Return a matrix of doubles as the fractions that were written."""
-    values = [written_fraction(value) for value in np.ravel(matrix).tolist()]
-    return as_array([values], matrix.shape)
-
-
-def as_array(rows: Sequence[Sequence[Fraction]], shape: tuple[int, ...]) -> Rational:
-    """Return fractions, row by row, as an array of a shape."""
-    found = np.empty(int(np.prod(shape)), dtype=object)
-    found[:] = [value for row in rows for value in row]
-    return found.reshape(shape)
-
-
-def nearest(matrix: Rational) -> FloatArray:
-    """Return fractions as the nearest doubles."""
-    # As `float` of a fraction has it, in a tenth of its time; most entries are zero.
-    values = [value.numerator / value.denominator if value else 0.0 for value in matrix.ravel().tolist()]
-    return np.array(values, dtype=np.float64).reshape(matrix.shape)
-
-
-def _number(value: Fraction) -> str:
-    return repr(float(value)) if float(value) != int(float(value)) else str(int(float(value)))
-
-
-def _after(before: Fraction, after: Fraction) -> str:
-    """Return the new number, as a difference where it is nearer to the old one than doubles tell."""
-    if abs(after - before) * 10**12 > abs(before):
-        return _number(after)
-    change = float(after - before)
-    return f"{_number(before)} {'-' if change < 0.0 else '+'} {abs(change):.4g}"

@@ -1,1 +1,1 @@
-"""An observer as a functional mock-up unit (FMI 2.0 and 3.0, co-simulation): variables, description, C, archive."""
+"""An observer as a functional mock-up unit (FMI 2.0 and 3.0, co-simulation)."""

@@ -19,27 +19,56 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 from obsynth.errors import SpecError
-from obsynth.experiments.monitors.learned import LearnedThresholds
-from obsynth.experiments.monitors.learned_levels import HOLD
-from obsynth.exporting.c_source import (
-    STATISTIC,
-    Alarms,
-    Realisation,
-    c_identifier,
-    comment,
-    dae_alarms,
-    dae_c_texts,
-    header_text,
-    in_precision,
-    integer_table,
-    linear_alarms,
-    require_no_sample_time,
-    source_text,
-    verification_words,
-)
+from obsynth.exporting.alarms import STATISTIC, Alarms, linear_alarms
+from obsynth.exporting.c_source import c_identifier, comment, header_text, integer_table, source_text
+from obsynth.exporting.dae_c_source import dae_alarms, dae_c_texts, require_no_sample_time
+from obsynth.exporting.dae_float import in_precision
+from obsynth.exporting.realisation import Realisation, verification_words
 from obsynth.files.outputs import working_folder, write_atomically
-from obsynth.observers.dae.observer import FLAGS, DAEObserver, compiler, shared_library
+from obsynth.monitoring.thresholds.learned import LearnedThresholds
+from obsynth.monitoring.thresholds.learned_levels import HOLD
+from obsynth.observers.nonlinear.c_code import FLAGS, compiler, shared_library
+from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.results.design import ObserverDesign, unverified_mark
+
+#: Whether a variable is a number (or a flag), its attributes in XML, and its start and unit where it has any.
+_Variable: TypeAlias = tuple[bool, dict[str, str], dict[str, str]]
+
+
+_STEP_CAPABILITY = {"canHandleVariableCommunicationStepSize": "false"}
+
+#: How a version of FMI spells what both have: the token, a number, what lists the outputs, and what the FMU can do.
+_VERSIONS = {
+    "2.0": (
+        "guid",
+        "Real",
+        ("Outputs", "InitialUnknowns"),
+        {
+            **_STEP_CAPABILITY,
+            "canNotUseMemoryManagementFunctions": "true",
+            "canGetAndSetFMUstate": "true",
+            "canSerializeFMUstate": "true",
+        },
+    ),
+    "3.0": (
+        "instantiationToken",
+        "Float64",
+        ("Output", "InitialUnknown"),
+        {
+            **_STEP_CAPABILITY,
+            "fixedInternalStepSize": "",
+            "canGetAndSetFMUState": "true",
+            "canSerializeFMUState": "true",
+        },
+    ),
+}
+
+
+#: Of every name in the C of the observer inside an FMU.
+_PREFIX = "observer"
+
+#: Archives of equal content are equal: the first day that a zip file can hold.
+_FIRST_DAY = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -147,10 +176,6 @@ def _apart(known: Sequence[str], measured: Sequence[str]) -> tuple[str, ...]:
     )
 
 
-#: Whether a variable is a number (or a flag), its attributes in XML, and its start and unit where it has any.
-_Variable: TypeAlias = tuple[bool, dict[str, str], dict[str, str]]
-
-
 def _variable(
     name: str,
     causality: str,
@@ -197,34 +222,6 @@ def _variables(signals: Signals) -> Iterator[_Variable]:
     flags.append(("sample_used", "the last sample was used; otherwise the estimates are those of the model alone"))
     for name, told in flags:
         yield _variable(name, "output", "discrete", told, initial="calculated", is_number=False)
-
-
-_STEP_CAPABILITY = {"canHandleVariableCommunicationStepSize": "false"}
-#: How a version of FMI spells what both have: the token, a number, what lists the outputs, and what the FMU can do.
-_VERSIONS = {
-    "2.0": (
-        "guid",
-        "Real",
-        ("Outputs", "InitialUnknowns"),
-        {
-            **_STEP_CAPABILITY,
-            "canNotUseMemoryManagementFunctions": "true",
-            "canGetAndSetFMUstate": "true",
-            "canSerializeFMUstate": "true",
-        },
-    ),
-    "3.0": (
-        "instantiationToken",
-        "Float64",
-        ("Output", "InitialUnknown"),
-        {
-            **_STEP_CAPABILITY,
-            "fixedInternalStepSize": "",
-            "canGetAndSetFMUState": "true",
-            "canSerializeFMUState": "true",
-        },
-    ),
-}
 
 
 def model_description(
@@ -289,12 +286,6 @@ def build_description(identifier: str, sources: list[str]) -> bytes:
 def _text(root: Element) -> bytes:
     ElementTree.indent(root)
     return bytes(ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
-
-
-#: Of every name in the C of the observer inside an FMU.
-_PREFIX = "observer"
-#: Archives of equal content are equal: the first day that a zip file can hold.
-_FIRST_DAY = (1980, 1, 1, 0, 0, 0)
 
 
 def write_fmu(

@@ -6,13 +6,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
-from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.condition import Condition
 from obsynth.methods.descriptor_kalman.method import DescriptorKalman
+from obsynth.methods.engines.recursive.claims import RECURSIVE_CLAIMS
 from obsynth.methods.method import ClaimMeaning, PlantKind, Purpose
-from obsynth.methods.recursive import RECURSIVE_CLAIMS
 from obsynth.numerics.arguments import Count, ForgettingFactor, Probability, WrittenAs
-from obsynth.observers.recursive.observer import Form, Guard
-from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
+from obsynth.observers.recursive.settings import Form, Guard
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ class AdaptiveObserver(DescriptorKalman):
         self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, exactly: bool = True
     ) -> tuple[Condition, ...]:
         """Return the existence conditions; the list ends at the first failure."""
-        from obsynth.methods.recursive.conditions import recursive_conditions
+        from obsynth.analysis.existence.recursive import recursive_conditions
 
         literal = self.form == "literal"
         return tuple(recursive_conditions(plant, parameters=True, literal=literal, early=self.early_constraints))

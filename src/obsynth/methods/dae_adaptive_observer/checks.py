@@ -9,14 +9,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from obsynth.analysis.existence.moussaali_dae import SOURCE, dae_conditions
 from obsynth.errors import ObsynthError, SolverError
-from obsynth.methods.dae_adaptive_observer.conditions import SOURCE, dae_conditions
-from obsynth.methods.recursive.checks import CLAIM_TOLERANCE, claims_row, failed_run, refinement_rows
-from obsynth.numerics.arguments import FloatArray
+from obsynth.methods.engines.recursive.checks import CLAIM_TOLERANCE, claims_row, failed_run, refinement_rows
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.newton import LARGEST_RESIDUAL
 from obsynth.numerics.ranks import SINGULAR_CONDITION, covariance_factor
 from obsynth.observers.batches import run_dae_batch
-from obsynth.observers.dae.building import (
+from obsynth.observers.nonlinear.building import (
     FEWEST_STEPS,
     OPTIONS,
     DAEFacts,
@@ -24,10 +24,11 @@ from obsynth.observers.dae.building import (
     dae_observer_from_options,
     resolved_options,
 )
-from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.running import plain_recursion
-from obsynth.proofs.balls import Ball, prove_positive_definite
+from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import proved_rate
+from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.proofs.products import logarithm_of_product
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
@@ -37,18 +38,25 @@ from obsynth.verification.plant import condition_rows
 
 #: Central differences over this share of a size leave about its square, and rounding over it.
 DERIVATIVE_DIFFERENCE = 1e-5
+
 #: So much may be left between differences and derivatives, in sizes of the signals.
 DERIVATIVE_TOLERANCE = 1e-6
+
 #: Runs and steps of the Monte Carlo: with one parameter the mean of 48 squares is wrong by the factor below one time in
 #: several hundred.
 MONTE_CARLO_RUNS = 48
+
 #: So many where those seem to refute the covariances.
 MORE_TRIALS = 240
+
 TRIAL_STEPS = 40
+
 MONTE_CARLO_SEED = 20130206
+
 #: A mean of normalised squares may be off by this factor: covariances of a nonlinear plant are first-order ones.  Less
 #: than this is left to the information in the row.
 CONSISTENCY_FACTOR = 2.0
+
 #: Between these probabilities lie 95 %.
 TAIL_PROBABILITIES = (0.025, 0.975)
 

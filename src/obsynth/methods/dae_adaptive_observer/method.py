@@ -6,14 +6,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
-from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.condition import Condition
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
 from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, WrittenAs
-from obsynth.observers.dae.settings import Guard, Weight
+from obsynth.observers.nonlinear.settings import Guard, Weight
 from obsynth.observers.outliers import Outliers
 from obsynth.plants.dae import DAEModel
 
 FormChoice: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman", "auto"]
+
 IntegrationChoice: TypeAlias = Literal["backward-euler", "radau", "auto"]
 
 
@@ -155,12 +156,12 @@ class DaeAdaptiveObserver(Method):
 
     def existence(self, plant: DAEModel, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions; the list ends at the first failure."""
-        from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
+        from obsynth.analysis.existence.moussaali_dae import dae_conditions
 
         return tuple(dae_conditions(plant, 1.0 if self.dt is None else self.dt))
 
     def require_stated(self, plant: DAEModel) -> None:
         """Raise `SpecError` where noise or a parameter's deviation is not stated."""
-        from obsynth.observers.dae.building import dae_observer_from_options
+        from obsynth.observers.nonlinear.building import dae_observer_from_options
 
         dae_observer_from_options(plant, self.as_given())

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from obsynth.analysis.conditions import require_all
+from obsynth.analysis.existence.condition import require_all
 from obsynth.methods.dae_adaptive_observer.method import DaeAdaptiveObserver
 from obsynth.methods.method import Synthesis
-from obsynth.observers.dae.building import (
+from obsynth.observers.nonlinear.building import (
     LARGEST_TURN,
     NOMINAL_STEPS,
     DAEFacts,
@@ -18,10 +18,11 @@ from obsynth.observers.dae.building import (
     largest_turn,
     resolved_options,
 )
-from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.running import plain_recursion
-from obsynth.plants.dae import PROJECTION_NOTICE, DAEModel
-from obsynth.plants.noise_model import offset_state
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.implicit_step import PROJECTION_NOTICE
+from obsynth.plants.noise import offset_state
 from obsynth.results.design import Certificate
 
 

@@ -6,12 +6,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
-from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.condition import Condition
+from obsynth.methods.engines.recursive.claims import RECURSIVE_CLAIMS
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
-from obsynth.methods.recursive import RECURSIVE_CLAIMS
 from obsynth.numerics.arguments import Positive, WrittenAs
 from obsynth.observers.outliers import Outliers
-from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 
@@ -113,13 +114,13 @@ class DescriptorKalman(Method):
         self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, exactly: bool = True
     ) -> tuple[Condition, ...]:
         """Return the existence conditions; the list ends at the first failure."""
-        from obsynth.methods.recursive.synthesis import kalman_conditions
+        from obsynth.analysis.existence.kalman import kalman_conditions
 
         return kalman_conditions(plant, early=self.early_constraints)
 
     def require_stated(self, plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> None:
         """Raise `SpecError` where noise or unknown inputs of the plant are none that the method covers."""
-        from obsynth.methods.recursive.synthesis import with_stated_noise, without_unknown_inputs
+        from obsynth.analysis.existence.kalman import with_stated_noise, without_unknown_inputs
 
         with_stated_noise(plant, self.as_given())
         if isinstance(plant, DescriptorSystem) and plant.nd:
@@ -129,13 +130,13 @@ class DescriptorKalman(Method):
         self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, progress: Callable[[str], None]
     ) -> Synthesis:
         """Return gains, observer and certificate, not yet verified."""
-        from obsynth.methods.recursive.synthesis import synthesise
+        from obsynth.methods.engines.recursive.synthesis import synthesise
 
         return synthesise(plant, self, progress=progress)
 
     @classmethod
     def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
         """Yield a row for each claim, from the plant and the shipped realisation alone."""
-        from obsynth.methods.recursive.checks import checks
+        from obsynth.methods.engines.recursive.checks import checks
 
         return checks(design, printed_digits)

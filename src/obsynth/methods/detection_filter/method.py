@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.condition import Condition
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind
 from obsynth.numerics.arguments import WrittenAs, is_finite_number
 from obsynth.plants.descriptor import DescriptorSystem
@@ -94,7 +94,7 @@ class DetectionFilterMethod(Method):
 
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions of a plant."""
-        from obsynth.methods.detection_filter.conditions import conditions
+        from obsynth.analysis.existence.ding2000 import conditions
 
         return conditions(plant)
 

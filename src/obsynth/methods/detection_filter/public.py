@@ -8,7 +8,8 @@ from obsynth.methods.detection_filter.checks import TOGETHER
 from obsynth.methods.detection_filter.method import DetectionFilterMethod
 from obsynth.methods.functions import design_function
 from obsynth.methods.verifying import verify
-from obsynth.results.design import ObserverDesign, VerificationReport
+from obsynth.results.design import ObserverDesign
+from obsynth.results.verification_report import VerificationReport
 
 
 @dataclass(frozen=True, repr=False)

@@ -7,38 +7,36 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.analysis.conditions import require_all
-from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.transformations.linear_plants import eliminate_algebraic_states
+from obsynth.analysis.existence.condition import require_all
+from obsynth.analysis.existence.ding2000 import unknown_inputs
 from obsynth.errors import SolverError
-from obsynth.methods.detection_filter.checks import (
-    Transfer,
-    added_gain,
-    error_transfer,
-    gain_is_proved,
-    sensitivity_is_proved,
-)
-from obsynth.methods.detection_filter.conditions import unknown_inputs
 from obsynth.methods.detection_filter.method import DetectionFilterMethod
 from obsynth.methods.method import Synthesis
-from obsynth.numerics.arguments import FloatArray, largest_singular_value
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_solution
 from obsynth.numerics.norms import response
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.plant_units import PlantUnits
+from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.results.design import Certificate
+from obsynth.verification.norm_proofs import Transfer, added_gain, error_transfer, gain_is_proved, sensitivity_is_proved
 
 #: The grid of frequencies begins at this share of its end, where the band begins at zero.
 LEAST_FREQUENCY = 1e-6
+
 #: The proved gain is the first of these above one, and the proved sensitivity the first below what a grid finds, with
 #: which the proof is above the rounding of its numbers.
 GAIN_MARGINS, SENSITIVITY_MARGINS = (1e-6, 1e-4, 1e-2), (1e-4, 1e-3, 1e-2, 0.1, 0.5)
+
 #: Share of the room that a bound leaves which strictness of the inequality takes: the other half is for rounding.
 STRICTNESS = 0.5
+
 #: A state with less than this share of the largest variance is none that noise reaches, up to rounding.
 UNREACHED = 1e-12
+
 #: Frequencies of the grid, and how often the least value is refined between its neighbours.
 GRID_FREQUENCIES, GRID_REFINEMENTS = 400, 40
 

@@ -8,34 +8,23 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge
 
-from obsynth.analysis.conditions import Condition
-from obsynth.errors import SpecError
-from obsynth.methods.fault_estimation_filter.least_gain_proof import LEAST_GAIN_WITNESSES
-from obsynth.methods.method import (
-    ClaimMeaning,
-    Method,
+from obsynth.analysis.existence.condition import Condition
+from obsynth.conditions.options import (
     OwnConstraints,
     OwnRegion,
-    PlantKind,
-    Purpose,
     SolverName,
     SolverOptions,
-    Synthesis,
     own_term_conflicts,
     own_terms,
 )
-from obsynth.numerics.arguments import (
-    FewSamples,
-    OpenUnitInterval,
-    Positive,
-    WrittenAs,
-    checked_value,
-    require_no_overflow,
-    shown,
-)
+from obsynth.errors import SpecError
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
+from obsynth.numerics.arguments import FewSamples, OpenUnitInterval, Positive, WrittenAs, checked_value, shown
+from obsynth.numerics.arrays import require_no_overflow
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.least_gain_proof import LEAST_GAIN_WITNESSES
 
 #: The least relative distance to the optimum at which a proof can be expected: less leaves no room for one.
 LEAST_MARGIN = 1e-2
@@ -194,7 +183,7 @@ class FaultEstimationFilter(Method):
 
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, decided exactly or in floating point; the list ends at the first failure."""
-        from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
+        from obsynth.analysis.existence.wang2015 import fault_filter_conditions
 
         return fault_filter_conditions(plant, exactly=exactly)
 

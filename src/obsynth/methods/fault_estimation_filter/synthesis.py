@@ -1,4 +1,4 @@
-r"""Fault-estimation filter for discrete-time descriptor systems.
+"""Fault-estimation filter for discrete-time descriptor systems.
 
 Source: Z. Wang, M. Rodrigues, D. Theilliol, Y. Shen, *Fault estimation filter design for discrete-time descriptor
 systems*, IET Control Theory and Applications 9 (10), 2015: filter (23), gain structure (60), LMI (45).
@@ -33,48 +33,94 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.analysis.conditions import require_all
+from obsynth.analysis.existence.condition import require_all
+from obsynth.analysis.existence.restricted_equivalent import PreparedPlant, prepare, with_sensor_faults_as_states
+from obsynth.analysis.existence.wang2015 import examine_fault_filter
+from obsynth.conditions import lazy_cvxpy as cp
+from obsynth.conditions.gamma_lower_bound import BOUND_MARGIN, least_gain_certificate, proved_lower_bound
+from obsynth.conditions.lmi import chosen_solver, solved
 from obsynth.errors import InfeasibleError, SolverError
-from obsynth.methods.conic import lazy_cvxpy as cp
-from obsynth.methods.conic.lmi import chosen_solver, solved
-from obsynth.methods.fault_estimation_filter.central_filter import (
+from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
+from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
+from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
+from obsynth.methods.method import Synthesis
+from obsynth.numerics.arrays import FloatArray, as_matrix, largest_singular_value
+from obsynth.numerics.central_filter import (
     AT_THE_BOUND,
     FEW_STATES,
     MOST_STATES_FOR_LEVELS,
-    GainProblem,
-    Injection,
     LeastGain,
-    WeightLimit,
     least_level,
     least_noise_filter,
     noise_weighted_filters,
     noise_weighted_filters_within,
-    null_basis,
     search_by_bisection,
     search_least_gain,
 )
-from obsynth.methods.fault_estimation_filter.conditions import (
-    PreparedPlant,
-    examine_fault_filter,
-    prepare,
-    with_sensor_faults_as_states,
-)
-from obsynth.methods.fault_estimation_filter.gamma_lower_bound import (
-    BOUND_MARGIN,
-    least_gain_certificate,
-    proved_lower_bound,
-)
-from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
-from obsynth.methods.fault_estimation_filter.realisation import bounded_real_certificate, notes, realise_filter
-from obsynth.methods.method import Synthesis
-from obsynth.numerics.arguments import FloatArray, as_matrix, largest_singular_value
+from obsynth.numerics.injection_problem import GainProblem, Injection, WeightLimit, null_basis
 from obsynth.numerics.regions import disk
-from obsynth.observers.linear.observer import LinearObserver, averaged
+from obsynth.observers.linear.derived import averaged
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
 
 if TYPE_CHECKING:
     from obsynth.conditions.problem import Conditions
+
+
+#: The error shall decay at least this fast (spectral radius), or half as fast as that of the starting filter: the
+#: smallest gains alone would leave an observable mode at the very edge of stability.
+SLOWEST_DECAY = 0.999
+
+#: Up to so many states the whole inequality competes although nothing needs it.
+MOST_STATES_FOR_WHOLE = 12
+
+#: Noise on the states, relative to that of the plant, for filters that shall decay faster; and how much more variance
+#: than the least of such filters that may cost.
+STATE_NOISE = (1e-4, 1e-3, 1e-2, 1e-1)
+
+PRICE_OF_SPEED = 1.04
+
+#: Halvings of the step towards the filter of least noise, for few, for many, and for still more states.
+LINE_STEPS = 7
+
+COARSE_LINE_STEPS = 3
+
+COARSEST_LINE_STEPS = 2
+
+
+#: A shipped gain is never asked to be smaller than this fraction of the starting filter's.
+SMALLEST_USEFUL_GAIN = 1e-3
+
+#: Why the inequality was not asked.
+NOTHING_TO_POLISH = "the lower bound is reached: the disturbance has this effect before any measurement can counter it"
+
+#: Asking for a gain above this multiple of the starting filter's adds nothing but bad scaling.
+LARGEST_USEFUL_GAIN = 1e3
+
+#: The gains are designed for a slightly smaller gamma than claimed, so that the claim has a well-conditioned proof.
+CERTIFICATE_MARGIN = 5e-3
+
+CERTIFICATE_SHARE = 0.2
+
+#: Gains below this, relative to the disturbance and the output it could reach, are rounding errors.
+ROUNDING_GAIN = 1e-11
+
+#: Level of the certificate, relative to the same, when no disturbance reaches the fault estimate at all.
+NOMINAL_GAIN = 1e-3
+
+#: A gamma between these multiples of the least gain found by the equations calls the inequality by default, up to so
+#: many states: far below the least no polish helps, and far above none is needed.
+BELOW_LEAST, ABOVE_LEAST = 0.95, 1.0 + 1e-4
+
+MOST_STATES_TO_POLISH = 20
+
+
+#: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
+BACKGROUND_NOISE = 1e-3
+
+#: Coordinates in which a certificate is looked for before the gain is judged again.
+FIRST_TRIES = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,21 +250,6 @@ def gains_by_inequality(goal: Goal, printed: PrintedInequality, records: list[di
     return found
 
 
-#: The error shall decay at least this fast (spectral radius), or half as fast as that of the starting filter: the
-#: smallest gains alone would leave an observable mode at the very edge of stability.
-SLOWEST_DECAY = 0.999
-#: Up to so many states the whole inequality competes although nothing needs it.
-MOST_STATES_FOR_WHOLE = 12
-#: Noise on the states, relative to that of the plant, for filters that shall decay faster; and how much more variance
-#: than the least of such filters that may cost.
-STATE_NOISE = (1e-4, 1e-3, 1e-2, 1e-1)
-PRICE_OF_SPEED = 1.04
-#: Halvings of the step towards the filter of least noise, for few, for many, and for still more states.
-LINE_STEPS = 7
-COARSE_LINE_STEPS = 3
-COARSEST_LINE_STEPS = 2
-
-
 def small_gain_design(
     problem: GainProblem, least: LeastGain, gain: float, *, printed: PrintedInequality, engine: str
 ) -> tuple[Injection, list[dict[str, Any]]]:
@@ -308,25 +339,6 @@ def _towards(goal: Goal, injection: Injection, target: Injection | None, *, slow
             best, least, share = mixed, cost, tried
         step *= 0.5
     return best
-
-
-#: A shipped gain is never asked to be smaller than this fraction of the starting filter's.
-SMALLEST_USEFUL_GAIN = 1e-3
-#: Why the inequality was not asked.
-NOTHING_TO_POLISH = "the lower bound is reached: the disturbance has this effect before any measurement can counter it"
-#: Asking for a gain above this multiple of the starting filter's adds nothing but bad scaling.
-LARGEST_USEFUL_GAIN = 1e3
-#: The gains are designed for a slightly smaller gamma than claimed, so that the claim has a well-conditioned proof.
-CERTIFICATE_MARGIN = 5e-3
-CERTIFICATE_SHARE = 0.2
-#: Gains below this, relative to the disturbance and the output it could reach, are rounding errors.
-ROUNDING_GAIN = 1e-11
-#: Level of the certificate, relative to the same, when no disturbance reaches the fault estimate at all.
-NOMINAL_GAIN = 1e-3
-#: A gamma between these multiples of the least gain found by the equations calls the inequality by default, up to so
-#: many states: far below the least no polish helps, and far above none is needed.
-BELOW_LEAST, ABOVE_LEAST = 0.95, 1.0 + 1e-4
-MOST_STATES_TO_POLISH = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -468,17 +480,11 @@ def _require_reachable(problem: GainProblem, least: LeastGain, gain: float, *, s
     )
 
 
-#: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
-BACKGROUND_NOISE = 1e-3
-#: Coordinates in which a certificate is looked for before the gain is judged again.
-FIRST_TRIES = 4
-
-
 def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the filter; see `obsynth.fault_estimation_filter` for the options, results and errors."""
     solver = chosen_solver(asked.solver, asked.solver_options)
     if asked.own_inequality:
-        from obsynth.conditions.own_terms import filter_by_inequality
+        from obsynth.methods.engines.own_terms import filter_by_inequality
 
         return filter_by_inequality(plant, asked, progress=progress)
     asked = replace(asked, solver=solver)

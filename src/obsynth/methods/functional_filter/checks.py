@@ -1,127 +1,41 @@
-"""The error system of a functional filter: faults that follow their models, deviations by noise and by walks.
-
-Checks of a functional filter, from the plant, the shipped realisation and T, T0 alone; gains without T and T0.
-"""
+"""Checks of a functional filter, from the plant, the shipped realisation and T, T0 alone; gains without T and T0."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
-import flint
 import numpy as np
 
-from obsynth.analysis.plant_units import PlantUnits
-from obsynth.methods.functional_filter.conditions import conditions, residual_sets
-from obsynth.methods.ui_pi_observer.augmented_plant import shipped_model
-from obsynth.methods.ui_pi_observer.checks import decoupling_norms
-from obsynth.numerics.arguments import FloatArray, reachable
+from obsynth.analysis.existence.augmented_pencils import shipped_model
+from obsynth.analysis.existence.functional_filter import conditions, residual_sets
+from obsynth.methods.functional_filter.tracking import estimate_deviations, wanted_faults
+from obsynth.methods.ui_pi_observer.decoupling import decoupling_norms
+from obsynth.numerics.arrays import FloatArray, reachable
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import arb_matrix
-from obsynth.proofs.products import EXPONENTIAL_BITS, as_ball, certain_noise_covariance
+from obsynth.plants.plant_units import PlantUnits
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.claims import (
-    Identity,
-    decay_row,
-    equality,
-    listed_gains,
-    relative_tolerance,
-    stability_row,
-)
-from obsynth.verification.error_system import ErrorModel, natural_scaling
+from obsynth.verification.claims import listed_gains
+from obsynth.verification.error_system import natural_scaling
+from obsynth.verification.identities import Identity, equality, relative_tolerance
+from obsynth.verification.inequalities import decay_row, stability_row
 from obsynth.verification.plant import condition_rows, plant_information
-
-#: Regulator equations of more unknowns are solved in double precision.
-MOST_RATIONAL_UNKNOWNS = 100
-
-
-def tracking_map(
-    plant: DescriptorSystem, observer: LinearObserver, t: FloatArray, phi: FloatArray, cw: FloatArray
-) -> FloatArray:
-    """Return Pi ``(nz, nw)``: where eps goes when every fault follows its model, ``Az Pi + b Cw = Pi Phi``."""
-    from scipy.linalg import solve_sylvester
-
-    entering = (observer.By @ plant.Df - t @ plant.Bf) @ cw
-    if not entering.size:
-        return np.zeros(entering.shape)
-    exact = _with_digits_to_spare(observer.Az, phi, entering) if entering.size <= MOST_RATIONAL_UNKNOWNS else None
-    return np.asarray(solve_sylvester(observer.Az, -phi, -entering)) if exact is None else exact
-
-
-def _with_digits_to_spare(a: FloatArray, phi: FloatArray, entering: FloatArray) -> FloatArray | None:
-    """Return Pi to its last digit, however near a slow pole is to the fault model; ``None`` where it has one."""
-    order, count = entering.shape
-    whole, right = np.kron(a, np.eye(count)), np.kron(np.eye(order), phi.T)
-    with flint.ctx.workprec(EXPONENTIAL_BITS):
-        own, model, known = (arb_matrix(np.asarray(part)) for part in (whole, right, entering.reshape(-1, 1)))
-        try:
-            found = (model - own).solve(known)
-        except ZeroDivisionError:
-            return None
-    return as_ball(found).midpoint.reshape(order, count)
-
-
-def wanted_faults(
-    plant: DescriptorSystem, observer: LinearObserver, matrices: Mapping[str, FloatArray], *, mean: int
-) -> FloatArray:
-    """Return what rows should make of the models' states ``(rows, nw)``: the fault with the claimed delay, or
-    nothing."""
-    phi, cw = matrices["Phi"], matrices["Cw"]
-    rows = np.zeros((len(observer.Cz), len(phi)))
-    for row, (name, delay) in enumerate(zip(observer.fault_names, observer.fault_delays, strict=True)):
-        first = delay - (mean - 1) // 2
-        back = np.linalg.inv(phi) if delay or mean > 1 else np.eye(len(phi))
-        powers = [np.linalg.matrix_power(back, first + j) for j in range(mean)]
-        rows[row] = cw[plant.fault_names.index(name)] @ (sum(powers[1:], start=powers[0]) / mean)
-    return rows
-
-
-def estimate_deviations(
-    plant: DescriptorSystem, observer: LinearObserver, matrices: Mapping[str, FloatArray]
-) -> FloatArray:
-    """Return deviations ``(faults, 2)`` of fhat under noise and of ``fhat - f`` with walks; dt = 0: per sqrt(s)."""
-    errors = ErrorModel(plant, observer, matrices["T"], -matrices["T0"])
-    rows = observer.fault_rows
-    discrete = float(plant.dt > 0.0)
-    noise = certain_noise_covariance(
-        errors.Az, -errors.noise, observer.Cz[rows], discrete * errors.fault_output[3], plant.dt
-    )
-    walk = _walk_covariance(plant, observer, matrices, errors)
-    alone = np.maximum(np.diag(noise), 0.0)
-    return np.asarray(np.sqrt(np.column_stack([alone, alone + np.maximum(np.diag(walk), 0.0)])))
-
-
-def _walk_covariance(
-    plant: DescriptorSystem, observer: LinearObserver, matrices: Mapping[str, FloatArray], errors: ErrorModel
-) -> FloatArray:
-    """Return the covariance of ``fhat(k) - f(k - delay)`` that the walks of the fault models cause."""
-    phi, cw, drive, pi = (matrices[name] for name in ("Phi", "Cw", "walks", "tracking"))
-    rows, count = observer.fault_rows, len(phi)
-    # In coordinates around the motion that follows the models, only what drives them is left.
-    lag = max((0, *observer.fault_delays))
-    order = observer.order
-    a = np.zeros((order + lag * count, order + lag * count))
-    b = np.zeros((len(a), drive.shape[1]))
-    c = np.zeros((len(observer.fault_names), len(a)))
-    a[:order, :order], b[:order] = observer.Az, -pi @ drive
-    for j in range(lag):
-        place = slice(order + j * count, order + (j + 1) * count)
-        if j == 0:
-            b[place] = drive
-        else:
-            a[place, order + (j - 1) * count : order + j * count] = np.eye(count)
-    c[:, :order] = observer.Cz[rows]
-    for row, (name, delay) in enumerate(zip(observer.fault_names, observer.fault_delays, strict=True)):
-        # w(k) = Phi^delay w(k - delay) + the steps since; the estimate is of the oldest of them.
-        for j in range(delay):
-            back = np.linalg.matrix_power(np.linalg.inv(phi), delay - j)
-            c[row, order + j * count : order + (j + 1) * count] = cw[plant.fault_names.index(name)] @ back
-    return certain_noise_covariance(a, b, c, np.zeros((len(c), drive.shape[1])), plant.dt)
-
 
 #: Estimates at a frequency may miss by this much, relative to terms that pass through the inverse of ``sI - Az``.
 DECOUPLING_LEVEL = 1e-7
+
+
+#: The regulator equation may miss by this much, relative to its terms: its solution is no part of the gains.
+TRACKING_TOLERANCE = 1e-8
+
+#: Claimed deviations may be missed by this share: two ways through a Lyapunov equation.
+DEVIATION_TOLERANCE = 1e-4
+
+
+_FUNCTIONAL_MATRICES = ("T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations")
+
+_SOURCE = "identities of the error z - T E x, ours"
 
 
 def decoupling_rows(design: ObserverDesign) -> Iterator[Check]:
@@ -168,12 +82,6 @@ def _blind_to(design: ObserverDesign) -> Iterator[tuple[str, list[int], list[str
         yield label.rstrip(": "), rows, [name for name in plant.fault_names if name not in seen]
 
 
-#: The regulator equation may miss by this much, relative to its terms: its solution is no part of the gains.
-TRACKING_TOLERANCE = 1e-8
-#: Claimed deviations may be missed by this share: two ways through a Lyapunov equation.
-DEVIATION_TOLERANCE = 1e-4
-
-
 def noise_rows(design: ObserverDesign) -> Iterator[Check]:
     """Yield, for each estimate, the deviation that noise causes, and that of its error with the stated walk."""
     (plant, observer), matrices = design.linear, design.certificate.matrices
@@ -208,10 +116,6 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
                 float(claimed_total) * (1.0 + DEVIATION_TOLERANCE),
                 source="recomputed, Lyapunov equation",
             )
-
-
-_FUNCTIONAL_MATRICES = ("T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations")
-_SOURCE = "identities of the error z - T E x, ours"
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:

@@ -10,10 +10,11 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from annotated_types import Ge
 
-from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
 from obsynth.errors import SpecError
-from obsynth.methods.method import OPTIONS_PATH, ClaimMeaning, Method, PlantKind, Purpose
-from obsynth.numerics.arguments import FewSamples, FloatArray, NonNegative, WrittenAs, is_finite_number
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.numerics.arguments import FewSamples, NonNegative, WrittenAs, is_finite_number
+from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
@@ -143,7 +144,7 @@ class FunctionalFilter(Method):
 
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, one or two for each fault asked for."""
-        from obsynth.methods.functional_filter.conditions import conditions
+        from obsynth.analysis.existence.functional_filter import conditions
 
         return conditions(
             plant,

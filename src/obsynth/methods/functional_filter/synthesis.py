@@ -20,39 +20,41 @@ import flint
 import numpy as np
 from scipy.linalg import block_diag, schur
 
+from obsynth.analysis.existence.functional_filter import chosen_faults, residual_sets
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.methods.functional_filter.checks import estimate_deviations, tracking_map
-from obsynth.methods.functional_filter.conditions import chosen_faults, residual_sets
 from obsynth.methods.functional_filter.kalman_gain import (
-    MOST_LONGER,
     RATE_REACHED,
     FilterModel,
     KalmanGain,
-    default_rates,
     filter_model,
     kalman_gain,
     model_states,
     require_noise,
-    settling_time,
     whitening,
 )
 from obsynth.methods.functional_filter.method import FunctionalFilter
+from obsynth.methods.functional_filter.rates import MOST_LONGER, default_rates, settling_time
+from obsynth.methods.functional_filter.tracking import estimate_deviations, tracking_map
 from obsynth.methods.method import Synthesis
-from obsynth.methods.placement.region import checked_poles, place
 from obsynth.methods.refusals import require_above_rounding, require_all_told
-from obsynth.numerics.arguments import FloatArray
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.eigenstructure import checked_poles, place
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, product_but_rounding, rounding_rank
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.fault_models import Exosystem, exosystem
-from obsynth.proofs.balls import arb_matrix
+from obsynth.plants.faults import Exosystem, exosystem
+from obsynth.proofs.extended_balls import arb_matrix
 from obsynth.proofs.products import EXPONENTIAL_BITS, as_ball
 from obsynth.results.design import Certificate
-from obsynth.verification.claims import slowest_decay, stability_factor
+from obsynth.verification.inequalities import slowest_decay, stability_factor
 
 #: A matrix larger than its eigenvalues by this is given in coordinates in which it is triangular.
 FAR_FROM_NORMAL = 1e3
+
+
+#: Errors that need longer than so many times the settling time are mentioned.
+SLOW_ERRORS = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,10 +212,6 @@ def _side_by_side(found: Sequence[Rows], orders: Sequence[int], inputs: int, nx:
 
 def _stacked(matrices: Sequence[FloatArray], width: int) -> FloatArray:
     return np.vstack([np.zeros((0, width)), *matrices])
-
-
-#: Errors that need longer than so many times the settling time are mentioned.
-SLOW_ERRORS = 20.0
 
 
 def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Callable[[str], None]) -> Synthesis:

@@ -17,15 +17,18 @@ from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import rounding_of, window_as_designed
 from obsynth.methods.guaranteed_test.programs import TOLERANCE
 from obsynth.methods.guaranteed_test.proofs import Repaired, Square, proved_threshold, repaired_multipliers
-from obsynth.methods.guaranteed_test.windows import Window, rows_before, window_of
-from obsynth.numerics.arguments import FloatArray
+from obsynth.methods.guaranteed_test.tolerant import rows_before
+from obsynth.methods.guaranteed_test.windows import Window, window_of
+from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import UNIT_ROUNDOFF, gamma, rounded_up
 from obsynth.results.design import ObserverDesign
 
 #: Patterns of missing rows whose programmes are kept: those of a gap that moves through a window.
 KEPT_PATTERNS = 256
+
 #: Where nothing satisfies a window to the tightest tolerance it is tried with this one: only proofs count.
 LOOSE = 1e-7
+
 #: A ray that refutes a window is added so many times to a test, which it moves as far as one likes.
 TIMES_OF_A_RAY = 1e3
 

@@ -8,12 +8,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import SpecError
-from obsynth.methods.guaranteed_test.windows import Asked
+from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind
 from obsynth.plants.dae import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
@@ -187,10 +188,10 @@ class GuaranteedTestMethod(Asked, Method):
     ) -> tuple[Condition, ...]:
         """Return the existence conditions: bounds are stated, and something tells the fault."""
         if isinstance(plant, DAEModel):
-            from obsynth.methods.guaranteed_test.synthesis import nonlinear_conditions
+            from obsynth.methods.guaranteed_test.nonlinear import nonlinear_conditions
 
             return nonlinear_conditions(plant, self)
-        from obsynth.methods.guaranteed_test.conditions import conditions
+        from obsynth.methods.guaranteed_test.existence import conditions
 
         return conditions(plant, self)
 
@@ -203,14 +204,14 @@ class GuaranteedTestMethod(Asked, Method):
     ) -> Any:
         """Return weights, observer and certificate, not yet verified; ``scenario``: see the synthesis."""
         if isinstance(plant, DAEModel):
-            from obsynth.methods.guaranteed_test.synthesis import synthesise_nonlinear
+            from obsynth.methods.guaranteed_test.nonlinear import synthesise_nonlinear
 
             return synthesise_nonlinear(plant, self, progress=progress)
         for option in ("region", "sample_time", "given", "model"):
             if getattr(self, option) is not None:
                 raise SpecError(f"{option} is for nonlinear plants: leave it out.", path=f"method.options.{option}")
         if self.isolate and isinstance(plant, DescriptorSystem):
-            from obsynth.methods.guaranteed_test.synthesis import synthesise_bank
+            from obsynth.methods.guaranteed_test.bank_synthesis import synthesise_bank
 
             found = synthesise_bank(plant, self, progress=progress)
             return found if scenario is None else replace(found, notes=(*found.notes, NOMINAL_BANK))
@@ -221,7 +222,8 @@ class GuaranteedTestMethod(Asked, Method):
     @classmethod
     def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
         """Yield a row for each claim, from the plant and the shipped numbers alone."""
-        from obsynth.methods.guaranteed_test.checks import bank_checks, checks, is_bank
+        from obsynth.methods.guaranteed_test.bank import bank_checks, is_bank
+        from obsynth.methods.guaranteed_test.checks import checks
 
         del printed_digits
         bank = is_bank(design) and isinstance(design.plant, DescriptorSystem)
@@ -237,9 +239,9 @@ class GuaranteedTestMethod(Asked, Method):
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel | None:
         """Return what the registers follow: the multipliers of one equation each; without a fault the row is zero."""
-        from obsynth.methods.guaranteed_test.checks import is_bank, tests_of
+        from obsynth.methods.guaranteed_test.bank import is_bank, tests_of
         from obsynth.methods.guaranteed_test.problem import window_as_designed
-        from obsynth.methods.guaranteed_test.windows import tracked
+        from obsynth.methods.guaranteed_test.tolerant import tracked
 
         if not cls.has_error_model(design):
             return None

@@ -12,21 +12,17 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.methods.guaranteed_test.windows import (
-    Asked,
-    Bounds,
-    Question,
-    Window,
-    disturbance_names,
-    fault_names,
-    side_by_side,
-    window_of,
-)
-from obsynth.numerics.arguments import LARGEST, FloatArray, is_finite_number, real_number, require_no_overflow
+from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.guaranteed_test.tolerant import side_by_side
+from obsynth.methods.guaranteed_test.windows import Bounds, Question, Window, disturbance_names, fault_names, window_of
+from obsynth.numerics.arguments import is_finite_number, real_number
+from obsynth.numerics.arrays import LARGEST, FloatArray, require_no_overflow
 from obsynth.numerics.ranks import decide_rank
-from obsynth.observers.linear.observer import LinearObserver, WindowObserver
-from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
-from obsynth.proofs.exact_arithmetic import ExactPencil
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.window.observer import WindowObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.proofs.exact_pencils import ExactPencil
 
 #: What each course covers, and what not.
 COURSES: Mapping[str, str] = {
@@ -38,16 +34,20 @@ COURSES: Mapping[str, str] = {
     "ramp": "a straight line over the window: the interval is of its value at one sample",
     "rate": "a fault that changes by at most fault_rate a sample: the interval is of its value at one sample",
 }
+
 #: Samples that are tried for ``samples="auto"``; for a step, those after its healthy past.
 LADDER = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
+
 #: The ladder ends where a window has more states than this.
 MOST_STATES = 2500
+
 #: The least number of samples whose threshold is within this share of the last one's is taken.
 WITHIN = 0.05
 
 
 #: Rows, evenly spread, whose windows decide on the number of samples and the lag where matrices change with k.
 TRIED_ROWS = 8
+
 #: What is for plants with constant matrices, and what to do instead.
 REFUSED: Mapping[str, str] = {
     "isolate": "design one test for each fault, insensitive to the others (free: others)",

@@ -1,5 +1,6 @@
 """The linear programmes of a window: the largest fault that nothing tells from none, by HiGHS; only their answers are
-proved."""
+proved.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.conditions import lazy_cvxpy as cp
 from obsynth.errors import SolverError
-from obsynth.methods.conic import lazy_cvxpy as cp
 from obsynth.methods.guaranteed_test.windows import Window
-from obsynth.numerics.arguments import FloatArray
+from obsynth.numerics.arrays import FloatArray
 
 #: Tightest tolerance that HiGHS takes.
 TOLERANCE = 1e-10
+
 _TIGHT = {"primal_feasibility_tolerance": TOLERANCE, "dual_feasibility_tolerance": TOLERANCE}
+
 #: What is asked of HiGHS in turn: its tightest answer; one without presolve; what it has of its own accord, which large
 #: networks need; an interior point.
 ATTEMPTS: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -25,6 +28,7 @@ ATTEMPTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("highs-ipm", {}),
     ("highs-ipm", {"presolve": False}),
 )
+
 #: Statuses of `scipy.optimize.linprog`.
 SOLVED_STATUS, UNBOUNDED = 0, 3
 

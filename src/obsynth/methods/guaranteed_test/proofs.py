@@ -1,11 +1,4 @@
-"""Proofs about large windows by simulation: E nonsingular leads from one state to the next, so no matrix of all rows is
-inverted.
-
-Multipliers of the equations follow from the weights of the outputs, of which a few are corrected: as many as there are
-free columns but for later states.  A witness is simulated from its start, and what is left of outputs is noise.  All in
-balls of many bits, so that every machine finds the same distance to the exact solution.
-
-Proofs about a window: what shipped multipliers promise, what a witness shows, and why there is no test.
+"""Proofs about a window: what shipped multipliers promise, what a witness shows, and why there is no test.
 
 Shipped doubles satisfy equations up to rounding.  What is missing is computed exactly, in whole numbers; a square part
 of the equations with a proved inverse then tells how far the exact solution lies from what is shipped, at most.
@@ -13,259 +6,57 @@ of the equations with a proved inverse then tells how far the exact solution lie
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
 from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
+from obsynth.methods.guaranteed_test.condensed import LEAST_WEIGHT, Condensed
 from obsynth.methods.guaranteed_test.problem import rounded_outward
 from obsynth.methods.guaranteed_test.windows import Window
-from obsynth.numerics.arguments import FloatArray
-from obsynth.numerics.ranks import decide_rank
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, arb_matrix, rounded_up
-
-#: Bits of the balls: far more than any window that double precision solves loses.
-CONDENSED_BITS = 512
-#: Weights count at least this share of the largest one when those to correct, or a square part, are chosen.
-LEAST_WEIGHT = 1e-3
-#: Windows with fewer rows are proved by the inverse of a square part, which needs no structure.
-FEWEST_ROWS = 500
-
-
-@contextmanager
-def many_bits() -> Iterator[None]:
-    """Compute in balls of many bits."""
-    before, ctx.prec = ctx.prec, CONDENSED_BITS
-    try:
-        yield
-    finally:
-        ctx.prec = before
-
-
-def _middles(matrix: Any) -> FloatArray:
-    return np.array([float(entry.mid()) for entry in matrix.entries()]).reshape(matrix.nrows(), matrix.ncols())
-
-
-def _away(matrix: Any, values: FloatArray) -> FloatArray:
-    """Return how far the entries of a matrix in balls are from doubles at most, in their order."""
-    sizes = [float(abs(entry - value).upper()) for entry, value in zip(matrix.entries(), values.tolist(), strict=True)]
-    # The conversion rounds to nearest.
-    return np.asarray(np.nextafter(np.array(sizes), np.inf))
-
-
-@dataclass(frozen=True, eq=False)
-class Condensed:
-    """A window whose states follow from the first one."""
-
-    window: Window
-
-    @classmethod
-    def of(cls, window: Window) -> Condensed | None:
-        """Return it, or ``None`` where the window is small or has not this structure."""
-        if window.rows < FEWEST_ROWS or not isinstance(window.model.plant, DescriptorSystem):
-            return None
-        plant, samples = window.plant, window.question.samples
-        bounds = window.bounds
-        # Products of entries and whole numbers would be rounded.
-        whole = window.rows == window.outputs_at + samples * plant.ny and np.abs(window.times).max(initial=1) == 1
-        unbounded = bool(np.isinf(bounds.state).all() and np.isinf(bounds.first).all())
-        if not whole or not unbounded or window.equations != samples - 1:
-            return None
-        return cls(window) if plant.nx and decide_rank(plant.E).full else None
-
-    @cached_property
-    def _inverse(self) -> Any:
-        e = self.window.plant.E
-        return None if np.array_equal(e, np.eye(len(e))) else arb_matrix(e).inv()
-
-    def _over_e(self, matrix: Any) -> Any:
-        return matrix if self._inverse is None else self._inverse * matrix
-
-    @cached_property
-    def _others(self) -> np.ndarray:
-        """Columns that are no states."""
-        return np.array([k for k, label in enumerate(self.window.labels) if label[0] != "x"])
-
-    def _parts(self, columns: np.ndarray) -> tuple[list[FloatArray], list[FloatArray]]:
-        """Return what columns put into the equations of each sample and into the outputs of each."""
-        window, plant = self.window, self.window.plant
-        whole = window.matrix[:, columns].toarray()
-        equations = whole[: window.outputs_at].reshape(window.equations, plant.nx, -1)
-        outputs = whole[window.outputs_at :].reshape(window.question.samples, plant.ny, -1)
-        return list(equations), list(outputs)
-
-    @cached_property
-    def _responses(self) -> Any:
-        """What the first state, free columns and theta do to all outputs, in balls: ``(samples ny, nx + free + 1)``."""
-        window, plant = self.window, self.window.plant
-        free = [k for k in self._others.tolist() if k and window.free[k]]
-        equations, outputs = self._parts(np.array([*free, 0]))
-        a, c = self._over_e(arb_matrix(plant.A)), arb_matrix(plant.C)
-        seen, state, found = c, arb_matrix(np.zeros((plant.nx, len(free) + 1))), []
-        for k, output in enumerate(outputs):
-            here = c * state + arb_matrix(output)
-            rows = [seen.tolist(), here.tolist()]
-            found += [first + others for first, others in zip(*rows, strict=True)]
-            seen = seen * a
-            if k < window.equations:
-                state = a * state - self._over_e(arb_matrix(equations[k]))
-        return arb_mat(found)
-
-    @many_bits()
-    def least_weights(self) -> FloatArray | None:
-        """Return the least weights of the outputs that see theta alone ``(rows,)``, equations zero; else ``None``."""
-        responses = self._responses
-        count = responses.ncols()
-        wanted = arb_mat(count, 1, [arb(0)] * (count - 1) + [arb(1)])
-        try:
-            # Far states of a network show so little that double precision has no say in it.
-            found = responses * (responses.transpose() * responses).solve(wanted)
-        except ZeroDivisionError:
-            return None
-        return np.concatenate([np.zeros(self.window.outputs_at), _middles(found)[:, 0]])
-
-    @many_bits()
-    def multipliers(
-        self, values: FloatArray, *, refine: bool, among: FloatArray | None
-    ) -> tuple[FloatArray, FloatArray] | None:
-        """Return multipliers and their distance from exact ones ``(rows,)`` each; ``None`` where none is proved."""
-        window = self.window
-        first = window.outputs_at
-        weights = values[first:].copy()
-        responses = self._responses
-        count = responses.ncols()
-        chosen = self._chosen(weights) if among is None else np.flatnonzero(among[first:] > 0.0)
-        if chosen is None or len(chosen) != count:
-            return None
-        entries = responses.tolist()
-        square = arb_mat([entries[k] for k in chosen.tolist()]).transpose()
-        target = arb_mat(count, 1, [arb(0)] * (count - 1) + [arb(1)])
-        exact: Any = None
-        for _ in range(3 if refine else 1):
-            exact = arb_matrix(weights[:, None])
-            try:
-                step = square.solve(target - responses.transpose() * exact)
-            except ZeroDivisionError:
-                return None
-            for place, k in enumerate(chosen.tolist()):
-                exact[k, 0] = exact[k, 0] + step[place, 0]
-            if refine:
-                weights = _middles(exact)[:, 0]
-        equations = self._equations(exact)
-        found = np.array(values)
-        if refine:
-            found[first:] = weights
-            found[:first] = _middles(equations)[:, 0]
-        distance = np.concatenate([_away(equations, found[:first]), _away(exact, found[first:])])
-        kept = np.ones(len(found), dtype=bool)
-        kept[first:] = False
-        kept[first + chosen] = True
-        return found, np.where(kept, np.maximum(distance, np.finfo(np.float64).tiny), 0.0)
-
-    def _chosen(self, weights: FloatArray) -> np.ndarray | None:
-        """Return the outputs whose weights are corrected: heavy ones with responses that differ most."""
-        from scipy.linalg import qr
-
-        responses = _middles(self._responses)
-        heavy = np.maximum(np.abs(weights), LEAST_WEIGHT * float(np.max(np.abs(weights), initial=0.0)))
-        if responses.shape[0] < responses.shape[1] or not heavy.any():
-            return None
-        scaled = responses / np.maximum(np.abs(responses).max(axis=0), np.finfo(np.float64).tiny) * heavy[:, None]
-        _, order = qr(scaled.T, mode="r", pivoting=True)
-        return np.sort(order[: responses.shape[1]])
-
-    def _equations(self, weights: Any) -> Any:
-        """Return the multipliers of all equations that belong to weights of the outputs, in balls."""
-        window, plant = self.window, self.window.plant
-        a, c = arb_matrix(plant.A.T), arb_matrix(plant.C.T)
-        later, found = arb_matrix(np.zeros((plant.nx, 1))), []
-        entries = weights.entries()
-        for k in range(window.equations - 1, -1, -1):
-            part = arb_mat(plant.ny, 1, entries[(k + 1) * plant.ny : (k + 2) * plant.ny])
-            later = a * later - c * part
-            later = later if self._inverse is None else self._inverse.transpose() * later
-            found.append(later.entries())
-        return arb_mat(len(found) * plant.nx, 1, [entry for part in found[::-1] for entry in part])
-
-    @many_bits()
-    def point(self, values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        """Return a witness and its distance from an exact one ``(columns,)`` each; ``None`` where noise is missing.
-
-        Later states, and noise of as many columns as there are outputs, are corrected.
-        """
-        window, plant = self.window, self.window.plant
-        absorbing = self._absorbing
-        if absorbing is None:
-            return None
-        kept = np.array([k for k in self._others if k not in set(absorbing.ravel().tolist())])
-        equations, outputs = self._parts(kept)
-        others = arb_matrix(values[kept][:, None])
-        a, c = self._over_e(arb_matrix(plant.A)), arb_matrix(plant.C)
-        labels = {label: k for k, label in enumerate(window.labels)}
-        state = arb_matrix(np.array([[values[labels["x", 0, i]]] for i in range(plant.nx)]))
-        noise = window.bounds.noise_output[:, self._noise_columns]
-        back = arb_matrix(noise).inv()
-        found, distance = np.array(values), np.zeros(len(values))
-        for k in range(window.question.samples):
-            left = back * (c * state + arb_matrix(outputs[k]) * others)
-            self._put(found, distance, absorbing[k], -left)
-            if k < window.equations:
-                state = a * state - self._over_e(arb_matrix(equations[k]) * others)
-                self._put(found, distance, np.array([labels["x", k + 1, i] for i in range(plant.nx)]), state)
-        return found, distance
-
-    @staticmethod
-    def _put(found: FloatArray, distance: FloatArray, places: np.ndarray, exact: Any) -> None:
-        found[places] = _middles(exact)[:, 0]
-        distance[places] = np.maximum(_away(exact, found[places]), np.finfo(np.float64).tiny)
-
-    @cached_property
-    def _noise_columns(self) -> np.ndarray:
-        """Columns of noise, as many as outputs, that reach the outputs alone and span them."""
-        bounds, ny = self.window.bounds, self.window.plant.ny
-        able = np.flatnonzero((bounds.noise > 0.0) & ~bounds.noise_state.any(axis=0))
-        able = able[[np.count_nonzero(bounds.noise_output[:, k]) == 1 for k in able]] if able.size else able
-        best: dict[int, int] = {}
-        for k in able.tolist():
-            row = int(np.flatnonzero(bounds.noise_output[:, k])[0])
-            best.setdefault(row, k)
-        return np.array([best[row] for row in range(ny)]) if len(best) == ny else np.zeros(0, dtype=np.int64)
-
-    @cached_property
-    def _absorbing(self) -> np.ndarray | None:
-        """Columns of the window ``(samples, ny)`` that these are; ``None`` where an output has no noise of its own."""
-        if not len(self._noise_columns):
-            return None
-        labels = {label: k for k, label in enumerate(self.window.labels)}
-        samples = range(self.window.question.samples)
-        return np.array([[labels["w", k, int(i)] for i in self._noise_columns] for k in samples])
-
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, rounded_up
 
 #: Diagonal of the pivoted triangle, as a share of its first entry, below which rows are taken as dependent.
 DEPENDENT_ROW = 1e-13
+
 #: Newton steps towards the exact solution before it is rounded for the last time.
 RATIONAL_REFINEMENTS = 4
+
 #: Bits of ball arithmetic where double precision proves no inverse, and the most rows for it.
 INVERSE_BITS, MOST_ROWS_IN_BALLS = 256, 700
+
 #: A bounded number so near to its bound, as a share of it, is at its bound.
 AT_BOUND_SHARE = 1e-9
+
 #: Least room that a bounded number counts for when a square part is chosen, as a share of its bound.
 LEAST_ROOM = 1e-4
+
 #: Values below this share of the largest, in their units, are rounding of zeros.
 ROUNDED_VALUE = 1e-13
+
 #: Room for what another processor finds for the distance to the exact solution: a factor.
 RADIUS_ROOM = 8.0
+
 _MANTISSA = 53
 
 
 #: Doubles as whole numbers of Python times one power of two, of which this is the exponent: exact.
 Whole: TypeAlias = tuple[np.ndarray, int]
+
+
+#: Most rows for which a course that hides a fault is looked for: all of them at once.
+MOST_ROWS_FOR_A_RAY = 2500
+
+#: Most rows for which equations that depend on each other are solved in rationals.
+MOST_ROWS_IN_RATIONALS = 400
+
+
+#: Residual, in scaled equations, below which a fault is taken as hidden, to be proved then.
+HIDDEN = 1e-9
 
 
 def _whole(doubles: FloatArray) -> Whole:
@@ -566,12 +357,6 @@ def _repaired(
     return Repaired(values, distance)
 
 
-#: Most rows for which a course that hides a fault is looked for: all of them at once.
-MOST_ROWS_FOR_A_RAY = 2500
-#: Most rows for which equations that depend on each other are solved in rationals.
-MOST_ROWS_IN_RATIONALS = 400
-
-
 def _in_rationals(
     matrix: FloatArray, weight: FloatArray, values: FloatArray, missing: Any, *, refine: bool
 ) -> Repaired | None:
@@ -697,7 +482,3 @@ def proved_ray(window: Window) -> FloatArray | None:
         return None
     point[told] = repaired.values
     return point
-
-
-#: Residual, in scaled equations, below which a fault is taken as hidden, to be proved then.
-HIDDEN = 1e-9

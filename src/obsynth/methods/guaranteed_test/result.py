@@ -8,17 +8,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.extensions import extension
 from obsynth.methods.functions import design_function
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import Programmes, free_faults, problem_as_designed, window_as_designed
-from obsynth.methods.guaranteed_test.windows import courses_of, rows_before
-from obsynth.numerics.arguments import FloatArray, arguments_checked, real_array, whole_number
-from obsynth.observers.linear.observer import LinearObserver, WindowObserver
+from obsynth.methods.guaranteed_test.tolerant import rows_before
+from obsynth.methods.guaranteed_test.windows import courses_of
+from obsynth.numerics.arguments import arguments_checked, real_array, whole_number
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import measured_record
-from obsynth.observers.running import Estimates
-from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
+from obsynth.observers.window.observer import WindowObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
+from obsynth.results.registered import registered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,7 +62,7 @@ class GuaranteedTest(ObserverDesign):
     @property
     def tests(self) -> tuple[GuaranteedTest, ...]:
         """The tests of a bank (``isolate``), one for each fault, each as a design of its own; or this one alone."""
-        from obsynth.methods.guaranteed_test.checks import is_bank, tests_of
+        from obsynth.methods.guaranteed_test.bank import is_bank, tests_of
 
         if not is_bank(self):
             return (self,)
@@ -71,7 +75,7 @@ class GuaranteedTest(ObserverDesign):
         Of a test that is blind to nothing (``free`` none) these are all faults, and one that is blind to all others
         isolates.
         """
-        from obsynth.methods.guaranteed_test.checks import groups_of, is_bank
+        from obsynth.methods.guaranteed_test.bank import groups_of, is_bank
 
         names = self.fault_names
         if is_bank(self):
@@ -171,7 +175,7 @@ class GuaranteedTest(ObserverDesign):
         fault : str, optional
             Of a bank: which one; the first by default.
         """
-        from obsynth.methods.guaranteed_test.checks import hidden_by, is_bank
+        from obsynth.methods.guaranteed_test.bank import hidden_by, is_bank
 
         if is_bank(self):
             names = self.linear[0].fault_names
@@ -310,7 +314,7 @@ class GuaranteedTest(ObserverDesign):
         Axes
             In seconds and in the fault's unit; what is chosen is marked.
         """
-        found: Axes = extension("picture of a guaranteed test")(self, axes=axes)
+        found: Axes = registered("plot_least_thresholds")(self, axes=axes)
         return found
 
 

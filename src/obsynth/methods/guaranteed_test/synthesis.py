@@ -1,47 +1,25 @@
-"""The weights of the least threshold, by linear programmes whose answers are then proved.
-
-Finding a bank of guaranteed tests: for each fault the smallest group that can be isolated, and the least
-threshold.
-
-Guaranteed tests of nonlinear plants: of the sampled linear model, with what it leaves out as a disturbance.
-"""
+"""The weights of the least threshold, by linear programmes whose answers are then proved."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition, require_all
-from obsynth.analysis.transformations.linearisation import bounded_model, remainder_names
-from obsynth.analysis.transformations.uncertain_plant import affine_plant
-from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError
+from obsynth.analysis.existence.condition import require_all
+from obsynth.errors import ObsynthError, PreconditionError, SolverError
 from obsynth.methods.designing import design
-from obsynth.methods.guaranteed_test.checks import (
-    BANK_GROUPS,
-    BANK_PAIRS,
-    BY_TEST,
-    PAIR_MULTIPLIERS,
-    PAIR_RADIUS,
-    blind_to,
-    blind_to_one,
-    joined,
-    pairs_of,
-    proved_hidden,
-)
-from obsynth.methods.guaranteed_test.conditions import SOURCE, conditions, told
+from obsynth.methods.guaranteed_test.existence import conditions, told
+from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.guaranteed_test.problem import (
     COURSES,
     MOST_STATES,
     WITHIN,
     Problem,
     Programmes,
-    between,
     delay_in_samples,
-    fault_of,
     observer_of,
     observer_of_rows,
     problem_of,
@@ -56,38 +34,45 @@ from obsynth.methods.guaranteed_test.proofs import (
     repaired_multipliers,
     repaired_point,
 )
-from obsynth.methods.guaranteed_test.windows import (
-    Asked,
+from obsynth.methods.guaranteed_test.tolerant import (
     Beside,
-    Question,
-    Window,
-    disturbance_names,
     mean_over_record,
     noisy_as_bounded,
     thresholds_over_record,
     with_tolerances,
 )
-from obsynth.methods.method import Synthesis, silent
-from obsynth.methods.verifying import tracking_of
-from obsynth.numerics.arguments import FloatArray
-from obsynth.plants.dae import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem, TimeVaryingDescriptorSystem
-from obsynth.proofs.balls import UNIT_ROUNDOFF
+from obsynth.methods.guaranteed_test.windows import Question, Window, disturbance_names
+from obsynth.methods.method import Synthesis
+from obsynth.methods.tracking import tracking_of
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.uncertain_plant import affine_plant
 from obsynth.results.design import Certificate
 from obsynth.simulation.linear import scenario_runs, scenario_stepper
 from obsynth.simulation.scenario import Scenario
-from obsynth.verification.error_structure import error_structure
+from obsynth.verification.over_tolerances.error_structure import error_structure
 
 #: A threshold below this share of what all bounds could do is tried as an exact zero.
 ZERO_THRESHOLD = 1e-9
+
 #: The table of samples against threshold in a certificate.
 TRADE_OFF = "trade_off"
 
 
 #: The method whose observer runs beside a test: faults do not move its state estimate.
 BESIDE = "fault-estimation-filter"
+
 #: Samples of the scenario over which thresholds are compared, at most.
 MOST_COMPARED_SAMPLES = 500
+
+
+#: A programme of so many equations took so many seconds, and others about this power of their ratio as many.
+MEASURED_EQUATIONS, MEASURED_SECONDS, TIME_GROWTH = 1800, 2.3, 2.3
+
+
+#: Seconds below which no number is given, and from which on minutes are.
+SHORT_SECONDS, MINUTES = 5.0, 120.0
 
 
 def synthesise(
@@ -214,20 +199,12 @@ def chosen_samples(
     return tried[place], table, dict(zip(rows, found[place], strict=True))
 
 
-#: A programme of so many equations took so many seconds, and others about this power of their ratio as many.
-MEASURED_EQUATIONS, MEASURED_SECONDS, TIME_GROWTH = 1800, 2.3, 2.3
-
-
 def in_time(states: int, samples: int) -> str:
     """Return about how long the linear programme of a window takes, in words."""
     seconds = MEASURED_SECONDS * (states * samples / MEASURED_EQUATIONS) ** TIME_GROWTH
     if seconds < SHORT_SECONDS:
         return "a few seconds"
     return f"about {seconds:.0f} s" if seconds < MINUTES else f"about {seconds / 60.0:.0f} minutes"
-
-
-#: Seconds below which no number is given, and from which on minutes are.
-SHORT_SECONDS, MINUTES = 5.0, 120.0
 
 
 class Shipped:
@@ -420,268 +397,4 @@ def _notes_of_rows(
     yield (
         f"A fault of k acts on the way to sample k + 1; {', '.join(disturbance_names(problem.plant))} stand for mu(k) "
         "in the equations."
-    )
-
-
-def synthesise_bank(plant: DescriptorSystem, asked: Any, *, progress: Callable[[str], None]) -> Synthesis:
-    """Return one observer with a row for each fault, its certificate, and what an alarm of each row means."""
-    require_all(conditions(plant, replace(asked, isolate=False, fault=plant.fault_names[0]), with_windows=False))
-    progress("searching for the smallest groups that can be isolated")
-    found = [_smallest(plant, asked, fault) for fault in range(plant.nf)]
-    groups, lags, reasons = zip(*found, strict=True)
-    if asked.course == "any" and asked.lag is None:
-        asked = replace(asked, lag=max(lags))
-    tests = [blind_to(asked, plant, fault, group) for fault, group in enumerate(groups)]
-    progress("searching for the least number of samples")
-    tables = [_table(plant, test) for test in tests]
-    samples = max(samples for samples, _ in tables)
-    asked = replace(asked, samples=samples)
-    progress(f"proving the thresholds on {samples} samples")
-    made = [synthesise(plant, replace(test, samples=samples, lag=asked.lag), progress=silent) for test in tests]
-    pairs = _pairs(plant, asked)
-    matrices = _stacked([dict(test.certificate.matrices) for test in made]) | pairs
-    matrices |= {
-        BANK_GROUPS: np.array([[float(k in group) for k in range(plant.nf)] for group in groups]),
-        TRADE_OFF: np.column_stack([tables[0][1][:, 0], *[table[:, 1] for _, table in tables]]),
-    }
-    claims = {
-        f"{name}[{fault}]": value
-        for fault, test in zip(plant.fault_names, made, strict=True)
-        for name, value in test.certificate.claims.items()
-    }
-    options = {**made[0].options, "isolate": True, "fault": None, "free": "others"}
-    gains = {
-        f"{name}[{fault}]": gain
-        for fault, test in zip(plant.fault_names, made, strict=True)
-        for name, gain in test.gains.items()
-    }
-    observer = joined([test.observer for test in made], plant.fault_names)  # type: ignore[misc]
-    notes = tuple(_bank_notes(plant, groups, reasons, claims, matrices[BANK_PAIRS]))
-    return Synthesis(options, gains, observer, Certificate(matrices, claims), notes=notes)
-
-
-def _smallest(plant: DescriptorSystem, asked: Any, fault: int) -> tuple[tuple[int, ...], int, str]:
-    """Return the smallest group with this fault that can be isolated, the lag, and why there is no smaller one."""
-    others = [other for other in range(plant.nf) if other != fault]
-    why, first = "", None
-    for size in range(len(others) + 1):
-        best: tuple[float, tuple[int, ...], int] | None = None
-        candidates = list(combinations(others, size))
-        for chosen in candidates:
-            group = tuple(sorted((fault, *chosen)))
-            own = blind_to(asked, plant, fault, group)
-            condition, lag = told(problem_of(plant, own), own)
-            if not condition.holds:
-                first = first or condition
-                why = why or condition.detail
-                _require_proved(plant, replace(own, lag=own.lag if own.course != "any" else lag), condition)
-                continue
-            width = _table(plant, replace(own, lag=lag or own.lag))[1][-1, 1] if len(candidates) > 1 else 0.0
-            if best is None or width < best[0]:
-                best = (float(width), group, lag)
-        if best is not None:
-            return best[1], best[2], why
-    if first is not None:
-        first.require()
-    raise SolverError(f"No test of {plant.fault_names[fault]} was found: the result is inconclusive.")
-
-
-def _require_proved(plant: DescriptorSystem, own: Any, condition: Condition) -> None:
-    if not proved_hidden(plant, own):
-        raise SolverError(
-            f"Whether {own.fault} can be distinguished from {', '.join(own.free)} is inconclusive: {condition.detail}"
-        )
-
-
-def _table(plant: DescriptorSystem, own: Any) -> tuple[int, FloatArray]:
-    """Return the number of samples of a test alone, and its table of samples against thresholds."""
-    samples, table, _ = chosen_samples(problem_of(plant, own), own, None)
-    return samples, table
-
-
-def _pairs(plant: DescriptorSystem, asked: Any) -> dict[str, FloatArray]:
-    """Return the thresholds of tests that are blind to one other fault alone, infinite where there are none."""
-    pairs = pairs_of(plant)
-    table, proofs = np.zeros((plant.nf, plant.nf)), []
-    for one, other in pairs:
-        own = blind_to_one(asked, plant, one, other)
-        condition, _ = told(problem_of(plant, own), own)
-        if condition.holds:
-            made = synthesise(plant, own, progress=silent)
-            table[one, other] = made.certificate.claims["threshold"]
-            proofs.append(made.certificate.matrices)
-        else:
-            _require_proved(plant, own, condition)
-            table[one, other] = np.inf
-            proofs.append({"multipliers": np.zeros(1), "multiplier_radius": np.zeros(1)})
-    if not pairs:
-        return {BANK_PAIRS: table}
-    stacked = _stacked([dict(proof) for proof in proofs])
-    return {BANK_PAIRS: table, PAIR_MULTIPLIERS: stacked["multipliers"], PAIR_RADIUS: stacked["multiplier_radius"]}
-
-
-def _stacked(given: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:
-    """Return by name a row for each test, as wide as the widest."""
-    found = {}
-    for name in BY_TEST:
-        if not any(name in matrices for matrices in given):
-            continue
-        found[name] = padded([np.ravel(matrices.get(name, np.zeros(1))) for matrices in given])
-    return found
-
-
-def _bank_notes(
-    plant: DescriptorSystem, groups: Any, reasons: Any, claims: Mapping[str, float], pairs: FloatArray
-) -> Any:
-    names = plant.fault_names
-    for fault, (group, why) in enumerate(zip(groups, reasons, strict=True)):
-        size, found = claims[f"threshold[{names[fault]}]"], claims[f"surely_found[{names[fault]}]"]
-        meant = " or ".join(names[k] for k in group)
-        yield (
-            f"An alarm of {names[fault]} means {meant}, as long as the bounds hold: threshold {size:.6g}, "
-            f"{found:.6g} is certain to be detected.{f' No smaller group can be isolated: {why}' if why else ''}"
-        )
-        listed = [
-            f"{names[other]}: {'impossible' if np.isinf(pairs[fault, other]) else f'{pairs[fault, other]:.6g}'}"
-            for other in range(plant.nf)
-            if other != fault
-        ]
-        if len(listed) > 1:
-            yield (
-                f"Thresholds of {names[fault]} by a test that is insensitive to one other fault alone: "
-                f"{'; '.join(listed)}."
-            )
-
-
-#: Room for what another processor finds for the remainder: a share, and roundings of the signals.
-SHARE_ROOM, REMAINDER_ROUNDINGS = 1e-6, 1024.0
-
-
-def nonlinear_conditions(model: DAEModel, asked: Any) -> tuple[Condition, ...]:
-    """Return the conditions: a region and a sample time are stated; then those of the linear model."""
-    lacking = [name for name in ("region", "sample_time") if getattr(asked, name) is None]
-    stated = Condition(
-        "region stated",
-        "a nonlinear plant stays in a region",
-        not lacking,
-        float(len(lacking)),
-        0.0,
-        SOURCE,
-        "" if not lacking else f"give {' and '.join(lacking)}: the remainder of the linear model is bounded there.",
-    )
-    if lacking:
-        return (stated,)
-    return (stated, *conditions(*_linear(model, asked)))
-
-
-def _linear(model: DAEModel, asked: Any) -> tuple[DescriptorSystem, Any]:
-    """Return the sampled linear model with its remainder, and what is asked of it."""
-    if asked.isolate:
-        raise SpecError(
-            "isolate is for linear plants: design one test for each fault, with the others free.",
-            path="method.options.isolate",
-        )
-    if asked.model is not None:
-        raise SpecError("model is written by obsynth: leave it out.", path="method.options.model")
-    if not isinstance(asked.noise_bound, Mapping):
-        raise SpecError(
-            "noise_bound: a nonlinear plant states no deviations; give the bound of each output by name: "
-            f"{', '.join(model.output_names)}.",
-            path="method.options.noise_bound",
-        )
-    listed = asked.free if not isinstance(asked.free, str) or asked.free in model.parameters else ()
-    others = [listed] if isinstance(listed, str) else list(listed or ())
-    fault = model.parameter_names[fault_of(model.parameter_names, asked.fault)]
-    wrong = [name for name in others if name not in model.parameters or name == fault]
-    if wrong:
-        raise SpecError(
-            f"free names {', '.join(map(str, wrong))}: the other parameters are "
-            f"{', '.join(name for name in model.parameters if name != fault) or 'none'}.",
-            path="method.options.free",
-        )
-    given = asked.disturbance_bounds or {}
-    if not isinstance(given, Mapping) or any(name not in model.inputs for name in given):
-        raise SpecError(
-            f"disturbance_bounds of a nonlinear plant are by name, of the inputs that are not known, among "
-            f"{', '.join(model.inputs) or 'none'}; the others are known.",
-            path="method.options.disturbance_bounds",
-        )
-    linear, bounds = bounded_model(
-        model, asked.region, asked.sample_time, faults=[fault, *others], disturbances=list(given), given=asked.given
-    )
-    _require_inside(linear, given, asked.region)
-    sizes = {
-        name: max(abs(float(end)) for end in asked.region.get(name, (1.0, 1.0)))
-        for name in (*model.state_names, *model.input_names)
-    }
-    largest = max(sizes.values(), default=1.0)
-    room = {
-        name: value * (1.0 + SHARE_ROOM) + REMAINDER_ROUNDINGS * UNIT_ROUNDOFF * largest
-        for name, value in bounds.items()
-    }
-    own = replace(
-        asked,
-        fault=fault,
-        free=others or "none",
-        disturbance_bounds={**given, **room},
-        region=None,
-        sample_time=None,
-        given=None,
-    )
-    return linear, own
-
-
-def _require_inside(plant: DescriptorSystem, given: Mapping[str, Any], region: Mapping[str, Any]) -> None:
-    """Raise `SpecError` where an unknown input may leave the region."""
-    names = tuple(given)
-    half, middle = between(given, names, "disturbance_bounds", every=True)
-    for name, size, at in zip(names, half.tolist(), middle.tolist(), strict=True):
-        point = plant.operating_point.get(name, 0.0)
-        if not region[name][0] <= point + at - size or not point + at + size <= region[name][1]:
-            raise SpecError(
-                f"region of {name} is {list(region[name])}, but its bounds reach from {point + at - size:.6g} to "
-                f"{point + at + size:.6g}: widen the region.",
-                path="method.options.region",
-            )
-
-
-def synthesise_nonlinear(model: DAEModel, asked: Any, *, progress: Callable[[str], None]) -> Synthesis:
-    """Return the test of the linear model with its remainder; what no test can do is not claimed."""
-    lacking = [name for name in ("region", "sample_time") if getattr(asked, name) is None]
-    if lacking:
-        raise PreconditionError(
-            f"A nonlinear plant needs {' and '.join(lacking)}: the remainder of its linear model in the region counts "
-            "as a disturbance. Or linearise and sample it (obsynth.linearise, obsynth.discretise): the test is then "
-            "as good as the linear model.",
-            condition="region stated",
-        )
-    progress("bounding the remainder of the linear model")
-    plant, own = _linear(model, asked)
-    found = synthesise(plant, own, progress=progress)
-    kept = {name: part for name, part in found.certificate.matrices.items() if not name.startswith("witness")}
-    claims = {name: value for name, value in found.certificate.claims.items() if name != "least"}
-    region = {name: [float(end) for end in ends] for name, ends in asked.region.items()}
-    options = {
-        **found.options,
-        "region": region,
-        "sample_time": asked.sample_time,
-        "given": asked.given,
-        "model": model.as_dict(),
-    }
-    left_out = [own.disturbance_bounds[name] for name in remainder_names(plant)]
-    share = np.array(left_out)
-    notes = [note for note in found.notes if "no function" not in note and "least is not claimed" not in note]
-    notes.insert(
-        0,
-        f"The plant is nonlinear: the remainder of its linear model is at most {share.max():.3g} in a state or an "
-        "output, while all signals stay in the region, between samples too; known inputs, faults and unknown inputs "
-        "are held there. That there is no smaller threshold is not claimed, as the remainder is bounded and not known.",
-    )
-    return replace(
-        found,
-        options=options,
-        certificate=Certificate(kept, claims),
-        notes=tuple(notes),
-        plant=plant,
-        transformation=None,
     )

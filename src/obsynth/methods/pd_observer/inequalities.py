@@ -7,33 +7,22 @@ r"""The matrix inequalities of the PD observer, in coordinates of our choice.
 with Y = P3' J, Z = P3' L, ``T = P3' + Z C``: M = P3' Ae and (a, b, c) = (0, 1, 0) for stability, M = P3' (Ae + alpha D)
 for a decay rate, (c^2 - r^2, c, 1) for a disk of centre -c and radius r.  P3, Y, Z are common, P belongs to each.
 What is minimised keeps P3 from singular: plain feasibility gave gains of 1e9, a maximal margin 3e13.
-
-Time scales of a PD observer, and what of its options is proved impossible before a solver runs.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.structure import analyse_structure
-from obsynth.errors import InfeasibleError, SolverError
-from obsynth.methods.conic import lazy_cvxpy as cp
-from obsynth.methods.conic import lmi
-from obsynth.methods.pd_observer.method import PdObserver
-from obsynth.methods.pd_observer.realisation import with_sensor_noise
-from obsynth.numerics.arguments import FloatArray, largest_singular_value
+from obsynth.conditions import lazy_cvxpy as cp
+from obsynth.conditions import lmi
+from obsynth.conditions.filasova import PD_MARGIN
+from obsynth.errors import SolverError
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.doubling import symmetric
-from obsynth.numerics.ranks import NEGLIGIBLE_MODE, decide_rank
-from obsynth.numerics.scaling import balanced_matrix, equilibrate_pencil
-from obsynth.plants.descriptor import DescriptorSystem
-
-#: How far inside the cone the inequalities must hold, with ``P3 + P3' >= 2 I`` as the scale.
-PD_MARGIN = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,104 +147,3 @@ def _gain(task: PdTask, found: _Variables, moving: Any, c: FloatArray, row: Any,
     inputs = row.shape[0]
     blocks = [*stability, [row, task.delta * row, -(level**2) * theta * np.eye(inputs)]]
     return [lmi.at_least(p, PD_MARGIN), lmi.at_most(lmi.symmetric_blocks(blocks), -PD_MARGIN)]
-
-
-#: Damping ratio from which a mode decays by itself.
-WELL_DAMPED = 0.5
-#: Well-damped modes this many times faster than the plant's pace are none of the observer's business.
-FAR_BEYOND = 100.0
-
-
-def fastest_mode(a: FloatArray) -> float:
-    """Return the largest modulus of an eigenvalue to follow, damped ones far beyond left out; 1 for integrators."""
-    balanced = balanced_matrix(a)[0]
-    modes = np.linalg.eigvals(balanced)
-    sizes = np.abs(modes)
-    if not np.max(sizes) > NEGLIGIBLE_MODE * largest_singular_value(balanced):
-        return 1.0
-    # An integrator is at rest, on whichever side of zero rounding has put it.
-    moving = sizes > NEGLIGIBLE_MODE * float(np.max(sizes))
-    damped = moving & (modes.real < -WELL_DAMPED * sizes)
-    # What is not damped sets the pace; where all is damped or at rest, the slowest mode that moves does.
-    pace = float(np.max(sizes[moving & ~damped], initial=0.0)) or float(np.min(sizes[moving]))
-    return float(np.max(sizes[(sizes <= FAR_BEYOND * pace) | ~damped]))
-
-
-def default_delta(plant: DescriptorSystem, asked: PdObserver, decay: float) -> float:
-    """Return the delta to use, in seconds: as asked, or the inverse of the plant's fastest mode where that serves."""
-    if asked.delta is not None:
-        return float(asked.delta)
-    if asked.disk_numbers is not None:
-        centre, radius = asked.disk_numbers
-        return 1.0 / centre if centre > 0.0 else 2.0 / (centre + radius)
-    delta = 1.0 / fastest_mode(plant.A)
-    limit = theorem_2_limit(plant, decay) if asked.theorem == 2 else math.inf
-    return min(delta, 0.5 * limit)
-
-
-def theorem_2_limit(plant: DescriptorSystem, decay: float) -> float:
-    """Return the delta from which Theorem 2 has no solution: the least ``4 |sigma| / w^2`` of an unobservable pair."""
-    pairs = [mode for mode in analyse_structure(plant).unobservable_modes if mode.imag > 0.0]
-    return min((4.0 * abs(mode.real + decay) / mode.imag**2 for mode in pairs), default=math.inf)
-
-
-def require_possible(plant: DescriptorSystem, asked: PdObserver, *, delta: float, decay: float) -> None:
-    """Refuse what no gains, or no solution of these inequalities, can give."""
-    hidden = analyse_structure(plant).unobservable_modes
-    slowest = max((mode.real for mode in hidden), default=-math.inf)
-    if -slowest <= decay:
-        raise InfeasibleError(
-            f"No observer reaches a decay rate of {decay:.6g} 1/s: the mode with real part {slowest:.6g} is "
-            "unobservable, so that no gain moves it. Ask for less, or measure something it moves.",
-            necessary=True,
-        )
-    if asked.disk_numbers is not None:
-        centre, radius = asked.disk_numbers
-        outside = [mode for mode in hidden if abs(mode + centre) >= radius]
-        if outside:
-            raise InfeasibleError(
-                f"No observer has all its eigenvalues within {radius:.6g} of {-centre:.6g}: the mode {outside[0]:.6g} "
-                "is unobservable, so that no gain moves it.",
-                necessary=True,
-            )
-        if abs(-1.0 / delta + centre) >= radius:
-            raise InfeasibleError(
-                f"The inequality for the disk has no solution with delta = {delta:.6g} s: -1/delta must lie inside the "
-                f"disk. Leave delta out, or take {1.0 / centre if centre > 0.0 else 2.0 / (centre + radius):.6g} s.",
-                necessary=False,
-            )
-    limit = theorem_2_limit(plant, decay) if asked.theorem == 2 else math.inf
-    if delta >= limit:
-        raise InfeasibleError(
-            f"Theorem 2 has no solution with delta = {delta:.6g} s: an unobservable pair of modes needs delta < "
-            f"4 |sigma| / w^2 = {limit:.6g} s. Lower delta, or use theorem 1, which does not depend on it.",
-            necessary=False,
-            lower_bound=None,
-        )
-    if asked.noise_gain is not None:
-        least = least_noise_gain(plant)
-        if asked.noise_gain <= least:
-            raise InfeasibleError(
-                f"No observer has a noise gain of {asked.noise_gain:.6g}: already in steady state the fault has to be "
-                f"computed from the outputs, which multiplies errors by {least:.6g} or more. Raise noise_gain.",
-                necessary=True,
-                lower_bound=least,
-            )
-
-
-def least_noise_gain(plant: DescriptorSystem) -> float:
-    """Return a lower bound, for any unbiased observer, on the gain from constant sensor noise to the fault estimate.
-
-    That of the least linear map that reads every pair ``A x + Bf f = 0`` from ``C x + Df f``; zero where sensor noise
-    alone does not reach every output.
-    """
-    noisy = with_sensor_noise(plant)
-    noise = noisy.Dw[:, ~np.any(noisy.Bw != 0.0, axis=0)]
-    if not decide_rank(noise, expected=plant.ny).full:
-        return 0.0
-    equations = np.hstack([plant.A, plant.Bf])
-    scaled = equilibrate_pencil(np.zeros_like(equations), equations)
-    rank = decide_rank(scaled.A, equilibrated=False).rank
-    still = scaled.columns[:, None] * np.linalg.svd(scaled.A)[2][rank:].T
-    seen, faults = np.hstack([plant.C, plant.Df]) @ still, still[plant.nx :]
-    return largest_singular_value(faults @ np.linalg.pinv(np.linalg.pinv(noise) @ seen)) if still.size else 0.0

@@ -8,21 +8,12 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.condition import Condition
+from obsynth.conditions.options import OwnConstraints, OwnRegion, SolverName, SolverOptions, own_term_conflicts
 from obsynth.errors import SpecError
-from obsynth.methods.method import (
-    ClaimMeaning,
-    Method,
-    OwnConstraints,
-    OwnRegion,
-    PlantKind,
-    Purpose,
-    SolverName,
-    SolverOptions,
-    Synthesis,
-    own_term_conflicts,
-)
-from obsynth.numerics.arguments import FloatArray, NonNegative, Positive, WrittenAs, as_matrix, real_array, shown
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
+from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, real_array, shown
+from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
@@ -30,6 +21,7 @@ from obsynth.verification.error_system import ErrorModel
 #: Up to so many unknown states "auto" takes the inequality (a second or two); up to so many it tries it where the
 #: closed form does not serve (a minute or two).
 MOST_STATES_FOR_LMI = 20
+
 MOST_STATES_FOR_SPARE_LMI = 50
 
 
@@ -222,13 +214,13 @@ class PdObserver(Method):
 
     def gain_matrix(self, nf: int) -> FloatArray | None:
         """Return G ``(nf, nf)``, nonsingular; ``None`` when none is asked for."""
-        from obsynth.methods.pd_observer.realisation import checked_adaptation_gain
+        from obsynth.methods.pd_observer.given_gains import checked_adaptation_gain
 
         return None if self.adaptation_gain is None else checked_adaptation_gain(self.adaptation_gain, nf)
 
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, decided exactly or in floating point; the list ends at the first failure."""
-        from obsynth.methods.pd_observer.conditions import pd_observer_conditions
+        from obsynth.analysis.existence.filasova import pd_observer_conditions
 
         return pd_observer_conditions(plant, exactly=exactly)
 
@@ -237,7 +229,7 @@ class PdObserver(Method):
         cls, plant: DescriptorSystem, *, J: Any, L: Any, M: Any, N: Any, adaptation_gain: Any = None, decay: float = 0.0
     ) -> Synthesis:
         """Return realisation and certificate of the gains of eqs. (4), (6); see `obsynth.design_from_gains`."""
-        from obsynth.methods.pd_observer.realisation import synthesis_from_gains
+        from obsynth.methods.pd_observer.given_gains import synthesis_from_gains
 
         gains = {"J": J, "L": L, "M": M, "N": N}
         return synthesis_from_gains(plant, gains=gains, adaptation_gain=adaptation_gain, decay=decay)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError, VerificationError
-from obsynth.methods.designing import design_from_gains, failed_rows
+from obsynth.methods.designing import design_from_gains
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.results.design import ObserverDesign
+from obsynth.results.verification_report import failed_rows
 
 
 @arguments_checked

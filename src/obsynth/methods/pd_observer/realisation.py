@@ -9,41 +9,20 @@ Any K and S with ``I - S C`` nonsingular come from gains: ``L = (I - S C)^-1 S``
 ``eps = [x; f] - nu`` and the estimates ``S nu + T (y - D u)``, ``S + T C = I``, no derivative of the noise is left:
 
     eps' = Az eps + [0; I] f' + (Bd - By Dd) d + (Bw - By Dw) w,   error = S eps - T (Dd d + Dw w)
-
-A certificate of Theorem 1 for gains in hand, without a solver.
-
-A solution P1, P3 exists for every delta > 0 (elimination lemma): P1 from a Lyapunov equation, and in coordinates in
-which the factors around P3 are unit columns, P3 cancels its off-diagonal block.
-
-PD observers whose gains are given; and the gain G of the loop, checked.
 """
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.conditions import require_all
-from obsynth.errors import SpecError
-from obsynth.methods.method import Synthesis
-from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
-from obsynth.numerics.arguments import FloatArray, as_matrix, largest_singular_value, require_shape
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import ContinuousNorms
-from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_solution
 from obsynth.numerics.norms import HinfNorm
-from obsynth.numerics.ranks import decide_rank
-from obsynth.numerics.scaling import balanced_matrix
-from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import Ball
-from obsynth.results.design import Certificate
-from obsynth.verification.claims import prove_gain
 from obsynth.verification.error_system import ErrorModel
 
 
@@ -168,165 +147,3 @@ def solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.solve(matrix, right))
     except np.linalg.LinAlgError:
         return np.full_like(right, np.nan)
-
-
-#: delta is moved by this factor when -1/delta is close to an eigenvalue, where the construction breaks down.
-DELTA_STEP = 1.7
-#: Condition number of the change of coordinates that is good enough.
-GOOD_CONDITION = 1e3
-#: As many values of delta are tried.
-DELTA_TRIES = 12
-#: Slack of the Riccati equation relative to the output weight, largest first: the first that proves is taken.
-PD_SLACKS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
-
-
-def explicit_certificate(
-    Az: FloatArray, estimate: FloatArray, *, decay: float
-) -> tuple[FloatArray, FloatArray, float] | None:
-    """Return P1, P3 ``(n, n)`` and delta for a shipped observer; ``None`` when its errors do not decay so fast."""
-    moving = Az + decay * np.eye(len(Az))
-    if not abscissa(moving, 0.0) < 0.0:
-        return None
-    balanced, units = balanced_matrix(moving)
-    try:
-        p = _gram(balanced)
-        # A delta for which -1 / delta is far from the eigenvalues.
-        one = np.eye(len(balanced))
-        middle = 1.0 / float(np.exp(np.mean(np.log(np.abs(np.linalg.eigvals(balanced))))))
-        steps = sorted(range(-DELTA_TRIES // 2, DELTA_TRIES // 2), key=abs)
-        candidates = [middle * DELTA_STEP**step for step in steps]
-        conditions = [float(np.linalg.cond(one + delta * balanced)) for delta in candidates]
-        good = [i for i, condition in enumerate(conditions) if condition <= GOOD_CONDITION]
-        delta = candidates[good[0] if good else int(np.argmin(conditions))]
-        x = _coupling(balanced, p, delta)
-        inverse = np.linalg.inv(estimate)
-    except np.linalg.LinAlgError:
-        return None
-    p1 = inverse.T @ (p / units[:, None] / units) @ inverse
-    return 0.5 * (p1 + p1.T), (x / units[:, None] / units) @ inverse, delta
-
-
-def symmetric_certificate(Az: FloatArray) -> tuple[FloatArray, FloatArray, float] | None:
-    """Return a certificate of Theorem 2 in closed form for ``Az (n, n)`` and L = 0; ``None`` when errors do not decay.
-
-    It is a symmetric P3 and a weight, both positive definite: ``A' P3 + P3 A = -weight``, and ``P3 + (delta / 2)
-    weight`` is P1 for every delta below a limit, infinite where it always serves.
-    """
-    from scipy.linalg import eigvalsh
-
-    if not abscissa(Az, 0.0) < 0.0:
-        return None
-    balanced, units = balanced_matrix(Az)
-    try:
-        p = _gram(balanced)
-        through = p @ balanced
-        weight, skew = -(through + through.T), 0.5 * (through - through.T)
-        largest = float(eigvalsh(skew.T @ np.linalg.solve(p, skew), weight)[-1])
-    except np.linalg.LinAlgError:
-        return None
-    # With P1 = P3 + (delta / 2) weight the lower left block is delta times S, the skew part of P3 A: it holds when
-    # weight > (delta / 2) S' P3^-1 S.
-    limit = 2.0 / largest if largest > 0.0 else np.inf
-    return p / units[:, None] / units, weight / units[:, None] / units, limit
-
-
-def coupled_certificate(a: FloatArray, delta: float) -> tuple[FloatArray, FloatArray]:
-    """Return P1 and P3 ``(n, n)`` of Theorem 1 for a stable observer, L = 0; noise where ``-1 / delta`` is a pole."""
-    balanced, units = balanced_matrix(a)
-    p = _gram(balanced)
-    x = _coupling(balanced, p, delta)
-    return p / units[:, None] / units, x / units[:, None] / units
-
-
-def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> FloatArray | None:
-    """Return P ``(n, n)`` that proves the l2 gain of ``x' = a x + b v``, ``z = c x`` below ``gain``, or ``None``."""
-    balanced, units = balanced_matrix(a)
-    entering, shown = b.midpoint / units[:, None], c * units
-    weight = max(largest_singular_value(shown) ** 2, np.finfo(np.float64).tiny)
-    spare = None
-    for slack in PD_SLACKS:  # the largest that gives a proof
-        out = shown.T @ shown + slack * weight * np.eye(len(a))
-        p = continuous_solution(balanced.T, entering.T, out, -(gain**2) * np.eye(entering.shape[1]))
-        if p is None:
-            continue
-        found = 0.5 * (p + p.T) / units[:, None] / units
-        found = np.asarray(0.5 * (found + found.T))
-        if not np.all(np.isfinite(found)):
-            continue
-        proof = prove_gain(a, b, c, found, gain)
-        if proof.in_double_precision:
-            return found
-        spare = found if proof.proved and spare is None else spare
-    return spare
-
-
-def _gram(a: FloatArray) -> FloatArray:
-    """Return P with ``a' P + P a = -norm(a) I`` for a stable ``a (n, n)``."""
-
-    with warnings.catch_warnings(action="ignore"):
-        # "An eigenvalue pair whose sum is very close to zero": what comes of it is proved or thrown away.
-        p = continuous_lyapunov(a.T, -np.linalg.norm(a) * np.eye(len(a)))
-    return np.asarray(0.5 * (p + p.T))
-
-
-def _coupling(a: FloatArray, p: FloatArray, delta: float) -> FloatArray:
-    """Return X with ``He([a'; -I] X [I, delta I]) + [0, p; p, 0] < 0`` for a stable ``a`` with Gram matrix p."""
-    # With alpha = a xi1 - xi2, beta = xi1 + delta xi2 the first term is 2 alpha' X beta; the second is negative on
-    # alpha = 0 and on beta = 0, whatever delta is.
-    n, one = len(a), np.eye(len(a))
-    change = np.linalg.inv(np.block([[a, -one], [one, delta * one]]))
-    form = change.T @ np.block([[np.zeros((n, n)), p], [p, np.zeros((n, n))]]) @ change
-    return np.asarray(-form[:n, n:])
-
-
-def checked_adaptation_gain(value: Any, nf: int) -> FloatArray:
-    """Return G as a matrix ``(nf, nf)``; raise `SpecError` when it has another shape or is singular."""
-    matrix = as_matrix(value, "adaptation_gain")
-    if matrix.shape == (1, 1) and nf != 1:
-        matrix = float(matrix[0, 0]) * np.eye(nf)
-    if matrix.shape != (nf, nf) or not decide_rank(matrix, expected=nf).full:
-        raise SpecError(
-            f"adaptation_gain is {matrix.shape[0]} by {matrix.shape[1]}: give a nonsingular matrix {nf} by {nf}, or "
-            "one number.",
-            path="method.options.adaptation_gain",
-        )
-    return matrix
-
-
-def synthesis_from_gains(
-    plant: DescriptorSystem, *, gains: Mapping[str, Any], adaptation_gain: Any, decay: float
-) -> Synthesis:
-    """Return the realisation and certificate of given gains; see `obsynth.design_from_gains`."""
-    require_all(pd_observer_conditions(plant))
-    form = explicit_form(plant)
-    work = plant if form is None else form.plant
-    matrices = {name: as_matrix(value, name) for name, value in gains.items()}
-    for name, rows in (("J", work.nx), ("L", work.nx), ("M", work.nf), ("N", work.nf)):
-        require_shape(matrices[name].shape, (rows, work.ny), name)
-    if not (np.isfinite(decay) and decay >= 0.0):
-        raise SpecError(f"decay is {decay}: give 0 or a positive number in 1/seconds.", path="decay")
-    g = None if adaptation_gain is None else checked_adaptation_gain(adaptation_gain, work.nf)
-    inner = np.eye(work.nf) if g is None else g
-    pairs = (("J", "M"), ("L", "N"))
-    gain_j, gain_l = (np.vstack([matrices[top], inner @ matrices[bottom]]) for top, bottom in pairs)
-    observer = _realised(work, gain_j, gain_l)
-    found = explicit_certificate(observer.Az, observer.Cz[: observer.order], decay=decay)
-    if found is None:  # not stable, or too slow: the report will say so
-        found = np.eye(observer.order), np.eye(observer.order), 1.0
-    return Synthesis(
-        {"from_gains": True, "decay": decay},
-        matrices if g is None else {**matrices, "G": g},
-        observer,
-        Certificate({"P1": found[0], "P3": found[1]}, {"theorem": 1.0, "delta": found[2], "decay": float(decay)}),
-        {"runs": []},
-        transformation=form,
-    )
-
-
-def _realised(plant: DescriptorSystem, gain_j: FloatArray, gain_l: FloatArray) -> LinearObserver:
-    augmented = with_faults_as_states(plant)
-    if not np.linalg.cond(np.eye(augmented.nx) + gain_l @ augmented.C) < 1.0 / np.finfo(np.float64).eps:
-        raise SpecError(
-            "I + L C is singular with these gains: the observer's equations do not determine its estimates.", path="L"
-        )
-    return realise_pd_observer(plant, augmented, gain_j, gain_l)

@@ -2,79 +2,60 @@
 
 Unlike the paper: P and Q are both variables in Theorem 2; the G of (25), which is in no theorem, acts inside the loop;
 what is minimised, ``||[Y Z]||_F + ||P3||_F`` with ``P3 + P3' >= 2 I``, keeps solvers from P3 close to singular.
-
-A decay rate that nobody gives is chosen in the plant's own units, and its gains are small in these.
-
-Of many states gains come in closed form: L = 0 and J of a Kalman filter for unit noise.  Their certificate comes from a
-Lyapunov equation of ``A - J C``, for a delta below a limit that it tells.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from obsynth.analysis.conditions import require_all
-from obsynth.analysis.plant_units import FAR_UNITS, PlantUnits
+from obsynth.analysis.existence.condition import require_all
+from obsynth.analysis.existence.filasova import explicit_form, pd_observer_conditions
 from obsynth.analysis.structure import analyse_structure
+from obsynth.conditions.lmi import chosen_solver
+from obsynth.conditions.options import own_terms
 from obsynth.errors import InfeasibleError, SolverError
-from obsynth.methods.conic.lmi import chosen_solver
-from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis, own_terms
-from obsynth.methods.pd_observer.checks import (
-    GAIN_CLAIMS,
-    error_inputs,
-    prove_gains,
-    prove_shipped_stability,
-)
-from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
-from obsynth.methods.pd_observer.inequalities import (
-    PdSolution,
-    PdTask,
-    default_delta,
-    fastest_mode,
-    require_possible,
-    solve,
-)
+from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
+from obsynth.methods.pd_observer.closed_form import closed_form
+from obsynth.methods.pd_observer.gains import PdGains, certified
+from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve
+from obsynth.methods.pd_observer.limits import default_delta, fastest_mode, require_possible
 from obsynth.methods.pd_observer.method import PdObserver
-from obsynth.methods.pd_observer.realisation import (
-    coupled_certificate,
-    explicit_certificate,
-    gain_certificate,
-    realise_pd_observer,
-    symmetric_certificate,
-    with_faults_as_states,
-    with_sensor_noise,
-)
-from obsynth.numerics.arguments import FloatArray, largest_singular_value
-from obsynth.numerics.doubling import EQUATION_TOLERANCE, continuous_riccati_solution, symmetric
-from obsynth.numerics.matrix_equations import continuous_solution
-from obsynth.numerics.ranks import NEGLIGIBLE_SHARE
+from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.scaling import balancing_factors
-from obsynth.numerics.spectra import abscissa
-from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.plant_units import FAR_UNITS, PlantUnits
 from obsynth.results.design import Certificate
-from obsynth.verification.claims import prove_symmetric_positive
 
 #: Beside the given units of signals that of time is the power of two nearest to this many times the inverse of the
 #: plant's fastest mode, where the objective weighs J and L as it does for a plant with modes of a few 1/s in seconds.
 TIME_UNITS = 10.0
+
 #: By default errors should decay at least at this fraction of the plant's fastest mode.
 DECAY_SHARE = 0.1
+
 #: When the gains that this takes are out of proportion, less is tried.
 DECAY_RETRIES = (1.0, 0.3, 0.1, 0.03)
+
 #: Gains may grow by this factor for the sake of the default decay rate.
 DECAY_PRICE = 100.0
+
 #: In the plant's own units, gains of this size are small, whatever the smallest ones are.
 SMALL_GAIN = 1.0
+
 #: With more unknown states the least of these rates comes first, in one set of units, and the first failure is the end.
 MANY_UNKNOWN_STATES = 100
+
 #: By default a decay rate is never closer to that of an unobservable mode, which nothing moves.
 HIDDEN_SHARE = 0.5
+
+
+_CLOSED_FORM = "a Riccati equation (engine 'riccati'), with L = 0 and N = 0."
 
 
 class _Units(NamedTuple):
@@ -319,7 +300,7 @@ def synthesise(plant: DescriptorSystem, asked: PdObserver, *, progress: Callable
     """Design the observer; see `obsynth.pd_observer` for the options, results and errors."""
     solver_of = chosen_solver(asked.solver, asked.solver_options)
     if own_terms(asked) or asked.region is not None:
-        from obsynth.conditions.own_terms import pd_by_inequality
+        from obsynth.methods.engines.own_terms import pd_by_inequality
 
         return pd_by_inequality(plant, asked, progress=progress)
     asked = replace(asked, solver=solver_of)
@@ -402,9 +383,6 @@ def notes(plant: DescriptorSystem, asked: PdObserver, gains: PdGains) -> tuple[s
     )
 
 
-_CLOSED_FORM = "a Riccati equation (engine 'riccati'), with L = 0 and N = 0."
-
-
 def _engine_notes(asked: PdObserver, gains: PdGains, states: int) -> list[str]:
     wanted = asked.engines_for(states)[0]
     if gains.engine != wanted:
@@ -415,229 +393,3 @@ def _engine_notes(asked: PdObserver, gains: PdGains, states: int) -> list[str]:
     if asked.engine == "auto" and wanted != "lmi":
         return [f"With {states} unknown states the gains come from {_CLOSED_FORM} Engine 'lmi' may find smaller ones."]
     return []
-
-
-@dataclass(frozen=True, eq=False)
-class PdGains:
-    """Gains in the loop with what proves them."""
-
-    J: FloatArray  # (nx + nf, ny), the paper's [J; G M]
-    L: FloatArray  # (nx + nf, ny), [L; G N]
-    P1: FloatArray  # (nx + nf, nx + nf), for the state [x; f]
-    P3: FloatArray
-    theorem: int
-    asked_delta: float  # seconds, of the design; ``delta``: of the certificate
-    delta: float
-    decay: float  # alpha, 1/seconds
-    observer: LinearObserver
-    record: Mapping[str, Any]
-    ends: tuple[FloatArray, ...] = ()  # P1 at the ends of the range of adaptation gains
-    gain_certificates: Mapping[str, FloatArray] = field(default_factory=dict)  # P_rate, P_noise (nx + nf, nx + nf)
-    proved: bool = False
-    proved_in_double_precision: bool = False
-    engine: str = ""
-
-    @property
-    def abscissa(self) -> float:
-        """Largest real part of an eigenvalue of the error system, 1/seconds."""
-        return abscissa(self.observer.Az, 0.0)
-
-
-def certified(
-    plant: DescriptorSystem, asked: PdObserver, found: PdSolution, *, delta: float, decay: float
-) -> PdGains | None:
-    """Return the gains with the solver's certificate or a computed one; ``None`` without a realisation."""
-    augmented = with_faults_as_states(plant)
-    try:
-        observer = realise_pd_observer(plant, augmented, found.J, found.L)
-    except np.linalg.LinAlgError:
-        return None
-    ends = asked.range_numbers
-    p1, p3 = symmetric(found.P1[0]), symmetric(found.P3) if asked.theorem == 2 else found.P3
-    gains = PdGains(found.J, found.L, p1, p3, asked.theorem, delta, delta, decay, observer, found.record)
-    if ends is not None:
-        return _certified_range(plant, replace(gains, ends=found.P1), ends)
-    certificates = _gain_certificates(plant, asked, gains)
-    if certificates is None:
-        return gains
-    gains = _judged(replace(gains, gain_certificates=certificates))
-    if gains.proved_in_double_precision:
-        return gains
-    own = explicit_certificate(observer.Az, observer.Cz[: observer.order], decay=decay) if asked.theorem == 1 else None
-    if own is None:
-        return gains
-    other = _judged(replace(gains, P1=own[0], P3=own[1], delta=own[2]))
-    return gains if gains.proved and not other.proved_in_double_precision else other
-
-
-def _gain_certificates(plant: DescriptorSystem, asked: PdObserver, gains: PdGains) -> dict[str, FloatArray] | None:
-    """Return the certificates of the bounds on l2 gains that are asked for; ``None`` when one is not found."""
-    observer, found = gains.observer, {}
-    for option, kind in GAIN_CLAIMS.items():
-        bound = getattr(asked, option)
-        if bound is None:
-            continue
-        entering = error_inputs(with_sensor_noise(plant), gains.J, gains.L, kind)
-        certificate = gain_certificate(observer.Az, entering, observer.Cz[observer.fault_rows], float(bound))
-        if certificate is None:
-            return None
-        found[f"P_{kind}"] = certificate
-    return found
-
-
-def _judged(gains: PdGains) -> PdGains:
-    """Return the gains with the outcome of proving their certificate."""
-    proofs = [
-        prove_symmetric_positive(gains.P1),
-        prove_shipped_stability(gains.observer, gains.P1, gains.P3, delta=gains.delta, decay=gains.decay),
-    ]
-    if gains.theorem == 2:
-        proofs.append(prove_symmetric_positive(gains.P3))
-    return replace(
-        gains,
-        proved=all(proof.proved for proof in proofs),
-        proved_in_double_precision=all(proof.in_double_precision for proof in proofs),
-    )
-
-
-def _certified_range(plant: DescriptorSystem, gains: PdGains, ends: tuple[float, float]) -> PdGains:
-    """Certify every ``g I`` of a range by its ends (affine in g); ships g = 1 or the nearer end, P1 interpolated."""
-    p1 = tuple(map(symmetric, gains.ends))
-    plants = [with_faults_as_states(plant, end * np.eye(plant.nf)) for end in ends]
-    proved = all(
-        prove_symmetric_positive(matrix).proved
-        and prove_gains(p.A, p.C, gains.J, gains.L, matrix, gains.P3, delta=gains.delta, decay=gains.decay).proved
-        for matrix, p in zip(p1, plants, strict=True)
-    )
-    shipped = min(max(1.0, ends[0]), ends[1])
-    share = (shipped - ends[0]) / (ends[1] - ends[0])
-    middle = (1.0 - share) * p1[0] + share * p1[1]
-    loop = np.eye(len(middle))
-    loop[plant.nx :, plant.nx :] *= shipped
-    back = np.linalg.inv(loop)
-    gain_j, gain_l = loop @ gains.J, loop @ gains.L
-    p3 = back.T @ gains.P3 @ back
-    p3 = symmetric(p3) if gains.theorem == 2 else p3
-    moved = replace(
-        gains,
-        J=gain_j,
-        L=gain_l,
-        P1=symmetric(back.T @ middle @ back),
-        P3=p3,
-        ends=p1,
-        observer=realise_pd_observer(plant, with_faults_as_states(plant), gain_j, gain_l),
-    )
-    moved = _judged(moved)
-    return replace(moved, proved=proved and moved.proved)
-
-
-#: Share of its limit at which delta is taken where it is free.
-DELTA_SHARE = 0.5
-#: Times that states are changed to those in which a Riccati solution is near one.
-MOST_NORMALISATIONS = 4
-#: With more states the Riccati equation is solved by doubling first.
-MOST_STATES_FOR_SCHUR = 60
-#: With more still, the QZ algorithm would take minutes.
-MOST_STATES_FOR_QZ = 200
-
-
-def closed_form(task: PdTask, *, free_delta: bool, once: bool = False) -> tuple[PdSolution, float]:
-    """Return gains for unit noise from a Riccati equation, L = 0, their certificate, and the delta that it is for."""
-    try:
-        return _closed_form(task, free_delta=free_delta)
-    except SolverError as error:
-        if once or "delta_limit" in error.record:
-            raise
-        failure = error
-    a, c = task.plants[0]
-    states = inverse = np.eye(len(a))
-    for _ in range(MOST_NORMALISATIONS):
-        found = _normalising(inverse @ a @ states, c @ states)
-        if found is None:
-            raise failure
-        states, inverse = states @ found[0], found[1] @ inverse
-        moved = replace(task, plants=((inverse @ a @ states, c @ states),))
-        try:
-            own, delta = _closed_form(moved, free_delta=free_delta)
-        except SolverError:
-            continue
-        p1, p3 = (inverse.T @ part @ inverse for part in (own.P1[0], own.P3))
-        return replace(own, J=states @ own.J, L=states @ own.L, P1=(symmetric(p1),), P3=p3), delta
-    raise failure
-
-
-def _normalising(a: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Return a change of states, and its inverse, in which the solution of the Riccati equation is near one."""
-    p = _doubled(a, c)
-    if p is None and len(a) <= MOST_STATES_FOR_QZ:
-        p = continuous_solution(a, c, np.eye(len(a)), np.eye(len(c)))
-    if p is None:
-        return None
-    sizes, directions = np.linalg.eigh(symmetric(p))
-    roots = np.sqrt(np.maximum(sizes, NEGLIGIBLE_SHARE * sizes[-1]))
-    return directions * roots, (directions / roots).T
-
-
-def _closed_form(task: PdTask, *, free_delta: bool) -> tuple[PdSolution, float]:
-    a, c = task.plants[0]
-    shifted = a + task.decay * np.eye(len(a))
-    record = {"what": _WHAT, "solver": "Riccati equation, LAPACK"}
-    gain = _riccati_gain(shifted, c, record)
-    moving = shifted - gain @ c
-    found = symmetric_certificate(moving)
-    if found is None:
-        raise SolverError(
-            "A Riccati equation gave gains that are not stable: the result is inconclusive.", record=record
-        )
-    p3, weight, limit = found
-    delta = min(task.delta, DELTA_SHARE * limit) if free_delta else task.delta
-    if delta < limit:
-        p1 = p3 + 0.5 * delta * weight
-    elif task.theorem == 1:
-        p1, p3 = coupled_certificate(moving, delta)
-    else:
-        raise SolverError(
-            "The closed form serves Theorem 2 for smaller delta alone: take engine 'lmi', or leave delta out.",
-            record={**record, "delta_limit": limit},
-        )
-    return PdSolution(gain, np.zeros_like(gain), (symmetric(p1),), p3, record), delta
-
-
-_WHAT = "a PD observer with L = 0"
-
-
-def _riccati_gain(a: FloatArray, c: FloatArray, record: Mapping[str, Any]) -> FloatArray:
-    """Return the gain of a Kalman filter for unit noise: of many states by doubling, else from the Hamiltonian matrix.
-
-    Where that is not found, or not stable, by the QZ algorithm on a pencil, which takes several times as long.
-    """
-    from scipy.linalg import schur
-
-    n, one = len(a), np.eye(len(a))
-    p = _doubled(a, c)
-    if p is not None and abscissa(a - p @ c.T @ c, 0.0) < 0.0:
-        return np.asarray(p @ c.T)
-    try:
-        _, basis, stable = schur(np.block([[a.T, -c.T @ c], [-one, -a]]), sort="lhp")
-        p = np.linalg.solve(basis[:n, :n].T, basis[n:, :n].T)
-        gain = np.asarray(0.5 * (p + p.T) @ c.T)
-        if stable == n and abscissa(a - gain @ c, 0.0) < 0.0:
-            return gain
-    except np.linalg.LinAlgError:
-        pass
-    p = None if n > MOST_STATES_FOR_QZ else continuous_solution(a, c, one, np.eye(len(c)))
-    if p is None:
-        raise SolverError("The Riccati equation was not solved: the result is inconclusive.", record=record)
-    return np.asarray(p @ c.T)
-
-
-def _doubled(a: FloatArray, c: FloatArray) -> FloatArray | None:
-    """Return the solution of the equation of `_riccati_gain` for many states, in a tenth of the time of eigenvalues."""
-    if len(a) <= MOST_STATES_FOR_SCHUR:
-        return None
-    p = continuous_riccati_solution(a, c, np.eye(len(a)), np.eye(len(c)))
-    if p is None:
-        return None
-    terms = (a @ p, p @ c.T @ c @ p, np.eye(len(a)))
-    left = float(np.linalg.norm(terms[0] + terms[0].T - terms[1] + terms[2]))
-    return p if left <= EQUATION_TOLERANCE * sum(float(np.linalg.norm(term)) for term in terms) else None

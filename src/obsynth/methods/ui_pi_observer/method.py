@@ -8,30 +8,21 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
+from obsynth.conditions.options import OwnConstraints, SolverName, SolverOptions, own_term_conflicts
 from obsynth.errors import SpecError
-from obsynth.methods.method import (
-    OPTIONS_PATH,
-    ClaimMeaning,
-    Method,
-    OwnConstraints,
-    PlantKind,
-    Purpose,
-    SolverName,
-    SolverOptions,
-    Synthesis,
-    own_term_conflicts,
-)
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
 from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, problem_with, shown
 from obsynth.numerics.spectra import decay_rates
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.fault_models import Exosystem, exosystem
+from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import STATED_BY_SEARCH
 from obsynth.verification.error_system import ErrorModel
 
 if TYPE_CHECKING:
-    from obsynth.methods.placement.region import Region
+    from obsynth.methods.engines.region import Region
+
 
 #: What to make of the freedom that poles leave.
 OBJECTIVES = ("conditioning", "gain")
@@ -179,7 +170,7 @@ class UiPiObserver(Method):
 
     def checked_region(self, dt: float) -> Region | None:
         """Return the region asked for."""
-        from obsynth.methods.placement.region import Region
+        from obsynth.methods.engines.region import Region
 
         if self.region is None:
             return None
@@ -223,7 +214,7 @@ class UiPiObserver(Method):
 
     def slowest_asked(self, dt: float) -> float | None:
         """Return the least rate of decay that was asked for, in 1/s."""
-        from obsynth.methods.placement.region import as_pole
+        from obsynth.numerics.eigenstructure import as_pole
 
         if self.decay is not None:
             return self.decay
@@ -235,7 +226,7 @@ class UiPiObserver(Method):
 
     def resolved(self, model: Exosystem, fault_names: Sequence[str]) -> dict[str, Any]:
         """Return the options as plain data, for the gain set."""
-        from obsynth.methods.placement.region import as_pole
+        from obsynth.numerics.eigenstructure import as_pole
 
         listed = None if self.poles is None else [as_pole(pole) for pole in self.poles]
         return {
@@ -247,7 +238,7 @@ class UiPiObserver(Method):
 
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, decided exactly or in floating point; several may fail."""
-        from obsynth.methods.ui_pi_observer.conditions import existence
+        from obsynth.analysis.existence.sharepasand import existence
 
         return existence(plant, exosystem(self.fault_model, plant.fault_names, plant.dt), exactly=exactly).conditions
 
@@ -256,7 +247,7 @@ class UiPiObserver(Method):
         cls, plant: DescriptorSystem, *, U: Any, D: Any, K: Any, F: Any, fault_model: Any = "step"
     ) -> Synthesis:
         """Return realisation and certificate of the gains of eqs. (11), (12), (23); see `obsynth.design_from_gains`."""
-        from obsynth.methods.ui_pi_observer.placement_problem import synthesis_from_gains
+        from obsynth.methods.ui_pi_observer.assembly import synthesis_from_gains
 
         return synthesis_from_gains(plant, U=U, D=D, K=K, F=F, fault_model=fault_model)
 

@@ -14,37 +14,39 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from obsynth.analysis.zeros import is_outside
+from obsynth.analysis.existence.augmented_pencils import number, numbers
+from obsynth.analysis.existence.sharepasand import Existence, existence
+from obsynth.conditions.lmi import chosen_solver
+from obsynth.conditions.options import own_terms
 from obsynth.errors import PreconditionError, SolverError
-from obsynth.methods.conic.lmi import chosen_solver
-from obsynth.methods.method import Synthesis, own_terms
-from obsynth.methods.placement.region import (
-    NOISE_PRICE,
-    KalmanProblem,
-    Region,
-    checked_poles,
-    compromise,
-    place,
-    region_gain,
-)
+from obsynth.methods.engines.kalman_problem import NOISE_PRICE, KalmanProblem, compromise
+from obsynth.methods.engines.region import Region, region_gain
+from obsynth.methods.method import Synthesis
 from obsynth.methods.refusals import require_all_told
-from obsynth.methods.ui_pi_observer.augmented_plant import number, numbers
-from obsynth.methods.ui_pi_observer.conditions import Existence, existence
+from obsynth.methods.ui_pi_observer.assembly import assembled
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
-from obsynth.methods.ui_pi_observer.placement_problem import (
-    PlacementProblem,
-    assembled,
-    kalman_problem,
-    placement_problem,
-)
-from obsynth.numerics.arguments import FloatArray
+from obsynth.methods.ui_pi_observer.placement_problem import PlacementProblem, kalman_problem, placement_problem
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.eigenstructure import checked_poles, place
+from obsynth.numerics.invariant_zeros import is_outside
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE
 from obsynth.numerics.spectra import decay_rates
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.fault_models import exosystem
+from obsynth.plants.faults import exosystem
 
 #: A default this many times slower than the plant itself is worth a note.
 SLOW_DEFAULT = 1000.0
+
+
+#: A region with a radius and no decay asks for at most this share of its radius.
+RADIUS_SHARE = 0.5
+
+
+Choice: TypeAlias = tuple[FloatArray, Sequence[complex] | None, Mapping[str, float], tuple[Mapping[str, Any], ...]]
+
+
+#: Rates of the poles that are placed for a decay, in units of it: apart from one another, and none on the bound.
+LEAST_RATE, RATE_SPREAD = 1.1, 1.0
 
 
 def notes(
@@ -81,15 +83,11 @@ def notes(
         )
 
 
-#: A region with a radius and no decay asks for at most this share of its radius.
-RADIUS_SHARE = 0.5
-
-
 def synthesise(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the observer; see `obsynth.ui_pi_observer` for the options, results and errors."""
     solver = chosen_solver(asked.solver, asked.solver_options)
     if own_terms(asked):
-        from obsynth.conditions.own_terms import ui_pi_by_inequality
+        from obsynth.methods.engines.own_terms import ui_pi_by_inequality
 
         return ui_pi_by_inequality(plant, asked, progress=progress)
     asked = replace(asked, solver=solver)
@@ -130,9 +128,6 @@ def synthesise(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callab
     )
 
 
-Choice: TypeAlias = tuple[FloatArray, Sequence[complex] | None, Mapping[str, float], tuple[Mapping[str, Any], ...]]
-
-
 def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str) -> Choice:
     """Return the gain for given poles; its size is that in the user's units where outputs are not mixed."""
     split, plant, units = problem.split, problem.plant, problem.units
@@ -171,10 +166,6 @@ def _chosen(
     else:
         gain = _for_decay(problem, kalman, problem.rate / time, asked.objective, dt)
     return gain, None, claims, runs
-
-
-#: Rates of the poles that are placed for a decay, in units of it: apart from one another, and none on the bound.
-LEAST_RATE, RATE_SPREAD = 1.1, 1.0
 
 
 def _for_decay(problem: PlacementProblem, kalman: KalmanProblem, decay: float, objective: str, dt: float) -> FloatArray:

@@ -1,1 +1,1 @@
-"""Linear observers: one realisation."""
+"""Linear time-invariant observers: one realisation."""

@@ -1,37 +1,41 @@
-"""What a recursive observer computes that does not depend on data: gains, batches run with them, the steady state.
-
-Numbers about a recursive observer that do not depend on data: contraction of the errors, excitation, last gains.
-"""
+"""What a recursive observer computes that does not depend on data: gains, batches run with them, the steady state."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from itertools import chain
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.analysis.time_varying import STEPS_WITHOUT_HORIZON
 from obsynth.errors import PreconditionError, SolverError, SpecError
-from obsynth.numerics.arguments import FloatArray, read_only
-from obsynth.numerics.norms import spectral_radius
-from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
+from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.spectra import abscissa
 from obsynth.numerics.square_root_estimation import least_squares_step, rank_revealing_step, update
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import batch_record, require_horizon
-from obsynth.observers.recursive.observer import (
-    PreparedStep,
-    RecursiveObserver,
-    StepMatrices,
-    deviations_in,
-    excitation_levels,
-    posterior_residual,
-    spreads,
-)
-from obsynth.observers.running import Estimates, named_estimates, require_plain
+from obsynth.observers.recursive.observer import RecursiveObserver, posterior_residual
+from obsynth.observers.recursive.step_model import PreparedStep, StepMatrices, spreads
+from obsynth.observers.running import named_estimates
+from obsynth.observers.sensor_timing import require_plain
+
+#: Numbers of gains that are kept for a second look, of twenty megabytes.
+MOST_KEPT_GAINS = 2**21
+
+
+#: The gains have settled when what is left of their way is below this share of them.
+SETTLED_GAINS = 1e-13
+
+#: Steps of the recursion before it is held to settle nowhere.
+MOST_SETTLING_STEPS = 20_000
+
+#: Steps in a row that must have settled: at a turning point gains stand still, too.
+STILL_STEPS = 5
+
+#: Gains that are where they were so many steps before have settled, although their last digits go to and fro.
+STILL_FOR_LONG = 256
 
 
 class GainStep(NamedTuple):
@@ -101,8 +105,6 @@ def gain_steps(
 
 #: Gains of the steps of an observer: `gain_steps`, or what remembers them.
 Gains: TypeAlias = Callable[[RecursiveObserver, int], Iterable[GainStep]]
-#: Numbers of gains that are kept for a second look, of twenty megabytes.
-MOST_KEPT_GAINS = 2**21
 
 
 def gains_once() -> Gains:
@@ -160,16 +162,6 @@ def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = N
     for k, found in enumerate(innovations):
         padded[:, k, : found.shape[1]] = found
     return named_estimates(observer, states=states, faults=parameters, innovations=padded)
-
-
-#: The gains have settled when what is left of their way is below this share of them.
-SETTLED_GAINS = 1e-13
-#: Steps of the recursion before it is held to settle nowhere.
-MOST_SETTLING_STEPS = 20_000
-#: Steps in a row that must have settled: at a turning point gains stand still, too.
-STILL_STEPS = 5
-#: Gains that are where they were so many steps before have settled, although their last digits go to and fro.
-STILL_FOR_LONG = 256
 
 
 class SteadyObserver(NamedTuple):
@@ -301,175 +293,3 @@ def _realised(observer: RecursiveObserver, found: GainStep) -> tuple[LinearObser
     begin = observer.init()
     # z = E x gives back x, as [L K] [E; C] = I, where the first outputs agree with it.
     return realisation, np.concatenate([step.H[:ne] @ begin.x, begin.parameters.theta])
-
-
-#: Errors that shrank below this are gone; the product starts anew from there, so that it does not underflow.
-GONE = 1e-200
-#: On shorter horizons an error need not have shrunk yet, so that the contraction only informs.
-STEPS_TO_CONTRACT = 50
-#: With more states, and a plant and noise that stay the same, fewer steps are followed, as work goes with the cube of
-#: the states; where errors do not shrink over these, so many times as many, until all were followed.
-MANY_STATES = 100
-FEWEST_FOLLOWED = 60
-FOLLOW_FURTHER = 3
-#: Spectral radius below which gains that are kept make errors decay, whatever rounding did to it.
-CLEARLY_STABLE = 1.0 - 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class GainScheduleSummary:
-    """What the gains along the horizon say."""
-
-    steps: int  # how many steps were looked at
-    # ``norm(product of L_k A_k)^(1 / steps)``: the mean factor by which an error shrinks in a step; where that is not
-    # below one, over the second half of the horizon
-    contraction: float
-    growth: float  # the largest norm of the product on the way: how much an error may grow before it decays
-    span: str  # what the contraction was taken over
-    # ``(nx,)``: size of the product in each state after the last step, relative to its largest: where errors last
-    survivors: FloatArray
-    # the least eigenvalue of the information on the parameters in any window, (26); NaN without parameters
-    excitation: float
-    excitation_k: int  # the sample that ends that window
-    L: FloatArray  # L, K: the gains (11) of the last step
-    K: FloatArray
-    deviations: FloatArray  # ``(nq,)``: standard deviations of the parameters after the last step
-    # ``(nx,)``: standard deviations of the states after the last step, the parameters being known
-    state_deviations: FloatArray
-
-
-def looked_at(observer: RecursiveObserver) -> int:
-    """Return how many steps of an observer's model are looked at."""
-    steps = observer.plant.horizon or STEPS_WITHOUT_HORIZON
-    return max(steps - 1, 1) if observer.early_constraints else steps
-
-
-def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_steps) -> GainScheduleSummary:
-    """Return what the gains along the horizon say."""
-    steps = looked_at(observer)
-    learning = observer.adaptation is not None
-    random_walk = observer.form == "random-walk"
-    # Of a walk, the state filter and the regressors are those of the model without the walk.
-    plain = observer.without_walk
-    whole = steps + int(observer.early_constraints)
-    product, regressors, last = ErrorProduct(observer.plant.nx, _first_end(observer, whole)), [], None
-    kept: tuple[float, str] | None = None
-    for found in gains(plain, steps):
-        last, kept = found, None
-        regressors.append(found.G)
-        product.move(found.gain[:, : len(found.step.A)] @ found.step.A)
-        if product.done == product.steps < whole:
-            if product.contraction()[0] < 1.0 or (kept := product.contraction_of_kept_gains()) is not None:
-                break
-            product.go_on_to(min(whole, FOLLOW_FURTHER * product.steps))
-    if last is None:
-        raise SpecError("The plant has no steps.", path="horizon")
-    (contraction, span), ne = kept if kept is not None else product.contraction(), len(last.step.A)
-    window = observer.adaptation.window if observer.adaptation is not None else 1
-    levels = excitation_levels(regressors, window)[window - 1 :]
-    deviations, state_deviations = deviations_in(last.spread), deviations_in(last.factor)
-    if random_walk:
-        *_, end = gains(observer, steps)
-        lengths = deviations_in(end.factor)
-        state_deviations, deviations = lengths[: observer.plant.nx], lengths[observer.plant.nx :]
-    return GainScheduleSummary(
-        steps=len(regressors),
-        contraction=contraction,
-        growth=product.growth,
-        span=span,
-        survivors=product.survivors,
-        excitation=float(levels.min()) if learning and levels.size else float("nan"),
-        excitation_k=int(levels.argmin()) + window if learning and levels.size else 0,
-        L=last.gain[:, :ne],
-        K=last.gain[:, ne:],
-        deviations=deviations,
-        state_deviations=state_deviations,
-    )
-
-
-def _first_end(observer: RecursiveObserver, steps: int) -> int:
-    """Return how many steps are followed at first: all, but for a filter of many states whose steps are all alike."""
-    plant = observer.plant
-    alike = plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant
-    if not alike or plant.horizon or observer.adaptation is not None or plant.nx <= MANY_STATES:
-        return steps
-    return min(steps, max(FEWEST_FOLLOWED, round(steps * (MANY_STATES / plant.nx) ** 3)))
-
-
-class ErrorProduct:
-    """The product of the matrices L_k A_k along so many steps, with its size on the way."""
-
-    def __init__(self, nx: int, steps: int) -> None:
-        self.steps, self.done = steps, 0
-        self.product, self.logarithm, self.growth = np.eye(nx), 0.0, 1.0
-        self.factor = np.eye(nx)
-        self.late, self.late_logarithm, self.middle = np.eye(nx), 0.0, 0.0
-        self.ended: tuple[float, str] | None = None
-
-    def go_on_to(self, steps: int) -> None:
-        """Go on to a later end, of which less than half is done."""
-        self.steps = steps
-        self.late, self.late_logarithm = np.eye(len(self.late)), 0.0
-
-    def move(self, factor: FloatArray) -> None:
-        """Take one step more; nothing but the count changes once errors are gone or out of range."""
-        self.done += 1
-        if self.ended is not None:
-            return
-        self.factor = factor
-        self.product = factor @ self.product
-        size = norm_or_bound(self.product)
-        self.growth = max(self.growth, size * float(np.exp(min(self.logarithm, 0.0))))
-        if not size < 1.0 / GONE:
-            self.growth, self.ended = float("inf"), (float("inf"), "from the start")
-            return
-        if size == 0.0:
-            self.ended = 0.0, "from the start"
-            return
-        if size < GONE:
-            self.product, self.logarithm = self.product / size, self.logarithm + float(np.log(size))
-        if self.done == self.steps // 2:
-            self.middle = self._length()
-        elif self.done > self.steps // 2:
-            self.late = factor @ self.late
-            late_size = norm_or_bound(self.late)
-            self.late, self.late_logarithm = self.late / late_size, self.late_logarithm + float(np.log(late_size))
-
-    def _length(self) -> float:
-        return self.logarithm + float(np.log(np.linalg.norm(self.product, 2)))
-
-    @property
-    def survivors(self) -> FloatArray:
-        """Size of the product in each state, relative to its largest ``(nx,)``."""
-        sizes = np.max(np.abs(self.product), axis=1)
-        return np.asarray(sizes / max(float(sizes.max()), np.finfo(np.float64).tiny))
-
-    def contraction_of_kept_gains(self) -> tuple[float, str] | None:
-        """Return the contraction of one step with the last gains, were they kept; ``None`` where errors stay then."""
-        radius = 1.0 if self.ended is not None else spectral_radius(self.factor)
-        span = "of one step with the last gains, were they kept: errors have not shrunk as a whole yet"
-        return (radius, span) if radius < CLEARLY_STABLE else None
-
-    def contraction(self) -> tuple[float, str]:
-        """Return the mean factor by which an error shrinks in a step, and what it was taken over."""
-        if self.ended is not None:
-            return self.ended
-        steps = self.steps
-        last = self._length()
-        whole = float(np.exp(last / steps))
-        # In units far apart, or where errors grow before they shrink, a slow mode may take longer than the horizon to
-        # make an error smaller than it was: then errors must shrink over the second half, as a whole and in every mode.
-        radius = spectral_radius(self.late) if whole >= 1.0 else 1.0
-        slowest = max(last - self.middle, self.late_logarithm + float(np.log(radius)) if radius else -np.inf)
-        second = float(np.exp(slowest / (steps - steps // 2)))
-        if whole >= 1.0 and second < 1.0 - BOUNDARY_TOLERANCE:
-            return second, "over the second half"
-        return whole, "from the start"
-
-
-def norm_or_bound(matrix: FloatArray) -> float:
-    """Return the 2-norm of a matrix; of a large one a bound on it, which takes no singular values."""
-    if len(matrix) <= MANY_STATES:
-        # What `norm` does of one matrix, without asking thousands of times which axes it has.
-        return float(np.linalg.svd(matrix, compute_uv=False).max(initial=0.0))
-    return float(np.sqrt(np.linalg.norm(matrix, 1) * np.linalg.norm(matrix, np.inf)))

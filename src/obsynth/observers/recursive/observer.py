@@ -1,15 +1,6 @@
 """The recursive observer that a time-varying design ships: descriptor Kalman filter, with or without parameters.
 
-Its options, all of them checked; its state and rows, and the estimates in them; the recursion, in which one
-factorisation for each sample gives state, regressor, innovation and its regressor; and whole records, step by step or
-through a kernel compiled by numba.
-
-The kernel takes filters with a random walk of parameters or none, and gives equal results up to rounding.  Unasked it
-is used from `LONG_RECORD` samples and up to `SMALL_ORDER` states.  Its first use compiles for some seconds.
-
-The matrices of one step as the recursion needs them: of a plant as it is, with early constraints, with walks.
-
-Early constraints: an equation of step k + 1 without x(k + 2) is an output of x(k + 1) already.
+A recursive observer from a plant and plain options: used to design one, and to check the one that was shipped.
 """
 
 from __future__ import annotations
@@ -18,26 +9,18 @@ import importlib.util
 import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, Literal, NamedTuple, Self, TypeAlias
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from obsynth.analysis.time_varying import IntArray, early_rows
-from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import (
-    Count,
-    FloatArray,
-    ForgettingFactor,
-    Probability,
-    as_matrix,
-    check_fields,
     checked_value,
     is_number,
-    read_only,
     real_array,
     real_number,
     real_vector,
@@ -45,24 +28,20 @@ from obsynth.numerics.arguments import (
     require_shape,
     truth,
 )
-from obsynth.numerics.ranks import UNDETERMINED_SHARE, covariance_factor, rounding_rank
+from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.ranks import UNDETERMINED_SHARE, covariance_factor
 from obsynth.numerics.square_root_estimation import (
     DEPENDENT_COLUMN,
-    OUTGROWN,
     SUSPECT_COLUMN,
     SUSPECT_PARITY,
     LeastSquaresStep,
     ParameterState,
-    Projection,
     least_squares_step,
-    noise_triangle,
-    projected_step,
-    projection_of,
     rank_revealing_step,
-    row_sizes,
     start_of,
     update,
 )
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.outliers import (
     Outliers,
     checked_limit,
@@ -72,339 +51,38 @@ from obsynth.observers.outliers import (
     robust_advance,
     with_surprise,
 )
-from obsynth.observers.records import (
-    TakenInputs,
-    held_inputs,
-    measured_record,
-    no_inputs,
-    require_horizon,
-    require_inputs,
-    taken_inputs,
-    whole_record,
+from obsynth.observers.records import measured_record, require_horizon, whole_record
+from obsynth.observers.recursive.settings import Adaptation
+from obsynth.observers.recursive.step_model import (
+    PreparedStep,
+    StepMatrices,
+    StepModel,
+    right_side,
+    spreads,
+    stacked_noise,
+    with_missing_inputs,
 )
-from obsynth.observers.running import Estimates, StepObserver, named_estimates
-from obsynth.plants.descriptor import MatrixSequence, TimeVaryingDescriptorSystem
+from obsynth.observers.running import StepObserver, named_estimates
+from obsynth.observers.taken_inputs import TakenInputs, held_inputs, no_inputs, require_inputs, taken_inputs
+from obsynth.plants.sequences import MatrixSequence
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
-#: From so many rows on the noise that stays the same is brought to a triangle once, and only what moves is added to it.
-MANY_ROWS = 100
-
-
-class StepMatrices(NamedTuple):
-    """One step ``E x(k+1) = A x(k) + B u(k) + Phi theta + q``, ``[y(k+1); Dn u(k+1)] = C x(k+1) + Psi theta + r``."""
-
-    H: FloatArray  # ``(ne + ny, nx)``: E above C
-    A: FloatArray  # A, B, Phi: ``(ne, nx)``, ``(ne, nu)``, ``(ne, nq)``
-    B: FloatArray
-    Phi: FloatArray
-    Psi: FloatArray  # ``(ny, nq)``
-    Dn: FloatArray  # ``(ny - measured, nu)``: outputs that are made of the next input
-    noise: FloatArray  # ``(ne + ny, any)``: square root of the covariance of q and r
+#: Rows whose arrays are put together at once: more would leave the processor's cache, and their room be made anew.
+ROWS_TOGETHER = 256
 
 
-def right_side(
-    step: StepMatrices, x: FloatArray, Upsilon: FloatArray, before: FloatArray, y: FloatArray, u: FloatArray
-) -> FloatArray:
-    """Return the data of a step ``(rows, 1 + nq)``: of its state, inputs and outputs, and by its parameters."""
-    ne, nq = len(step.A), Upsilon.shape[1]
-    right = np.empty((len(step.H), 1 + nq), order="F")
-    right[:ne, 0] = step.A.dot(x) + step.B.dot(before)
-    right[ne : ne + len(y), 0] = y
-    if len(step.Dn):
-        right[ne + len(y) :, 0] = step.Dn @ u
-    if nq:
-        right[:ne, 1:] = step.A @ Upsilon + step.Phi
-        right[ne:, 1:] = -step.Psi
-    return right
+#: Samples from which the kernel is used unasked: they take seconds without it, which is what loading numba, or the
+#: first compilation of an installation, takes.
+LONG_RECORD = 100_000
 
+#: Numbers in the state up to which the kernel is faster than LAPACK.
+SMALL_ORDER = 25
 
-def stacked_noise(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the block-diagonal square root of two independent noises."""
-    noise = np.zeros((len(first) + len(second), first.shape[1] + second.shape[1]))
-    noise[: len(first), : first.shape[1]], noise[len(first) :, first.shape[1] :] = first, second
-    return noise
+#: Steps that are prepared together: bounds the memory of plants that vary.
+PREPARED_STEPS = 4096
 
-
-def spreads(
-    step: StepMatrices, factor: FloatArray, diffuse: FloatArray, k: int, state_names: Sequence[str]
-) -> tuple[FloatArray, FloatArray]:
-    """Return a root ``(rows, any)`` of the covariance of a step's data on the way to sample ``k``, and what is unknown
-    in them ``(rows, r)``; raise `PreconditionError` where deviations outgrow double precision."""
-    ne, rows, width = len(step.A), len(step.H), factor.shape[1]
-    S = np.zeros((rows, max(width + step.noise.shape[1], rows)))
-    S[:ne, :width] = step.A @ factor
-    S[:, width : width + step.noise.shape[1]] = step.noise
-    if not float(np.max(np.abs(S), initial=0.0)) < OUTGROWN:
-        sizes = np.max(np.abs(np.nan_to_num(factor[: len(state_names)])), axis=1, initial=0.0)
-        names = leading_names(sizes, state_names)
-        raise PreconditionError(
-            f"The errors outgrow double precision at k = {k}: they grow in states that the outputs do not observe, or "
-            f"not often enough: {', '.join(map(repr, names))}. Measure more, shorten the horizon, or leave these "
-            "states out.",
-            condition="bounded errors",
-            signals=names,
-        )
-    return S, np.vstack([step.A @ diffuse, np.zeros((rows - ne, diffuse.shape[1]))])
-
-
-@dataclass
-class StepModel:
-    """The matrices of every step, with the parameters among the states where these walk at random.
-
-    Then ``[x(k+1); theta(k)]`` is the state at k + 1: theta(k) acted in the step to k + 1, and its increment is noise
-    of its own equation, not correlated in time. An algebraic equation used early holds for theta(k + 1), so that the
-    state is ``[x(k+1); theta(k+1)]``; the outputs still hold theta(k), which is theta(k + 1) without its last
-    increment: that noise they share.
-    """
-
-    plant: TimeVaryingDescriptorSystem
-    Q: MatrixSequence  # Q, R: ``(ne, ne)`` and ``(ny, ny)`` for each k
-    R: MatrixSequence
-    #: Algebraic equations, of independent noise, that are used as outputs one step earlier, see
-    #: `obsynth.analysis.time_varying.algebraic_rows`; none leaves the plant as it is.
-    late: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.intp), kw_only=True)
-    #: ``(nq, nq)``: square root of the covariance of one step of the walk.
-    walk: FloatArray | None = field(default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        plant = self.plant
-        self.early = bool(self.late.size)
-        self.others = np.setdiff1d(np.arange(plant.ne), self.late)
-        self._constant: StepMatrices | None = None
-        self._correction: StepMatrices | None = None
-        self._H: FloatArray | None = None
-        self._noise: FloatArray | None = None
-        self._last: tuple[int, StepMatrices, StepMatrices] | None = None
-        self._H_is_constant = plant.E.is_constant and plant.C.is_constant and (plant.A.is_constant or not self.early)
-        self._noise_is_constant = self.Q.is_constant and self.R.is_constant
-        self._is_constant = self._noise_is_constant and plant.is_time_invariant
-
-    def _other(self, matrix: FloatArray) -> FloatArray:
-        """Return the rows of a matrix of the equations that are not used early."""
-        return matrix[self.others] if self.early else matrix
-
-    def _factors(self, k: int) -> tuple[FloatArray, FloatArray]:
-        """Return square roots of the covariances of the other equations' noise, and of that of those used early."""
-        covariance, name = self.Q.at(k), f"Q({k})"
-        if not self.early:
-            return covariance_factor(covariance, name), np.zeros((0, 0))
-        if np.any(covariance[np.ix_(self.others, self.late)]):
-            raise SpecError(
-                f"Q({k}) couples the noise of algebraic equations with that of the others: early_constraints needs "
-                "them independent.",
-                path="method.options.early_constraints",
-            )
-        return (
-            covariance_factor(covariance[np.ix_(self.others, self.others)], name),
-            covariance_factor(covariance[np.ix_(self.late, self.late)], name),
-        )
-
-    def without_walk(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1, as if the parameters did not walk."""
-        if self._constant is not None:
-            return self._constant
-        plant, late = self.plant, self.late
-        noise, H, Psi, Dn = self._noise, self._H, plant.Psi.at(k), np.zeros((0, plant.nu))
-        if noise is None:
-            outputs = covariance_factor(self.R.at(k), f"R({k})")
-            if self.early:
-                outputs = stacked_noise(outputs, self._factors(k + 1)[1])
-            noise = stacked_noise(self._factors(k)[0], outputs)
-            self._noise = noise if self._noise_is_constant else None
-        if H is None:
-            seen = [plant.A.at(k + 1)[late]] if self.early else []
-            H = np.asfortranarray(np.vstack([self._other(plant.E.at(k + 1)), plant.C.at(k + 1), *seen]))
-            self._H = H if self._H_is_constant else None
-        if self.early:
-            Psi, Dn = np.vstack([Psi, plant.Phi.at(k + 1)[late]]), -plant.B.at(k + 1)[late]
-        A, B, Phi = (self._other(matrix.at(k)) for matrix in (plant.A, plant.B, plant.Phi))
-        found = StepMatrices(H, A, B, Phi, Psi, Dn, noise)
-        self._constant = found if self._is_constant else None
-        return found
-
-    def at(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1; the same object for the same step."""
-        last = self._last
-        if last is not None and last[0] == k:
-            return last[2]
-        step = self.without_walk(k)
-        if self.walk is None:
-            found = step
-        elif last is not None and last[1] is step:
-            found = last[2]
-        else:
-            found = with_walking_parameters(step, self.walk, early=self.early)
-        self._last = (k, step, found)
-        return found
-
-    def first(self) -> StepMatrices | None:
-        """Return the correction of x(0), and of parameters that walk, by the algebraic equations of step 0, where these
-        are used early."""
-        if not self.early:
-            return None
-        step = self._correction_without_walk(0)
-        return step if self.walk is None else with_walking_parameters(step, np.zeros_like(self.walk), early=True)
-
-    def correction(self, k: int) -> StepMatrices:
-        """Return the correction of x(k) by the algebraic equations of step k, of parameters that walk until there."""
-        step = self._correction_without_walk(k)
-        return step if self.walk is None else with_walking_parameters(step, self.walk, early=True)
-
-    def _correction_without_walk(self, k: int) -> StepMatrices:
-        """Return the correction as if the parameters did not walk: what is known is the 'equation'."""
-        if self._correction is not None:
-            return self._correction
-        plant, late = self.plant, self.late
-        found = StepMatrices(
-            np.vstack([np.eye(plant.nx), plant.A.at(k)[late]]),
-            np.eye(plant.nx),
-            np.zeros((plant.nx, plant.nu)),
-            np.zeros((plant.nx, plant.nq)),
-            plant.Phi.at(k)[late],
-            -plant.B.at(k)[late],
-            stacked_noise(np.zeros((plant.nx, 0)), self._factors(k)[1]),
-        )
-        self._correction = found if self._is_constant else None
-        return found
-
-
-def with_walking_parameters(step: StepMatrices, walk: FloatArray, *, early: bool = False) -> StepMatrices:
-    """Return one step with its parameters among the states: those before it, with early constraints those after it."""
-    ne, nx, nq = *step.A.shape, step.Phi.shape[1]
-    nothing, acting, rows, width = np.zeros((ne, nq)), step.Phi, len(step.H) + nq, step.noise.shape[1]
-    below = [np.zeros((nq, nx)), np.eye(nq)]
-    H = np.block([[step.H[:ne], nothing if early else -acting], below, [step.H[ne:], step.Psi]])
-    A = np.block([[step.A, acting if early else nothing], below])
-    noise = np.zeros((rows, width + nq))
-    noise[:ne, :width], noise[ne + nq :, :width] = step.noise[:ne], step.noise[ne:]
-    noise[ne : ne + nq, width:] = walk
-    if early:
-        measured = len(step.Psi) - len(step.Dn)
-        noise[ne + nq : ne + nq + measured, width:] = step.Psi[:measured] @ walk
-    return StepMatrices(
-        np.asfortranarray(H),
-        A,
-        np.vstack([step.B, np.zeros((nq, step.B.shape[1]))]),
-        np.zeros((ne + nq, 0)),
-        np.zeros((len(step.Psi), 0)),
-        step.Dn,
-        noise,
-    )
-
-
-def with_missing_inputs(step: StepMatrices, before: FloatArray | float, now: FloatArray | None) -> StepMatrices:
-    """Return one step whose inputs have variances ``before (nu,)``, and those of its own sample ``now (nu,)``."""
-    ne, nu = step.B.shape
-    acting = np.zeros((len(step.H), 2 * nu))
-    acting[:ne, :nu] = step.B * np.sqrt(before)
-    if now is not None and len(step.Dn):
-        acting[len(step.H) - len(step.Dn) :, nu:] = step.Dn * np.sqrt(now)
-    return step._replace(noise=np.hstack((step.noise, acting[:, acting.any(axis=0)])))
-
-
-@dataclass(frozen=True, eq=False)
-class PreparedStep:
-    """One step with its factorisation."""
-
-    step: StepMatrices  # which step it is
-    projection: Projection | None  # of H; ``None`` where its rank has to be decided
-    moved: FloatArray  # ``(rows, n)``: rotated A, empty without a projection
-    # The transpose of the rotated noise ``(any, rows)``, empty without a projection; of many rows its triangle.
-    known: FloatArray
-    sizes: FloatArray | None  # of the rows of H, see `row_sizes`
-
-    @classmethod
-    def of(cls, step: StepMatrices, last: PreparedStep | None) -> PreparedStep:
-        """Prepare a step."""
-        if last is not None and last.step is step:
-            return last
-        same = last if last is not None and last.step.H is step.H else None
-        # Once for a run: a varying H is in the same units at every step.
-        kept = last is not None and len(last.step.H) == len(step.H)
-        sizes = last.sizes if last is not None and kept else row_sizes(step.H)
-        projection = projection_of(step.H, sizes=sizes) if same is None else same.projection
-        if projection is None:
-            return cls(step, None, step.A[:0], step.noise[:0], sizes)
-        rotation = projection.rotation
-        moved = rotation[:, : len(step.A)] @ step.A
-        if same is not None and same.step.noise is step.noise:
-            return cls(step, projection, moved, same.known, sizes)
-        known = (rotation @ step.noise).T
-        return cls(step, projection, moved, known if len(rotation) < MANY_ROWS else noise_triangle(known), sizes)
-
-    def taken(self, factor: FloatArray, right: FloatArray | None) -> LeastSquaresStep | None:
-        """Take the step, or return ``None`` where a rank has to be decided; ``right`` is the identity by default."""
-        if self.projection is None:
-            return None
-        rotation = self.projection.rotation
-        width, known, rows = factor.shape[1], self.known, len(rotation)
-        # `dot` is `@` with half the overhead, which for few states is most of the time.
-        data = rotation if right is None else rotation.dot(right)
-        if rows >= MANY_ROWS:
-            return projected_step(self.projection, (self.moved @ factor).T, data, known=known)
-        # As many rows as the projection has at least: what is missing (rectangular roots) are rows of zeros.
-        noise = np.zeros((max(width + len(known), rows), rows), order="F")
-        noise[:width] = self.moved.dot(factor).T
-        noise[width : width + len(known)] = known
-        return projected_step(self.projection, noise, data)
-
-
-Form: TypeAlias = Literal["innovation", "literal", "random-walk"]
-Guard: TypeAlias = Literal["regularise", "directional", "none"]
-
-
-@dataclass(frozen=True, eq=False)
-class Adaptation:
-    """How parameters are estimated.
-
-    Parameters
-    ----------
-    form : {"innovation", "literal", "random-walk"}
-        Least squares on the whitened parity innovation; (18) as printed; or the parameters as states.
-    forgetting : float
-        lambda in (0, 1], dimensionless; not used by the random walk.
-    guard : {"regularise", "directional", "none"}
-        What keeps S bounded where excitation is missing.
-    initial_parameters : FloatArray
-        ``(nq,)``.
-    initial_covariance : FloatArray
-        ``S_0 (nq, nq)``, positive definite: also the covariance of the initial parameters.
-    walk : FloatArray
-        ``(nq, nq)``: covariance of one step of the random walk.
-    window : int
-        Samples over which excitation is watched.
-    reset : float
-        Detect and reset: probability, per sample, that innovations which no change has made larger pass the threshold
-        above which S and the covariance start again from S_0.  Zero never resets.
-
-    Raises
-    ------
-    SpecError
-        Something is out of range or has the wrong shape.
-    """
-
-    form: Form
-    forgetting: ForgettingFactor
-    guard: Guard
-    initial_parameters: FloatArray
-    initial_covariance: FloatArray
-    walk: FloatArray
-    window: Count
-    reset: Probability = 0.0
-
-    def __post_init__(self) -> None:
-        check_fields(self, Adaptation)
-        if self.reset and self.form == "random-walk":
-            raise SpecError("reset is for the forms with a forgetting factor.", path="reset")
-        start = np.atleast_1d(real_array(self.initial_parameters, "initial_parameters"))
-        q = len(start)
-        object.__setattr__(self, "initial_parameters", read_only(start))
-        for name, option in (("initial_covariance", "initial_parameter_covariance"), ("walk", "random_walk")):
-            matrix = as_matrix(getattr(self, name), option)
-            require_shape(matrix.shape, (q, q), option)
-            object.__setattr__(self, name, matrix)
-            factor = covariance_factor(matrix, option)
-            if name == "initial_covariance" and (np.diag(matrix) <= 0.0).any() | (rounding_rank(factor) < q):
-                raise SpecError(f"{option} (S_0) must be positive definite.", path=option)
+#: Fewer complete samples in a row than this are faster step by step.
+SHORT_STRETCH = 8
 
 
 def deviations_in(factor: FloatArray, diffuse: FloatArray | None = None) -> FloatArray:
@@ -528,10 +206,6 @@ def recursive_estimates(
 def _alike(rows: Sequence[RawEstimate], name: str) -> Iterator[tuple[NDArray[np.intp], FloatArray]]:
     """Yield places of rows with arrays of one shape, and these as one array."""
     return _groups([getattr(row, name) for row in rows])
-
-
-#: Rows whose arrays are put together at once: more would leave the processor's cache, and their room be made anew.
-ROWS_TOGETHER = 256
 
 
 def _groups(arrays: Sequence[FloatArray]) -> Iterator[tuple[NDArray[np.intp], FloatArray]]:
@@ -940,17 +614,6 @@ def stacked_steps(
     data = _products(turned.transpose(0, 2, 1), right)
     head, data = np.ascontiguousarray(triangle[:, :n]), np.ascontiguousarray(data[:count])
     return np.ascontiguousarray(moved), np.ascontiguousarray(known), head, data
-
-
-#: Samples from which the kernel is used unasked: they take seconds without it, which is what loading numba, or the
-#: first compilation of an installation, takes.
-LONG_RECORD = 100_000
-#: Numbers in the state up to which the kernel is faster than LAPACK.
-SMALL_ORDER = 25
-#: Steps that are prepared together: bounds the memory of plants that vary.
-PREPARED_STEPS = 4096
-#: Fewer complete samples in a row than this are faster step by step.
-SHORT_STRETCH = 8
 
 
 def kernel_is_chosen(observer: RecursiveObserver, samples: int, compiled: bool | None) -> bool:

@@ -1,0 +1,86 @@
+"""Existence conditions as named facts, so that each can be shown, checked again, or raised."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from obsynth.analysis.existence.witnesses import Unclear
+from obsynth.errors import PreconditionError
+from obsynth.numerics.ranks import RankDecision
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: Where errors say that options are.
+OPTIONS_PATH = "method.options"
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One existence condition: ``value`` against ``bound``, the evidence, the ``mode`` where it fails, a doubt (or that
+    its numbers cannot be computed, ``True``)."""
+
+    name: str
+    claim: str
+    holds: bool
+    value: float
+    bound: float
+    source: str
+    detail: str = ""
+    mode: complex | None = None
+    signals: tuple[str, ...] = ()
+    unclear: Unclear | bool | None = None
+
+    def require(self) -> None:
+        """Raise `PreconditionError` when the condition fails."""
+        if not self.holds:
+            opening = (
+                f"Unclear: whether the condition {self.name!r} holds ({self.source}) cannot be decided from the "
+                "digits of the data. "
+                if self.unclear
+                else f"No observer of this kind exists: the condition {self.name!r} fails ({self.source}). "
+            )
+            missing = [repr(name) for name in self.signals if repr(name) not in self.detail]
+            involved = f" Signals involved: {', '.join(missing)}." if missing else ""
+            raise PreconditionError(
+                f"{opening}Needed: {self.claim}. Found: {self.detail}{involved}",
+                condition=self.name,
+                mode=self.mode,
+                signals=self.signals,
+                unclear=bool(self.unclear),
+            )
+
+    def in_doubt(self, found: Unclear, plant: DescriptorSystem) -> Condition:
+        """Return the condition as one that rounding of the data could change, with what tells so in its detail."""
+        return replace(self, holds=False, unclear=found, detail=f"{self.detail.rstrip()} {found.described(plant)}")
+
+
+def up_to_failure(conditions: Iterable[Condition]) -> tuple[Condition, ...]:
+    """Return conditions in order, up to the first that fails: those after it may rely on it, and are not asked for."""
+    found = list[Condition]()
+    for condition in conditions:
+        found.append(condition)
+        if not condition.holds:
+            break
+    return tuple(found)
+
+
+def require_all(conditions: Iterable[Condition]) -> None:
+    """Raise `PreconditionError` for the first condition that fails."""
+    for condition in conditions:
+        condition.require()
+
+
+def rank_condition(
+    name: str, decision: RankDecision, remedy: str, *, source: str, signals: tuple[str, ...] = ()
+) -> Condition:
+    """Return the condition that a rank is full."""
+    return Condition(
+        name,
+        f"{name} = {decision.expected}",
+        decision.full,
+        float(decision.rank),
+        float(decision.expected),
+        source,
+        decision.describe() + ("" if decision.full else f": {remedy}"),
+        signals=() if decision.full else signals,
+    )

@@ -1,0 +1,137 @@
+"""When a detection filter exists: named conditions, decided exactly where the numbers are as somebody wrote them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.analysis.existence.condition import Condition, rank_condition
+from obsynth.analysis.existence.statements import Evaluator
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import decide_rank
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.elimination import eliminate_algebraic_states
+from obsynth.proofs.exact_arithmetic import holds_computed
+from obsynth.proofs.exact_pencils import ExactPencil
+
+#: The zeros of pencils with more columns are left to the Riccati equation.
+MOST_PENCIL_COLUMNS = 70
+
+#: The same of computed numbers, whose fractions are long; a zero of them on the axis is one, and others may be.
+MOST_COMPUTED_COLUMNS = 20
+
+_SOURCE = "Ding et al. 2000"
+
+
+def unknown_inputs(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
+    """Return ``[Bd, Bw]`` and ``[Dd, Dw]``."""
+    return np.hstack([plant.Bd, plant.Bw]), np.hstack([plant.Dd, plant.Dw])
+
+
+def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
+    """Return the existence conditions of a plant."""
+    first = (
+        Condition(
+            "continuous time",
+            "dt = 0",
+            plant.dt == 0.0,
+            plant.dt,
+            0.0,
+            _SOURCE,
+            "continuous" if plant.dt == 0.0 else "sampled: give a continuous plant, or see functional_filter.",
+        ),
+        Condition(
+            "faults",
+            "at least one fault",
+            plant.nf > 0,
+            float(plant.nf),
+            1.0,
+            _SOURCE,
+            f"{plant.nf} faults" if plant.nf else "none: name one by Bf or Df.",
+        ),
+    )
+    if not all(condition.holds for condition in first):
+        return first
+    try:
+        smooth = eliminate_algebraic_states(plant).plant
+    except PreconditionError as error:
+        return (
+            *first,
+            Condition(
+                error.condition,
+                "algebraic states that can be eliminated",
+                False,
+                np.nan,
+                np.nan,
+                _SOURCE,
+                str(error),
+                signals=error.signals,
+            ),
+        )
+    _, direct = unknown_inputs(smooth)
+    reach = decide_rank(direct, expected=smooth.ny)
+    remedy = (
+        "Unknown inputs and noise do not reach every output directly ([Dd, Dw] lacks row rank): some residual is free "
+        "of them at high frequencies. Ask functional_filter for residuals, or state the noise of all sensors."
+    )
+    return (
+        *first,
+        rank_condition("rank [Dd, Dw]", reach, remedy, source=_SOURCE, signals=smooth.output_names),
+        _detectable(smooth),
+        *(_no_zero_on_the_axis(plant) if reach.full else ()),
+    )
+
+
+def _detectable(plant: DescriptorSystem) -> Condition:
+    lost = Evaluator(plant.dense()).hidden_modes().outside
+    detail = (
+        f"the mode s = {complex(lost[0]):.4g} is undetectable: measure more."
+        if lost
+        else ("every mode is observable, or decays")
+    )
+    mode = complex(lost[0]) if lost else None
+    return Condition(
+        "detectable",
+        "unobservable modes decay",
+        not lost,
+        float(len(lost)),
+        0.0,
+        _SOURCE,
+        detail,
+        mode=mode,
+    )
+
+
+def _no_zero_on_the_axis(plant: DescriptorSystem) -> tuple[Condition, ...]:
+    """Return whether ``[A - sE, B; C, D]`` of the unknown inputs keeps its rank on the axis, where that is decided."""
+    b, d = unknown_inputs(plant)
+    a = np.block([[plant.A, b], [plant.C, d]])
+    computed = holds_computed(a) or holds_computed(plant.E)
+    if a.shape[1] > (MOST_COMPUTED_COLUMNS if computed else MOST_PENCIL_COLUMNS):
+        return ()
+    e = np.zeros_like(a)
+    e[: plant.nx, : plant.nx] = plant.E
+    zeros = ExactPencil.written(e, a).zeros(discrete=False)
+    found = [complex(root.value) for root in zeros if root.side == "boundary"]
+    if computed and not found:
+        return ()
+    detail = (
+        "none, exactly"
+        if not found
+        else (
+            f"s = {found[0]:.4g}: the unknown inputs do not reach some residual there, and the filter that gives all "
+            "residuals the same gain would not be stable. State noise of the states (Bw)."
+        )
+    )
+    return (
+        Condition(
+            "zeros of the unknown inputs",
+            "none on the imaginary axis",
+            not found,
+            float(len(found)),
+            0.0,
+            _SOURCE,
+            detail,
+            mode=found[0] if found else None,
+        ),
+    )

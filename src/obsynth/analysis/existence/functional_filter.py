@@ -1,0 +1,192 @@
+"""When a functional filter exists: each fault is visible, decoupled from the rest, at every pole of its model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.diagnosis.decoupled import fault_numbers
+from obsynth.analysis.diagnosis.diagnosing import model_points
+from obsynth.analysis.diagnosis.exact_fault_columns import question
+from obsynth.analysis.diagnosis.explanations import hidden_motion
+from obsynth.analysis.diagnosis.fault_columns import Question, dc_point
+from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
+from obsynth.analysis.existence.distance import ROUNDING_LEVEL
+from obsynth.analysis.existence.named_pencils import NamedPencil
+from obsynth.analysis.existence.plant_numbers import COMPUTED_STATES
+from obsynth.analysis.existence.statements import Evaluator, FullRank
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import remembered
+from obsynth.numerics.spectra import pole_text
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.faults import Exosystem, exosystem
+
+_SOURCE = "left null space of [A - sE, Bd, Bf; C, Dd, Df]"
+
+
+def conditions(
+    plant: DescriptorSystem,
+    *,
+    fault_model: Any = "step",
+    faults: Any = None,
+    residuals: Any = None,
+    exactly: bool | None = None,
+) -> tuple[Condition, ...]:
+    """Return the existence conditions, one or two for each fault asked for."""
+    sets = residual_sets(residuals, plant)
+    if plant.nf == 0:
+        return (
+            Condition("faults", "the plant has a fault", False, 0.0, 1.0, _SOURCE, "there is none: give Bf or Df."),
+        )
+    if sets is not None:
+        return tuple(condition for seen in sets for condition in _residual_conditions(plant, seen, exactly))
+    given = isinstance(fault_model, Exosystem)
+    model = fault_model if given else exosystem(fault_model, plant.fault_names, plant.dt)
+    return tuple(
+        condition
+        for fault in chosen_faults(faults, plant)
+        for condition in _fault_conditions(
+            plant, tuple(model_points(model, fault)), model.descriptions[fault], fault, exactly
+        )
+    )
+
+
+@remembered
+def _fault_conditions(
+    plant: DescriptorSystem, points: tuple[complex, ...], description: str, fault: int, exactly: bool | None
+) -> tuple[Condition, ...]:
+    """Return whether one fault, whose model has these poles, can be estimated, free of others and unknown inputs."""
+    name = plant.fault_names[fault]
+    asked = question(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
+    seen = _shown(plant, asked, f"{name} detectable", _rest(plant, fault))
+    if not asked.visible:
+        return (seen,)
+    lost = [point for point in points if not asked.shows_at(point)]
+    doubtful = [point for point in lost if _may_show(asked, point)]
+    shares = {point: _named(plant, asked).last_share(point) for point in points}
+    least = min(points, key=lambda point: shares[point], default=dc_point(plant.dt))
+    share = f", at the poles of its model at least {shares[least]:.2g} of it reaches the outputs" if shares else ""
+    kept = Condition(
+        f"{name} follows its model",
+        f"{name} has no zero at a pole of its model ({description})",
+        not lost,
+        float(len(lost)),
+        0.0,
+        _SOURCE,
+        f"{_gap(asked)}{share}" if not lost else _hidden(plant, asked, lost[0]),
+        mode=lost[0] if lost else None,
+        signals=(name,) if lost else (),
+    )
+    if doubtful and len(doubtful) == len(lost):
+        return seen, _in_doubt(kept, plant, asked, doubtful[0])
+    at_rounding_level = not lost and bool(shares) and shares[least] <= ROUNDING_LEVEL
+    return seen, _in_doubt(kept, plant, asked, least) if at_rounding_level else kept
+
+
+def _may_show(asked: Question, point: complex | None = None) -> bool:
+    """Whether a fault that floating point does not see shows on paper (at a point), or may for all that can be
+    isolated."""
+    if asked.exactly:
+        return False
+    if not asked.clear:
+        return True
+    plant = asked.source
+    if plant.nx + plant.nd + plant.nf > COMPUTED_STATES or plant.exact is not None:
+        return False
+    exact = question(plant, asked.removed, asked.number, True)
+    return exact.visible if point is None else exact.shows_at(point)
+
+
+def _named(plant: DescriptorSystem, asked: Question) -> NamedPencil:
+    """Return what the fault must not be a combination of, and the fault itself in the last column."""
+    kept = {name: [*asked.removed, asked.number] for name in ("Bf", "Df")}
+    return Evaluator(plant).named(FullRank([["A", "Bd", "Bf"], ["C", "Dd", "Df"]], kept))
+
+
+def _in_doubt(condition: Condition, plant: DescriptorSystem, asked: Question, point: complex) -> Condition:
+    """Return the condition as one that rounding of the data could change."""
+    named, name = _named(plant, asked), plant.fault_names[asked.number]
+    share = named.last_share(point)
+    other = f"hides {name} at {'z' if plant.dt > 0.0 else 's'} = {pole_text(point)}, and no filter estimates it"
+    doubt = Evaluator(plant).doubt(named, other, point=point, tolerance=max(ROUNDING_LEVEL, share), last=True)
+    detail = f"{share:.1g} of {name} reaches the outputs at {pole_text(point)}: rounding of the data is as large."
+    return replace(condition, detail=detail, mode=point, signals=(name,)).in_doubt(doubt, plant)
+
+
+def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int], exactly: bool | None) -> list[Condition]:
+    """Return whether each fault of a set shows in residuals that are blind to all others."""
+    removed = [j for j in range(plant.nf) if j not in seen]
+    found = []
+    for fault in seen:
+        asked = question(plant, removed, fault, exactly)
+        blind = [*plant.disturbance_names, *(plant.fault_names[j] for j in removed)]
+        without = f" without {', '.join(plant.fault_names[j] for j in removed)}" if removed else ""
+        name = f"{plant.fault_names[fault]} detectable{without}"
+        found.append(_shown(plant, asked, name, ", ".join(blind) or "the initial state"))
+    return found
+
+
+def _shown(plant: DescriptorSystem, asked: Question, name: str, rest: str) -> Condition:
+    """Return the condition of this name that a fault shows, decoupled from the rest."""
+    fault, point = plant.fault_names[asked.number], dc_point(plant.dt)
+    found = Condition(
+        name,
+        f"{fault} is visible, decoupled from {rest}",
+        asked.visible,
+        float(asked.visible),
+        1.0,
+        _SOURCE,
+        _gap(asked) if asked.visible else _hidden(plant, asked, point),
+        signals=() if asked.visible else (fault,),
+    )
+    return _in_doubt(found, plant, asked, point) if not asked.visible and _may_show(asked) else found
+
+
+def _rest(plant: DescriptorSystem, fault: int) -> str:
+    names = [*plant.disturbance_names, *(name for j, name in enumerate(plant.fault_names) if j != fault)]
+    return ", ".join(names) or "the initial state"
+
+
+def _gap(asked: Question) -> str:
+    return "decided exactly" if np.isinf(asked.gap) else f"gap {asked.gap:.1e}"
+
+
+def _hidden(plant: DescriptorSystem, asked: Question, point: complex) -> str:
+    motion = hidden_motion(plant, asked.number, point, asked.removed)
+    if motion is None:
+        return "no output responds to it."
+    return f"{motion} ({'z' if plant.dt > 0.0 else 's'} = {pole_text(point)})."
+
+
+def chosen_faults(faults: Any, plant: DescriptorSystem) -> list[int]:
+    """Return the columns of the faults to estimate."""
+    listed = [faults] if isinstance(faults, str) else list(plant.fault_names if faults is None else faults)
+    found = fault_numbers(plant, listed, f"{OPTIONS_PATH}.faults")
+    if len(found) < len(listed):
+        there = ", ".join(plant.fault_names)
+        raise SpecError(f"a fault is named twice; there are: {there}.", path=f"{OPTIONS_PATH}.faults")
+    return sorted(found)
+
+
+def residual_sets(residuals: Any, plant: DescriptorSystem) -> list[list[int]] | None:
+    """Return the sets of faults that residuals are to see; ``None`` where estimates are asked for."""
+    if residuals is None:
+        return None
+    everything = list(range(plant.nf))
+    if residuals == "detect":
+        return [everything]
+    if residuals == "isolate":
+        return [[i] for i in everything]
+    given = [residuals] if isinstance(residuals, str) else list(residuals)
+    sets = [[entry] if isinstance(entry, str) else list(entry) for entry in given]
+    unknown = sorted({str(name) for entry in sets for name in entry if name not in plant.fault_names})
+    if unknown or not all(sets):
+        raise SpecError(
+            f"residuals is {residuals!r}: give detect, isolate, or lists of faults to see; there are: "
+            f"{', '.join(plant.fault_names) or 'none'}.",
+            path=f"{OPTIONS_PATH}.residuals",
+        )
+    return [sorted(plant.fault_names.index(name) for name in entry) for entry in sets]

@@ -1,0 +1,169 @@
+r"""A plant without its unknown inputs, for the descriptor Kalman filter; and when that exists.
+
+With ``[V1 V2]`` orthonormal and ``Dd V2 = 0``, ``d1 = V1' d`` becomes a state without an equation of its own, and
+``d2 = V2' d`` is removed with an orthonormal N, ``N Bd V2 = 0``:
+
+.. math::
+    N [E \; 0] [x; d_1]^+ = N [A \; B_d V_1] [x; d_1] + N B u + N \mu, \qquad y = [C \; D_d V_1] [x; d_1] + \nu.
+
+Nothing else is known about d, so nothing is lost.  It exists when ``[N E 0; C Dd V1]`` has full column rank: (D1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.existence.condition import Condition
+from obsynth.analysis.existence.recursive import recursive_conditions
+from obsynth.analysis.time_varying import as_time_varying
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import require_shape
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.ranks import numerical_rank
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.plant_units import PlantUnits
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+
+#: Prior deviation of an unknown input at the first sample, relative to the one that moves a state by its own prior
+#: deviation: as good as none, and its square far from overflow.
+UNKNOWN_INPUT_PRIOR = 1e4
+
+
+@dataclass(frozen=True, eq=False)
+class WithoutUnknownInputs:
+    """A plant without unknown inputs."""
+
+    plant: TimeVaryingDescriptorSystem
+    equations: FloatArray  # N (ne, nx)
+    shown: FloatArray  # V1 (nd, n1)
+    names: tuple[str, ...]  # of the states d1
+    scale: FloatArray  # of the prior deviations of d1, (n1,)
+    note: str
+
+    def process_covariance(self, given: object) -> object:
+        """Return the covariance of the equations that are left, from that of all: a number or a constant matrix."""
+        if np.ndim(given) == 0:  # type: ignore[arg-type]
+            return given
+        if callable(given) or np.ndim(given) != 2:  # type: ignore[arg-type]
+            raise SpecError(
+                "Q changes with k, which is not known how to be combined with unknown inputs: give a constant "
+                "covariance.",
+                path="Q",
+            )
+        matrix = as_matrix(given, "Q")
+        count = self.equations.shape[1]
+        require_shape(matrix.shape, (count, count), "Q")
+        return self.equations @ matrix @ self.equations.T
+
+    def initial_state(self, given: object) -> object:
+        """Return the mean of the first state: unknown inputs are as likely to be of either sign."""
+        mean = np.zeros(self.equations.shape[1]) if given is None else np.ravel(np.asarray(given, dtype=np.float64))
+        return np.concatenate([mean, np.zeros(len(self.names))])
+
+    def initial_covariance(self, given: object) -> object:
+        """Return the covariance of the first state, in which unknown inputs may have any size."""
+        count = self.equations.shape[1]
+        own = np.eye(count) if given is None else as_matrix(given, "initial_covariance")
+        own = own[0, 0] * np.eye(count) if own.shape == (1, 1) else own
+        require_shape(own.shape, (count, count), "initial_covariance")
+        whole = np.zeros((count + len(self.names),) * 2)
+        whole[:count, :count] = own
+        deviation = UNKNOWN_INPUT_PRIOR * self.scale * max(float(np.sqrt(np.max(np.diag(own)))), 1.0)
+        whole[count:, count:] = np.diag(deviation**2)
+        return whole
+
+
+def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
+    """Return a plant without its unknown inputs; `SpecError` for what else these methods do not take."""
+    nothing = {name: None for name in ("Bd", "Dd", "disturbance_names")}
+    known = as_time_varying(plant.replace(**nothing))
+    # In units in which each unknown input has the same effect, and the plant is near one: no unit decides what shows.
+    own = PlantUnits.of(plant).rounded()
+    rows, outputs = own.equations[:, None], own.outputs[:, None]
+    sizes = np.linalg.norm(np.vstack([rows * plant.Bd, outputs * plant.Dd]), axis=0)
+    units = 1.0 / np.where(sizes > 0.0, sizes, 1.0)
+    bd, dd = plant.Bd * units, plant.Dd * units
+    _, values, right = np.linalg.svd(outputs * dd) if dd.size else (None, np.zeros(0), np.eye(plant.nd))
+    rank = numerical_rank(values, scale=1.0)
+    shown, hidden = right[:rank].T, right[rank:].T
+    if rank == plant.nd:
+        shown, names = np.eye(plant.nd), plant.disturbance_names
+    else:
+        names = tuple(f"unknown input {i + 1}" for i in range(rank))
+    left, sizes_of_entry, _ = np.linalg.svd(rows * bd @ hidden)
+    moved = numerical_rank(sizes_of_entry, scale=1.0)
+    if moved == plant.nx:
+        raise SpecError(
+            f"Unknown inputs ({', '.join(plant.disturbance_names)}) drive every equation: none is left to predict the "
+            "state with. State one of them as noise (Bw), or leave it out.",
+            path="Bd",
+        )
+    equations = left[:, moved:].T * own.equations if moved else np.eye(plant.nx)
+    if rank == plant.nd:
+        # In their own units again, with their own names.
+        bd, dd = plant.Bd, plant.Dd
+    through, direct = equations @ bd @ shown, dd @ shown
+    scale = 1.0 / np.linalg.norm(np.vstack([bd, dd]) @ shown, axis=0)
+    count = known.nx
+    taken = TimeVaryingDescriptorSystem(
+        np.hstack([equations @ plant.E, np.zeros((len(equations), rank))]),
+        np.hstack([equations @ plant.A, through]),
+        equations @ plant.B,
+        np.hstack([plant.C, direct]),
+        Phi=equations @ plant.Bf,
+        Psi=plant.Df,
+        dt=plant.dt,
+        state_names=(*plant.state_names, *names),
+        input_names=plant.input_names,
+        output_names=plant.output_names,
+        parameter_names=plant.fault_names,
+        operating_point=known.operating_point,
+        scales=known.scales,
+        units={**known.units, **{name: plant.units[name] for name in names if name in plant.units}},
+    )
+    parts = []
+    if rank:
+        parts.append(f"{', '.join(map(repr, names))} {'is' if rank == 1 else 'are'} estimated with the states")
+    if moved:
+        parts.append(f"{moved} of {count} equations were removed with the unknown inputs that reach no output directly")
+    note = f"Nothing is assumed about the unknown inputs {', '.join(map(repr, plant.disturbance_names))}: "
+    return WithoutUnknownInputs(
+        taken, equations, shown, names, scale, note + ("; ".join(parts) or "they have no effect") + "."
+    )
+
+
+def kalman_conditions(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, early: bool = False
+) -> tuple[Condition, ...]:
+    """Return the existence conditions; the list ends at the first failure."""
+    if isinstance(plant, DescriptorSystem) and plant.nd:
+        try:
+            plant = without_unknown_inputs(plant).plant
+        except SpecError:
+            # What it is says why it is not taken.
+            plant = plant.replace(Bd=None, Dd=None, disturbance_names=None)
+    return tuple(recursive_conditions(plant, parameters=False, early=early))
+
+
+def with_stated_noise(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the options with Q and R from the noise that a time-invariant plant states, where none are given."""
+    resolved = dict(options)
+    wanted = [name for name in ("Q", "R") if resolved[name] is None]
+    if not isinstance(plant, DescriptorSystem) or not plant.nw or not wanted:
+        return resolved
+    if np.any(plant.Bw @ plant.Dw.T):
+        raise SpecError(
+            "The plant's noise drives equations and outputs at once (Bw Dw' is not zero), which this method does not "
+            "cover: state independent noises, or give Q and R.",
+            path="Dw",
+        )
+    for name, matrix in (("Q", plant.Bw), ("R", plant.Dw)):
+        if resolved[name] is None:
+            resolved[name] = matrix @ matrix.T
+    return resolved

@@ -1,0 +1,92 @@
+"""Existence conditions of the observer of a DAE."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from obsynth.analysis.dae_structure import identifiability, index_report
+from obsynth.analysis.existence.condition import Condition
+from obsynth.errors import SolverError, a_kind
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.dae_functions import DAEFunctions
+
+#: Samples of the nominal trajectory along which directions are looked for.
+NOMINAL_SAMPLES = 51
+
+SOURCE = "Moussa Ali, Zhang 2013 (DAE)"
+
+
+def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
+    """Yield the existence conditions; the list ends at the first failure."""
+    if not isinstance(model, DAEModel):
+        yield Condition(
+            "plant of this kind",
+            "a DAEModel: F(x', x, u, theta) = 0, y = h(x, theta)",
+            False,
+            0.0,
+            1.0,
+            f"{SOURCE}, (3)",
+            f"the plant is {a_kind(model)}",
+        )
+        return
+    found = index_report(model, dt)
+    growth = ", then ".join(f"{value:.3g}" for value in found.conditions)
+    detail = f"the condition of dF/dx' / dt + dF/dx is {growth} when dt falls to a tenth"
+    if found.index == 0:
+        detail += (
+            f": it is singular for every dt; the equations {', '.join(map(repr, found.equations))} are not independent"
+        )
+    elif found.index > 1:
+        detail += (
+            f": index {found.index}, because of the equations {', '.join(map(repr, found.equations))}; differentiate "
+            "the constraint until it determines the algebraic states"
+        )
+    yield Condition(
+        "index",
+        "the plant has index 1",
+        found.index == 1,
+        float(found.index),
+        1.0,
+        f"{SOURCE}, (7)",
+        detail,
+        signals=found.states,
+    )
+    if found.index == 1:
+        told = _told(model, dt) if model.nq else ""
+        yield Condition(
+            "parameters",
+            "the plant has parameters to estimate",
+            model.nq > 0,
+            float(model.nq),
+            1.0,
+            f"{SOURCE}, (3)",
+            f"{model.nq} parameter(s){told}",
+        )
+
+
+def _told(model: DAEModel, dt: float) -> str:
+    """Return what the outputs do not tell at nominal constant inputs: no condition, since others may excite it."""
+    theta = model.nominal_parameters
+    y, _, L = DAEFunctions(model).outputs(model.nominal_state, theta)
+    sizes = np.where(np.isfinite(y) & (y != 0.0), np.abs(y), 1.0)
+    # A parameter that is nominally zero and is added to outputs, as a bias, is measured by these.
+    effects = np.abs(L / sizes[:, None]).max(axis=0, initial=0.0)
+    scales = np.where(theta != 0.0, np.abs(theta), 1.0 / np.where(effects > 0.0, effects, 1.0))
+    u = np.tile(model.nominal_input, (NOMINAL_SAMPLES, 1))
+    try:
+        found = identifiability(model, u, dt=dt, R=np.diag(sizes**2), parameter_scales=scales)
+    except SolverError as error:
+        return f"; at nominal inputs there is no trajectory: {error}"
+    if not found.unidentifiable:
+        faintest = found.singular_values[-1] / found.singular_values[0]
+        return (
+            "; at nominal constant inputs the outputs determine every direction of parameters and initial state, the "
+            f"weakest {faintest:.1e} times as strongly as the strongest"
+        )
+    listed = "; ".join(", ".join(f"{name} ({share:+.3g})" for name, share in row.items()) for row in found.unseen)
+    return (
+        f"; at nominal constant inputs the outputs do not determine these directions: {listed}. Ask "
+        "obsynth.identifiability whether other inputs excite them, or add a sensor"
+    )

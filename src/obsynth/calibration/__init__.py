@@ -1,1 +1,0 @@
-"""From a log to constants with their tolerances, noise covariances, and a verdict on the model."""

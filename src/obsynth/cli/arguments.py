@@ -1,0 +1,376 @@
+"""Arguments that several verbs have, as data: each is spelled once."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from obsynth.errors import SpecError
+from obsynth.monitoring.thresholds.options import FALSE_ALARMS, LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW
+
+#: An item of a list in help texts: its name with two blanks behind it, or nothing such, as in settings.
+_ITEM = re.compile(r"  (\S.{0,12}? {2,})?(?=\S)")
+
+#: How far the rest of an item without a name hangs, and the widest lines of help texts.
+_HANGING, _WIDEST_HELP = 6, 110
+
+#: What a monitor is made of.
+_WHAT_A_MONITOR_DOES = "compare the residual (or the parameters) with a threshold; obsynth run --help lists the kinds"
+
+
+#: In place of a file: standard input, or standard output.
+STREAM = "-"
+
+
+#: Arguments of the command line that are not called as the options that they give.
+_CALLED = {"disturbance_bounds": "disturbance", "initial_set": "initial"}
+
+#: Options that are no settings of monitors on the command line.
+_ELSEWHERE = {"scenario", "sample_time", "constants", "gamma"}
+
+#: Names of all settings of monitors.
+MONITOR_NAMES = sorted(
+    _CALLED.get(name, name)
+    for name in {name for table in (LINEAR_OPTIONS, PARAMETER_OPTIONS) for names in table.values() for name in names}
+    - _ELSEWHERE
+)
+
+
+class Argument(NamedTuple):
+    """An argument: its names, and the settings that argparse takes."""
+
+    names: tuple[str, ...]
+    settings: dict[str, Any]
+
+
+class Group(NamedTuple):
+    """Arguments under a title in the help; without a title, only one of them may be given."""
+
+    title: str
+    arguments: tuple[Argument, ...]
+    required: bool = False  # whether one of them must be given
+
+
+class Settings(NamedTuple):
+    """Rare arguments, given as ``--set NAME=VALUE``: listed at the end of the help."""
+
+    arguments: tuple[Argument, ...]
+
+
+def add_arguments(parser: Any, arguments: Iterable[Argument | Group | Settings]) -> None:
+    """Add arguments to a parser, or to a group of one; settings are read by `read_settings`."""
+    for item in arguments:
+        if isinstance(item, Settings):
+            continue
+        if isinstance(item, Group):
+            one_of = parser.add_mutually_exclusive_group
+            group = parser.add_argument_group(item.title) if item.title else one_of(required=item.required)
+            add_arguments(group, item.arguments)
+        else:
+            parser.add_argument(*item.names, **item.settings)
+
+
+def settings_of(arguments: Iterable[Argument | Group | Settings]) -> tuple[Argument, ...]:
+    """Return the arguments that are settings."""
+    return tuple(one for item in arguments if isinstance(item, Settings) for one in item.arguments)
+
+
+class Folded(argparse.RawDescriptionHelpFormatter):
+    """Help whose lines stay lines, folded to the terminal: the rest of an item hangs below its text."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        lines = list[str]()
+        for line in text.splitlines():
+            item = _ITEM.match(line)
+            hang = "" if item is None else " " * (len(item.group()) if item.group(1) else _HANGING)
+            folded = textwrap.wrap(
+                line, min(width, _WIDEST_HELP), subsequent_indent=indent + hang, break_on_hyphens=False
+            )
+            lines += folded or [""]
+        return "\n".join(lines)
+
+
+def add_settings(parser: argparse.ArgumentParser, settings: Sequence[Argument]) -> None:
+    """Let a parser take ``--set`` and know the defaults of settings; its help lists them at the end."""
+    parser.add_argument(
+        "--set",
+        dest="settings",
+        metavar="NAME=VALUE",
+        type=setting,
+        action="append",
+        default=[],
+        help="one of the settings below; may be repeated",
+    )
+    own = _settings_parser("", settings)
+    parser.set_defaults(**vars(own.parse_args([])))
+    lines = ["settings, each by --set NAME=VALUE (or --NAME VALUE):"]
+    for action in own._actions:
+        name = action.option_strings[0].removeprefix("--")
+        value = action.metavar or ("true" if action.const else "|".join(map(str, action.choices or ("VALUE",))))
+        told = (action.help or "") % {"default": action.default}
+        lines.append(f"  {name}={value}: {told}")
+    parser.epilog = "\n".join([*([parser.epilog, ""] if parser.epilog else []), *lines])
+    parser.formatter_class = Folded
+
+
+def _settings_parser(prog: str, settings: Sequence[Argument]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog=prog, usage="%(prog)s --set NAME=VALUE (see %(prog)s --help)", add_help=False)
+    add_arguments(parser, settings)
+    return parser
+
+
+def read_settings(
+    prog: str, arguments: Iterable[Argument | Group | Settings], options: argparse.Namespace, rest: Sequence[str]
+) -> list[str]:
+    """Put the settings of a command line into its options, and return what is no setting of the verb."""
+    parser = _settings_parser(prog, settings_of(arguments))
+    given = []
+    for name, value in getattr(options, "settings", ()):
+        known = parser._option_string_actions.get(f"--{name}")
+        if known is not None and known.nargs == 0:
+            given += [f"--{name}"] if value.casefold() in ("true", "yes", "1") else []
+        else:
+            given.append(f"--{name}={value}")
+    return parser.parse_known_args([*given, *rest], namespace=options)[1]
+
+
+def setting(text: str) -> tuple[str, str]:
+    """Return name and value of NAME=VALUE, whose value may hold equals signs."""
+    name, mark, value = text.partition("=")
+    if not mark or not name:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=VALUE")
+    return name.strip().replace("_", "-"), value
+
+
+def option(name: str, metavar: str | None, told: str, **settings: Any) -> Argument:
+    """Return an argument with a value; one of the form ``NAME=VALUE`` may be given several times."""
+    pairs = {"type": pair, "action": "append", "default": []} if "=" in (metavar or "") and not settings else {}
+    return Argument((name,), {"metavar": metavar, "help": told, **pairs, **settings})
+
+
+def flag(name: str, told: str) -> Argument:
+    """Return an argument without a value."""
+    return Argument((name,), {"action": "store_true", "help": told})
+
+
+def verbose(what: str) -> Argument:
+    """Return ``-v``."""
+    return Argument(("-v", "--verbose"), {"action": "store_true", "help": f"print {what} as well"})
+
+
+def pair(text: str) -> tuple[str, str]:
+    """Return the two sides of NAME=VALUE."""
+    # A column of the output, such as fhat[a=b], may hold an equals sign; a number or a plain column does not.
+    name, mark, value = text.rpartition("=")
+    if not mark or not name or not value:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=VALUE")
+    return name, value
+
+
+def number_type(
+    name: str, read: Callable[[str], float], fits: Callable[[float], bool], wrong: str
+) -> Callable[[str], float]:
+    """Return a type of arguments: numbers that fit. argparse tells its name where a text is no number, and what is
+    ``wrong`` where it is another one."""
+
+    def checked(text: str) -> float:
+        """Return the number in a text, where it fits."""
+        value = read(text)
+        if not fits(value):
+            raise argparse.ArgumentTypeError(f"{text} {wrong}")
+        return value
+
+    checked.__name__ = name
+    return checked
+
+
+digits = number_type("digits", int, lambda value: 1 <= value <= 15, "is not between 1 and 15")
+
+probability = number_type("probability", float, lambda value: 0.0 < value < 1.0, "is no probability between 0 and 1")
+
+positive = number_type("positive", float, lambda value: 0.0 < value < math.inf, "is no positive number")
+
+count = number_type("count", int, lambda value: value >= 1, "is less than 1")
+
+
+def refuse_given(options: argparse.Namespace, names: Iterable[str], meant: str) -> None:
+    """Refuse arguments that would do nothing; ``meant`` says what they are for."""
+    for name in names:
+        if name not in ("verb", "settings") and getattr(options, name, None) not in (None, False, []):
+            raise SpecError(f"{flag_of(name)} is for {meant}. Otherwise leave it out.", path=flag_of(name))
+
+
+def columns_of(options: argparse.Namespace) -> dict[str, str]:
+    """Return the columns of signals, and of the time, that the command line names."""
+    named = dict(options.map)
+    return {**named, "time": options.time_column} if options.time_column else named
+
+
+def delay(text: str) -> int | str:
+    """Return a delay in rows, or ``auto``."""
+    return text if text == "auto" else int(text)
+
+
+INPUT_DELAY = option(
+    "--input-delay",
+    "ROWS",
+    "by how many rows of the log inputs act later than in the design (default: from inputs.hold in the spec; "
+    "calibrate also takes 'auto')",
+    type=delay,
+)
+
+SYSTEM = option("--system", "FILE", "the spec (YAML)", type=Path, required=True)
+
+GAINS = option("--gains", "FILE", "a gain set (JSON) that design wrote", type=Path, required=True)
+
+SPEC_GAINS = option("--gains", "FILE", "a gain set for the spec's plant: nothing is designed", type=Path)
+
+UNVERIFIED = Settings(
+    (flag("--unverified", "use a gain set that fails its verification; every file that is written says so"),)
+)
+
+JSON = flag("--json", "print results and errors as JSON on stdout, for programs")
+
+FORCE = flag("--force", "replace an existing file of any kind (inputs are never replaced)")
+
+QUIET = flag("--quiet", "print no progress")
+
+JOBS = option("--jobs", "N", "processes (default: 1)", type=count)
+
+CLUSTER = option("--cluster", "ADDRESS", "address of the scheduler of a Dask cluster, in place of --jobs")
+
+MAP = option("--map", "SIGNAL=COLUMN", "column of a signal (or of the time) where the names differ; may be repeated")
+
+_SCALE = option("--scale", "SIGNAL=FACTOR", "factor from the unit of the column to that of the signal; may be repeated")
+
+SCALE = Settings((_SCALE,))
+
+TIME_COLUMN = option(
+    "--time-column",
+    "COLUMN",
+    "column with the time, in seconds or as dates (ISO 8601, or 05.03.2026 08:30) (default: time)",
+)
+
+#: How a log without faults is read.
+LOG_OPTIONS = (
+    MAP,
+    SCALE,
+    Settings(
+        (
+            option(
+                "--rows",
+                "A:B",
+                "rows of the log without faults: the first one, counted from 0, and one past the last (default: all)",
+            ),
+            TIME_COLUMN,
+        )
+    ),
+)
+
+MONITOR = Group("monitor", (option("--monitor", "KIND", _WHAT_A_MONITOR_DOES),))
+
+#: What its threshold is made of, where the scenario does not say it.
+MONITOR_SETTINGS = Settings(
+    (
+        option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
+        option("--noise-bound", "N", "bound on the noise, in standard deviations", type=float),
+        option(
+            "--initial",
+            "STATE=BOUND",
+            "pointwise, discrete designs: bound of a state of the plant at the start (or LOW:HIGH); may be repeated",
+        ),
+        option("--initial-error", "E", "bound on the norm of the error at the start", type=float),
+        option(
+            "--false-alarms",
+            "P",
+            f"statistical kinds: probability of a false alarm in the whole run (default: {FALSE_ALARMS:g})",
+            type=probability,
+        ),
+        option("--window", "N", f"length of the window in samples (default: {WINDOW})", type=count),
+        option(
+            "--change",
+            "X",
+            "cusum: change to detect, in standard deviations of the residual, or in parameter units (default: 1)",
+            type=positive,
+        ),
+    )
+)
+
+#: How a log is read, and what is watched in it.
+DATA_OPTIONS = (
+    MAP,
+    MONITOR,
+    MONITOR_SETTINGS,
+    Settings(
+        (
+            TIME_COLUMN,
+            INPUT_DELAY,
+            option(
+                "--normal",
+                "FILE",
+                "monitor 'learned': what obsynth thresholds wrote (.json), or a log without faults",
+            ),
+            _SCALE,
+            option(
+                "--threshold",
+                "COLUMN=LEVEL",
+                "alarm when the absolute value of a column of the output passes a level; may be repeated",
+            ),
+            option(
+                "--nominal",
+                "NAME=VALUE",
+                "monitor of a recursive design: nominal value of a parameter; may be repeated",
+            ),
+            option("--sample-time", "SECONDS", "monitor of a continuous design: time between the rows", type=float),
+            option("--gap", "SECONDS", "continuous designs: a longer interval between two rows is a gap", type=float),
+            option("--warm-up", "SECONDS", "length of the warm-up at the start and after gaps", type=float),
+        )
+    ),
+)
+
+
+def number_of(name: str, text: str) -> float:
+    """Return the value of an argument of the form NAME=VALUE."""
+    try:
+        return float(text)
+    except ValueError:
+        raise SpecError(f"{name}={text}: {text!r} is no number.", path=name) from None
+
+
+def numbers_of(pairs: list[tuple[str, str]]) -> Mapping[str, float]:
+    """Return values by name, from arguments of the form NAME=VALUE."""
+    return {name: number_of(name, text) for name, text in pairs}
+
+
+def ranges_of(pairs: list[tuple[str, str]]) -> dict[str, float | tuple[float, float]]:
+    """Return bounds by name, from arguments of the form NAME=BOUND or NAME=LOW:HIGH."""
+    found: dict[str, float | tuple[float, float]] = {}
+    for name, text in pairs:
+        low, colon, high = text.partition(":")
+        found[name] = (number_of(name, low), number_of(name, high)) if colon else number_of(name, text)
+    return found
+
+
+def flag_of(name: str) -> str:
+    """Return what an option is called on the command line."""
+    return f"--{_CALLED.get(name, name).replace('_', '-')}"
+
+
+def stated_settings(options: argparse.Namespace) -> dict[str, Any]:
+    """Return what a command line states of a monitor, by the names of the arguments of `obsynth.online_monitor`."""
+    return {
+        "disturbance_bounds": numbers_of(options.disturbance),
+        "noise_bound": options.noise_bound,
+        "initial_error": options.initial_error,
+        "window": options.window,
+        "false_alarms": options.false_alarms,
+        "change": options.change,
+        "initial_set": ranges_of(options.initial) or None,
+        "nominal": numbers_of(getattr(options, "nominal", [])),
+        "normal": getattr(options, "normal", None),
+    }

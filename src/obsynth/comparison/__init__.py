@@ -1,1 +1,0 @@
-"""Side by side: which method, and which sensors."""

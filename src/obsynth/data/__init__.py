@@ -1,1 +1,0 @@
-"""Measured data: logs and streams in, estimates out."""

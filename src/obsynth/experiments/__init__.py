@@ -1,1 +1,0 @@
-"""Designs at work: simulated on scenarios, watched by thresholds, counted over many runs."""

@@ -1,1 +1,0 @@
-"""Monitors of residuals and parameters: statistics, thresholds, and what they promise."""

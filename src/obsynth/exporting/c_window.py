@@ -1,0 +1,123 @@
+"""Guaranteed tests as C99: a window of samples, a dot product for each test, and its threshold."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.exporting.c_source import comment, filled_template, included, quoted, table_lines
+from obsynth.exporting.realisation import Realisation
+from obsynth.methods.guaranteed_test.bank import groups_of, is_bank
+from obsynth.methods.guaranteed_test.method import is_guaranteed
+from obsynth.methods.guaranteed_test.result import GuaranteedTest
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.window.observer import WindowObserver
+from obsynth.results.design import ObserverDesign
+
+
+def require_fixed(design: ObserverDesign, suffix: str) -> None:
+    """Raise `SpecError` for tests that solve programmes at each row, which no export holds."""
+    if not is_guaranteed(design):
+        return
+    if isinstance(design.observer, WindowObserver):
+        raise SpecError(
+            f"Design {design.name!r} is for a plant that changes with k: its weights change from row to row, which no "
+            "export holds. Run it with obsynth run, or with observer.step; gains and thresholds by row are in the gain "
+            "set.",
+            path="observer",
+        )
+    if (not is_window(design) or suffix != ".c") and design.linear[1].constant is not None:
+        # Other formats have no place for the middle of such bounds.
+        raise SpecError(
+            f"Design {design.name!r} has bounds that do not lie about zero, so that its row has a constant part, which "
+            "is exported as C (.c) only, without tolerances.",
+            path="disturbance_bounds",
+        )
+    for name, asked in (("exact", design.options.get("exact")), ("missing", design.options.get("missing") == "solve")):
+        if asked:
+            raise SpecError(
+                f"Design {design.name!r} has the option {name!r}: it solves linear programmes at each row, which "
+                "exported code does not. Design it without: the fixed test, with its weights and thresholds, can be "
+                "exported.",
+                path=name,
+            )
+
+
+def is_window(design: ObserverDesign) -> bool:
+    """Whether a design is nothing but tests on windows, without an observer of the state beside."""
+    return is_guaranteed(design) and not design.linear[1].state_names
+
+
+def window_c_texts(found: Realisation, prefix: str, header: str) -> tuple[str, str]:
+    """Return source and header."""
+    test = GuaranteedTest.of(found.design)
+    observer, count = found.observer, len(test.tests)
+    length = observer.order // count + 1
+    nu, ny = len(observer.input_names), len(observer.output_names)
+    sizes = {"TESTS": count, "LENGTH": length, "WIDTH": nu + ny, "NU": nu}
+    tables = {
+        "weights": _weights(found, count, length),
+        "limits": np.array([[one.threshold for one in test.tests]]),
+        "constants": observer.added[None],
+        "rounding": np.array([one.certificate.matrices["rounding"].ravel() for one in test.tests]),
+    }
+    taken = ([f"const double u[{nu}]"] if nu else []) + [f"const double y[{ny}]"]
+    arguments = [f"{prefix}_state *state", *taken, f"double values[{count}]", f"double thresholds[{count}]"]
+    signature = f"int {prefix}_step({', '.join(arguments)})"
+    upper = prefix.upper()
+    names, groups = found.design.linear[0].fault_names, groups_of(test) if is_bank(test) else None
+    told = [test.fault] if groups is None else [" or ".join(names[k] for k in group) for group in groups]
+    declared = [
+        comment(f"Test {quoted(test.name)} by {quoted(test.method)}, written by obsynth."),
+        *([comment(quoted(found.mark))] if found.mark else []),
+        f"#ifndef {upper}_H",
+        f"#define {upper}_H",
+        "",
+        comment("sha256 of the gain set"),
+        f'#define {upper}_SHA256 "{found.digest}"',
+        comment("seconds between samples; samples of a window"),
+        f"#define {upper}_DT {observer.dt!r}",
+        f"#define {upper}_LENGTH {length}",
+        "",
+        "typedef struct {",
+        f"    double window[{length}][{nu + ny}];",
+        f"    double largest[{nu + ny}];",
+        "    int at;",
+        "    int rows;",
+        f"}} {prefix}_state;",
+        "",
+        f"void {prefix}_reset({prefix}_state *state);",
+        "",
+        comment("Take one sample: deviations from the operating point, NaN where one is missing. A window that is not"),
+        comment("complete has no verdict: its values are NaN. Returns the number, from 1, of the test that stands out"),
+        comment("above its threshold, or 0. An alarm of a test means, while all bounds hold:"),
+        *(comment(f"{number}: {quoted(name)}") for number, name in enumerate(told, 1)),
+        *(comment(f"u[{k}]: {quoted(name)}") for k, name in enumerate(observer.input_names)),
+        *(comment(f"y[{k}]: {quoted(name)}") for k, name in enumerate(observer.output_names)),
+        f"{signature};",
+        "",
+        "#endif",
+    ]
+    copied = "for (i = 0; i < NU; i++) {\n        newest[i] = u[i];\n    }" if nu else ""
+    body = filled_template("window_test.c", prefix, {"SIGNATURE": signature, "COPY_INPUTS": copied})
+    source = [
+        comment(f"sha256 of the gain set: {found.digest}"),
+        *([comment(quoted(found.mark))] if found.mark else []),
+        f'#include "{included(header)}"',
+        "",
+        "#include <math.h>",
+        "",
+        "enum { " + ", ".join(f"{name} = {size}" for name, size in sizes.items()) + " };",
+        "",
+        comment("by test: weights of inputs and outputs, the newest sample first"),
+        *(line for name, table in tables.items() for line in table_lines(name, table)),
+    ]
+    return "\n".join([*source, "", body]), "\n".join(declared) + "\n"
+
+
+def _weights(found: Realisation, count: int, length: int) -> FloatArray:
+    """Return a row for each test: its weights of inputs and outputs at each sample of the window, newest first."""
+    observer = found.observer
+    newest, older = np.hstack([observer.Du, observer.Dy]), np.hstack([observer.Bu, observer.By])
+    each = [np.vstack([newest[[k]], older[k * (length - 1) : (k + 1) * (length - 1)]]) for k in range(count)]
+    return np.array([weights.ravel() for weights in each])

@@ -1,0 +1,184 @@
+"""A nonlinear observer in single precision: its C, and what the header says of its error, which is measured.
+
+No bound follows from the design alone, as the steps are solved: the C runs beside the observer in double precision over
+records that are simulated from the design, with missing samples.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from pathlib import Path
+
+import numpy as np
+
+from obsynth.errors import ObsynthError, SpecError
+from obsynth.exporting.c_source import filled_template
+from obsynth.files.outputs import working_folder
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.nonlinear.c_code import FLAGS, compiler, shared_library
+from obsynth.results.design import ObserverDesign
+from obsynth.simulation.dae import simulate_dae
+
+#: A number of a table, or of a line that a macro names.
+_WRITTEN_NUMBER = re.compile(r"(?<![\w.\"])-?\d+(?:\.\d+(?:e[+-]?\d+)?|e[+-]?\d+)(?![\w.\"])")
+
+
+#: Newton in floats: a last step whose square is rounding, and a residual of some roundings of its terms.
+FLOAT_LAST_STEP, FLOAT_RESIDUAL = 3e-4, 1e-5
+
+#: A projection that moves no state by more than rounding moves none, and bounds that dependent rows miss are kept.
+FLOAT_PROJECTION_NOTICE, FLOAT_DEPENDENT, FLOAT_SLACK = 1e-4, 1e-5, 1e-4
+
+#: What a sample adds to the information on faults is a difference of inverses of covariances.
+FLOAT_LEAST_ADDED = 1e-5
+
+#: What is larger has no square in a float.
+FLOAT_OVERFLOW = 1e18
+
+#: Samples of each record that errors are measured on, their seeds, and the samples without outputs.
+RECORD_SAMPLES, SEEDS = 400, (1, 2)
+
+MISSING_SAMPLES = slice(200, 205)
+
+#: Errors beyond this share of an estimate's own deviation: single precision does not carry the observer.
+LARGEST_ERROR_SHARE = 0.5
+
+_FLOAT_CONSTANTS = {
+    "LAST_STEP": FLOAT_LAST_STEP,
+    "LARGEST_RESIDUAL": FLOAT_RESIDUAL,
+    "PROJECTION_NOTICE": FLOAT_PROJECTION_NOTICE,
+    "DEPENDENT": FLOAT_DEPENDENT,
+    "SLACK": FLOAT_SLACK,
+    "OVERFLOW_LIMIT": FLOAT_OVERFLOW,
+    "MONITOR_LEAST": FLOAT_LEAST_ADDED,
+}
+
+
+def in_precision(text: str, precision: str) -> str:
+    """Return C in which numbers of signals are doubles, or floats as near to these as they can be."""
+    if precision == "double":
+        return re.sub(r"\bREAL\b", "double", text)
+    rounded = []
+    for line in re.sub(r"\bREAL\b", "float", text).split("\n"):
+        plain = line.startswith(("#define", "/*", " *"))
+        rounded.append(line if plain else _WRITTEN_NUMBER.sub(_as_float, line))
+    return "\n".join(rounded)
+
+
+def _as_float(found: re.Match[str]) -> str:
+    value = np.float32(found.group())
+    if not np.isfinite(value):
+        raise SpecError(
+            f"{found.group()} is beyond the largest number of precision 'float': scale the signals, or export doubles.",
+            path="precision",
+        )
+    return f"{value}f"
+
+
+def in_floats(text: str) -> str:
+    """Return C with floats in place of doubles; seconds stay doubles, as they are counted up."""
+    for name, value in _FLOAT_CONSTANTS.items():
+        text = re.sub(rf"^#define {name} .*$", f"#define {name} {value!r}f", text, flags=re.MULTILINE)
+    lines = [
+        line if re.search(r"\b(time|warm_up)\b", line) else re.sub(r"\bdouble\b", "float", line)
+        for line in text.split("\n")
+    ]
+    return in_precision("\n".join(lines), "float")
+
+
+def float_error(design: ObserverDesign, prefix: str, source: str, declared: str) -> str:
+    """Return what the header of an export in floats says of its error; raise `SpecError` where it is too large."""
+    model = design.nonlinear[0]
+    names = [*(f"xhat[{name}]" for name in model.state_names), *(f"fhat[{name}]" for name in model.parameter_names)]
+    worst, shares = np.zeros(len(names)), np.zeros(len(names))
+    with working_folder() as folder:
+        library = _compiled(folder, prefix, source, declared, model.nu, model.ny, (model.nx, model.nq))
+        for seed in SEEDS:
+            u, y, expected = _record(design, seed)
+            wanted = np.hstack([expected.states, expected.faults])
+            deviations = np.hstack([expected.state_deviations, expected.fault_deviations])
+            found = _taken(library, u, y, wanted.shape[1])
+            error = np.abs(found - wanted)
+            worst = np.maximum(worst, error.max(axis=0))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = np.where(error > 0.0, error / deviations, 0.0)[1:]
+            shares = np.maximum(shares, share.max(axis=0))
+    if not (np.isfinite(worst).all() and (shares <= LARGEST_ERROR_SHARE).all()):
+        at = int(np.argmax(np.where(np.isfinite(shares), shares, np.inf)))
+        raise SpecError(
+            f"Single precision does not carry this observer: {names[at]} is off by {worst[at]:.2g}, "
+            f"{shares[at]:.2g} of its own standard deviation. Leave precision at double.",
+            path="precision",
+        )
+    listed = ", ".join(f"{name} {error:.2g}" for name, error in zip(names, worst, strict=True))
+    return (
+        f"Floats: measured, not proved: the largest error against double precision in {len(SEEDS)} records of "
+        f"{RECORD_SAMPLES} samples simulated from the design (5 of them missing): {listed}; at most "
+        f"{shares.max(initial=0.0):.2g} of an estimate's own standard deviation"
+    )
+
+
+def _record(design: ObserverDesign, seed: int) -> tuple[FloatArray, FloatArray, Estimates]:
+    """Return inputs and outputs, as floats hold them, of the plant with the noise that the observer assumes, and what
+    the observer says of them in doubles."""
+    model, observer = design.nonlinear
+    u = np.tile(model.nominal_input, (RECORD_SAMPLES, 1)).reshape(RECORD_SAMPLES, model.nu)
+    try:
+        found = simulate_dae(
+            model,
+            u,
+            dt=observer.dt,
+            parameters=observer.initial_parameters,
+            initial_state=observer.initial_state,
+            Q=observer.Q,
+            R=observer.R,
+            integration=observer.integration,
+            seed=seed,
+        )
+        y = np.array(found.outputs)
+        y[MISSING_SAMPLES] = np.nan
+        u, y = (given.astype(np.float32).astype(np.float64) for given in (u, y))
+        return u, y, observer.run(y, u)
+    except ObsynthError as error:
+        raise SpecError(
+            "The error of single precision is measured on a record that is simulated from the design, which fails: "
+            f"{error} Leave precision at double.",
+            path="precision",
+        ) from error
+
+
+def _compiled(
+    folder: Path, prefix: str, source: str, declared: str, nu: int, ny: int, counts: tuple[int, int]
+) -> ctypes.CDLL:
+    command = compiler()
+    if command is None:
+        raise SpecError(
+            "The error of a nonlinear observer in floats is measured by running it: this needs a C compiler (cc, gcc "
+            "or clang, or what CC in the environment names). Install one, or leave precision at double.",
+            path="precision",
+        )
+    given = f"in, in + {nu}" if nu else "in"
+    sizes = {"STATES": str(counts[0]), "FAULTS": str(counts[1]), "TAKEN": str(nu + ny)}
+    harness = filled_template("run_floats.c", prefix, {"ARGUMENTS": given, **sizes})
+    own = re.sub(r'^#include ".*"$', '#include "observer.h"', source, count=1, flags=re.MULTILINE)
+    texts = {"observer.h": declared, "observer.c": own, "run.c": harness}
+    return ctypes.CDLL(str(shared_library(folder, texts, [*command, *FLAGS], path="precision")))
+
+
+def _taken(library: ctypes.CDLL, u: FloatArray, y: FloatArray, width: int) -> FloatArray:
+    given = np.ascontiguousarray(np.hstack([u, y]), dtype=np.float32)
+    out = np.zeros((len(y), width))
+    count = library.run(
+        given.ctypes.data_as(ctypes.POINTER(ctypes.c_float)),
+        out.ctypes.data_as(ctypes.POINTER(ctypes.c_double)),
+        len(y),
+    )
+    if count < len(y):
+        raise SpecError(
+            f"Single precision does not carry this observer: its step {count} has no solution there. Leave precision "
+            "at double.",
+            path="precision",
+        )
+    return out

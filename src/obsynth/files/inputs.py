@@ -1,0 +1,177 @@
+"""Files that are read: regular ones only, each of them protected from being overwritten by the same command."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any, TextIO
+
+from obsynth.errors import SpecError, a_kind
+
+#: Documents larger than this are refused: matrices of that size belong in matrix files.
+MOST_DOCUMENT_CHARACTERS = 32_000_000
+
+#: Half of a pair of characters, which no file can hold; as JSON writes it, and as text.
+_HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
+
+#: What a path can be that is neither a file nor a folder.
+_SPECIAL = {
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+
+#: Device and number of each file that the running command has read; `None` outside commands.
+_read: ContextVar[dict[tuple[int, int], Path] | None] = ContextVar("files read", default=None)
+
+
+@contextmanager
+def protected_inputs() -> Iterator[None]:
+    """Protect every file that is read from here on: the writer refuses to replace it, under whatever name."""
+    token = _read.set({})
+    try:
+        yield
+    finally:
+        _read.reset(token)
+
+
+def protect(path: Path) -> None:
+    """Count a file among the inputs of the running command."""
+    _protect(path, path)
+
+
+def protect_stream(stream: TextIO) -> None:
+    """Count the file that a stream reads among the inputs of the running command, if it is one."""
+    with suppress(OSError, ValueError, AttributeError):
+        _protect(stream.fileno(), Path("standard input"))
+
+
+def _protect(file: Path | int, name: Path) -> None:
+    inputs = _read.get()
+    if inputs is None:
+        return
+    with suppress(OSError, ValueError):
+        found = os.stat(file)
+        if stat.S_ISREG(found.st_mode):
+            inputs[found.st_dev, found.st_ino] = name
+
+
+def protected_as(path: Path) -> Path | None:
+    """Return the name under which the running command has read a file, links followed; `None` if it has not."""
+    inputs = _read.get()
+    if not inputs:
+        return None
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return inputs.get((found.st_dev, found.st_ino))
+
+
+def special_kind(path: Path) -> str | None:
+    """Return what an existing path is that is neither file nor folder, such as ``a named pipe``; `None` otherwise."""
+    return _SPECIAL.get(stat.S_IFMT(os.stat(path).st_mode))
+
+
+def input_file(path: Path, *, where: str | None = None, is_protected: bool = True) -> Path:
+    """Return ``path`` if it is a regular file, and protect it; anything else is a `SpecError` at ``where``."""
+    place = where or str(path)
+    try:
+        if path.is_dir():
+            raise SpecError(f"{path} is a folder: give the name of a file.", path=place)
+        if not path.exists():
+            raise SpecError(f"{path} does not exist.", path=place)
+        kind = special_kind(path)
+    except (OSError, ValueError) as error:
+        raise SpecError(f"{path!s} cannot be read: {reason(error)}.", path=place) from error
+    if kind is not None:
+        raise SpecError(f"{path} is {kind}: give the name of a file.", path=place)
+    if is_protected:
+        protect(path)
+    return path
+
+
+def read_text(
+    path: Path, *, where: str | None = None, is_protected: bool = True, most: int = MOST_DOCUMENT_CHARACTERS
+) -> str:
+    """Return the text of a UTF-8 file of at most ``most`` characters."""
+    place = where or str(path)
+    input_file(path, where=place, is_protected=is_protected)
+    try:
+        with path.open(encoding="utf-8-sig") as stream:
+            text = stream.read(most + 1)
+    except UnicodeDecodeError as error:
+        raise SpecError(f"{path} is no UTF-8 text (byte {error.start}).", path=place) from error
+    except (OSError, MemoryError) as error:
+        raise SpecError(f"{path} cannot be read: {reason(error)}.", path=place) from error
+    if len(text) > most:
+        raise SpecError(
+            f"{path} is too large for a document (more than {most:,} characters): large matrices belong in "
+            ".mtx or .npz files.",
+            path=place,
+        )
+    return text
+
+
+def read_json(
+    path: Path, *, where: str | None = None, is_protected: bool = True, most: int = MOST_DOCUMENT_CHARACTERS
+) -> Any:
+    """Return a JSON document: no NaN, no whole number beyond the range of floats, no key twice, no half characters."""
+    place = where or str(path)
+    text = read_text(path, where=place, is_protected=is_protected, most=most)
+    try:
+        document = json_data(text)
+        if _HALF_CHARACTER.search(text):
+            json.dumps(document, ensure_ascii=False).encode()
+    except (ValueError, RecursionError) as error:
+        what = (
+            ": files that obsynth wrote are expected here" if path.suffix.lower() in (".yaml", ".yml", ".csv") else ""
+        )
+        raise SpecError(f"{path} is no JSON document ({error}){what}.", path=place) from error
+    return document
+
+
+def json_data(text: str) -> Any:
+    """Return what a JSON text says; `ValueError` for NaN, numbers beyond the range of floats and repeated keys."""
+    return json.loads(text, parse_constant=_refused_constant, parse_int=_ranged_int, object_pairs_hook=_distinct_keys)
+
+
+def _refused_constant(name: str) -> float:
+    raise ValueError(f"{name} is not allowed in JSON")
+
+
+def _ranged_int(text: str) -> int:
+    if math.isinf(float(text)):
+        raise ValueError(f"a whole number of {len(text)} digits is too large")
+    return int(text)
+
+
+def _distinct_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        keys = [key for key, _ in pairs]
+        repeated = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {repeated!r} is there twice")
+    return found
+
+
+def reason(error: BaseException) -> str:
+    """Return what the system says about an error, without the name of the file."""
+    if isinstance(error, MemoryError):
+        return "it does not fit into memory"
+    return str(getattr(error, "strerror", None) or error).rstrip(".")
+
+
+def path_of(path: Any) -> Path:
+    """Return the path that a caller names; raise `SpecError` for what names none."""
+    if not isinstance(path, (str, os.PathLike)):
+        raise SpecError(f"path is {a_kind(path)}: give the name of a file.", path="path")
+    return Path(path)

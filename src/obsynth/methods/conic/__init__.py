@@ -1,1 +1,0 @@
-"""Matrix inequalities as convex problems, and the solvers that take them."""

@@ -1,0 +1,90 @@
+"""Verified designs of the gains that somebody's solution of a paper's conditions has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from obsynth.conditions.wang import CLAIMED_ABOVE_NORM, error_norm
+from obsynth.errors import VerificationError
+from obsynth.methods.designing import design_from_gains
+from obsynth.methods.functions import descriptor_kalman
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.injection_problem import GainProblem
+from obsynth.observers.recursive.steady_filter import steady_state_filter
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.recovery import Transformation, linear_plant
+from obsynth.results.design import ObserverDesign
+
+#: A gain of the inequality is that of the recursion when they differ by at most this share of their size: the minimum
+#: is flat, so that half the digits of a solver's optimum are those of its gain.
+SAME_GAIN = 1e-3
+
+
+def design_of(source: str, plant: DescriptorSystem | Transformation, *given: Any) -> ObserverDesign:
+    """Return the design of gains that conditions of this source have; ``given`` ends with the gains and a name."""
+    makers: dict[str, Callable[..., ObserverDesign]] = {
+        "wang2015": _wang2015,
+        "filasova": _filasova,
+        "sharepasand": _sharepasand,
+        "kalman": _kalman,
+    }
+    return makers[source](plant, *given)
+
+
+def _wang2015(
+    plant: DescriptorSystem | Transformation, convex: GainProblem, gains: dict[str, FloatArray], name: str
+) -> ObserverDesign:
+    """Return the design of gains, claiming as little above its true norm as can be proved."""
+    given: dict[str, Any] = {letter: gains[letter] for letter in "TNLW"}
+    if not convex.disturbances:
+        return design_from_gains(plant, "fault-estimation-filter", **given, name=name)
+    norm = error_norm(linear_plant(plant).dense(), gains)
+    if not np.isfinite(norm):
+        return design_from_gains(plant, "fault-estimation-filter", **given, gamma=1.0, name=name)
+    size = max(norm, float(np.finfo(np.float64).eps) * convex.disturbance_size, float(np.finfo(np.float64).tiny))
+    for room in CLAIMED_ABOVE_NORM:
+        found = design_from_gains(plant, "fault-estimation-filter", **given, gamma=(1.0 + room) * size, name=name)
+        if found.report.passed:
+            break
+    return found
+
+
+def _filasova(
+    plant: DescriptorSystem | Transformation, decay: float, gains: dict[str, FloatArray], name: str
+) -> ObserverDesign:
+    J, L, M, N = (gains[letter] for letter in "JLMN")
+    return design_from_gains(plant, "pd-observer", J=J, L=L, M=M, N=N, decay=decay, name=name)
+
+
+def _sharepasand(
+    plant: DescriptorSystem | Transformation, fault_model: Any, gains: dict[str, FloatArray], name: str
+) -> ObserverDesign:
+    U, D, K, F = (gains[letter] for letter in "UDKF")
+    return design_from_gains(plant, "ui-pi-observer", U=U, D=D, K=K, F=F, fault_model=fault_model, name=name)
+
+
+def _kalman(
+    plant: DescriptorSystem | Transformation,
+    Q: Any,
+    R: Any,
+    noisy: tuple[TimeVaryingDescriptorSystem, FloatArray, FloatArray],
+    gains: dict[str, FloatArray],
+    name: str,
+) -> ObserverDesign:
+    """Return the recursive filter whose gains tend to the given ones; `VerificationError` where they do not."""
+    made = descriptor_kalman(plant, Q=Q, R=R, name=name)
+    varying, process, sensor = noisy
+    steady = steady_state_filter(varying, Q=process, R=sensor)
+    for letter, wanted in (("L", steady.L), ("K", steady.K)):
+        miss = float(np.linalg.norm(gains[letter] - wanted) / max(float(np.linalg.norm(wanted)), 1.0))
+        if not miss <= SAME_GAIN:
+            raise VerificationError(
+                f"{letter} of the inequality differs from the steady gain of the recursion by {miss:.3g} of its "
+                "size: with other constraints or another objective this is no Kalman filter.",
+                report=made.report,
+            )
+    return made

@@ -1,0 +1,216 @@
+"""Kalman gains with a prescribed rate of decay (Anderson, Moore, "Linear optimal control", 1971, section 4).
+
+The default needs no numbers: as fast as a fixed price in noise allows.  This compromise is ours.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.doubling import continuous_riccati_solution
+from obsynth.numerics.matrix_equations import continuous_solution, discrete_solution, doubled_solution
+from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_covariance
+
+#: Times the Riccati equation is solved, each time in the coordinates of the last solution, which improve it.
+KALMAN_ROUNDS = 2
+
+#: From so many states on the Riccati equation is solved by doubling first.
+MOST_STATES_FOR_PENCILS = 40
+
+#: A rate that cannot be had at once is gone to in steps of this factor, from one that is at most so many below.
+RATE_FACTOR = 4.0
+
+MOST_RATE_STEPS = 12
+
+#: Steps are shortened down to this factor.
+LEAST_FACTOR = 1.2
+
+
+#: The default pays at most this factor in noise, against the quietest Kalman filter, for being fast.
+NOISE_PRICE = 10.0
+
+#: The default rate is found to about this factor.
+RATE_STEP = 1.05
+
+#: Estimates with less than this share of the outputs' noise have none but rounding.
+SILENT = 1e-8
+
+#: Deviations that differ by more than this share from one choice of states to another are rounding.
+SAME_DEVIATION = 0.1
+
+#: Halvings of the default rate before the quietest filter is taken as it is.
+MOST_RATE_HALVINGS = 40
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanProblem:
+    """An observable pair with noise: ``e+ = F e + B w + drive v``, innovation ``C e + D w + background n``."""
+
+    F: FloatArray  # (n, n)
+    C: FloatArray  # (ny, n)
+    B: FloatArray  # (n, k), for noise that counts, of unit covariance (dt = 0: intensity)
+    D: FloatArray  # (ny, k)
+    drive: FloatArray  # (n, p): so that the filter stays awake
+    background: FloatArray  # (ny, q): regular where an innovation has no noise
+    estimates: FloatArray  # (k, n): what the noise is counted in, the fault estimates
+    dt: float  # s, 0 for continuous time
+
+    def gain(self, decay: float, *, persistent: bool = False) -> FloatArray | None:
+        """Return the gain whose poles all decay at ``decay`` (1/s) or faster; ``None`` when the equation has none."""
+        plain = np.eye(self.F.shape[0])
+        best, change = self.solved(decay, plain)
+        if best is not None or not persistent:
+            return best
+        rate, steps = decay, 0
+        while best is None and steps <= MOST_RATE_STEPS:
+            rate, steps = rate / RATE_FACTOR, steps + 1
+            best, change = self.solved(rate, plain)
+        factor = RATE_FACTOR
+        while best is not None and rate < decay and factor > LEAST_FACTOR:
+            # By shorter steps where one fails: how long a step may be is a matter of rounding.
+            further = min(rate * factor, decay)
+            gain, moved = self.solved(further, change)
+            if gain is None:
+                factor = float(np.sqrt(factor))
+            else:
+                best, change, rate = gain, moved, further
+        return best if rate == decay else None
+
+    def solved(self, decay: float, change: FloatArray) -> tuple[FloatArray | None, FloatArray]:
+        """Return the gain of a rate, and coordinates (like ``change``) in which its error covariance is one."""
+        if not self.F.size:
+            return np.zeros((0, self.C.shape[0])), change
+        # The part of the process noise that the measurements carry is taken out first.
+        measured = self.D @ self.D.T + self.background @ self.background.T
+        direct = np.linalg.solve(measured, self.D @ self.B.T).T
+        free = self.F - direct @ self.C
+        rest = self.B @ self.B.T + self.drive @ self.drive.T - direct @ self.D @ self.B.T
+        rest = 0.5 * (rest + rest.T)
+        bound = float(np.exp(-decay * self.dt)) if self.dt > 0.0 else -decay
+        best: FloatArray | None = None
+        for _ in range(KALMAN_ROUNDS):
+            found = _filtered(free, self.C, rest, measured, (bound, self.dt), change)
+            if found is None:
+                break
+            total = found[0] + direct
+            # Strictly: a rate that is only met within rounding is none.
+            if abscissa(self.F - total @ self.C, self.dt) < bound:
+                best = total
+            change = found[1]
+        return best, change
+
+    def deviations(self, gain: FloatArray, change: FloatArray) -> FloatArray:
+        """Return the deviation of each estimate (unit intensity where dt = 0); ``gain (n, ny)``, ``change (n, n)``."""
+        entering = np.asarray(np.linalg.solve(change, self.B - gain @ self.D), dtype=np.float64)
+        moved = np.asarray(np.linalg.solve(change, (self.F - gain @ self.C) @ change), dtype=np.float64)
+        direct = np.zeros((self.estimates.shape[0], entering.shape[1]))
+        bound = 1.0 if self.dt > 0.0 else 0.0
+        if not abscissa(moved, self.dt) < bound:
+            # Stable in some coordinates and not in others: only rounding tells.
+            return np.full(len(direct), np.inf)
+        covariance = noise_covariance(moved, entering, self.estimates @ change, direct, self.dt)
+        return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+
+
+def _filtered(
+    f: FloatArray,
+    c: FloatArray,
+    driven: FloatArray,
+    measured: FloatArray,
+    asked: tuple[float, float],
+    change: FloatArray,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return the gain of a Kalman filter, and states in which its error covariance is the identity."""
+    bound, dt = asked
+    with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
+        # What a badly conditioned equation gives is judged by its poles.
+        try:
+            inverse = np.linalg.inv(change)
+            moved, noise = inverse @ f @ change, inverse @ driven @ inverse.T
+            moved = moved / bound if dt > 0.0 else moved - bound * np.eye(len(f))
+            noise = 0.5 * (noise + noise.T)
+            for doubled in (True, False) if len(f) >= MOST_STATES_FOR_PENCILS else (False,):
+                gain, covariance = _solved(moved, c @ change, noise, measured, dt, doubled=doubled)
+                gain = change @ (bound * gain if dt > 0.0 else gain)
+                values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+                if np.all(np.isfinite(gain)) and abscissa(f - gain @ c, dt) < bound:
+                    break
+        except (np.linalg.LinAlgError, ValueError, ArithmeticError):
+            return None
+    if not np.all(np.isfinite(gain)) or not np.all(np.isfinite(values)) or values[-1] <= 0.0:
+        return None
+    floor = float(np.finfo(np.float64).eps) * values[-1]
+    return np.asarray(gain), np.asarray(change @ (vectors * np.sqrt(np.maximum(values, floor))))
+
+
+def _solved(
+    f: FloatArray, c: FloatArray, noise: FloatArray, measured: FloatArray, dt: float, *, doubled: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return gain and error covariance of a Kalman filter, NaN where the equation is not solved: by doubling, or by the
+    QZ algorithm, which takes several times as long and hardly ever breaks down."""
+    if dt > 0.0:
+        y = (doubled_solution if doubled else discrete_solution)(f, c, noise, measured, np.zeros((len(f), len(c))))
+    else:
+        y = (continuous_riccati_solution if doubled else continuous_solution)(f, c, noise, measured)
+    if y is None:
+        return np.full((len(f), len(c)), np.nan), np.eye(len(f))
+    if dt > 0.0:
+        return np.asarray(np.linalg.solve(c @ y @ c.T + measured, c @ y @ f.T).T), y
+    return np.asarray(np.linalg.solve(measured, c @ y).T), y
+
+
+def compromise(problem: KalmanProblem, rate: float) -> tuple[FloatArray, float, float] | None:
+    """Return the fastest gain ``(n, ny)``, up to ``rate`` (1/s), that costs at most `NOISE_PRICE` in noise; its decay
+    (1/s), and the largest deviation of an estimate over that of the Kalman gain without a rate."""
+    start = np.eye(problem.F.shape[0])
+    plain, change = problem.solved(0.0, start)
+    slow = rate * 2.0**-MOST_RATE_HALVINGS
+    while plain is None and slow <= rate:
+        # The quietest filter may be so slow that its equation is lost in rounding: that of some rate is not.
+        plain, change = problem.solved(slow, start)
+        slow *= 2.0
+    if plain is None:
+        return None
+    # Each estimate by itself: they have units of their own.
+    quietest = problem.deviations(plain, change)
+    silent = SILENT * np.linalg.norm(problem.estimates, axis=1) * float(np.linalg.norm(problem.D))
+    # A deviation that depends on the coordinates it is computed in is rounding, too.
+    again = problem.deviations(plain, start)
+    counted = (quietest > silent) & np.isclose(quietest, again, rtol=SAME_DEVIATION, atol=0.0) & np.isfinite(quietest)
+    best = plain, 0.0, 1.0
+
+    def attempt(decay: float) -> tuple[FloatArray, float, float] | None:
+        gain, change = problem.solved(decay, start)
+        if gain is None:
+            return None
+        ratios = problem.deviations(gain, change)[counted] / quietest[counted]
+        # None is quieter than the filter without a rate: what is less is rounding in that one.
+        price = float(np.max(ratios, initial=1.0))
+        return (gain, decay, price) if price <= NOISE_PRICE else None
+
+    high = rate
+    slowest = float(np.min(decay_rates(eigenvalues(problem.F - plain @ problem.C), problem.dt), initial=np.inf))
+    for _ in range(MOST_RATE_HALVINGS):
+        found = attempt(high)
+        if found is not None:
+            best = found
+            break
+        high /= 2.0
+        if high <= slowest:
+            # The quietest filter is as fast as that by itself.
+            break
+    if best[1] in (0.0, rate):
+        return best
+    low, high = best[1], 2.0 * best[1]
+    while high > RATE_STEP * low:
+        middle = float(np.sqrt(low * high))
+        found = attempt(middle)
+        if found is None:
+            high = middle
+        else:
+            best, low = found, middle
+    return best

@@ -1,0 +1,246 @@
+"""Designs whose inequality holds something of one's own: constraints, an objective, a region for the eigenvalues.
+
+The methods leave these to the problem as it stands in the paper: solved as it is here, gains taken from it, and the
+realisation and certificate of these gains made as for any others.  `verify` knows nothing of how they were found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.existence.condition import require_all
+from obsynth.analysis.existence.filasova import explicit_form, pd_observer_conditions
+from obsynth.analysis.existence.restricted_equivalent import with_sensor_faults_as_states
+from obsynth.analysis.existence.sharepasand import existence
+from obsynth.analysis.existence.wang2015 import fault_filter_conditions
+from obsynth.conditions import atoms
+from obsynth.conditions import lazy_cvxpy as cp
+from obsynth.conditions.filasova import filasova_theorem1, filasova_theorem2
+from obsynth.conditions.lmi import SOLVER_SETTINGS, USABLE_STATUSES, semidefinite_solvers
+from obsynth.conditions.problem import Conditions, named_constraints
+from obsynth.conditions.share_pasand import sharepasand
+from obsynth.conditions.wang import error_norm, h2_terms, noise_paths, wang2015
+from obsynth.errors import PreconditionError, SolverError
+from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
+from obsynth.methods.fault_estimation_filter.realisation import synthesis_from_gains as filter_from_gains
+from obsynth.methods.method import Synthesis
+from obsynth.methods.pd_observer.given_gains import synthesis_from_gains as pd_from_gains
+from obsynth.methods.pd_observer.limits import default_delta
+from obsynth.methods.pd_observer.method import PdObserver
+from obsynth.methods.refusals import require_all_told
+from obsynth.methods.ui_pi_observer.assembly import synthesis_from_gains as ui_pi_from_gains
+from obsynth.methods.ui_pi_observer.method import UiPiObserver
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane, sector
+from obsynth.observers.linear.derived import averaged
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.faults import exosystem
+from obsynth.results.design import Certificate
+
+#: What is tried by default: an interior-point method, and one of first order that says infeasible where that stalls.
+AUTOMATIC = ("CLARABEL", "SCS")
+
+#: What a claimed gain keeps to the true norm, so that the claim has a proof with room for rounding.
+CLAIM_ROOM = 1e-3
+
+#: Multiples of a rate among which one inside a region is looked for.
+RATE_MULTIPLES = np.logspace(-4, 4, 161)
+
+#: Eigenvalues may be outside a region by this much, by a solver's rounding.
+REGION_TOLERANCE = 1e-6
+
+
+def filter_by_inequality(
+    plant: DescriptorSystem, asked: FaultEstimationFilter, *, progress: Callable[[str], None]
+) -> Synthesis:
+    """Return a fault-estimation filter by (45) with what was asked for in it; see `obsynth.fault_estimation_filter`."""
+    progress("checking the existence conditions")
+    require_all(fault_filter_conditions(plant))
+    free = bool(asked.free_residual_weight)
+    found = wang2015(plant, S=asked.S, W="free" if free else None, gamma=None)
+    squared, P, Y = found.variables["gamma_squared"], found.variables["P"], found.variables["Y"]
+    parts = [] if asked.region is None else [checked_region(asked.region)]
+    if asked.decay is not None:
+        parts.append(disk(0.0, float(np.exp(-asked.decay * plant.dt))))
+    where = None if not parts else parts[0] if len(parts) == 1 else parts[0] & parts[1]
+    added: dict[str, Any] = {}
+    if where is not None:
+        if not where.contains([0.0]):
+            raise PreconditionError(
+                f"No filter has all its eigenvalues in {where}: (32) puts those of the fault directions at 0. Give a "
+                "region with 0 in it.",
+                condition="region",
+                mode=0j,
+            )
+        added["region"] = atoms.region(found.data["A1"], P, where, Y=Y, Cy=found.data["C1"])[1]
+    if asked.gamma is not None:
+        added["gamma"] = squared <= asked.gamma**2
+    goal: Any = None
+    drop: tuple[str, ...] = ()
+    if asked.objective == "h2":
+        # From unit white disturbances and noise to the fault errors.
+        work = with_sensor_faults_as_states(plant)
+        b, d = np.hstack([work.Bd, work.Bw]), np.hstack([work.Dd, work.Dw])
+        added["H2 stable"], added["H2"], Z = h2_terms(plant, found, *noise_paths(plant, found, b, d))
+        goal, found = cp.trace(Z), replace(found, variables={**found.variables, "Z": Z})
+        drop = ("(45)",) if asked.gamma is None else ()
+    elif asked.objective is not None:
+        goal = asked.objective(found.variables)
+    found = found.changed(constraints=_with_own(asked, found, added), objective=goal, drop=drop)
+    progress("solving the matrix inequality")
+    runs = [_solved(found, asked)]
+    if goal is None and plant.nd:
+        # The bare optimum is badly conditioned: a little more gain buys small matrices.
+        least = float(np.sqrt(max(squared.value, 0.0)))
+        level = (1.0 + asked.gamma_margin) * least if asked.gamma is None else asked.gamma
+        found = found.changed(constraints={"gamma": squared <= level**2}, objective=cp.trace(P) + cp.norm(Y, "fro"))
+        runs.append(_solved(found, asked))
+    gains = found.gains()
+    work = with_sensor_faults_as_states(plant)
+    _require_inside(gains["T"] @ work.A - gains["L"] @ work.C, where)
+    gamma = None
+    if plant.nd:
+        gamma = (1.0 + CLAIM_ROOM) * error_norm(plant, gains)
+        gamma = asked.gamma if asked.gamma is not None and asked.gamma > gamma else gamma
+    progress("building the realisation and its certificate")
+    given: dict[str, Any] = {letter: gains[letter] for letter in "TNLW"}
+    made = filter_from_gains(plant, **given, gamma=gamma, indexes=None)
+    if asked.mean > 1 and isinstance(made.observer, LinearObserver):
+        zeros = np.zeros(((asked.mean - 1) * plant.nf, made.certificate.matrices["tracking"].shape[1]))
+        matrices, claims = dict(made.certificate.matrices), made.certificate.claims
+        matrices["tracking"] = np.vstack([matrices["tracking"], zeros])
+        made = replace(made, observer=averaged(made.observer, asked.mean), certificate=Certificate(matrices, claims))
+    return _told(made, asked, found, runs, where, free_residual_weight=free)
+
+
+def pd_by_inequality(plant: DescriptorSystem, asked: PdObserver, *, progress: Callable[[str], None]) -> Synthesis:
+    """Return a PD observer by a theorem with what was asked for in it; see `obsynth.pd_observer`."""
+    progress("checking the existence conditions")
+    require_all(pd_observer_conditions(plant))
+    theorem = filasova_theorem2 if asked.theorem == 2 else filasova_theorem1
+    where = None if asked.region is None else checked_region(asked.region)
+    decay, form = asked.decay or 0.0, explicit_form(plant)
+    delta = asked.delta
+    if delta is None:
+        delta = _fitting_delta(default_delta(plant if form is None else form.plant, asked, decay), where)
+    found = theorem(plant, delta=delta, decay=decay, region=where)
+    goal = None if asked.objective is None else asked.objective(found.variables)
+    found = found.changed(constraints=_with_own(asked, found, {}), objective=goal)
+    progress("solving the matrix inequality")
+    runs = [_solved(found, asked)]
+    gains = found.gains()
+    A_o, C_o = found.data["A_o"], found.data["C_o"]
+    J, L = np.vstack([gains["J"], gains["M"]]), np.vstack([gains["L"], gains["N"]])
+    _require_inside(np.asarray(np.linalg.solve(np.eye(len(A_o)) + L @ C_o, A_o - J @ C_o)), where)
+    progress("building the realisation and its certificate")
+    made = pd_from_gains(plant, gains=gains, adaptation_gain=None, decay=decay)
+    return _told(made, asked, found, runs, where, delta=delta, decay=decay)
+
+
+def ui_pi_by_inequality(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callable[[str], None]) -> Synthesis:
+    """Return a UI-PI observer by its inequality with what was asked for in it; see `obsynth.ui_pi_observer`."""
+    progress("checking the existence conditions")
+    model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
+    known = existence(plant, model)
+    require_all_told(known.conditions)
+    where = _region_of_poles(asked, plant.dt)
+    found = sharepasand(
+        plant, fault_model=asked.fault_model, region=where, E_sharp=asked.E_sharp, C_sharp=asked.C_sharp, G=asked.G
+    )
+    goal = asked.objective(found.variables) if callable(asked.objective) else None
+    found = found.changed(constraints=_with_own(asked, found, {}), objective=goal)
+    progress("solving the matrix inequality")
+    runs = [_solved(found, asked)]
+    gains = found.gains()
+    _require_inside(gains["Ahat"], where)
+    progress("building the realisation and its certificate")
+    given = {letter: gains[letter] for letter in "UDKF"}
+    made = ui_pi_from_gains(known.plant, **given, fault_model=asked.fault_model)
+    told = _told(made, asked, found, runs, where, **asked.resolved(model, plant.fault_names))
+    return replace(told, transformation=known.transformation)
+
+
+def _fitting_delta(delta: float, where: LMIRegion | None) -> float:
+    """Return the delta nearest to a given one with ``-1 / delta`` well inside a region."""
+    if where is None or where.contains([-1.0 / delta]):
+        return delta
+    rates = RATE_MULTIPLES * (1.0 / delta)
+    margins = where.margins(-rates) / rates
+    inside = rates[margins > 0.5 * np.max(margins)]
+    return float(1.0 / inside[np.argmin(np.abs(np.log(inside * delta)))]) if len(inside) else delta
+
+
+def _with_own(asked: Any, found: Conditions, added: Mapping[str, Any]) -> dict[str, Any]:
+    """Return constraints to add, those of the user among them."""
+    own = {} if asked.constraints is None else named_constraints(asked.constraints(found.variables))
+    return {**added, **own}
+
+
+def _region_of_poles(asked: UiPiObserver, dt: float) -> LMIRegion | None:
+    """Return the region of an observer's poles, by name too: decay, radius, damping."""
+    given = dict(asked.region) if isinstance(asked.region, Mapping) else {}
+    if asked.region is not None and not given:
+        return checked_region(asked.region)
+    checked = asked.checked_region(dt)
+    decay = asked.decay if checked is None else checked.decay
+    parts = [] if not decay else [disk(0.0, float(np.exp(-decay * dt))) if dt > 0.0 else half_plane(decay)]
+    if checked is not None and checked.radius is not None:
+        parts.append(disk(0.0, checked.radius))
+    if checked is not None and checked.damping is not None:
+        parts.append(sector(checked.damping))
+    whole = None
+    for part in parts:
+        whole = part if whole is None else whole & part
+    return whole
+
+
+def _require_inside(closed: FloatArray, where: LMIRegion | None) -> None:
+    """Raise where the eigenvalues that a solver's gains have are outside the region that was asked for."""
+    if where is None:
+        return
+    worst = float(np.min(where.margins(np.linalg.eigvals(closed)), initial=np.inf))
+    if worst < -REGION_TOLERANCE:
+        raise SolverError(
+            f"The solver ended with eigenvalues outside {where}, by {-worst:.3g}: the result is inconclusive. "
+            "Take another solver, or a wider region."
+        )
+
+
+def _solved(found: Conditions, asked: Any) -> dict[str, Any]:
+    """Solve a problem by the solver that was asked for, and return the record of the run."""
+    names = AUTOMATIC if asked.solver == AUTOMATIC[0] else (asked.solver,)
+    for name in (name for name in names if name == names[0] or name in semidefinite_solvers()):
+        settings = {**SOLVER_SETTINGS.get(name, {}), **(asked.solver_options or {})}
+        failure = None
+        record: dict[str, Any] = {"what": found.source, "solver": str(name), "settings": settings}
+        try:
+            found.solve(name, settings)
+            break
+        except SolverError as error:
+            error.record, failure = {**record, "status": "crashed"}, error
+    if failure is not None:
+        raise failure
+    record |= {"status": str(found.problem.status)}
+    if record["status"] not in USABLE_STATUSES:
+        raise SolverError(
+            f"{name} ended with status {record['status']!r} for {found.source} with "
+            f"{', '.join(map(repr, found.constraints))}: with these constraints nothing was found. Relax them, or take "
+            "another solver.",
+            record=record,
+        )
+    return record
+
+
+def _told(
+    made: Synthesis, asked: Any, found: Conditions, runs: list[dict[str, Any]], where: LMIRegion | None, **resolved: Any
+) -> Synthesis:
+    """Return a synthesis from gains as the one that was asked for, with its record."""
+    options = {**asked.as_plain(), **resolved, "constraints": list(found.constraints)}
+    imposed = f", and every eigenvalue in {where}" if where is not None else ""
+    note = f"The inequality was solved as it stands in the paper, with {', '.join(found.constraints)}{imposed}."
+    return replace(made, options=options, solver={"engine": "lmi", "runs": runs}, notes=(note, *made.notes))

@@ -1,0 +1,1 @@
+"""What the recursive methods share: synthesis, steady state, and the checks of their covariances."""

@@ -1,0 +1,162 @@
+"""Monte Carlo on the plant's own model: are the errors as large as the covariances say, and the innovations white?
+
+Errors of a linear estimator do not depend on the trajectory: on the one that is zero the *prior mean* is random.  To
+draw x(0) and project it onto the constraint would be inconsistent, as mu(k) of an algebraic equation depends on x(k).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import KNOWN_SHARE, ROUNDED_BESIDE
+from obsynth.numerics.scaling import LogBalance
+from obsynth.observers.recursive.gain_schedule import gain_steps
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.step_model import StepMatrices
+from obsynth.results.checks import Check, upper_bound_check
+
+#: Trials and steps: a wrong variance of 10 % is 20 standard deviations away.
+CONSISTENCY_TRIALS = 400
+
+CONSISTENCY_STEPS = 60
+
+CONSISTENCY_SEED = 20130703
+
+#: Bands are this many standard deviations of the statistic wide: a sound design fails one time in two million.
+BAND_DEVIATIONS = 5.0
+
+_SOURCE = "recomputed, Monte Carlo with a fixed seed"
+
+
+def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int) -> Iterator[Check]:
+    """Yield NEES, NIS and whiteness of a shipped observer on noise as it is stated."""
+    rng = np.random.default_rng(CONSISTENCY_SEED)
+    truth = stated.init()
+    nq = len(truth.parameters.theta)
+    x = rng.standard_normal((CONSISTENCY_TRIALS, truth.factor.shape[1])) @ truth.factor.T
+    theta = rng.standard_normal((CONSISTENCY_TRIALS, nq)) @ truth.parameters.spread.T
+    model = stated.recursion.model
+    first = model.first()
+    nis, pairs = [], []
+    scores: dict[int, tuple[FloatArray, FloatArray]] = {}
+    before = np.zeros((CONSISTENCY_TRIALS, 0))
+    count, factor = min(steps, CONSISTENCY_STEPS), truth.factor
+    for position, gains in enumerate(gain_steps(shipped, count)):
+        k = position if first is None else position - 1
+        true = model.at(k) if first is None or position else first
+        noise = rng.standard_normal((CONSISTENCY_TRIALS, true.noise.shape[1])) @ true.noise.T
+        known = np.zeros_like(noise)
+        known[:, : len(true.A)] = x @ gains.step.A.T
+        data = known + noise
+        innovation = data @ gains.parity.T
+        x, theta = data @ gains.gain.T, theta @ gains.retain.T + data @ gains.learn.T
+        if innovation.shape[1]:
+            nis.append(innovation)
+            shared = min(before.shape[1], innovation.shape[1])
+            pairs.append(before[:, :shared] * innovation[:, :shared])
+        before = innovation
+        if position in (0, count // 2, count - 1):
+            joint = np.hstack([x + theta @ gains.Upsilon.T if nq else x, theta])
+            # Factorisations round relative to the whole noise: a covariance that tends to zero ends there.
+            terms = state_terms(gains.step, data_deviations(gains.step, factor))
+            parameters = np.linalg.norm(gains.spread, axis=1)
+            parameters = parameters + np.abs(gains.learn) @ data_deviations(gains.step, factor)
+            # Of states and parameters together: its square is their covariance after the step.
+            top = np.hstack([gains.factor, gains.Upsilon @ gains.spread])
+            root = np.vstack([top, np.hstack([np.zeros((len(gains.spread), gains.factor.shape[1])), gains.spread])])
+            terms = np.concatenate([terms + np.abs(gains.Upsilon) @ parameters, parameters])
+            scores[k + 1] = normalised(joint, root, terms)
+        factor = gains.factor
+    yield from _error_rows(scores)
+    squares = np.concatenate([np.zeros(0), *(found.ravel() for found in nis)]) ** 2
+    if squares.size:
+        yield _band("NIS", "squared whitened innovations per degree of freedom are one", squares)
+        products = np.concatenate([found.ravel() for found in pairs])
+        if products.size:
+            yield _estimated(
+                "whiteness",
+                "mean product of innovations of successive samples: they are uncorrelated",
+                float(products.mean()),
+                0.0,
+                BAND_DEVIATIONS / float(np.sqrt(products.size)),
+                f"{products.size} products",
+            )
+
+
+def data_deviations(step: StepMatrices, factor: FloatArray) -> FloatArray:
+    """Return the standard deviations of the data of one step, ``(rows,)``; ``factor (nx, any)``."""
+    deviations = np.linalg.norm(step.noise, axis=1)
+    deviations[: len(step.A)] = np.hypot(deviations[: len(step.A)], np.linalg.norm(step.A @ factor, axis=1))
+    return np.asarray(deviations)
+
+
+def state_terms(step: StepMatrices, sizes: FloatArray) -> FloatArray:
+    """Return how large the terms are that make up the state after a step, for data of these sizes."""
+    rows, columns = step.H.shape
+    problem = LogBalance(rows + columns)
+    problem.add(step.H, range(rows), range(rows, rows + columns))
+    # In the units given a part of it may be less than what a pseudoinverse takes for zero.
+    units = np.exp2(np.round(problem.solve()))
+    left, own = units[:rows], units[rows:]
+    inverse = own[:, None] * np.linalg.pinv(left[:, None] * step.H * own) * left
+    terms = (np.abs(inverse) @ sizes).T / own
+    return np.asarray(((terms + ROUNDED_BESIDE * np.max(terms, axis=-1, keepdims=True)) * own).T)
+
+
+def normalised(errors: FloatArray, root: FloatArray, terms: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return ``errors (trials, n)`` in units of their covariance ``root root'``, of the rank beside ``terms (n,)``, and
+    those that are claimed to be zero in units of the terms."""
+    sizes = np.where(terms > 0.0, terms, 1.0)
+    left, values, _ = np.linalg.svd(root / sizes[:, None])
+    found = (errors / sizes) @ left
+    kept = np.flatnonzero(values > KNOWN_SHARE)
+    return np.asarray(found[:, kept] / values[kept]), np.delete(found, kept, axis=1)
+
+
+def _error_rows(scores: Mapping[int, tuple[FloatArray, FloatArray]]) -> Iterator[Check]:
+    """Yield NEES at its worst sample, and the errors in directions without covariance."""
+    # Errors at different samples are correlated, fully so without process noise: each has a band of its own.
+    rows = [
+        _band("NEES", "squared errors per degree of freedom are one", found**2, f" at k = {k}")
+        for k, (found, _) in scores.items()
+        if found.size
+    ]
+    if rows:
+        yield min(rows, key=lambda row: row.margin / (row.bound - 1.0) * np.sign(row.bound - 1.0))
+    exact = [float(np.max(np.abs(known))) for _, known in scores.values() if known.size]
+    if exact:
+        yield upper_bound_check(
+            "known directions",
+            "where the covariance is zero, so is the error (in units of what it is made of)",
+            float(np.max(exact)),
+            BAND_DEVIATIONS * KNOWN_SHARE,
+            source=_SOURCE,
+            detail=f"{CONSISTENCY_TRIALS} trials",
+        )
+
+
+def _band(name: str, claim: str, squares: FloatArray, where: str = "") -> Check:
+    """Return the row that the mean of squares of independent standard normal numbers is one."""
+    width = BAND_DEVIATIONS * float(np.sqrt(2.0 / squares.size))
+    return _estimated(name, claim, float(squares.mean()), 1.0, width, f"mean of {squares.size}{where}")
+
+
+def _estimated(name: str, claim: str, mean: float, expected: float, width: float, detail: str) -> Check:
+    """Return the row that a mean is within so much of what is expected."""
+    low, high = expected - width, expected + width
+    return Check(
+        name,
+        claim,
+        mean,
+        high if mean >= expected else low,
+        width - abs(mean - expected),
+        bool(low <= mean <= high),
+        _SOURCE,
+        "computed",
+        f"{detail}; chance alone keeps it within {low:.4g} to {high:.4g}, but one time in two million",
+        "estimated",
+        (low, high),
+    )

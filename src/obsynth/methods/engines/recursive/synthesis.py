@@ -1,0 +1,202 @@
+"""What the recursive methods have in common: noise that the plant states, gains to read, claims, notes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.existence.condition import require_all
+from obsynth.analysis.existence.kalman import with_stated_noise, without_unknown_inputs
+from obsynth.analysis.existence.recursive import detectability_condition
+from obsynth.analysis.time_varying import WARN_MARKOV_CONDITION, HorizonRanks, as_time_varying, horizon_ranks
+from obsynth.errors import PreconditionError
+from obsynth.methods.method import Method, Synthesis
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import covariance_factor
+from obsynth.observers.recursive.gain_schedule_summary import (
+    STEPS_TO_CONTRACT,
+    GainScheduleSummary,
+    gain_schedule_summary,
+)
+from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options, plain_options
+from obsynth.observers.recursive.steady_filter import reached_condition
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.plant_units import FAR_UNITS, PlantUnits
+from obsynth.plants.signal_names import leading_names
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.design import Certificate
+
+#: Information on the parameters in a window below this share of their prior's is as good as none.
+LOST_EXCITATION = 1.0
+
+
+def synthesise(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Method, *, progress: Callable[[str], None]
+) -> Synthesis:
+    """Put the observer together; see `obsynth.descriptor_kalman` and `obsynth.adaptive_observer`."""
+    progress("checking the existence conditions along the horizon")
+    require_all(asked.existence(plant))
+    options = with_stated_noise(plant, asked.as_given())
+    if options.get("guard", "") is None:
+        options["guard"] = "none" if options["form"] == "literal" else "regularise"
+    progress("computing the gains")
+    missing = [name for name in ("Q", "R") if options[name] is None]
+    far = isinstance(plant, DescriptorSystem) and PlantUnits.of(plant).spread > FAR_UNITS
+    if isinstance(plant, DescriptorSystem) and far:
+        options |= _identities(PlantUnits.of(plant).rounded(), options)
+    if not isinstance(plant, DescriptorSystem) or not plant.nd:
+        return _of_varying(as_time_varying(plant), options, missing=missing, own_units=far)
+    reduced = without_unknown_inputs(plant)
+    options |= {
+        "initial_state": reduced.initial_state(options["initial_state"]),
+        "initial_covariance": reduced.initial_covariance(options["initial_covariance"]),
+    }
+    if options["Q"] is not None:
+        options["Q"] = reduced.process_covariance(options["Q"])
+    found = _of_varying(reduced.plant, options, missing=missing, own_units=far)
+    return replace(found, notes=(reduced.note, *found.notes))
+
+
+def _of_varying(
+    plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any], *, missing: Sequence[str], own_units: bool
+) -> Synthesis:
+    """Return observer, gains, claims and notes; ``missing``: covariances of noise that were not stated."""
+    observer = observer_from_options(plant, options)
+    ranks = horizon_ranks(plant, early=observer.early_constraints)
+    facts = gain_schedule_summary(observer)
+    if missing and not own_units and not _contracts(facts) and plant.ne == plant.nx and _has_steady_state(observer):
+        still = DescriptorSystem(
+            plant.E.at(1), plant.A.at(0), C=plant.C.at(1), Bf=plant.Phi.at(0), Df=plant.Psi.at(0), dt=plant.dt or 1.0
+        )
+        options, own_units = {**options, **_identities(PlantUnits.of(still).rounded(), options)}, True
+        observer = observer_from_options(plant, options)
+        facts = gain_schedule_summary(observer)
+    _require_contraction(observer, facts, () if own_units else missing)
+    claims = {
+        "condition": ranks.condition,
+        "condition_k": float(ranks.condition_k),
+        "residual_directions": float(ranks.directions),
+        "contraction": facts.contraction,
+        "steps": float(facts.steps),
+    }
+    if observer.adaptation is not None:
+        claims |= {"excitation": facts.excitation, "excitation_k": float(facts.excitation_k)}
+    resolved = {**options, "Q": observer.Q, "R": observer.R}
+    # By the names of the plant that is filtered, as they were understood.
+    resolved |= {
+        "outlier_sizes": observer.outlier_sizes,
+        "sensors": observer.sensors,
+        "state_bounds": observer.state_bounds,
+    }
+    return Synthesis(
+        plain_options(resolved),
+        {"L": facts.L, "K": facts.K},
+        observer,
+        Certificate({}, claims),
+        notes=tuple(_notes(observer, ranks, facts, missing, own_units=own_units)),
+        plant=plant,
+    )
+
+
+def _contracts(facts: GainScheduleSummary) -> bool:
+    """Whether errors decay along the horizon, or the horizon is too short to tell."""
+    return facts.steps < STEPS_TO_CONTRACT or facts.contraction < 1.0
+
+
+def _identities(units: PlantUnits, options: Mapping[str, Any]) -> dict[str, FloatArray]:
+    """Return the covariances that are not given as identities in units in which a plant is near one."""
+    found = {"Q": 1.0 / units.equations, "R": 1.0 / units.outputs, "initial_covariance": units.states}
+    found["initial_parameter_covariance"] = units.faults
+    return {name: np.diag(size**2) for name, size in found.items() if name in options and options[name] is None}
+
+
+def _has_steady_state(observer: RecursiveObserver) -> bool:
+    """Whether a time-invariant plant is detectable, and Q reaches its modes: then its initial-condition response
+    decays."""
+    if not (observer.plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant):
+        return False
+    roots = covariance_factor(observer.Q.at(0), "Q"), covariance_factor(observer.R.at(0), "R")
+    return detectability_condition(observer.plant).holds and reached_condition(observer.plant, *roots).holds
+
+
+def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary, identity: Sequence[str]) -> None:
+    """Raise `PreconditionError` where errors do not decay along the horizon."""
+    if _contracts(facts):
+        return
+    names = leading_names(facts.survivors, observer.state_names)
+    kept = (
+        f"keeps the mean factor {facts.contraction:.6g} per step"
+        if facts.contraction < float("inf")
+        else "grows without bound"
+    )
+    if _has_steady_state(observer):
+        given = f" {' and '.join(identity)} taken as the identity weigh this plant in its units." if identity else ""
+        raise PreconditionError(
+            "Unclear: the horizon is too short to decide whether errors decay fast enough. The outputs observe every "
+            f"state, and with these Q and R the errors decay in the end; but over {facts.steps} steps the product of "
+            f"L_k A_k {kept}, in {', '.join(map(repr, names))}.{given} State Q and R in the units of equations and "
+            "outputs, or take units in which entries are near one.",
+            condition="contraction",
+            signals=names,
+            unclear=True,
+        )
+    raise PreconditionError(
+        f"Errors do not decay: over {facts.steps} steps the product of L_k A_k {kept}, in "
+        f"{', '.join(map(repr, names))}. Either these states are unobservable: measure more, or leave them out; or Q "
+        "and initial_covariance claim that they are known exactly: give them a variance.",
+        condition="contraction",
+        signals=names,
+    )
+
+
+def _notes(
+    observer: RecursiveObserver,
+    ranks: HorizonRanks,
+    facts: GainScheduleSummary,
+    missing: Sequence[str],
+    *,
+    own_units: bool,
+) -> Iterator[str]:
+    if missing:
+        units = ", in units in which the plant is near one (those given are far from these)"
+        yield (
+            f"No noise is stated: {' and '.join(missing)} taken as the identity{units if own_units else ''}, which "
+            "sets gains and deviations."
+        )
+    if ranks.condition > WARN_MARKOV_CONDITION:
+        yield (
+            f"H_k has the condition number {ranks.condition:.3g} at k = {ranks.condition_k}: about "
+            f"{np.log10(ranks.condition):.0f} digits of the estimate are lost there."
+        )
+    if observer.plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant:
+        roots = covariance_factor(observer.Q.at(0), "Q"), covariance_factor(observer.R.at(0), "R")
+        reached = reached_condition(observer.plant, *roots)
+        if not reached.holds:
+            yield f"The filter has no steady state: {reached.detail}"
+    adaptation = observer.adaptation
+    if adaptation is None:
+        return
+    if adaptation.window > facts.steps:
+        yield (
+            f"The window of {adaptation.window} samples is longer than the {facts.steps} steps of the horizon: "
+            "excitation is not watched."
+        )
+    prior = float(np.linalg.eigvalsh(np.linalg.inv(adaptation.initial_covariance))[0])
+    if facts.excitation < LOST_EXCITATION * prior:
+        yield (
+            f"The parameters are poorly excited in the window that ends at k = {facts.excitation_k} (information "
+            f"{facts.excitation:.3g}, the prior has {prior:.3g}): the values reported there are the prior ones"
+            + (
+                "."
+                if adaptation.form == "random-walk" or adaptation.guard != "none"
+                else ", and without a guard S winds up."
+            )
+        )
+    if adaptation.form == "literal" and ranks.directions < observer.plant.ny:
+        yield (
+            f"The literal form (18) uses {ranks.directions} residual direction(s) of {observer.plant.ny} output(s); "
+            "the innovation form uses all parity directions."
+        )

@@ -1,0 +1,222 @@
+"""Gains that put all poles into a region (M. Chilali, P. Gahinet, IEEE TAC 41, 1996), with little noise."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.conditions import lazy_cvxpy as cp
+from obsynth.conditions import lmi
+from obsynth.errors import SolverError, SpecError
+from obsynth.methods.engines.kalman_problem import KalmanProblem
+from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value
+from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
+from obsynth.numerics.spectra import eigenvalues, speeds
+
+#: The inequalities are asked for a region smaller by this share, so that a solution on its boundary still counts.
+INNER_SHARE = 1e-3
+
+#: Weight of the states beside the estimates in what is minimised, so that no direction is free.
+STATE_WEIGHT = 1e-3
+
+#: The matrix of the Lyapunov function stays above this multiple of the identity, in scaled states.
+LEAST_LYAPUNOV = 1e-6
+
+#: Above this many states the inequality moves only those poles that a Kalman gain leaves outside the region.
+MOST_MOVED_STATES = 20
+
+
+@dataclass(frozen=True)
+class Region:
+    """Where all movable poles must lie; ``radius`` and ``damping`` in continuous time only."""
+
+    decay: float = 0.0  # every mode decays at least as exp(-decay t)
+    radius: float | None = None  # abs(s) <= radius
+    damping: float | None = None  # least ratio, 0 to 1
+
+    @classmethod
+    def of(cls, data: Mapping[str, Any], dt: float) -> Region:
+        """Return a checked region."""
+        known = [field.name for field in fields(cls)]
+        problems = [f"unknown key {key!r}; there are: {', '.join(known)}." for key in data if key not in known]
+        for key, value in data.items():
+            if key in known and (not is_finite_number(value) or value < 0.0 or (key != "decay" and value == 0.0)):
+                problems.append(f"{key} is {value!r}: give a positive number.")
+        if not problems:
+            found = cls(**data)
+            if found.damping is not None and found.damping >= 1.0:
+                problems.append(f"damping is {found.damping}: give a ratio below 1.")
+            if found.radius is not None and found.radius <= found.decay:
+                problems.append(f"the region is empty: radius {found.radius} is not above decay {found.decay}.")
+            if dt > 0.0 and (found.radius is not None or found.damping is not None):
+                problems.append("radius and damping are for continuous time: give decay alone.")
+        if problems or not data:
+            raise SpecError(
+                "Option region of ui-pi-observer:",
+                path="method.options.region",
+                problems=problems or ["give at least one of decay, radius, damping."],
+            )
+        return cls(**data)
+
+    def in_time(self, unit: float) -> Region:
+        """Return the region with rates per ``unit`` (seconds) instead of per second."""
+        return replace(self, decay=unit * self.decay, radius=None if self.radius is None else unit * self.radius)
+
+    def shrunk(self) -> Region:
+        """Return the region inside of which poles count as well within it."""
+        return replace(
+            self,
+            decay=(1.0 + 0.5 * INNER_SHARE) * self.decay,
+            radius=None if self.radius is None else (1.0 - 0.5 * INNER_SHARE) * self.radius,
+            damping=None if self.damping is None else min((1.0 + 0.5 * INNER_SHARE) * self.damping, 1.0),
+        )
+
+    def holds(self, values: Any, dt: float) -> bool:
+        """Whether all ``values`` lie in the region."""
+        poles = np.asarray(values, dtype=np.complex128)
+        if dt > 0.0:
+            return bool(np.all(np.abs(poles) < np.exp(-self.decay * dt)))
+        inside = np.all(poles.real < -self.decay) if self.decay else np.all(poles.real < 0.0)
+        if self.radius is not None:
+            inside = inside and np.all(speeds(poles, dt) <= self.radius)
+        if self.damping is not None:
+            inside = inside and np.all(-poles.real >= self.damping * np.abs(poles))
+        return bool(inside)
+
+
+def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
+    """Return K ``(n, ny)`` with the poles of ``F - K C`` in the region and little noise, and the solver's record.
+
+    Above `MOST_MOVED_STATES` states a Kalman gain of the region's rate comes first, and the record is empty where it
+    is enough.
+    """
+    n, dt = problem.F.shape[0], problem.dt
+    if n == 0:
+        return np.zeros((0, problem.C.shape[0])), {}
+    # What one way cannot find, the other may.
+    ways = [_partly, _by_inequality] if n > MOST_MOVED_STATES else [_by_inequality, _partly]
+    failures: list[SolverError] = []
+    for way in ways:
+        try:
+            gain, record = way(problem, region, solver=solver)
+        except SolverError as error:
+            failures.append(error)
+            continue
+        if region.holds(eigenvalues(problem.F - gain @ problem.C), dt):
+            return gain, record
+        failures.append(
+            SolverError(
+                f"{solver} ended with poles outside the region: the result is inconclusive. Widen the region, or "
+                "use decay= instead.",
+                record=record,
+            )
+        )
+    raise failures[ways.index(_by_inequality)]
+
+
+def _partly(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
+    """Move only those poles into the region that a Kalman gain of the same rate leaves outside.
+
+    With ``F - K C = V diag(T1, T2) V^-1``, T1 inside, a gain ``V [0; K2]`` makes ``T2 - K2 C V2`` of T2.
+    """
+    from scipy.linalg import schur, solve_sylvester
+
+    gain = problem.gain((1.0 + INNER_SHARE) * region.decay)
+    if gain is None:
+        raise SolverError("The Riccati equation has no usable solution: give poles=, or a slower region.")
+    inner = region.shrunk()
+    triangular, turn, good = schur(
+        problem.F - gain @ problem.C, output="real", sort=lambda re, im: inner.holds([complex(re, im)], problem.dt)
+    )
+    if good == len(triangular):
+        return gain, {}
+    first, mixed, second = triangular[:good, :good], triangular[:good, good:], triangular[good:, good:]
+    apart = np.vstack([solve_sylvester(first, -second, -mixed), np.eye(len(second))])
+    moved, rows = turn @ apart, turn[:, good:].T
+    rest = replace(
+        problem,
+        F=second,
+        C=problem.C @ moved,
+        B=rows @ (problem.B - gain @ problem.D),
+        drive=rows @ problem.drive,
+        estimates=problem.estimates @ moved,
+    )
+    more, record = _by_inequality(rest, region, solver=solver)
+    return np.asarray(gain + moved @ more), record
+
+
+def _by_inequality(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
+    n, dt = problem.F.shape[0], problem.dt
+    change = _scaling(problem, region)
+    inverse = np.linalg.inv(change)
+    f, c = inverse @ problem.F @ change, problem.C @ change
+    estimates = problem.estimates @ change
+    # The drive is left out: the region says how fast the poles must be, and less noise is what is left to ask for.
+    entering = inverse @ np.hstack([problem.B, np.zeros((n, problem.background.shape[1]))])
+    direct = np.hstack([problem.D, problem.background])
+    size = max(largest_singular_value(estimates), SMALLEST)
+    weight = estimates.T @ estimates / size**2 + STATE_WEIGHT * np.eye(n)
+    p, y = lmi.symmetric_variable(n), lmi.matrix_variable(n, c.shape[0])
+    z = lmi.symmetric_variable(entering.shape[1])
+    moved = p @ f - y @ c
+    noise = p @ entering - y @ direct
+    constraints = [
+        lmi.at_least(p, LEAST_LYAPUNOV),
+        lmi.at_least(lmi.symmetric_blocks([[z], [noise, p]])),
+    ]
+    if dt > 0.0:
+        radius = float(np.exp(-region.decay * dt)) * (1.0 - INNER_SHARE * min(1.0, region.decay * dt))
+        constraints += [
+            lmi.at_least(lmi.symmetric_blocks([[p - weight], [moved, p]])),
+            lmi.at_least(lmi.symmetric_blocks([[radius * p], [moved, radius * p]])),
+        ]
+    else:
+        constraints.append(lmi.at_most(moved + moved.T + weight, 0.0))
+        constraints += _continuous_region(region, p, moved)
+    record = lmi.minimise(cp.trace(z), constraints, what="poles in a region", solver=solver)
+    return np.asarray(change @ np.linalg.solve(lmi.value_of(p), lmi.value_of(y))), record
+
+
+def _continuous_region(region: Region, p: Any, moved: Any) -> list[Any]:
+    found = []
+    if region.decay:
+        found.append(lmi.at_most(moved + moved.T + 2.0 * region.decay * (1.0 + INNER_SHARE) * p, 0.0))
+    if region.radius is not None:
+        radius = region.radius * (1.0 - INNER_SHARE)
+        found.append(lmi.at_least(lmi.symmetric_blocks([[radius * p], [moved, radius * p]])))
+    if region.damping is not None:
+        cosine = min(region.damping * (1.0 + INNER_SHARE), 1.0)
+        sine = float(np.sqrt(1.0 - cosine**2))
+        both, turned = sine * (moved + moved.T), cosine * (moved.T - moved)
+        found.append(lmi.at_most(lmi.symmetric_blocks([[both], [turned, both]]), 0.0))
+    return found
+
+
+def _scaling(problem: KalmanProblem, region: Region) -> FloatArray:
+    """Return a state change in which the error covariance of a filter of the same rate is the identity."""
+
+    gain = problem.gain(region.decay)
+    if gain is None:
+        return np.eye(problem.F.shape[0])
+    closed, entering = problem.F - gain @ problem.C, problem.B - gain @ problem.D
+    noise = entering @ entering.T + problem.drive @ problem.drive.T
+    noise = noise + gain @ problem.background @ problem.background.T @ gain.T
+    with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
+        # A poor scaling is judged by what the solver makes of it.
+        if problem.dt > 0.0:
+            radius = np.exp(-region.decay * problem.dt)
+            covariance = discrete_lyapunov(closed / radius, noise)
+        else:
+            covariance = continuous_lyapunov(closed + region.decay * np.eye(len(closed)), -noise)
+    if not np.all(np.isfinite(covariance)):
+        return np.eye(len(closed))
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    if values[-1] <= 0.0:
+        return np.eye(len(closed))
+    floor = float(np.finfo(np.float64).eps) * values[-1]
+    return np.asarray(vectors * np.sqrt(np.maximum(values, floor)))

@@ -1,0 +1,193 @@
+"""The gain set beside the realisation, and what the rounding of printed gains can do to each identity.
+
+Source: Wang 2015, eqs. (8), (17), (20), (23), (60). To first order an identity at gains printed to k decimals is off by
+half a unit times the sizes of its cofactors, each found by moving an entry of the gains by as much, either way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from obsynth.methods.fault_estimation_filter.whole_transfer import (
+    OBSERVER_MATRICES,
+    Equations,
+    fault_identities,
+    step_key,
+)
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import Scaling
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import Check, nothing_wrong
+from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.identities import Identity, equality, tracking_totals, worst
+
+#: Letters that every gain set has; it may have R as well.
+NEEDED = ("T", "N", "L", "W", "Psi", "Upsilon")
+
+RESTRICTED, WEIGHT = "gains: T and N", "gains: W"
+
+
+#: The gains that are printed; Psi, Upsilon and R follow from them.
+PRINTED = "TNLW"
+
+
+def gains_fit(work: DescriptorSystem, gains: Mapping[str, FloatArray], observer: LinearObserver) -> Check:
+    """Return the row on letters and shapes of the gain set."""
+    na, ny, nf = work.nx, work.ny, work.nf
+    shapes = {
+        "T": (na, na),
+        "N": (na, ny),
+        "L": (na, ny),
+        "W": (nf, ny),
+        "Psi": (na, nf),
+        "Upsilon": (ny, nf),
+        "R": (na, ny),
+    }
+    wrong = [letter for letter in NEEDED if letter not in gains]
+    wrong += [letter for letter in gains if letter not in shapes]
+    wrong += [
+        letter
+        for letter, shape in shapes.items()
+        if letter in gains and (gains[letter].shape != shape or not np.all(np.isfinite(gains[letter])))
+    ]
+    order = na + len(observer.state_names) * (max(observer.fault_delays, default=1) - 1)
+    wrong += ["the order of the observer"] if observer.order != order else []
+    return nothing_wrong(
+        "gains fit",
+        "the gain set has the letters and shapes of the plant, the observer the order that follows",
+        wrong,
+        source="gain set",
+    )
+
+
+def gain_identities(
+    work: DescriptorSystem, gains: Mapping[str, FloatArray], equations: Equations, scaling: Scaling
+) -> dict[str, Identity]:
+    """Return the identities that T, N and W satisfy, and that the rounding of printed gains disturbs."""
+    t, n, w = gains["T"], gains["N"], gains["W"]
+    upsilon = work.C @ equations.detectability_matrix(gains)
+    # The columns are in the units of the faults, which differ: each is compared with its own largest products.
+    peaks = np.max(np.abs(w) @ np.abs(upsilon), axis=0, initial=0.0)
+    return {
+        RESTRICTED: Identity((t @ work.E, n @ work.C, -np.eye(work.nx)), ((t, work.E), (n, work.C)), scaling.states),
+        WEIGHT: Identity((w @ upsilon, -np.eye(work.nf)), ((w, upsilon),), 1.0 / np.where(peaks > 0.0, peaks, 1.0)),
+    }
+
+
+def gain_rows(
+    work: DescriptorSystem,
+    gains: Mapping[str, FloatArray],
+    observer: LinearObserver,
+    tracking: FloatArray,
+    equations: Equations,
+    scaling: Scaling,
+    allowances: Mapping[str, FloatArray],
+    *,
+    fixed_weight: bool,
+) -> Iterator[Check]:
+    """Yield the rows on the gain set, which must fit."""
+    identities = gain_identities(work, gains, equations, scaling)
+    claims = {
+        RESTRICTED: ("T E + N C = I", "Wang 2015, eq. (8)"),
+        WEIGHT: ("W Upsilon = I", "Wang 2015, eq. (44)"),
+    }
+    for name, (claim, source) in claims.items():
+        yield equality(name, claim, identities[name].residual(allowances.get(name)), source)
+    psi, upsilon = equations.detectability_matrix(gains), gains["Upsilon"]
+    sizes = equations.absolute.detectability_matrix({"T": np.abs(gains["T"])})
+    detectability = [
+        Identity((gains["Psi"], -psi), ((sizes,),), entrywise=True),
+        Identity((upsilon, -work.C @ gains["Psi"]), ((work.C, sizes),), entrywise=True),
+    ]
+    yield equality(
+        "gains: Psi and Upsilon",
+        "Psi holds the columns (TA)^(rho_i - 1) T f_i, and Upsilon = C Psi",
+        worst([identity.residual() for identity in detectability]),
+        "Wang 2015, eq. (20)",
+    )
+    if "R" in gains:
+        yield equality(
+            "gains: R",
+            "R is the free part of L: R Upsilon = 0, and L - R = T A Psi G with G Upsilon = I"
+            + (", G = W" if fixed_weight else ""),
+            worst([identity.residual() for identity in _free_part_identities(work, gains, scaling, fixed_weight)]),
+            "Wang 2015, eq. (60)",
+        )
+    formed = equations.realised(gains)
+    terms = equations.absolute.realised({letter: np.abs(gains[letter]) for letter in "TNLW"}, minus=1.0)
+    realised = [
+        Identity((getattr(observer, name), -formed[name]), ((terms[name],),), entrywise=True)
+        for name in OBSERVER_MATRICES
+    ]
+    realised.append(Identity((tracking, -equations.tracking(gains["T"])), entrywise=True))
+    yield equality(
+        "gains: realisation",
+        "the realisation is that of T, N, L and W, and the certificate tracks T x",
+        worst([identity.residual() for identity in realised]),
+        "Wang 2015, eq. (23); our state estimate",
+    )
+
+
+def _free_part_identities(
+    work: DescriptorSystem, gains: Mapping[str, FloatArray], scaling: Scaling, fixed_weight: bool
+) -> list[Identity]:
+    # Beside a free weight, which left inverse G of Upsilon is taken depends on the units of the outputs: any is right.
+    outputs, fixed, free = 1.0 / scaling.outputs, gains["L"] - gains["R"], gains["R"]
+    moved = gains["T"] @ work.A @ gains["Psi"]
+    # The columns of L - R are combinations of those of T A Psi: nothing is left beside their span.
+    basis, sizes, _ = np.linalg.svd(moved / scaling.states[:, None], full_matrices=False)
+    span = scaling.states[:, None] * basis[:, sizes > 0.0]
+    shares = (basis[:, sizes > 0.0] / scaling.states[:, None]).T
+    upsilon = gains["Upsilon"]
+    # R is the difference of L and the fixed part: it is judged against these, however small it is itself.
+    parts = np.abs(gains["L"]) + np.abs(fixed) + np.abs(free)
+    rows = np.max(parts * outputs, axis=1, keepdims=True)
+    columns = np.max(np.abs(upsilon) / outputs[:, None], axis=0, keepdims=True)
+    products = ((rows, columns), (gains["T"], work.A, gains["Psi"]))
+    formed = parts + np.abs(gains["T"]) @ np.abs(work.A) @ np.abs(gains["Psi"]) @ np.abs(gains["W"])
+    # The projection mixes the rows in balanced units.
+    mixed = scaling.states[:, None] * np.max(formed / scaling.states[:, None], axis=0, initial=0.0)
+    found = [
+        Identity((free @ upsilon,), products),
+        Identity((fixed @ upsilon, -moved), products),
+        Identity((fixed, -span @ (shares @ fixed)), ((mixed,),), outputs),
+    ]
+    return [*found, Identity((fixed, -moved @ gains["W"]), ((mixed,),), outputs)] if fixed_weight else found
+
+
+def printed_allowances(
+    plant: DescriptorSystem,
+    work: DescriptorSystem,
+    observer: LinearObserver,
+    gains: Mapping[str, FloatArray],
+    scaling: Scaling,
+    digits: int,
+) -> dict[str, FloatArray]:
+    """Return, by identity, what the rounding of the gains can add to each of its entries, to first order."""
+    half_a_unit = 0.5 * 10.0**-digits
+    equations = Equations.of(plant, work, observer.fault_delays)
+
+    def totals(letter: str = "", move: FloatArray | None = None) -> dict[str, FloatArray]:
+        moved = dict(gains) if move is None else {**gains, letter: gains[letter] + move}
+        built = LinearObserver(**{**observer.as_dict(), **equations.realised(moved)})
+        tracking = equations.tracking(moved["T"])
+        lag = tracking.shape[1] // plant.nx - 1
+        errors = ErrorModel(plant, built, tracking, lag=lag)
+        found = gain_identities(work, moved, equations, scaling)
+        for name, steps in fault_identities(errors, built.fault_delays).items():
+            found |= {step_key(name, step): identity for step, identity in enumerate(steps)}
+        return {**tracking_totals(errors), **{name: identity.total for name, identity in found.items()}}
+
+    centre = totals()
+    found = {name: np.zeros_like(total) for name, total in centre.items()}
+    for letter in PRINTED:
+        for index in np.ndindex(gains[letter].shape):
+            move = np.zeros_like(gains[letter])
+            move[index] = half_a_unit
+            more, less = totals(letter, move), totals(letter, -move)
+            for name, middle in centre.items():
+                found[name] += np.maximum(np.abs(more[name] - middle), np.abs(less[name] - middle))
+    return found

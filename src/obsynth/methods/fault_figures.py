@@ -1,0 +1,155 @@
+"""What a design does to faults, unknown inputs and noise, in closed form on one clock; no random numbers.
+
+The plant is sampled, with faults and unknown inputs held between samples; the error of an estimate is followed from
+one impulse at each input, so that plants with modes on the boundary need no stationary covariance.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.elimination import eliminate_algebraic_states
+from obsynth.plants.transformations.sampling import discretise
+from obsynth.simulation.linear import stabilising_feedback
+
+#: Shares of a step at which its delay is read.
+DELAY_SHARE, NEARLY_ALL = 0.5, 0.9
+
+#: A fault estimate off its step by more than this at the horizon did not reach it.
+REACHED_STEP = 0.1
+
+#: An unstable plant that grows by more than this is held by a feedback; one without inputs is followed until it has
+#: grown by the second, beyond which differences of its outputs are rounding.
+HELD_GROWTH, LARGEST_STEP_GROWTH = 1e3, 1e6
+
+
+@dataclass(frozen=True)
+class FaultFigures:
+    """What becomes of a unit step of one fault, of noise and of unknown inputs, in its estimate.
+
+    Parameters
+    ----------
+    fault : str
+        The fault.
+    half, most : float, seconds
+        Time until the estimate of a unit step first shows 50 and 90 % of it; infinite where it never does.
+    at_horizon, peak : float
+        The estimate of a unit step at the horizon, and its largest absolute value before.
+    horizon : float, seconds
+        How long the step was followed: a shorter time where the plant is unstable and nothing holds it.
+    deviation : float
+        Standard deviation under the stated noise.
+    unknown_input_gain : float
+        Largest gain of a held sinusoidal unknown input to the estimate, per unit of the input.
+    """
+
+    fault: str
+    half: float
+    most: float
+    at_horizon: float
+    peak: float
+    horizon: float
+    deviation: float
+    unknown_input_gain: float
+
+    @property
+    def leak(self) -> float:
+        """Deprecated: `unknown_input_gain`."""
+        warnings.warn("leak is now unknown_input_gain.", DeprecationWarning, stacklevel=2)
+        return self.unknown_input_gain
+
+    @property
+    def reaches(self) -> bool:
+        """Whether a step is there at the horizon."""
+        return bool(abs(self.at_horizon - 1.0) <= REACHED_STEP and np.isfinite(self.most))
+
+
+def on_the_clock(plant: DescriptorSystem, sample_time: float) -> DescriptorSystem:
+    """Return the plant sampled, in its own time where it is so already, without algebraic states."""
+    if plant.dt > 0.0:
+        return eliminate_algebraic_states(plant).plant
+    return discretise(plant, sample_time).plant
+
+
+def held(plant: DescriptorSystem, steps: int) -> tuple[int, FloatArray]:
+    """Return for how many samples, and with which ``feedback (nu, nx)``, ``u = -feedback x``, a sampled plant
+    ``(E = I)`` is kept in bounds: with none where it hardly grows; with no input, for a shorter time."""
+    nothing = np.zeros((plant.nu, plant.nx))
+    rate = float(np.log(max(float(np.max(np.abs(np.linalg.eigvals(plant.A)), initial=0.0)), 1.0)))
+    if rate * steps <= np.log(HELD_GROWTH):
+        return steps, nothing
+    try:
+        found = stabilising_feedback(plant)
+        if float(np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ found)))) < 1.0:
+            return steps, found
+    except PreconditionError:
+        pass
+    return max(int(np.log(LARGEST_STEP_GROWTH) / rate), 2), nothing
+
+
+def step_responses(
+    plant: DescriptorSystem, observer: LinearObserver, steps: int, feedback: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Return responses to impulses ``(steps, faults, nf + nd + nw)`` and to steps ``(steps, faults, nf)``."""
+    order, rows = observer.order, observer.fault_rows
+    # Where no noise is stated, every output has one of its own, of deviation one.
+    silent = not plant.Dw.any() and not plant.Bw.any()
+    driven, measured = (np.zeros((plant.nx, plant.ny)), np.eye(plant.ny)) if silent else (plant.Bw, plant.Dw)
+    inputs = np.hstack([plant.Bf, plant.Bd, driven])
+    direct = np.hstack([plant.Df, plant.Dd, measured])
+    # A feedback u = -feedback x is known to the observer: it changes no estimate, and keeps numbers small.
+    gain = np.zeros((plant.nu, plant.nx)) if feedback is None else feedback
+    seen = plant.C - plant.D @ gain
+    moved, into = plant.A - plant.B @ gain, observer.By @ seen - observer.Bu @ gain
+    a = np.block([[moved, np.zeros((plant.nx, order))], [into, observer.Az]])
+    b = np.vstack([inputs, observer.By @ direct])
+    c = np.hstack([observer.Dy[rows] @ seen - observer.Du[rows] @ gain, observer.Cz[rows]])
+    found = np.empty((steps, len(c), b.shape[1]))
+    found[0] = observer.Dy[rows] @ direct
+    state = b
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(1, steps):
+            found[k] = c @ state
+            state = a @ state
+    return found, np.cumsum(found[:, :, : plant.nf], axis=0)
+
+
+def fault_figures(plant: DescriptorSystem, observer: LinearObserver, steps: int) -> tuple[FaultFigures, ...]:
+    """Return the figures of every fault that a sampled observer estimates on a sampled plant ``(E = I)``."""
+    impulse, step = step_responses(plant, observer, *held(plant, steps))
+    unknown = impulse[:, :, plant.nf : plant.nf + plant.nd]
+    noise = impulse[:, :, plant.nf + plant.nd :]
+    # An observer that runs away has figures beyond all numbers, and needs no warning besides.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return tuple(_figures(plant, observer, step, unknown, noise))
+
+
+def _figures(
+    plant: DescriptorSystem, observer: LinearObserver, step: FloatArray, unknown: FloatArray, noise: FloatArray
+) -> Iterator[FaultFigures]:
+    for row, name in enumerate(observer.fault_names):
+        own = step[:, row, plant.fault_names.index(name)]
+        gains = np.abs(np.fft.rfft(unknown[:, row], axis=0))
+        yield FaultFigures(
+            name,
+            _first(own >= DELAY_SHARE, plant.dt),
+            _first(own >= NEARLY_ALL, plant.dt),
+            float(own[-1]),
+            float(np.max(np.abs(own))),
+            len(own) * plant.dt,
+            float(np.sqrt(np.sum(noise[:, row] ** 2))),
+            float(np.max(gains, initial=0.0)),
+        )
+
+
+def _first(reached: NDArray[np.bool_], dt: float) -> float:
+    return float(np.argmax(reached)) * dt if np.any(reached) else float("inf")

@@ -1,0 +1,207 @@
+"""Random-walk intensity of a fault that is not stated: slowly, but so that a step is seen in the plant's own time.
+
+And the deviation against the delay: one Riccati equation for each walk, as smoothing over L samples takes ``sum_j G_j C
+M_j`` from the error covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from obsynth.errors import ObsynthError, SolverError
+from obsynth.methods.functional_filter.kalman_gain import (
+    ASKED_AT,
+    LEAST_SAMPLES,
+    RATE_REACHED,
+    STEP_TIME_CONSTANTS,
+    FilterModel,
+    KalmanGain,
+    filter_model,
+    kalman_gain,
+)
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import decide_rank
+from obsynth.numerics.spectra import moving_speeds
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.faults import exosystem
+from obsynth.plants.pencil import structure_of
+from obsynth.plants.plant_units import PlantUnits
+from obsynth.verification.inequalities import slowest_decay
+
+#: Where no walk shows a step in time: walks that miss it by so much more than the best are as good.
+AS_CLOSE = 0.05
+
+#: A walk that misses a step by more shows nothing of it in time: how much more than that is a matter of rounding.
+#: Where no walk shows more, it has so many times as long, this often: the slowest of all would show nothing ever, and
+#: is taken only where rounding hides what faster ones show.
+NOTHING_SHOWN, LONGER, MOST_LONGER = 0.5, 2.0, 55
+
+#: Errors that need longer than so many settling times to decay would stay in any run: the gain moves such poles.
+FOR_GOOD = 1e5
+
+#: Decades of the search around a rate of the size of the noise, and its steps per decade at the end.
+DECADES, RATE_BISECTIONS = 8, 9
+
+
+#: Lags in samples, and walks relative to the middle one.
+TRIED_LAGS, FACTORS = (0, 1, 2, 5, 10, 25), (0.3, 1.0, 3.0)
+
+
+def settling_time(plant: DescriptorSystem) -> float:
+    """Return the time in seconds after which a step of a fault should be seen."""
+    own = 1.0 / (plant.dt or PlantUnits.of(plant).time)
+    alive = np.sort(moving_speeds(structure_of(plant).finite_eigenvalues, plant.dt, own))
+    # The median, for which numpy would load its masked arrays.
+    middle = 0.5 * (alive[(alive.size - 1) // 2] + alive[alive.size // 2]) if alive.size else 0.0
+    wanted = STEP_TIME_CONSTANTS / float(middle) if alive.size else max(plant.dt, 1.0) * 10.0
+    return max(wanted, LEAST_SAMPLES * plant.dt)
+
+
+def default_rates(
+    model: FilterModel, seconds: float, *, lag: int, longer: int = MOST_LONGER
+) -> tuple[FloatArray, KalmanGain]:
+    """Return the slowest walk of all fault models with which steps are seen in time, and its gain."""
+    states = model.drive.shape[1]
+    natural = np.max(np.abs(model.estimate[:, model.order :]), axis=0, initial=0.0)
+    sizes = np.ones(states)
+    for row, size in zip(model.estimate[:, model.order :], model.fault_sizes, strict=True):
+        sizes[row != 0.0] = max(float(size), np.finfo(np.float64).tiny)
+    noise = max(float(np.max(np.abs(model.M), initial=0.0)), float(np.max(np.abs(model.N), initial=0.0)))
+    noise = noise or 1.0  # a fault that equations without noise tell
+    unit = np.where(natural > 0.0, noise / sizes, noise / float(np.max(sizes, initial=1.0)))
+    tried: dict[float, KalmanGain | None] = {}
+
+    def gain(exponent: float) -> KalmanGain | None:
+        if exponent not in tried:
+            try:
+                tried[exponent] = kalman_gain(model, 10.0**exponent * unit, lag=lag)
+            except SolverError:
+                tried[exponent] = None
+        return tried[exponent]
+
+    def missed(exponent: float, seconds: float) -> float:
+        found = gain(exponent)
+        return np.inf if found is None else step_misses(model, found, seconds)
+
+    exponents = [float(e) for e in range(-DECADES, DECADES + 1)]
+    for waited in range(longer + 1):
+        seconds *= LONGER if waited else 1.0
+        misses: list[float] = []
+        for exponent in exponents:
+            misses.append(missed(exponent, seconds))
+            if misses[-1] <= RATE_REACHED:
+                break
+        least = min(misses)
+        if least <= NOTHING_SHOWN:
+            break
+    if not any(found is not None for found in tried.values()):
+        raise SolverError("No random-walk intensity of the fault gives a stable filter: give fault_rate, or poles.")
+    high = exponents[len(misses) - 1]
+    if least > RATE_REACHED:
+        # Some zero keeps every estimate from a step for long: the slowest walk that comes about as close as any.
+        close = np.inf if least > NOTHING_SHOWN else least + AS_CLOSE
+        high = next(e for e, miss in zip(exponents, misses, strict=True) if tried[e] is not None and miss <= close)
+    else:
+        low = high - 1.0
+        for _ in range(RATE_BISECTIONS):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if missed(middle, seconds) <= RATE_REACHED else (middle, high)
+    walks = 10.0**high * unit
+    found = _forgetting(model, walks, _known(gain(high)), seconds, lag)
+    return walks, replace(found, seen=(seconds, step_misses(model, found, seconds)))
+
+
+def _forgetting(model: FilterModel, walks: FloatArray, found: KalmanGain, seconds: float, lag: int) -> KalmanGain:
+    """Return the gain, or one for the same walks whose errors do not stay for good, where there is one."""
+    slowest = 1.0 / (FOR_GOOD * seconds)
+    if not slowest_decay(model.A - found.K @ model.C, model.dt) < slowest:
+        return found
+    try:
+        return kalman_gain(model, walks, lag=lag, decay=slowest)
+    except SolverError:
+        return found
+
+
+def step_misses(model: FilterModel, gain: KalmanGain, seconds: float) -> float:
+    """Return how far estimates of a unit step of each fault are from it at and after a time, at worst."""
+    a = model.A - gain.K @ model.C
+    worst = 0.0
+    start = model.drive @ np.linalg.pinv(model.estimate[:, model.order :])
+    for share in ASKED_AT:
+        error = model.estimate @ _after(a, share * seconds, model.dt) @ start
+        worst = max(worst, float(np.max(np.abs(error), initial=0.0)))
+    return worst
+
+
+def _after(a: FloatArray, seconds: float, dt: float) -> FloatArray:
+    from scipy.linalg import expm
+
+    if dt > 0.0:
+        return np.asarray(np.linalg.matrix_power(a, max(round(seconds / dt), 1)))
+    return np.asarray(expm(a * seconds))
+
+
+def _known(gain: KalmanGain | None) -> KalmanGain:
+    if gain is None:
+        raise SolverError("The Riccati equation of the filter has no stable solution: give fault_rate, or poles.")
+    return gain
+
+
+@dataclass(frozen=True, eq=False)
+class DelayCurve:
+    """Fields: fault; rates: walks per sample; lags: samples; deviations ``(rates, lags)`` of the delayed error."""
+
+    fault: str
+    rates: tuple[float, ...]
+    lags: tuple[int, ...]
+    deviations: FloatArray
+
+    @property
+    def sentence(self) -> str:
+        """What the first sample of delay is worth at the middle walk, and five of them."""
+        row = self.deviations[len(self.rates) // 2]
+        rate = self.rates[len(self.rates) // 2]
+        at = {lag: float(value) for lag, value in zip(self.lags, row, strict=True)}
+        return (
+            f"{self.fault}: for a random-walk intensity of {rate:.3g} per sample one sample of delay takes the "
+            "deviation from "
+            f"{at[0]:.3g} to {at[1]:.3g}, five samples to {at[5]:.3g}."
+        )
+
+
+def delay_curve(plant: DescriptorSystem, fault: int, rate: float | None = None) -> DelayCurve | None:
+    """Return the curve of a fault of a sampled plant, free of all others; ``None`` where it cannot be estimated."""
+    if not plant.dt > 0.0 or not plant.nw:
+        return None
+    removed = [j for j in range(plant.nf) if j != fault]
+    model = filter_model(plant, exosystem("step", plant.fault_names, plant.dt), removed=removed, faults=[fault])
+    if not len(model.M) or decide_rank(model.M, expected=len(model.M)).rank < len(model.M):
+        return None
+    try:
+        middle = float(default_rates(model, settling_time(plant), lag=0)[0][0]) if rate is None else rate
+        rows = []
+        for factor in FACTORS:
+            gain = kalman_gain(model, np.array([factor * middle]), lag=max(TRIED_LAGS))
+            if gain.covariance is None:
+                return None
+            closed = model.A - gain.K @ model.C
+            rows.append(_smoothed(gain.covariance, model.C, closed, model.estimate, gain.lag))
+    except ObsynthError:
+        return None
+    rates = tuple(factor * middle for factor in FACTORS)
+    return DelayCurve(plant.fault_names[fault], rates, TRIED_LAGS, np.array(rows))
+
+
+def _smoothed(
+    p: FloatArray, c: FloatArray, closed: FloatArray, estimate: FloatArray, gains: Sequence[FloatArray]
+) -> list[float]:
+    """Return the deviation of the estimate at each of `TRIED_LAGS`."""
+    known, moved, found = np.zeros_like(p), p.copy(), []
+    for gain in gains[: max(TRIED_LAGS) + 1]:
+        known = known + gain @ c @ moved
+        moved = closed @ moved
+        found.append(float(np.sqrt(max((estimate @ (p - known) @ estimate.T)[0, 0], 0.0))))
+    return [found[lag] for lag in TRIED_LAGS]

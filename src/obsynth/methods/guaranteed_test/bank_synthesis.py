@@ -1,0 +1,167 @@
+"""Finding a bank of guaranteed tests: for each fault the smallest group that can be isolated, and the least
+threshold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.existence.condition import Condition, require_all
+from obsynth.errors import SolverError
+from obsynth.methods.guaranteed_test.bank import (
+    BANK_GROUPS,
+    BANK_PAIRS,
+    BY_TEST,
+    PAIR_MULTIPLIERS,
+    PAIR_RADIUS,
+    blind_to,
+    blind_to_one,
+    joined,
+    pairs_of,
+    proved_hidden,
+)
+from obsynth.methods.guaranteed_test.existence import conditions, told
+from obsynth.methods.guaranteed_test.problem import problem_of
+from obsynth.methods.guaranteed_test.synthesis import TRADE_OFF, chosen_samples, padded, synthesise
+from obsynth.methods.method import Synthesis, silent
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.design import Certificate
+
+#: Room for what another processor finds for the remainder: a share, and roundings of the signals.
+SHARE_ROOM, REMAINDER_ROUNDINGS = 1e-6, 1024.0
+
+
+def synthesise_bank(plant: DescriptorSystem, asked: Any, *, progress: Callable[[str], None]) -> Synthesis:
+    """Return one observer with a row for each fault, its certificate, and what an alarm of each row means."""
+    require_all(conditions(plant, replace(asked, isolate=False, fault=plant.fault_names[0]), with_windows=False))
+    progress("searching for the smallest groups that can be isolated")
+    found = [_smallest(plant, asked, fault) for fault in range(plant.nf)]
+    groups, lags, reasons = zip(*found, strict=True)
+    if asked.course == "any" and asked.lag is None:
+        asked = replace(asked, lag=max(lags))
+    tests = [blind_to(asked, plant, fault, group) for fault, group in enumerate(groups)]
+    progress("searching for the least number of samples")
+    tables = [_table(plant, test) for test in tests]
+    samples = max(samples for samples, _ in tables)
+    asked = replace(asked, samples=samples)
+    progress(f"proving the thresholds on {samples} samples")
+    made = [synthesise(plant, replace(test, samples=samples, lag=asked.lag), progress=silent) for test in tests]
+    pairs = _pairs(plant, asked)
+    matrices = _stacked([dict(test.certificate.matrices) for test in made]) | pairs
+    matrices |= {
+        BANK_GROUPS: np.array([[float(k in group) for k in range(plant.nf)] for group in groups]),
+        TRADE_OFF: np.column_stack([tables[0][1][:, 0], *[table[:, 1] for _, table in tables]]),
+    }
+    claims = {
+        f"{name}[{fault}]": value
+        for fault, test in zip(plant.fault_names, made, strict=True)
+        for name, value in test.certificate.claims.items()
+    }
+    options = {**made[0].options, "isolate": True, "fault": None, "free": "others"}
+    gains = {
+        f"{name}[{fault}]": gain
+        for fault, test in zip(plant.fault_names, made, strict=True)
+        for name, gain in test.gains.items()
+    }
+    observer = joined([test.observer for test in made], plant.fault_names)  # type: ignore[misc]
+    notes = tuple(_bank_notes(plant, groups, reasons, claims, matrices[BANK_PAIRS]))
+    return Synthesis(options, gains, observer, Certificate(matrices, claims), notes=notes)
+
+
+def _smallest(plant: DescriptorSystem, asked: Any, fault: int) -> tuple[tuple[int, ...], int, str]:
+    """Return the smallest group with this fault that can be isolated, the lag, and why there is no smaller one."""
+    others = [other for other in range(plant.nf) if other != fault]
+    why, first = "", None
+    for size in range(len(others) + 1):
+        best: tuple[float, tuple[int, ...], int] | None = None
+        candidates = list(combinations(others, size))
+        for chosen in candidates:
+            group = tuple(sorted((fault, *chosen)))
+            own = blind_to(asked, plant, fault, group)
+            condition, lag = told(problem_of(plant, own), own)
+            if not condition.holds:
+                first = first or condition
+                why = why or condition.detail
+                _require_proved(plant, replace(own, lag=own.lag if own.course != "any" else lag), condition)
+                continue
+            width = _table(plant, replace(own, lag=lag or own.lag))[1][-1, 1] if len(candidates) > 1 else 0.0
+            if best is None or width < best[0]:
+                best = (float(width), group, lag)
+        if best is not None:
+            return best[1], best[2], why
+    if first is not None:
+        first.require()
+    raise SolverError(f"No test of {plant.fault_names[fault]} was found: the result is inconclusive.")
+
+
+def _require_proved(plant: DescriptorSystem, own: Any, condition: Condition) -> None:
+    if not proved_hidden(plant, own):
+        raise SolverError(
+            f"Whether {own.fault} can be distinguished from {', '.join(own.free)} is inconclusive: {condition.detail}"
+        )
+
+
+def _table(plant: DescriptorSystem, own: Any) -> tuple[int, FloatArray]:
+    """Return the number of samples of a test alone, and its table of samples against thresholds."""
+    samples, table, _ = chosen_samples(problem_of(plant, own), own, None)
+    return samples, table
+
+
+def _pairs(plant: DescriptorSystem, asked: Any) -> dict[str, FloatArray]:
+    """Return the thresholds of tests that are blind to one other fault alone, infinite where there are none."""
+    pairs = pairs_of(plant)
+    table, proofs = np.zeros((plant.nf, plant.nf)), []
+    for one, other in pairs:
+        own = blind_to_one(asked, plant, one, other)
+        condition, _ = told(problem_of(plant, own), own)
+        if condition.holds:
+            made = synthesise(plant, own, progress=silent)
+            table[one, other] = made.certificate.claims["threshold"]
+            proofs.append(made.certificate.matrices)
+        else:
+            _require_proved(plant, own, condition)
+            table[one, other] = np.inf
+            proofs.append({"multipliers": np.zeros(1), "multiplier_radius": np.zeros(1)})
+    if not pairs:
+        return {BANK_PAIRS: table}
+    stacked = _stacked([dict(proof) for proof in proofs])
+    return {BANK_PAIRS: table, PAIR_MULTIPLIERS: stacked["multipliers"], PAIR_RADIUS: stacked["multiplier_radius"]}
+
+
+def _stacked(given: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:
+    """Return by name a row for each test, as wide as the widest."""
+    found = {}
+    for name in BY_TEST:
+        if not any(name in matrices for matrices in given):
+            continue
+        found[name] = padded([np.ravel(matrices.get(name, np.zeros(1))) for matrices in given])
+    return found
+
+
+def _bank_notes(
+    plant: DescriptorSystem, groups: Any, reasons: Any, claims: Mapping[str, float], pairs: FloatArray
+) -> Any:
+    names = plant.fault_names
+    for fault, (group, why) in enumerate(zip(groups, reasons, strict=True)):
+        size, found = claims[f"threshold[{names[fault]}]"], claims[f"surely_found[{names[fault]}]"]
+        meant = " or ".join(names[k] for k in group)
+        yield (
+            f"An alarm of {names[fault]} means {meant}, as long as the bounds hold: threshold {size:.6g}, "
+            f"{found:.6g} is certain to be detected.{f' No smaller group can be isolated: {why}' if why else ''}"
+        )
+        listed = [
+            f"{names[other]}: {'impossible' if np.isinf(pairs[fault, other]) else f'{pairs[fault, other]:.6g}'}"
+            for other in range(plant.nf)
+            if other != fault
+        ]
+        if len(listed) > 1:
+            yield (
+                f"Thresholds of {names[fault]} by a test that is insensitive to one other fault alone: "
+                f"{'; '.join(listed)}."
+            )

@@ -1,0 +1,219 @@
+"""Whether a window tells a fault: proved by numbers that hide it, or by a test that finds it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from obsynth.analysis.existence.condition import Condition
+from obsynth.errors import SpecError
+from obsynth.methods.guaranteed_test.condensed import Condensed
+from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.guaranteed_test.problem import Problem, missing_bounds, problem_of, samples_given
+from obsynth.methods.guaranteed_test.proofs import proved_ray, repaired_multipliers
+from obsynth.methods.guaranteed_test.windows import Window, fault_names
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+
+SOURCE = "duality of linear programmes"
+
+#: Values of a hidden course below this share of its largest are not told.
+TOLD_COURSE = 1e-6
+
+
+#: What least squares may leave of an equation, as a share of the fault's own weight.
+SEEN = 1e-6
+
+
+#: More states than these are not listed.
+MOST_NAMED_STATES = 8
+
+
+def conditions(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Asked, *, with_windows: bool = True
+) -> tuple[Condition, ...]:
+    """Return the conditions in order; ``with_windows``: also whether a window tells the fault, if the others hold."""
+    first: tuple[Condition, ...] = ()
+    names, none = fault_names(plant), "the plant has no parameter (Phi, Psi)."
+    named = asked.fault is not None or len(names) == 1
+    if isinstance(plant, DescriptorSystem):
+        detail = "the plant is continuous: sample it (transform: sample_time, obsynth.discretise)."
+        sampled = plant.dt > 0.0
+        first = (Condition("discrete time", "dt > 0", sampled, plant.dt, 0.0, SOURCE, "" if sampled else detail),)
+        named, none = named if not asked.isolate else plant.nf > 0, "the plant has no fault (Bf, Df)."
+    advice = f"name one of {', '.join(names)} (fault)." if names else none
+    lacking = list(missing_bounds(plant, asked))
+    first = (
+        *first,
+        Condition(
+            "fault named",
+            "one fault is tested for",
+            named,
+            float(len(names)),
+            1.0,
+            SOURCE,
+            "" if named else advice,
+        ),
+        Condition(
+            "bounds stated",
+            "disturbances and noise have bounds",
+            not lacking,
+            float(len(lacking)),
+            0.0,
+            SOURCE,
+            " ".join(lacking),
+        ),
+    )
+    if not all(condition.holds for condition in first) or not with_windows:
+        return first
+    # Of a bank: that a fault is told where no other is there; some group then tells it.
+    alone = [replace(asked, isolate=False, fault=name, free="none") for name in names]
+    each = alone if asked.isolate and isinstance(plant, DescriptorSystem) else [asked]
+    return (*first, *(told(problem_of(plant, own), own)[0] for own in each))
+
+
+def told(problem: Problem, asked: Asked) -> tuple[Condition, int]:
+    """Return the condition that some window tells the fault, and the lag with which it does."""
+    lags = [problem.question.lag]
+    if problem.question.course == "any" and asked.lag is None:
+        lags = list(range(problem.plant.nx + 2))
+    if isinstance(problem.plant, TimeVaryingDescriptorSystem):
+        lags = [lag for lag in lags if lag < _samples_by_row(problem, asked)] or lags[:1]
+    for lag in lags:
+        for window in _decisive(problem, asked, lag):
+            if has_test(window):
+                return told_condition(window, True, ""), lag
+    return told_condition(window, False, _why(problem, asked, window)), lags[-1]
+
+
+def _decisive(problem: Problem, asked: Asked, lag: int) -> Iterator[Window]:
+    """Yield the windows of which one has a test where there is any."""
+    if isinstance(problem.plant, TimeVaryingDescriptorSystem):
+        samples = _samples_by_row(problem, asked)
+        rows = problem.tried(samples)
+        if not rows:
+            raise SpecError(
+                f"The plant's horizon of {problem.horizon} steps has no window of {samples} samples (k = 1 is the "
+                "first): give fewer samples, or extend the model.",
+                path="method.options.samples",
+            )
+        yield from (problem.window(samples, lag=lag, row=row) for row in reversed(rows))
+        return
+    most = samples_decided_on(problem, asked, lag)
+    least = max(problem.question.before, lag) + 2
+    # A test on fewer samples is one on more: short windows are decided in no time.
+    doubled = [least * 2**k for k in range(most.bit_length())]
+    yield from (problem.window(samples, lag=lag) for samples in (*(tried for tried in doubled if tried < most), most))
+
+
+def _samples_by_row(problem: Problem, asked: Asked) -> int:
+    """Return the samples on which it is decided where each row has a window of its own."""
+    given = samples_given(asked)
+    return problem.ladder()[-1] if given == "auto" else int(given)
+
+
+def samples_decided_on(problem: Problem, asked: Asked, lag: int) -> int:
+    """Return the samples on which it is decided."""
+    enough = problem.enough(lag)
+    if asked.samples != "auto":
+        return int(min(max(asked.samples, lag + 1), max(enough, lag + 1)))
+    if asked.after is not None:
+        return min(asked.before + asked.after, enough)
+    return enough
+
+
+def has_test(window: Window) -> bool:
+    """Whether exact multipliers see the fault and no free column."""
+    multipliers = least_multipliers(window)
+    if multipliers is None:
+        return False
+    return repaired_multipliers(window, multipliers, refine=True) is not None
+
+
+def least_multipliers(window: Window) -> FloatArray | None:
+    """Return multipliers that see theta with weight one and no free column; ``None`` where least squares have none."""
+    condensed = Condensed.of(window)
+    if condensed is not None:
+        return condensed.least_weights()
+    rows, columns = window.scales
+    told = np.flatnonzero(window.free | (np.arange(len(window.bar)) == 0))
+    matrix = np.ldexp(np.ldexp(window.matrix[:, told].toarray(), columns[told]), rows[:, None]).T
+    wanted = np.zeros(len(told))
+    wanted[0] = float(np.ldexp(1.0, int(columns[0])))
+    found = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
+    if np.max(np.abs(matrix @ found - wanted)) > SEEN * wanted[0]:
+        return None
+    return np.asarray(np.ldexp(found, rows))
+
+
+def told_condition(window: Window, holds: bool, detail: str) -> Condition:
+    """Return the condition that a window tells the fault, in words."""
+    fault = fault_names(window.model.plant)[window.question.fault]
+    return Condition(
+        "fault detectable",
+        f"{fault} changes the samples in a way that no free signal does",
+        holds,
+        float(holds),
+        1.0,
+        SOURCE,
+        detail,
+        signals=() if holds else (fault,),
+    )
+
+
+def _why(problem: Problem, asked: Asked, window: Window) -> str:
+    """Return in words what hides the fault."""
+    fault, varies = problem.fault, isinstance(problem.plant, TimeVaryingDescriptorSystem)
+    found = proved_ray(window)
+    samples = window.question.samples
+    if found is None and varies:
+        return (
+            f"no weights of {samples} samples respond to {fault} and to nothing that is free at the rows that were "
+            "tried."
+        )
+    if found is None:
+        return (
+            f"no test on {samples} samples responds to {fault} and to nothing that is free, but a time course that "
+            "hides it could not be "
+            "proved: this is at the edge of double precision. Bounds of the states (state_bounds) help, even wide ones."
+        )
+    where = f"the window that ends at k = {samples}" if varies else f"{samples} samples"
+    text = f"{hidden(window, found)} (proved for {where}: every equation holds exactly)."
+    if varies:
+        return text
+    lag = window.question.lag
+    if problem.question.course == "any" and asked.lag is not None:
+        for more in range(lag + 1, problem.plant.nx + 2):
+            if has_test(problem.window(max(samples, problem.enough(more)), lag=more)):
+                return f"{text} The least lag for which there is a test is {more}."
+    if asked.samples != "auto" and samples < problem.enough(lag):
+        for more in range(samples + 1, problem.enough(lag) + 1):
+            if has_test(problem.window(more, lag=lag)):
+                return f"{text} The least number of samples for which there is a test is {more}."
+    return text
+
+
+def hidden(window: Window, point: FloatArray) -> str:
+    """Return which signals together look like nothing."""
+    plant, question = window.model.plant, window.question
+    names = fault_names(plant)
+    fault = names[question.fault]
+    largest = float(np.max(np.abs(point)))
+    others = []
+    for label, value in zip(window.labels, point, strict=True):
+        if label[0] == "f" and label[2] != question.fault and abs(value) > TOLD_COURSE * largest:
+            name = names[label[2]]
+            if name not in others:
+                others.append(name)
+    states = {
+        plant.state_names[label[2]]
+        for label, value in zip(window.labels, point, strict=True)
+        if label[0] == "x" and abs(value) > TOLD_COURSE * largest
+    }
+    moving = f", while {', '.join(sorted(states))} move" if states and len(states) <= MOST_NAMED_STATES else ""
+    if others:
+        return f"{fault} and {' and '.join(others)} together give the same outputs as neither of them{moving}"
+    return f"{fault} gives the same outputs as no fault{moving or ', from another start of the states'}"

@@ -1,0 +1,152 @@
+"""Guaranteed tests of nonlinear plants: of the sampled linear model, with what it leaves out as a disturbance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.existence.condition import Condition
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.methods.guaranteed_test.bank_synthesis import REMAINDER_ROUNDINGS, SHARE_ROOM
+from obsynth.methods.guaranteed_test.existence import SOURCE, conditions
+from obsynth.methods.guaranteed_test.problem import between, fault_of
+from obsynth.methods.guaranteed_test.synthesis import synthesise
+from obsynth.methods.method import Synthesis
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.remainders import bounded_model, remainder_names
+from obsynth.proofs.balls import UNIT_ROUNDOFF
+from obsynth.results.design import Certificate
+
+
+def nonlinear_conditions(model: DAEModel, asked: Any) -> tuple[Condition, ...]:
+    """Return the conditions: a region and a sample time are stated; then those of the linear model."""
+    lacking = [name for name in ("region", "sample_time") if getattr(asked, name) is None]
+    stated = Condition(
+        "region stated",
+        "a nonlinear plant stays in a region",
+        not lacking,
+        float(len(lacking)),
+        0.0,
+        SOURCE,
+        "" if not lacking else f"give {' and '.join(lacking)}: the remainder of the linear model is bounded there.",
+    )
+    if lacking:
+        return (stated,)
+    return (stated, *conditions(*_linear(model, asked)))
+
+
+def _linear(model: DAEModel, asked: Any) -> tuple[DescriptorSystem, Any]:
+    """Return the sampled linear model with its remainder, and what is asked of it."""
+    if asked.isolate:
+        raise SpecError(
+            "isolate is for linear plants: design one test for each fault, with the others free.",
+            path="method.options.isolate",
+        )
+    if asked.model is not None:
+        raise SpecError("model is written by obsynth: leave it out.", path="method.options.model")
+    if not isinstance(asked.noise_bound, Mapping):
+        raise SpecError(
+            "noise_bound: a nonlinear plant states no deviations; give the bound of each output by name: "
+            f"{', '.join(model.output_names)}.",
+            path="method.options.noise_bound",
+        )
+    listed = asked.free if not isinstance(asked.free, str) or asked.free in model.parameters else ()
+    others = [listed] if isinstance(listed, str) else list(listed or ())
+    fault = model.parameter_names[fault_of(model.parameter_names, asked.fault)]
+    wrong = [name for name in others if name not in model.parameters or name == fault]
+    if wrong:
+        raise SpecError(
+            f"free names {', '.join(map(str, wrong))}: the other parameters are "
+            f"{', '.join(name for name in model.parameters if name != fault) or 'none'}.",
+            path="method.options.free",
+        )
+    given = asked.disturbance_bounds or {}
+    if not isinstance(given, Mapping) or any(name not in model.inputs for name in given):
+        raise SpecError(
+            f"disturbance_bounds of a nonlinear plant are by name, of the inputs that are not known, among "
+            f"{', '.join(model.inputs) or 'none'}; the others are known.",
+            path="method.options.disturbance_bounds",
+        )
+    linear, bounds = bounded_model(
+        model, asked.region, asked.sample_time, faults=[fault, *others], disturbances=list(given), given=asked.given
+    )
+    _require_inside(linear, given, asked.region)
+    sizes = {
+        name: max(abs(float(end)) for end in asked.region.get(name, (1.0, 1.0)))
+        for name in (*model.state_names, *model.input_names)
+    }
+    largest = max(sizes.values(), default=1.0)
+    room = {
+        name: value * (1.0 + SHARE_ROOM) + REMAINDER_ROUNDINGS * UNIT_ROUNDOFF * largest
+        for name, value in bounds.items()
+    }
+    own = replace(
+        asked,
+        fault=fault,
+        free=others or "none",
+        disturbance_bounds={**given, **room},
+        region=None,
+        sample_time=None,
+        given=None,
+    )
+    return linear, own
+
+
+def _require_inside(plant: DescriptorSystem, given: Mapping[str, Any], region: Mapping[str, Any]) -> None:
+    """Raise `SpecError` where an unknown input may leave the region."""
+    names = tuple(given)
+    half, middle = between(given, names, "disturbance_bounds", every=True)
+    for name, size, at in zip(names, half.tolist(), middle.tolist(), strict=True):
+        point = plant.operating_point.get(name, 0.0)
+        if not region[name][0] <= point + at - size or not point + at + size <= region[name][1]:
+            raise SpecError(
+                f"region of {name} is {list(region[name])}, but its bounds reach from {point + at - size:.6g} to "
+                f"{point + at + size:.6g}: widen the region.",
+                path="method.options.region",
+            )
+
+
+def synthesise_nonlinear(model: DAEModel, asked: Any, *, progress: Callable[[str], None]) -> Synthesis:
+    """Return the test of the linear model with its remainder; what no test can do is not claimed."""
+    lacking = [name for name in ("region", "sample_time") if getattr(asked, name) is None]
+    if lacking:
+        raise PreconditionError(
+            f"A nonlinear plant needs {' and '.join(lacking)}: the remainder of its linear model in the region counts "
+            "as a disturbance. Or linearise and sample it (obsynth.linearise, obsynth.discretise): the test is then "
+            "as good as the linear model.",
+            condition="region stated",
+        )
+    progress("bounding the remainder of the linear model")
+    plant, own = _linear(model, asked)
+    found = synthesise(plant, own, progress=progress)
+    kept = {name: part for name, part in found.certificate.matrices.items() if not name.startswith("witness")}
+    claims = {name: value for name, value in found.certificate.claims.items() if name != "least"}
+    region = {name: [float(end) for end in ends] for name, ends in asked.region.items()}
+    options = {
+        **found.options,
+        "region": region,
+        "sample_time": asked.sample_time,
+        "given": asked.given,
+        "model": model.as_dict(),
+    }
+    left_out = [own.disturbance_bounds[name] for name in remainder_names(plant)]
+    share = np.array(left_out)
+    notes = [note for note in found.notes if "no function" not in note and "least is not claimed" not in note]
+    notes.insert(
+        0,
+        f"The plant is nonlinear: the remainder of its linear model is at most {share.max():.3g} in a state or an "
+        "output, while all signals stay in the region, between samples too; known inputs, faults and unknown inputs "
+        "are held there. That there is no smaller threshold is not claimed, as the remainder is bounded and not known.",
+    )
+    return replace(
+        found,
+        options=options,
+        certificate=Certificate(kept, claims),
+        notes=tuple(notes),
+        plant=plant,
+        transformation=None,
+    )

@@ -1,0 +1,71 @@
+"""What the threshold of a nonlinear plant rests on: its region, and the bound on what its linear model leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import ObsynthError
+from obsynth.plants.constants import shown
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.transformations.remainders import bounded_model
+from obsynth.results.checks import Check, upper_bound_check
+from obsynth.results.design import ObserverDesign
+
+
+def while_inside(design: ObserverDesign) -> str:
+    """Return the region of a design in words; empty for linear plants."""
+    region = design.options.get("region")
+    if not region:
+        return ""
+    units = design.options["model"]["units"]
+    told = [
+        f"{name} stays within {shown(low)} to {shown(high, units.get(name, ''))}"
+        for name, (low, high) in region.items()
+    ]
+    return f", while {', '.join(told)}, between samples too"
+
+
+def remainder_check(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]) -> Check:
+    """Return the row on what the linear model leaves out of the nonlinear one in the region, bounded again."""
+    plant, _ = design.linear
+    reason, worst = "", np.inf
+    try:
+        asked = read(design.options)
+        own = [name for name in plant.disturbance_names if name in asked.model["inputs"]]
+        _, found = bounded_model(
+            DAEModel(**asked.model),
+            asked.region,
+            asked.sample_time,
+            faults=plant.fault_names,
+            disturbances=own,
+            given=asked.given,
+            shipped=plant,
+        )
+        kept = plant.disturbance_names[len(own) :] == tuple(found) and plant.dt == asked.sample_time
+        ratios = [value / max(asked.disturbance_bounds[name], np.finfo(float).tiny) for name, value in found.items()]
+        worst = max(ratios) if kept and _apart(design, len(own)) else np.inf
+    except (ObsynthError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        reason = str(error)
+    return upper_bound_check(
+        "remainder",
+        "the remainder of the linear model is within the bounds of the disturbances that represent "
+        f"it{while_inside(design)}",
+        worst,
+        1.0,
+        source="affine arithmetic over the region; the exponential's series with its remainder",
+        kind="proved",
+        detail=reason or "the largest ratio of what is proved to what is shipped",
+    )
+
+
+def _apart(design: ObserverDesign, own: int) -> bool:
+    """Whether the last disturbances are one for each state and each output, and nothing else is uncertain."""
+    plant, _ = design.linear
+    nx, ny = plant.nx, plant.ny
+    into = np.hstack([np.eye(nx), np.zeros((nx, ny))])
+    seen = np.hstack([np.zeros((ny, nx)), np.eye(ny)])
+    same = np.array_equal(plant.Bd[:, own:], into) and np.array_equal(plant.Dd[:, own:], seen)
+    return bool(same and np.array_equal(plant.E, np.eye(nx)))

@@ -1,0 +1,210 @@
+"""Alarms as events: from when to when, which fault, how large, on what evidence; and rows that were without a
+decision.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from obsynth.monitoring.logs.log_observer import GAP, OUT_OF_ORDER, PARTIAL, RECOVERING, REPEATED_STAMP, WARM_UP
+from obsynth.monitoring.thresholds.learned_levels import HOLD
+from obsynth.observers.estimates import BAND_WIDTH
+
+#: What stands for the status of rows that are well, but in which the monitor decides nothing.
+NO_DECISION = "undecided"
+
+#: What stands for the fault of an alarm whose evidence does not distinguish the faults.
+NOT_DISTINGUISHED_YET = "not distinguished yet"
+
+#: Monitors of innovations: an alarm of theirs contradicts the stated noise and random walks, on which deviations rest.
+CONTRADICTING = ("nis", "learned")
+
+#: What a summary says where such an interval is in its table.
+NOT_VALID = (
+    "An interval is not valid where its alarm contradicts the stated noise and random walks: the fault may lie outside."
+)
+
+#: How a run begins to say that nothing alarmed.
+NO_ALARM = "No alarm"
+
+#: Why a row cannot alarm, by its status.
+REASONS = {
+    WARM_UP: "the initial-condition response has not settled yet (--warm-up)",
+    RECOVERING: "the effect of a gap before them has not settled yet (--warm-up)",
+    GAP: "samples are missing, or left out as outliers",
+    REPEATED_STAMP: "their stamps are those of the rows before",
+    OUT_OF_ORDER: "their stamps are earlier than those of the rows before",
+    NO_DECISION: "the monitor takes no decision there: its window is not full, or a warm-up or a gap is not over",
+}
+
+
+#: Alarms that a summary lists.
+MOST_LISTED_ALARMS = 20
+
+
+@dataclass(frozen=True)
+class AlarmEvent:
+    """An alarm: rows above a threshold that are less than 20 rows apart, rows that are missing among them.
+
+    Parameters
+    ----------
+    by : str
+        The column, or the kind of the monitor, whose threshold is passed.
+    fault : str
+        The fault that it points to, at the largest evidence at which one is named; empty where there is none.
+    start, end : float, seconds
+        Times of the first and the last row above the threshold.
+    first_row, last_row : int
+        Their numbers, from 1.
+    rows : int
+        Rows above the threshold.
+    size, low, high : float
+        Estimate of the fault at its largest evidence, and its interval there: 95 % of the stated noise, or guaranteed
+        by an adaptive threshold; NaN where it is not known.
+    evidence : float
+        Largest share of the threshold that was reached.
+    distinguished : bool
+        Whether the evidence distinguishes the faults; no fault is named otherwise.
+    """
+
+    by: str
+    fault: str
+    start: float
+    end: float
+    first_row: int
+    last_row: int
+    rows: int
+    size: float
+    low: float
+    high: float
+    evidence: float
+    distinguished: bool = True
+
+    @property
+    def clear(self) -> bool:
+        """Whether the fault's interval, where one is known, excludes zero: else another fault may be meant."""
+        return bool(self.fault) and not self.low < 0.0 < self.high
+
+    @property
+    def valid(self) -> bool:
+        """Whether the interval is known and rests on nothing that the alarm itself contradicts."""
+        return not math.isnan(self.low) and self.by not in CONTRADICTING
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the event as plain data."""
+        return {**asdict(self), "interval_valid": self.valid}
+
+
+class AlarmLog:
+    """Gathers alarms row by row; ``columns`` are those of the output that hold estimates and intervals."""
+
+    def __init__(self, columns: Sequence[str]) -> None:
+        self._places = {name: i for i, name in enumerate(columns)}
+        self._open, self._closed = dict[str, AlarmEvent](), list[AlarmEvent]()
+        self._named_by = dict[str, float]()  # the evidence at which the fault of an open event was named
+        self._place, self._places_of = 0, dict[str, int]()  # of this row, and of the last row of an open event
+        self.silent = Counter[str]()
+
+    def advance(self, missing: int) -> None:
+        """Go on to the next row, before which some are missing."""
+        self._place += missing + 1
+
+    def take(
+        self,
+        by: str,
+        fault: str,
+        evidence: float,
+        time: float,
+        row: int,
+        cells: Sequence[float],
+        *,
+        distinguished: bool = True,
+    ) -> None:
+        """Take a row above a threshold; ``cells`` are the numbers of its output; ``distinguished``: whether a
+        fault would be named if there was one."""
+        before = self._open.get(by)
+        if before is not None and self._place - self._places_of[by] > HOLD:
+            self._closed.append(self._open.pop(by))
+            before = None
+        if before is None:
+            self._named_by[by] = -math.inf
+        self._places_of[by] = self._place
+        largest = before is None or evidence > before.evidence or math.isnan(before.evidence)
+        known = (math.nan,) * 3 if before is None else (before.size, before.low, before.high)
+        named = "" if before is None else before.fault
+        tells = before is None or (distinguished and not evidence <= self._named_by[by])
+        size, low, high = self._size(fault, cells) if tells else known
+        if tells:
+            named = fault
+            self._named_by[by] = evidence if distinguished else -math.inf
+        self._open[by] = AlarmEvent(
+            by,
+            named,
+            time if before is None else before.start,
+            time,
+            row if before is None else before.first_row,
+            row,
+            1 if before is None else before.rows + 1,
+            size,
+            low,
+            high,
+            evidence if largest or before is None else before.evidence,
+            distinguished or (before is not None and before.distinguished),
+        )
+
+    def _size(self, fault: str, cells: Sequence[float]) -> tuple[float, float, float]:
+        def cell(name: str) -> float:
+            place = self._places.get(name)
+            return math.nan if place is None else float(cells[place])
+
+        size, deviation = cell(f"fhat[{fault}]"), cell(f"sd fhat[{fault}]")
+        low, high = cell(f"lowest {fault}"), cell(f"highest {fault}")
+        if math.isnan(low) and math.isfinite(deviation):
+            low, high = size - BAND_WIDTH * deviation, size + BAND_WIDTH * deviation
+        return size, low, high
+
+    def events(self) -> tuple[AlarmEvent, ...]:
+        """Return all alarms, those that are not over too, by their start."""
+        return tuple(sorted([*self._closed, *self._open.values()], key=lambda event: (event.first_row, event.by)))
+
+
+def alarm_rows(events: Sequence[AlarmEvent], shown: Callable[[float], str]) -> tuple[list[tuple[str, ...]], int]:
+    """Return a table of alarms, heading first and without empty columns, and how many more there are."""
+    if not events:
+        return [], 0
+
+    def number(value: float) -> str:
+        return "" if math.isnan(value) else f"{value:.4g}"
+
+    rows = [("alarm by", "from", "to", "rows", "fault", "size", "interval", "peak / threshold")]
+    for event in events[:MOST_LISTED_ALARMS]:
+        interval = "" if math.isnan(event.low) else f"{number(event.low)} to {number(event.high)}"
+        interval += " (not valid)" if interval and not event.valid else ""
+        ends = shown(event.start), shown(event.end)
+        fault = event.fault if event.clear or not event.fault else f"{event.fault} (unclear)"
+        fault = fault if event.distinguished else NOT_DISTINGUISHED_YET
+        rows.append((event.by, *ends, str(event.rows), fault, number(event.size), interval, f"{event.evidence:.3g}"))
+    kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows[1:])]
+    return [tuple(row[i] for i in kept) for row in rows], len(events) - len(rows) + 1
+
+
+def alarm_notes(events: Sequence[AlarmEvent]) -> list[str]:
+    """Return what a reader of the table has to know about its intervals."""
+    return [NOT_VALID] if any(not math.isnan(event.low) and not event.valid for event in events) else []
+
+
+def silence(run: Any, by: str) -> list[str]:
+    """Return what a run without alarms says, and how many rows were without a decision; ``by`` names what watched."""
+    silent, found = sum(run.silent.values()), list[str]()
+    if not run.alarms and silent < run.rows:
+        told = f" in the {run.rows - silent} rows that could alarm" if silent else ""
+        found.append(f"{NO_ALARM} by {by}{told}.")
+    if silent:
+        why = [f"{count} {status}: {REASONS.get(status, status)}"
+               for status, count in run.silent.items() if status != PARTIAL]  # fmt: skip
+        found.append(f"{silent} of {run.rows} rows were without a decision: {'; '.join(why)}.")
+    return found

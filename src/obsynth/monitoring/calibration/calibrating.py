@@ -1,0 +1,430 @@
+"""Fitting a model's constants and noise to a log: the public function, and the order in which it asks.
+
+Linear descriptor plants for calibration: constants in their matrices, continuous, discrete, or varying with k.
+
+An algebraic equation of a discrete plant (a row of zeros in E) is taken with the state it constrains, one sample later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.monitoring.calibration.diagnostics import STANDS_OUT, standing_out, wrong_samples
+from obsynth.monitoring.calibration.innovations_fit import InnovationsFit, chosen_timing, innovations_fit
+from obsynth.monitoring.calibration.integration_error import IntegrationError, integration_error
+from obsynth.monitoring.calibration.linear_plant import LinearPlant
+from obsynth.monitoring.calibration.logs import Log, LogData, read_log, told_rows
+from obsynth.monitoring.calibration.noise_proposals import proposed_states
+from obsynth.monitoring.calibration.noise_states import NoiseStates, PlantWithNoise, asked_states
+from obsynth.monitoring.calibration.plants import CalibrationPlant, NonlinearPlant
+from obsynth.monitoring.calibration.problem import Problem, calibration_problem, require_variation
+from obsynth.monitoring.calibration.reporting import reported
+from obsynth.monitoring.calibration.result import Calibration
+from obsynth.monitoring.calibration.simulation_error import (
+    FIRST_ROWS,
+    Fit,
+    SimulationError,
+    simulation_fits,
+    with_seen_start,
+)
+from obsynth.monitoring.calibration.wrong_runs import wrong_runs
+from obsynth.numerics.arguments import Seed, arguments_checked, is_whole, whole_number
+from obsynth.numerics.arrays import read_only
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+
+#: How often samples that stand out are left out: each time the others are known better.
+OUTLIER_ROUNDS = 3
+
+#: What is said of an offset without which the model follows nothing.
+OFFSET_TAKEN = "Without an offset of the sensor {} the model does not follow the log: it has a state for it."
+
+#: Two sample times are the same within this share.
+SAME_TIME = 1e-6
+
+
+@arguments_checked
+def calibrate(
+    model: DAEModel | DescriptorSystem | TimeVaryingDescriptorSystem,
+    log: LogData,
+    unknown: Mapping[str, Sequence[float]],
+    *,
+    priors: Mapping[str, Sequence[float]] | None = None,
+    noisy: Sequence[str] | None = None,
+    R: Mapping[str, float | None] | None = None,
+    Q: Mapping[str, float | None] | None = None,
+    initial_state: ArrayLike | Mapping[str, float] | None = None,
+    initial_covariance: ArrayLike | Mapping[str, float] | None = None,
+    rows: str | slice | Sequence[int] | None = None,
+    columns: Mapping[str, str] | None = None,
+    scales: Mapping[str, float] | None = None,
+    dt: float | None = None,
+    input_delay: int | str = "auto",
+    method: Literal["innovations", "simulation"] = "innovations",
+    integration: Literal["auto", "backward-euler", "radau"] = "auto",
+    substeps: int = 1,
+    level: float = 0.95,
+    starts: int = 3,
+    seed: Seed = 0,
+    sensor_noise: Mapping[str, Any] | None = None,
+    offset: Mapping[str, Any] | Sequence[str] | None = None,
+    walks: Mapping[str, Any] | Sequence[str] | None = None,
+    progress: Callable[[str], object] | None = None,
+) -> Calibration:
+    r"""Fit constants and noise covariances of a plant to a log of rows without faults.
+
+    The start is a least-squares fit of simulations.  Then the likelihood of the innovations is made greatest,
+
+    .. math::
+        -\log p = \tfrac12 \sum_k e_k^T S_k^{-1} e_k + \log\det 2 \pi S_k , \qquad
+        S_k = H_k P_k^- H_k^T + R ,
+
+    over constants, Q and R, by the recursion that the observers run, with exact gradients.
+
+    Parameters
+    ----------
+    model : DAEModel, DescriptorSystem or TimeVaryingDescriptorSystem
+        ``nx`` states, ``nu`` inputs, ``ny`` outputs.  Linear plants hold their constants in entries that are
+        expressions (`obsynth.uncertain_system`, or texts of a time-varying plant); constant faults and parameters may
+        be unknown too.  Their signals are deviations from the operating point, of which logs know nothing; ``k`` is
+        the row of the log.
+    log : path, pandas.DataFrame or mapping
+        CSV or Parquet file, or columns by name: ``time`` in seconds, every input and every output; NaN where an output
+        is missing.  Single outputs a hundred times further off than the others count as missing, and are reported.
+    unknown : mapping of str to (low, high)
+        Constants and parameters that are to be found, with finite bounds around their nominal values; none (``{}``)
+        to find the noise alone.
+    priors : mapping of str to (mean, deviation), optional
+        What is known of them besides, as normal distributions.
+    noisy : list of str, optional
+        Equations to whose right sides noise is added in each step; all by default.
+    R, Q : mapping of str to float, optional
+        Variances that are known, by sensor and by noisy equation; the others are found.
+    initial_state : array_like or mapping, optional
+        ``(nx,)``, or values by name; by default nominal values, of linear plants zero.
+    initial_covariance : array_like or mapping, optional
+        ``(nx, nx)``, one variance, or variances by name.  By default deviations are 10 % of the nominal
+        sizes, or as far as the log begins elsewhere (a note says so); of linear plants, what alone would make outputs
+        as large as they are.
+    rows : str, slice or pair, optional
+        ``"a:b"``: the rows that are free of faults, as Python counts; all by default.
+    columns : mapping of str to str, optional
+        Column of a signal, or of ``time``, where the names differ.
+    scales : mapping of str to float, optional
+        What a column is multiplied by to be in the signal's unit.
+    dt : float, optional
+        Seconds between rows; the median of the stamps by default.
+    input_delay : int or "auto", optional
+        Rows by which the log's inputs act later than the convention says: ``u(k)`` during the step that ends at k, of
+        linear plants during the one that begins there.  ``"auto"`` takes the delay of which the likelihood is clearly
+        better, such as 1 of a log that writes what is sent at k: up to 3 are tried, and more while the last is best.
+    method : {"innovations", "simulation"}, optional
+        The second one stops at the fit of simulations, whose boxes are too small where its residuals are not white.
+    integration : {"auto", "backward-euler", "radau"}, optional
+        ``"auto"`` takes backward Euler unless its error of one step exceeds a quarter of a sensor's deviation, or exact
+        steps would move a constant by half of its deviation; for linear plants in continuous time Radau.  Discrete
+        plants are stepped as they are.
+    substeps : int, optional
+        Steps in a sample.
+    level : float, optional
+        Probability of the box, for all constants at once.
+    starts : int, optional
+        Fits of simulations, from the nominal constants and from random ones.
+    seed : int, optional
+        Of those.
+    sensor_noise : mapping, optional
+        ``{y: {"correlation": seconds or "unknown"}}``: outputs whose noise is coloured, as in `with_noise`; white
+        noise is found beside it.  ``{}`` says that all noise is white.  By default coloured noise is taken where the
+        innovations ask for it and the likelihood says so, and is reported.
+    offset : mapping or list of str, optional
+        Outputs with an offset that is not known; ``{}`` says that there is none.  By default as for ``sensor_noise``.
+    walks : mapping or list of str, optional
+        Unknown inputs, faults and parameters that walk at random; inputs of a nonlinear plant that no log holds.
+        Unknown inputs of linear plants by default as for ``sensor_noise``.
+    progress : callable, optional
+        Called with the name of each stage.
+
+    Returns
+    -------
+    Calibration
+        Nominal values, box, undetermined directions, Q and R, checks of the innovations, and a verdict.
+
+    Raises
+    ------
+    SpecError
+        A name, a bound or an option is wrong; or the log is (``code``: ``irregular``, ``time``, ``nan``,
+        ``too-short``).
+    PreconditionError
+        ``not-exciting``: nothing moves.  ``explains-nothing``: the model cannot follow the log, for example as units
+        are off by 1000.  ``cannot-simulate``: it has no solution along the log's inputs.  ``undetermined-step``: a
+        step of a linear plant does not determine its state.
+
+    References
+    ----------
+    .. [Ljung1999] L. Ljung, System Identification, 2nd ed., 1999, 7.2 and 10.1: prediction errors and their gradients.
+    .. [Chung2013] Y. Chung et al., "A nondegenerate penalized likelihood estimator for variance parameters",
+       Psychometrika 78, 2013: the weight that keeps variances from zero, which we give only to those that the log
+       cannot distinguish from it.
+    """
+    if not isinstance(level, (int, float)) or not 0.0 < level < 1.0:
+        raise SpecError(f"level is {level!r}: give a probability, such as 0.95.", path="level")
+    starts = whole_number(starts, "starts")
+    if input_delay != "auto" and not is_whole(input_delay):
+        raise SpecError(f"input_delay is {input_delay!r}: give whole rows, or 'auto'.", path="input_delay")
+    note = progress or (lambda text: None)
+    model = _loads_as_parameters(require_plant(model), walks)
+    factors = dict(getattr(model, "scales", {})) | dict(scales or {})
+    whole = read_log(
+        log,
+        model.input_names,
+        model.output_names,
+        rows=rows,
+        columns=columns,
+        scales=factors,
+        dt=_sample_time(model, dt, substeps),
+    )
+    digest = whole.digest
+    whole = whole.unstuck()
+    whole = whole.without(wrong_samples(whole.y))
+    whole = whole.shifted(input_delay) if isinstance(input_delay, int) else whole
+    plant = NonlinearPlant(model) if isinstance(model, DAEModel) else LinearPlant(model, whole)
+    asked = asked_states(sensor_noise, offset, walks, model.output_names)
+
+    def problem_with(states: NoiseStates, log: Log) -> Problem:
+        extended = PlantWithNoise(plant, states, log) if states else plant
+        own = noisy
+        if isinstance(extended, PlantWithNoise):
+            own = (*(plant.equation_names if noisy is None else noisy), *extended.noisy)
+        return calibration_problem(
+            extended,
+            log,
+            unknown=unknown,
+            priors=priors,
+            noisy=own,
+            Q=Q,
+            R=R,
+            initial_state=_by_name(initial_state, plant.state_names),
+            initial_covariance=_by_name(initial_covariance, plant.state_names),
+            substeps=substeps,
+            integration=plant.integration(integration),
+        )
+
+    require_variation(problem_with(asked, whole))
+    innovations = method == "innovations"
+    fitting = _Fitting(
+        plant, problem_with, starts, seed, level, note, integration == "auto", initial_covariance is None, innovations
+    )
+    search = innovations and input_delay == "auto" and bool(model.input_names)
+    found, asked, told = fitting.first_fit(asked, whole, search=search, may_take_offsets=offset is None)
+    found = fitting.without_outliers(found)
+    kinds = (("coloured", sensor_noise), ("offset", offset), ("walk", walks))
+    open_kinds = tuple(kind for kind, given in kinds if given is None)
+    if found.fit is not None and open_kinds:
+        found = fitting.with_proposals(found, found.fit, asked, open_kinds, told)
+    return reported(
+        found.problem, found.fits[0], found.fit, level=level, losses=found.losses, error=found.error, digest=digest
+    )
+
+
+def _loads_as_parameters(model: Any, walks: Mapping[str, Any] | Sequence[str] | None) -> Any:
+    """Return a nonlinear plant whose inputs that walk are parameters: no log holds them."""
+    loads = [name for name in walks or () if isinstance(model, DAEModel) and name in model.inputs]
+    if not loads:
+        return model
+    inputs = {name: value for name, value in model.inputs.items() if name not in loads}
+    return model.replace(inputs=inputs, parameters={**model.parameters, **{name: model.inputs[name] for name in loads}})
+
+
+def _by_name(value: Any, names: Sequence[str]) -> Any:
+    """Return what is said of the plant's own states by their names, where it is an array: others may follow."""
+    if value is None or isinstance(value, Mapping) or np.ndim(value) == 0:
+        return value
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape == (len(names),):
+        return dict(zip(names, array.tolist(), strict=True))
+    if array.shape == (len(names), len(names)) and not np.any(array - np.diag(np.diag(array))):
+        return dict(zip(names, np.diag(array).tolist(), strict=True))
+    return value
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A problem as it was fitted at last, with its fits, what backward Euler errs, and what each delay of the inputs
+    loses in nats, where it was searched for."""
+
+    problem: Problem
+    fits: list[Fit]
+    fit: InnovationsFit | None
+    error: IntegrationError | None
+    losses: Mapping[int, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitting:
+    """How a problem is fitted: simulations first, steps that are exact enough, timing, then the innovations."""
+
+    plant: CalibrationPlant
+    problem_with: Callable[[NoiseStates, Log], Problem]
+    starts: int
+    seed: int
+    level: float
+    note: Callable[[str], object]
+    choose_steps: bool
+    widen_start: bool
+    innovations: bool
+
+    def fitted(self, problem: Problem, *, search: bool) -> _Found:
+        """Return the fit of a problem; the delay of the inputs is searched for where asked."""
+        fits = simulation_fits(problem, self.starts, self.seed, self.note)
+        if self.widen_start and (seen := with_seen_start(problem, fits[0])) is not problem:
+            problem, fits = seen, simulation_fits(seen, 1, self.seed, self.note, start=fits[0].t)
+        error = None
+        if self.choose_steps and isinstance(self.plant, NonlinearPlant):
+            names, start = problem.names, fits[0]
+            states = SimulationError(problem).states(start)[:, : len(self.plant.state_names)]
+            theta = np.array(self.plant.theta(names, start.t), dtype=np.float64)
+            error = integration_error(
+                self.plant.promoted(names), states, problem.u, theta, start.deviations, problem.log.dt
+            )
+            if error is not None and error.matters:
+                self.note("integrating by Radau")
+                problem = problem.integrated("radau", problem.substeps)
+                fits = simulation_fits(problem, self.starts, self.seed, self.note)
+        losses: Mapping[int, float] = {}
+        if search:
+            problem, fits, losses = chosen_timing(problem, fits, self.seed, self.note, any_start=self.widen_start)
+        fit = None
+        if self.innovations:
+            before = problem, error
+            problem, fit, error = _innovations(problem, fits, self.level, self.note, error)
+            if self.widen_start and fit is not None:
+                seen = with_seen_start(before[0], fits[0], first=fit.whitened[:FIRST_ROWS])
+                if seen is not before[0]:
+                    fits = simulation_fits(seen, 1, self.seed, self.note, start=fits[0].t)
+                    problem, fit, error = _innovations(seen, fits, self.level, self.note, before[1])
+        return _Found(problem, fits, fit, error, losses)
+
+    def first_fit(
+        self, asked: NoiseStates, log: Log, *, search: bool, may_take_offsets: bool
+    ) -> tuple[_Found, NoiseStates, list[str]]:
+        """Return the fit with the states that were asked for; and with those, and a sentence for each, the offsets of
+        sensors that it takes where without them the model explains nothing."""
+        try:
+            return self.fitted(self.problem_with(asked, log), search=search), asked, []
+        except PreconditionError as error:
+            # An offset as large as what a sensor does looks like a model that explains nothing.
+            if not may_take_offsets or not self.innovations or error.condition != "explains-nothing":
+                raise
+            asked = replace(asked, offsets=log.output_names)
+            try:
+                found = self.fitted(self.problem_with(asked, log), search=search)
+            except PreconditionError:
+                raise error from None
+        told = [OFFSET_TAKEN.format(name) for name in log.output_names]
+        return replace(found, problem=found.problem.with_notes(*told)), asked, told
+
+    def with_proposals(
+        self, found: _Found, fit: InnovationsFit, asked: NoiseStates, kinds: tuple[str, ...], before: list[str]
+    ) -> _Found:
+        """Return the fit with states of some kinds where its innovations ask for them; ``before``: what is told of
+        those that it has."""
+        log = found.problem.log
+        states, told = proposed_states(
+            found.problem, fit, asked, kinds, lambda states: self.problem_with(states, log), self.note
+        )
+        if not told:
+            return found
+        again = self.fitted(self.problem_with(states, log), search=False)
+        # What is white beside coloured noise is less than both: more samples stand out.
+        problem = again.problem.with_notes(*before, *told)
+        return self.without_outliers(replace(again, problem=problem, losses=found.losses))
+
+    def without_outliers(self, found: _Found) -> _Found:
+        """Return the fit again without samples that stand out alone or a few in a row: they would make R a multiple of
+        what it is."""
+        for _ in range(OUTLIER_ROUNDS):
+            if found.fit is None:
+                break
+            problem = found.problem
+            alone = standing_out(found.fit.whitened)
+            wrong = alone | wrong_runs(problem, found.fit)
+            off = np.abs(found.fit.innovations).T
+            if not wrong.any():
+                break
+            self.note("without samples that stand out")
+            names, log = problem.output_names, problem.log
+            told = [
+                f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations (row "
+                f"{told_rows(log.rows[0] + np.flatnonzero(wrong[:, i]))}): they count as not measured."
+                for i, name in enumerate(names)
+                if wrong[:, i].any()
+            ]
+            kept = replace(
+                log,
+                y=read_only(np.where(wrong, np.nan, problem.y)),
+                notes=(*log.notes, *told),
+                outliers=tuple(
+                    np.concatenate([before, off[i, alone[:, i]]])
+                    for i, before in enumerate(log.outliers or [np.zeros(0)] * len(names))
+                ),
+            )
+            fits = simulation_fits(problem.with_log(kept), 1, self.seed, self.note, start=found.fit.t)
+            again = _innovations(problem.with_log(kept), fits, self.level, self.note, found.error)
+            found = _Found(again[0], fits, *again[1:], found.losses)
+        return found
+
+
+def _innovations(
+    problem: Problem, fits: list[Fit], level: float, note: Callable[[str], object], error: IntegrationError | None
+) -> tuple[Problem, InnovationsFit | None, IntegrationError | None]:
+    """Return the fit, with the steps that it needs: errors of single steps that are small may move constants still."""
+    chosen = error is not None and not error.matters
+    exact = problem.integrated("radau", problem.substeps) if chosen else None
+    fit, moved = innovations_fit(problem, fits, level, note, exact=exact)
+    if error is None or exact is None:
+        return problem, fit, error
+    if fit is None:
+        note("integrating by Radau")
+        problem, (fit, _) = exact, innovations_fit(exact, fits, level, note)
+    return problem, fit, replace(error, moved=moved)
+
+
+def require_plant(given: Any) -> DAEModel | DescriptorSystem | TimeVaryingDescriptorSystem:
+    """Return the plant whose matrices hold the constants: that before elimination and sampling, if there were any."""
+    plant = getattr(given, "source", given)
+    uncertainty = getattr(plant, "uncertainty", None)
+    if uncertainty is not None and uncertainty.steps:
+        made = getattr(plant, "_made_from", None)
+        if made is None:
+            raise SpecError(
+                "Elimination or sampling has mixed the constants of this plant: give the plant as it was written.",
+                path="model",
+            )
+        plant = made[0]
+    if not isinstance(plant, (DAEModel, DescriptorSystem, TimeVaryingDescriptorSystem)):
+        raise SpecError(
+            f"model is {type(given).__name__}: give a DAEModel, a DescriptorSystem or a TimeVaryingDescriptorSystem.",
+            path="model",
+        )
+    return plant
+
+
+def _sample_time(model: Any, dt: float | None, substeps: int) -> float | None:
+    """Return the time between rows: that of a discrete plant is its own."""
+    own = 0.0 if isinstance(model, DAEModel) else float(model.dt)
+    if not own:
+        return dt
+    if dt is not None and abs(dt - own) > SAME_TIME * own:
+        raise SpecError(f"dt is {dt:g} s, but a step of this plant takes {own:g} s: leave dt out.", path="dt")
+    if substeps != 1:
+        raise SpecError(
+            "substeps divides the steps of continuous plants, and this one is discrete: leave it out.", path="substeps"
+        )
+    return own

@@ -1,0 +1,228 @@
+"""Which states for coloured noise, offsets and loads the innovations of a log ask for, chosen by likelihood.
+
+One state at a time is added, that which gains most: its nats less half a logarithm of the number of samples for each
+number that it adds (Schwarz 1978).  An offset is integrated out, which counts it already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+
+from obsynth.analysis.dae_structure import identifiability
+from obsynth.analysis.existence.moussaali_dae import NOMINAL_SAMPLES
+from obsynth.errors import SolverError
+from obsynth.monitoring.calibration.diagnostics import SIGNIFICANT, mean_off, whiteness
+from obsynth.monitoring.calibration.explanations import LEAST_EXPLANATION, regression_gain
+from obsynth.monitoring.calibration.innovations_fit import InnovationsFit
+from obsynth.monitoring.calibration.likelihood import IMPOSSIBLE, Likelihood
+from obsynth.monitoring.calibration.maximum import Objective
+from obsynth.monitoring.calibration.noise_states import NoiseStates, PlantWithNoise, correlation_name
+from obsynth.monitoring.calibration.plants import NonlinearPlant
+from obsynth.monitoring.calibration.problem import Problem
+from obsynth.monitoring.calibration.reporting import COLOURED_SHARE, FIRST_KEPT
+from obsynth.monitoring.calibration.simulation_error import Fit
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.noise import noise_state, process_variance
+from obsynth.plants.transformations.noise_states import with_noise
+
+#: Numbers that a state adds: the variance and correlation of coloured noise, the variance of a walk.
+ADDED_NUMBERS = {"coloured": 2, "offset": 0, "walk": 1}
+
+#: Nats above which a state is taken.  An offset that is not taken spoils constants, and one too many only widens boxes.
+LEAST_NATS = {"coloured": LEAST_EXPLANATION, "offset": 1.0, "walk": LEAST_EXPLANATION}
+
+#: Nats that an offset explains beside constants, variances as they are, before it is tried; and by how much constants
+#: are moved to see what they explain, in widths of their bounds.
+ASKING, SMALL_MOVE = 2.0, 1e-4
+
+
+_STATE_SENTENCES = {
+    "coloured": "The noise of {name} is coloured: the model has a state for it (better by {gain:.3g} nats).",
+    "offset": "The sensor {name} has an offset: the model has a state for it (better by {gain:.3g} nats).",
+    "walk": "The unknown input {name} is taken as a random walk (better by {gain:.3g} nats).",
+}
+
+
+_OFFSET_HIDES = (
+    "At constant inputs {faults} cannot be distinguished from the offset of {name}: a design for both may be "
+    "refused. If the sensor has no offset, state this (offset: {{}} in calibrate)."
+)
+
+
+#: Wrong samples in a row at most, and how many after them must be where they are predicted.
+LONGEST_RUN, RETURNED = 5, 3
+
+
+def proposed_states(
+    problem: Problem,
+    fit: InnovationsFit,
+    asked: NoiseStates,
+    kinds: Sequence[str],
+    problem_with: Callable[[NoiseStates], Problem],
+    note: Callable[[str], object],
+) -> tuple[NoiseStates, list[str]]:
+    """Return the states asked for with those that the innovations ask for, and a sentence for each of these."""
+    states, told = asked, list[str]()
+    asking = _asking(problem, fit)
+    value, known = fit.value, _Known.of(problem, fit)
+    while True:
+        found = []
+        for kind, name, tried in _candidates(states, kinds, problem.output_names, problem.plant.unknown_inputs):
+            if (kind, name) not in asking:
+                continue
+            note(f"{kind} of {name}")
+            reached, place = known.best(_like(problem, problem_with(tried)))
+            gain = value - reached - 0.5 * ADDED_NUMBERS[kind] * np.log(problem.log.samples)
+            least = LEAST_NATS[kind]
+            if kind == "offset" and least < gain < LEAST_EXPLANATION and hidden_faults(problem, fit, tried):
+                least = LEAST_EXPLANATION
+            found.append((gain - least, kind, name, tried, reached, place))
+        if not found:
+            break
+        gain, kind, name, tried, reached, place = max(found, key=lambda item: item[0])
+        if not gain > 0.0:
+            break
+        hidden = hidden_faults(problem, fit, tried) if kind == "offset" else ()
+        least = LEAST_EXPLANATION if hidden else LEAST_NATS[kind]
+        told.append(_STATE_SENTENCES[kind].format(name=name, gain=gain + least))
+        if hidden:
+            told.append(_OFFSET_HIDES.format(name=name, faults=" and ".join(hidden)))
+        states, value, known = tried, reached, place
+    return states, told
+
+
+def hidden_faults(problem: Problem, fit: InnovationsFit, states: NoiseStates) -> tuple[str, ...]:
+    """Return the faults of a nonlinear plant that the outputs determine at nominal constant inputs, but not beside the
+    offsets of sensors."""
+    inner = problem.plant.inner if isinstance(problem.plant, PlantWithNoise) else problem.plant
+    if not isinstance(inner, NonlinearPlant) or not inner.model.nq:
+        return ()
+    model, found = inner.model, []
+    u = np.tile(model.nominal_input, (NOMINAL_SAMPLES, 1))
+    for plant in (model, cast(DAEModel, with_noise(model, offset=states.offsets)[0])):
+        try:
+            told = identifiability(plant, u, dt=problem.log.dt, R=np.diag(fit.R), method=problem.integration)
+        except SolverError:
+            return ()
+        found.append(told.unidentifiable)
+    return tuple(name for name in model.parameter_names if name in found[1] and name not in found[0])
+
+
+def _asking(problem: Problem, fit: InnovationsFit) -> set[tuple[str, str]]:
+    """Return kinds and names that innovations ask for: coloured noise of a sensor where those of one are not white or
+    an equation has process noise, which may stand for it; offsets that explain more of them than constants can; unknown
+    inputs."""
+    found = {("walk", name) for name in problem.plant.unknown_inputs}
+    names, ny = problem.output_names, len(problem.output_names)
+    coloured = [whiteness(column).probability < SIGNIFICANT for column in fit.whitened.T]
+    # Process noise that stands for coloured noise whitens that sensor: the next one pays for it, or none does.
+    # A mean is no colour, but a bias.
+    hidden = any(coloured) or not np.all(fit.limited_Q)
+    found |= {
+        ("coloured", name)
+        for name, own, column in zip(names, coloured, fit.whitened.T, strict=True)
+        if own or (hidden and not mean_off(column))
+    }
+    v = fit.v
+    before = whitened_run(problem, v, problem.y)
+    moves = [
+        (whitened_run(problem, v + step, problem.y) - before) / SMALL_MOVE
+        for step in SMALL_MOVE * np.hstack([np.diag(problem.widths), np.zeros((len(fit.t), len(v) - len(fit.t)))])
+    ]
+    deviations = np.sqrt(np.nanmean(fit.innovations**2, axis=0))
+    for j, name in enumerate(names):
+        offset = deviations[j] * (np.arange(ny) == j)
+        effect = whitened_run(problem, v, problem.y - offset) - before
+        if regression_gain(before.ravel(), [move.ravel() for move in moves], effect.ravel()) > ASKING:
+            found.add(("offset", name))
+    return found
+
+
+def whitened_run(problem: Problem, v: FloatArray, y: FloatArray) -> FloatArray:
+    """Return whitened innovations ``(n, ny)`` of other measurements, NaN where nothing was measured."""
+    return Likelihood(problem, y).innovations(v)[0]
+
+
+def _candidates(
+    states: NoiseStates, kinds: Sequence[str], outputs: Sequence[str], unknown_inputs: Sequence[str]
+) -> Iterator[tuple[str, str, NoiseStates]]:
+    for name in outputs:
+        if "coloured" in kinds and name not in states.correlations:
+            yield "coloured", name, replace(states, correlations={**states.correlations, name: None})
+        if "offset" in kinds and name not in states.offsets:
+            yield "offset", name, replace(states, offsets=(*states.offsets, name))
+    for name in unknown_inputs:
+        if "walk" in kinds and name not in states.loads:
+            yield "walk", name, replace(states, loads=(*states.loads, name))
+
+
+def _like(problem: Problem, new: Problem) -> Problem:
+    """Return a problem with the steps, the inputs and the start of another one, as far as it goes."""
+    if (new.integration, new.substeps) != (problem.integration, problem.substeps):
+        new = new.integrated(problem.integration, problem.substeps)
+    own = len(problem.plant.state_names)
+    places = [new.plant.state_names.index(name) for name in problem.plant.state_names]
+    P0 = new.P0.copy()
+    P0[np.ix_(places, places)] = problem.P0[:own, :own]
+    return new.with_start(P0)
+
+
+class _Known:
+    """What a fit found, by name, from which a search with one more state begins."""
+
+    def __init__(self, t: dict[str, float], variances: dict[str, float], kept: dict[str, float], R: FloatArray) -> None:
+        self.t, self.variances, self.kept, self.R = t, variances, kept, R
+
+    @classmethod
+    def of(cls, problem: Problem, fit: InnovationsFit) -> _Known:
+        """Return what a fit found; ``kept``: how much of an innovation of each sensor its next one keeps."""
+        columns = zip(problem.output_names, fit.whitened.T, strict=True)
+        kept = {name: whiteness(column).first for name, column in columns}
+        both = (*problem.noisy, *problem.output_names)
+        variances = dict(zip(both, (*fit.Q.tolist(), *fit.R.tolist()), strict=True))
+        spread = np.nanmean(fit.innovations**2, axis=0)
+        return cls(dict(zip(problem.unknown, fit.t.tolist(), strict=True)), variances, kept, spread)
+
+    def best(self, problem: Problem) -> tuple[float, _Known]:
+        """Return the least negative log likelihood with another model, and what it found."""
+        plant = problem.plant
+        nominal = {name: float(value) for name, value in zip(problem.unknown, problem.nominal, strict=True)}
+        best, value = None, np.inf
+        for longer in (1.0, 5.0):
+            t, variances = nominal | self.t, dict(self.variances)
+            for j, name in enumerate(problem.output_names):
+                if correlation_name(name) in self.t or noise_state(name) not in problem.noisy:
+                    continue
+                time = -longer * problem.log.dt / float(np.log(np.clip(self.kept[name], *FIRST_KEPT)))
+                if correlation_name(name) in problem.unknown:
+                    t[correlation_name(name)] = float(np.log(time))
+                variances[noise_state(name)] = process_variance(
+                    COLOURED_SHARE * self.R[j], time, problem.log.dt, problem.integration
+                )
+                variances[name] = (1.0 - COLOURED_SHARE) * variances[name]
+            start = np.clip([t[name] for name in problem.unknown], problem.low, problem.high)
+            fit = Fit(start, problem.x0, np.sqrt(self.R), 0.0, np.zeros((0, 0)))
+            objective = Objective(problem, fit)
+            full = objective.full(objective.start(start))
+            for i, name in enumerate((*problem.noisy, *problem.output_names)):
+                if variances.get(name, 0.0) > 0.0:
+                    full[objective.nt + i] = np.log(variances[name])
+            full[: objective.nt] /= problem.widths
+            reached, z = objective.descent(full[objective.free])
+            if reached < value and reached < IMPOSSIBLE:
+                value, best = reached, (objective, z)
+            if not isinstance(plant, PlantWithNoise) or not plant.bounds:
+                break
+        if best is None:
+            return np.inf, self
+        objective, z = best
+        Q, R = objective.noise(z)
+        found = dict(zip((*problem.noisy, *problem.output_names), (*Q.tolist(), *R.tolist()), strict=True))
+        return value, _Known(
+            dict(zip(problem.unknown, objective.constants(z).tolist(), strict=True)), found, self.kept, self.R
+        )

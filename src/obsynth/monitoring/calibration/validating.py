@@ -1,0 +1,534 @@
+"""Comparing a recorded, fault-free log with a design: its innovations, the variances that the log contradicts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import PreconditionError, SolverError, SpecError
+from obsynth.monitoring.calibration.diagnostics import (
+    SIGNIFICANT,
+    Consistency,
+    SensorValidation,
+    Validation,
+    change_of_mean,
+    consistency,
+    whiteness,
+    wrong_samples,
+)
+from obsynth.monitoring.calibration.explanations import Explanation, explanations, whitened
+from obsynth.monitoring.calibration.integration_error import IntegrationError, integration_error
+from obsynth.monitoring.calibration.logs import Log, LogData, quantum, read_log
+from obsynth.monitoring.calibration.maximum import Objective, greatest_likelihood
+from obsynth.monitoring.calibration.plants import NonlinearPlant
+from obsynth.monitoring.calibration.problem import Problem
+from obsynth.monitoring.calibration.simulation_error import Fit
+from obsynth.monitoring.calibration.step_graphs import sample_graphs
+from obsynth.monitoring.calibration.told_variances import (
+    likeliest_shares,
+    shared_walk,
+    stated_walk,
+    told_shares,
+    with_walk,
+)
+from obsynth.numerics.arguments import arguments_checked
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.nonlinear.estimates import GatheredRows
+from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.recursive.observer import RecursiveObserver, recursive_estimates
+from obsynth.observers.running import changed
+from obsynth.observers.window.observer import WindowObserver
+from obsynth.plants.transformations.noise_states import with_noise
+from obsynth.results.design import ObserverDesign
+
+#: Nats that a variance of the design must cost, the others being free, before its ratio is told.
+CLEAR_NATS = 3.0
+
+#: Where something else explains coloured innovations, variances are told if they explain this many times as many nats:
+#: process noise and coloured sensor noise are hardly distinguished on one log.
+CLEARLY_MORE = 1.25
+
+#: Ratios nearer to one than this factor are not told: nobody knows a variance better.
+TOLD_FACTOR = 1.5
+
+
+#: A mean of innovations, or a parameter's deviation from its start, beyond so many standard deviations is told.
+OFFSET = 3.0
+
+#: Rows that a log must have at least.
+LEAST_VALIDATED_ROWS = 20
+
+#: A sensor's variance that a log may say, at least, as a share of what the design says.
+LEAST_RATIO = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedInnovations:
+    """Innovations ``(n, ny)`` and their deviations; sum of NIS and of its degrees; each parameter ``(n, 2)``."""
+
+    innovations: FloatArray
+    deviations: FloatArray
+    squares: float
+    degrees: int
+    estimates: Mapping[str, FloatArray]
+    states: FloatArray  # ``(n, nx)``
+
+    @property
+    def standardised(self) -> FloatArray:
+        """Innovations in their own deviations ``(n, ny)``, NaN where nothing was measured."""
+        return np.asarray(self.innovations / self.deviations)
+
+    @property
+    def loss(self) -> float:
+        """Negative log likelihood of each sensor's innovations, in nats, up to a constant."""
+        whole = 0.5 * self.standardised**2 + np.log(self.deviations)
+        return float(whole[np.isfinite(whole)].sum())
+
+
+def recorded_innovations(design: ObserverDesign, log: Log) -> RecordedInnovations:
+    """Run a design over a log."""
+    observer = design.observer
+    if isinstance(observer, (DAEObserver, RecursiveObserver)) and observer.sensors is not None:
+        # Afterwards every value is known at its own time.
+        log = replace(log, y=observer.timing.in_order(log.y))
+    if isinstance(observer, DAEObserver):
+        found = _over(changed(observer, sensors=None), log)
+        return _recorded(found, found.innovations, np.sqrt(np.einsum("kii->ki", found.innovation_covariances)))
+    if isinstance(observer, RecursiveObserver):
+        return _recursive(changed(observer, sensors=None), log, dict(getattr(design.plant, "operating_point", {})))
+    raise TypeError(f"{type(observer).__name__} has no innovations with a covariance")
+
+
+def _integration_error(observer: object, log: Log, record: RecordedInnovations) -> IntegrationError | None:
+    """Return the error of backward Euler along a log, where an observer takes such steps."""
+    if not (isinstance(observer, DAEObserver) and observer.integration == "backward-euler"):
+        return None
+    # Where the noise of a sensor is coloured, R is what is white beside it, next to nothing.
+    return integration_error(
+        observer.model,
+        record.states,
+        log.u,
+        np.array([columns[-1, 0] for columns in record.estimates.values()]),
+        np.median(record.deviations, axis=0),
+        observer.dt,
+    )
+
+
+def _over(observer: DAEObserver, log: Log) -> Estimates:
+    """Return the estimates over a log; inputs that are missing are those that runs take in their place."""
+    u = log.measured_inputs
+    if not np.isnan(u).any():
+        return observer.run(log.y, u, progress=False)
+    state, rows = observer.init(), GatheredRows(observer)
+    for y_k, u_k in zip(log.y, u, strict=True):
+        state, row = observer.accept(state, y_k, u_k)
+        rows.add(row)
+    return rows.estimates()
+
+
+def _recursive(observer: RecursiveObserver, log: Log, point: Mapping[str, float]) -> RecordedInnovations:
+    """Predict each sample from those before it: a step without measurements, beside the one with them."""
+    plant = observer.plant
+    y = log.y - np.array([point.get(name, 0.0) for name in plant.output_names])
+    u = log.measured_inputs - np.array([point.get(name, 0.0) for name in plant.input_names])
+    state, nothing = observer.init(), np.full(plant.ny, np.nan)
+    e, deviations, rows = np.full(y.shape, np.nan), np.full(y.shape, np.nan), []
+    for k in range(len(y)):
+        if k:
+            mean, covariance = observer.recursion.predicted(state, nothing, u[k])
+            deviations[k] = np.sqrt(np.diag(covariance))
+            e[k] = np.where(np.isfinite(deviations[k]), y[k] - mean, np.nan)
+        state, row = observer.advance(state, y[k], u[k])
+        rows.append(row)
+    return _recorded(recursive_estimates(observer, rows), e, deviations)
+
+
+def _recorded(found: Estimates, innovations: FloatArray, deviations: FloatArray) -> RecordedInnovations:
+    columns = np.stack([found.parameters, found.parameter_deviations], axis=2)
+    estimates = {name: read_only(columns[:, i]) for i, name in enumerate(found.parameter_names)}
+    return RecordedInnovations(
+        innovations, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()), estimates, found.states
+    )
+
+
+def noise_ratios(observer: DAEObserver, log: Log) -> tuple[Mapping[str, float], float, FloatArray]:
+    """Return what a log says of the variances of a design, parameters at their start, or as they walk: likeliest over
+    designed variance for each that it contradicts, the nats that the likeliest ones gain, and the walk of the
+    parameters ``(nq, nq)`` that goes with them, at most the one that is stated."""
+    model = observer.model
+    held = model.replace(parameters=dict(zip(model.parameter_names, observer.initial_parameters, strict=True)))
+    designed_Q, designed_R = np.diag(observer.Q), np.diag(observer.R)
+    noisy = tuple(name for name, variance in zip(model.equation_names, designed_Q, strict=True) if variance > 0.0)
+    walk = observer.random_walk if stated_walk(observer).any() else np.zeros((model.nq, model.nq))
+    walking = np.diag(walk) > 0.0
+    if walking.any() and not held.is_data:
+        # Equations given as functions take no further states.
+        return {}, 0.0, walk
+    walks = dict(zip(np.array(model.parameter_names)[walking].tolist(), np.diag(walk)[walking].tolist(), strict=True))
+    made: Any = with_noise(held, walks=walks)[0] if walks else held
+    names = (*noisy, *walks, *model.output_names)
+    # What is added to the equation of a state that walks acts during the whole step.
+    designed = np.concatenate([designed_Q[designed_Q > 0.0], np.diag(walk)[walking] / log.dt**2, designed_R])
+    nothing, start = np.zeros(0), np.concatenate([observer.initial_state, observer.initial_parameters[walking]])
+    unsure = observer.initial_parameter_covariance[np.ix_(walking, walking)]
+    plant = NonlinearPlant(made)
+    graphs = sample_graphs(plant, (), log.dt, integration=observer.integration, substeps=1, samples=log.samples)
+    quanta = np.array([quantum(column) for column in log.y.T])
+    problem = Problem(
+        plant,
+        log,
+        log.u,
+        (),
+        nothing,
+        nothing,
+        nothing,
+        nothing,
+        nothing,
+        (*noisy, *walks),
+        np.full(len(noisy) + len(walks), np.nan),
+        np.full(model.ny, np.nan),
+        start,
+        np.block(
+            [
+                [observer.initial_covariance, np.zeros((model.nx, len(walks)))],
+                [np.zeros((len(walks), model.nx)), unsure],
+            ]
+        ),
+        quanta,
+        LEAST_RATIO * designed_R,
+        graphs,
+        observer.integration,
+        1,
+    )
+    fit = Fit(nothing, start, np.sqrt(designed_R), 0.0, np.zeros((0, 0)))
+    objective = Objective(problem, fit)
+    try:
+        best = greatest_likelihood(objective, [fit], lambda text: None)
+    except PreconditionError:
+        # Without a likelihood nothing can be told of its variances.
+        return {}, 0.0, walk
+    found = {}
+    for i, (name, variance) in enumerate(zip(names, designed, strict=True)):
+        ratio = float(np.exp(best.z[i]) / variance)
+        z = best.z.copy()
+        z[i] = np.log(variance)
+        if name not in walks and max(ratio, 1.0 / ratio) > TOLD_FACTOR and objective(z)[0] - best.value > CLEAR_NATS:
+            found[name] = ratio
+    shares = np.ones(model.nq)
+    likeliest = np.exp(best.z[len(noisy) : len(noisy) + len(walks)] - np.log(designed[len(noisy) :][: len(walks)]))
+    shares[walking] = np.minimum(likeliest, 1.0)
+    return found, objective(np.log(designed))[0] - best.value, shared_walk(walk, shares)
+
+
+@arguments_checked
+def validate(
+    design: ObserverDesign,
+    log: LogData,
+    *,
+    rows: str | slice | Sequence[int] | None = None,
+    columns: Mapping[str, str] | None = None,
+    scales: Mapping[str, float] | None = None,
+    progress: Callable[[str], object] | None = None,
+) -> Validation:
+    """Test whether a log without faults agrees with a design.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Recursive or nonlinear: one that predicts its outputs with a covariance.
+    log : path, pandas.DataFrame or mapping
+        CSV or Parquet file, or columns by name: ``time`` in seconds, inputs and outputs.
+    rows : str, slice or pair, optional
+        ``"a:b"``, as Python counts: the rows without faults; all by default.
+    columns : mapping of str to str, optional
+        Column of a signal, or of ``time``, where the names differ.
+    scales : mapping of str to float, optional
+        What a column is multiplied by; those of the plant by default.
+    progress : callable, optional
+        Called with a text at each stage.
+
+    Returns
+    -------
+    Validation
+        NIS per degree of freedom, mean and whiteness of each sensor's innovations, variances that the log contradicts,
+        and a verdict with what to change.
+
+    Raises
+    ------
+    SpecError
+        The design has no innovations with a covariance, a name is unknown, or the log cannot be used.
+    SolverError
+        A step of a nonlinear plant has no solution along the log.
+    """
+    note = progress or (lambda text: None)
+    found = _usable_log(design, log, rows=rows, columns=columns, scales=scales)
+    note(f"innovations of {found.samples} rows")
+    whole_walk = recorded_innovations(design, found)
+    design, record, told = _as_far_as_it_walks(design, found, whole_walk, note)
+    far_off, near = _far(whole_walk.estimates, design, found.samples)
+    sensors = _sensors(record, design.plant.output_names)
+    whole, white = consistency(record.squares, record.degrees), _white(sensors)
+    place = change_of_mean(record.standardised if white else whitened(record.standardised))
+    change = None if place is None else found.rows[0] + place
+    ratios, others = _contradicted(design, found, record, sensors, whole, note)
+    sentences = _sentences(sensors, ratios, change, far_off, coloured=others is not None)
+    if others is not None:
+        sentences.append(_explained(others))
+    passed = whole.holds and not sentences
+    if not (passed or whole.holds or ratios) and others is None:
+        far = "small" if whole.value > whole.high else "large"
+        sentences.append(
+            f"Q and R are too {far} together: the innovations are {np.sqrt(whole.value):.2g} times what is expected."
+        )
+    error = _integration_error(design.observer, found, record)
+    if error is not None and error.matters:
+        sentences.append(
+            f"A step of backward Euler has an error of up to {error.largest:.2g} deviations of "
+            f"{error.sensor} (row {found.rows[0] + error.row}), which moves estimates of "
+            "parameters: integration: radau has no such error."
+        )
+    if passed:
+        sentences.append("The innovations are as the design expects them: white, without offset, of the stated size.")
+    return Validation(
+        passed,
+        design.name,
+        whole,
+        sensors,
+        ratios,
+        change,
+        (*found.notes, *told, *near, *sentences),
+        read_only(record.innovations),
+        read_only(record.deviations),
+        read_only(np.array(found.y)),
+        read_only(found.y - record.innovations),
+        whole_walk.estimates,
+        found.described,
+    )
+
+
+def _usable_log(
+    design: ObserverDesign,
+    log: LogData,
+    *,
+    rows: str | slice | Sequence[int] | None,
+    columns: Mapping[str, str] | None,
+    scales: Mapping[str, float] | None,
+) -> Log:
+    """Return the log of a design whose innovations it can contradict, without samples that are clearly wrong."""
+    if not states_innovations(design):
+        raise SpecError(
+            f"The method {design.method} states no covariance of its residual with which a log could be compared: "
+            "validate a recursive or nonlinear design, or run the log with a monitor.",
+            path="design",
+        )
+    plant = design.plant
+    factors = dict(getattr(plant, "scales", {})) | dict(scales or {})
+    found = read_log(
+        log, plant.input_names, plant.output_names, rows=rows, columns=columns, scales=factors, dt=design.observer.dt
+    )
+    if found.samples < LEAST_VALIDATED_ROWS:
+        raise SpecError(
+            f"The log has {found.samples} rows here: at least {LEAST_VALIDATED_ROWS} are needed.",
+            path="rows",
+            code="too-short",
+        )
+    return found.shifted(design.input_delay).without(wrong_samples(found.y))
+
+
+def _contradicted(
+    design: ObserverDesign,
+    log: Log,
+    record: RecordedInnovations,
+    sensors: Mapping[str, SensorValidation],
+    whole: Consistency,
+    note: Callable[[str], object],
+) -> tuple[Mapping[str, float], tuple[Explanation, ...] | None]:
+    """Return the variances that a log contradicts, and what explains innovations that these leave coloured; ``None``
+    where they are white, as the design states its variances or with the likeliest ones."""
+    white, observer = _white(sensors), design.observer
+    # A variance that moves no innovation out of what is expected is no reason to change a design.
+    if whole.holds and white and all(item.nis.holds for item in sensors.values()):
+        return {}, None
+    said = None
+    if isinstance(observer, DAEObserver):
+        note("variances that the log makes likeliest")
+        # What a gate leaves out is no sample of the stated noise.
+        passed_by_gate = replace(log, y=read_only(np.where(np.isfinite(record.innovations), log.y, np.nan)))
+        said = noise_ratios(observer, passed_by_gate)
+    ratios: Mapping[str, float] = {} if said is None else said[0]
+    if white:
+        return ratios, None
+    others = _explanations(design, log, record, note)
+    if said is None or not ratios or not isinstance(observer, DAEObserver):
+        return ratios, others
+    # Wrong variances colour the innovations too: with the likeliest ones they are white, and nothing explains more.
+    _, gain, walk = said
+    likeliest = recorded_innovations(design.replace(observer=_with_variances(observer, ratios, walk)), log)
+    rival = CLEARLY_MORE * others[0][1] if others else 0.0
+    if not _white(_sensors(likeliest, design.plant.output_names)) or rival > gain:
+        return {}, others
+    return ratios, None
+
+
+def _as_far_as_it_walks(
+    design: ObserverDesign, log: Log, record: RecordedInnovations, note: Callable[[str], object]
+) -> tuple[ObserverDesign, RecordedInnovations, list[str]]:
+    """Return the design with as much of the walk of its parameters as the log shows, its run, and what is said of
+    that; ``record`` is the run with all of it."""
+    observer = design.observer
+    walk = stated_walk(observer)
+    if not walk.any() or not isinstance(observer, (DAEObserver, RecursiveObserver)):
+        return design, record, []
+    runs = {walk.tobytes(): (design, record)}
+
+    def loss(tried: FloatArray) -> float:
+        if tried.tobytes() not in runs:
+            another = design.replace(observer=with_walk(observer, tried))
+            runs[tried.tobytes()] = another, recorded_innovations(another, log)
+        return runs[tried.tobytes()][1].loss
+
+    note("how far parameters walk in this log")
+    shares = likeliest_shares(walk, loss)
+    return *runs[shared_walk(walk, shares).tobytes()], told_shares(design.observer.fault_names, walk, shares)
+
+
+def states_innovations(design: ObserverDesign) -> bool:
+    """Whether a design predicts its outputs with a covariance, which a log could contradict."""
+    return not isinstance(design.observer, (LinearObserver, WindowObserver))
+
+
+def _sensors(record: RecordedInnovations, names: Sequence[str]) -> dict[str, SensorValidation]:
+    found = {}
+    for name, column in zip(names, record.standardised.T, strict=True):
+        seen = np.isfinite(column)
+        count = int(seen.sum())
+        mean = float(column[seen].mean() * np.sqrt(count)) if count else 0.0
+        found[name] = SensorValidation(consistency(float((column[seen] ** 2).sum()), count), mean, whiteness(column))
+    return found
+
+
+def _sentences(
+    sensors: Mapping[str, SensorValidation],
+    ratios: Mapping[str, float],
+    change: int | None,
+    far: Mapping[str, float],
+    *,
+    coloured: bool,
+) -> list[str]:
+    found = []
+    for name, ratio in ratios.items():
+        letter, what = "R" if name in sensors else "Q", "small" if ratio > 1.0 else "large"
+        factor = max(ratio, 1.0 / ratio)
+        found.append(f"{letter} of {name} is {_times(factor)} too {what}.")
+    for name, sensor in sensors.items():
+        if abs(sensor.mean) > OFFSET:
+            found.append(
+                f"The innovations of {name} have an offset of {sensor.mean:+.1f} deviations of their mean: a "
+                "constant or an offset of the sensor is wrong."
+            )
+        if sensor.whiteness.probability < SIGNIFICANT:
+            found.append(
+                f"The innovations of {name} are not white (p = {sensor.whiteness.probability:.2g}, first "
+                f"autocorrelation {sensor.whiteness.first:+.2f}): "
+                + ("coloured noise or a model error." if coloured else "Q against R is wrong.")
+            )
+    if change is not None:
+        found.append(
+            f"The mean of the innovations changes at row {change}: these rows are not free of faults"
+            + (", or something that is not in the model changes there." if coloured else ".")
+        )
+    for name, deviation in far.items():
+        found.append(
+            f"The estimate of {name} ends {deviation:.1f} deviations from its nominal value: a constant is "
+            f"wrong, {'coloured noise acts on it, ' if coloured else ''}or the rows are not free of faults."
+        )
+    return found
+
+
+def _white(sensors: Mapping[str, SensorValidation]) -> bool:
+    return all(sensor.whiteness.probability >= SIGNIFICANT for sensor in sensors.values())
+
+
+def _with_variances(observer: DAEObserver, ratios: Mapping[str, float], walk: FloatArray) -> DAEObserver:
+    """Return the observer with the likeliest variances on a log, where these are told."""
+    q = [ratios.get(name, 1.0) for name in observer.model.equation_names]
+    r = [ratios.get(name, 1.0) for name in observer.model.output_names]
+    Q, R = np.diag(np.diag(observer.Q) * q), np.diag(np.diag(observer.R) * r)
+    return replace(observer, Q=Q, R=R, random_walk=walk)
+
+
+def _explanations(
+    design: ObserverDesign, log: Log, record: RecordedInnovations, note: Callable[[str], object]
+) -> tuple[Explanation, ...]:
+    """Return what explains innovations that are not white, other than the variances."""
+    observer, constants = design.observer, dict[str, float]()
+    if isinstance(observer, DAEObserver):
+        constants = {name: float(value) for name, value in observer.model.constants.items()}
+
+    def with_constant(name: str, value: float) -> FloatArray:
+        note(f"innovations with another value of {name}")
+        nonlinear: Any = observer  # no other observer has constants
+        model = nonlinear.model.replace(constants={**nonlinear.model.constants, name: value})
+        try:
+            found = recorded_innovations(design.replace(observer=replace(nonlinear, model=model)), log)
+        except SolverError:
+            return np.full(record.innovations.shape, np.nan)
+        return np.asarray(found.innovations / record.deviations)
+
+    return explanations(
+        record.standardised,
+        log.u,
+        design.plant.output_names,
+        design.plant.input_names,
+        dt=log.dt,
+        constants=constants,
+        with_constant=with_constant,
+    )
+
+
+def _explained(told: Sequence[Explanation]) -> str:
+    if not told:
+        return "No single offset, correlated noise, delay of an input or constant explains that: plot the residuals."
+    listed = "; ".join(f"{text} ({gain:.3g} nats)" for text, gain in told)
+    return (
+        f"What explains it best, by likelihood: {listed}. The factors of Q and R have no meaning until that is "
+        "corrected."
+    )
+
+
+def _far(
+    estimates: Mapping[str, FloatArray], design: ObserverDesign, samples: int
+) -> tuple[dict[str, float], list[str]]:
+    """Return by how many deviations each parameter's estimate ends off its start, where that is further than it walks;
+    and a sentence for each that walks so far."""
+    observer, walk = design.observer, stated_walk(design.observer)
+    start = dict(zip(observer.fault_names, getattr(observer, "initial_parameters", ()), strict=False))
+    variances = np.diag(walk) if walk.size else np.zeros(len(start))
+    walked = dict(zip(start, np.sqrt(samples * variances), strict=True))
+    found, told = {}, []
+    for name, columns in estimates.items():
+        value, deviation = columns[-1]
+        if name not in start or not deviation > 0.0 or not abs(value - start[name]) > OFFSET * deviation:
+            continue
+        off = float(abs(value - start[name]) / deviation)
+        if abs(value - start[name]) > OFFSET * np.hypot(deviation, walked[name]):
+            found[name] = off
+        else:
+            told.append(
+                f"The estimate of {name} ends {off:.1f} deviations from its nominal value, no further than it may "
+                "walk: if it is a fault, these rows are not free of it."
+            )
+    return found, told
+
+
+def _times(factor: float) -> str:
+    if factor > 1000.0:
+        return "more than a thousand times"
+    words = {2: "two", 3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}
+    near = round(factor)
+    return f"{words[near]} times" if near in words and abs(factor - near) < 0.25 * near else f"{factor:.3g} times"

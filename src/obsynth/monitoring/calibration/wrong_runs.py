@@ -1,0 +1,66 @@
+"""Several wrong samples of one sensor in a row: far from their prediction, and gone when they are over.
+
+What happened in the plant is seen by other sensors, or goes on.  Once wrong samples are hidden, the next one is where
+it was predicted; then they count as not measured, as single ones do.  Left in a log, three of them made coloured noise
+look white, or of twice its size.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.monitoring.calibration.diagnostics import (
+    LEAST_DIAGNOSED_ROWS,
+    MOST_OUTLIERS,
+    STANDS_OUT,
+    BoolArray,
+    usual_size,
+)
+from obsynth.monitoring.calibration.innovations_fit import InnovationsFit
+from obsynth.monitoring.calibration.noise_proposals import LONGEST_RUN, RETURNED, whitened_run
+from obsynth.monitoring.calibration.problem import Problem
+
+
+def wrong_runs(problem: Problem, fit: InnovationsFit) -> BoolArray:
+    """Return which measurements ``(n, ny)`` stand out with others of the same sensor beside them, are not seen by
+    another sensor, and leave the next samples where these are predicted without them."""
+    found = np.zeros(problem.y.shape, dtype=bool)
+    seen = np.isfinite(problem.y)
+    enough = seen.sum(axis=0) >= LEAST_DIAGNOSED_ROWS
+    usual = np.array([usual_size(e) if many else np.inf for e, many in zip(fit.whitened.T, enough, strict=True)])
+    far = seen & (np.abs(fit.whitened) > STANDS_OUT * usual)
+    for i in range(far.shape[1]):
+        for first, last in _groups(far[:, i]):
+            if np.delete(far[first : last + 1], i, axis=1).any():
+                continue
+            end = _end(problem, fit, usual[i], i, first, last)
+            if end is not None:
+                found[first : end + 1, i] = seen[first : end + 1, i]
+    return np.asarray(found & (found.sum(axis=0) <= MOST_OUTLIERS * seen.sum(axis=0)))
+
+
+def _groups(far: BoolArray) -> list[tuple[int, int]]:
+    """Return first and last row of what stands out together, of no more than a run and the sample after it; single ones
+    are none."""
+    found: list[tuple[int, int]] = []
+    for row in np.flatnonzero(far).tolist():
+        if found and row - found[-1][1] <= LONGEST_RUN:
+            found[-1] = (found[-1][0], row)
+        else:
+            found.append((row, row))
+    return [(first, last) for first, last in found if 0 < last - first <= LONGEST_RUN]
+
+
+def _end(problem: Problem, fit: InnovationsFit, usual: float, output: int, first: int, last: int) -> int | None:
+    """Return the first row to which samples must be hidden so that those after it are where they are predicted; `None`
+    where there is none."""
+    for end in range(first, min(last, first + LONGEST_RUN - 1) + 1):
+        y = problem.y.copy()
+        y[first : end + 1, output] = np.nan
+        after = np.flatnonzero(np.isfinite(y[end + 1 :, output]))[:RETURNED] + end + 1
+        if (
+            len(after) == RETURNED
+            and (np.abs(whitened_run(problem, fit.v, y)[after, output]) <= STANDS_OUT * usual).all()
+        ):
+            return end
+    return None

@@ -1,0 +1,510 @@
+"""A linear observer on a log, row by row: gaps, bad rows, warm-up; and which observer a design has on a log."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from functools import lru_cache, partial
+from typing import ClassVar, TypeVar
+
+import numpy as np
+
+from obsynth.errors import ObsynthError, PreconditionError, SpecError
+from obsynth.monitoring.logs.log_observer import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, LogObserver, Row
+from obsynth.monitoring.logs.step_observer import SteppingLogObserver
+from obsynth.monitoring.logs.window_observer import WindowLogObserver
+from obsynth.monitoring.thresholds.monitor import LinearSample
+from obsynth.numerics.arguments import real_number
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.continuous import first_order_hold
+from obsynth.observers.linear.derived import noise_variances, transient
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.taken_inputs import no_inputs, over_samples, taken_inputs
+from obsynth.observers.window.observer import WindowObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.design import ObserverDesign
+
+#: How many lengths of an interval are kept discretised.
+KEPT_INTERVALS = 64
+
+#: A gap is over when what it can have left in fault estimates and residuals is below this share of their usual changes
+#: from row to row, which so many rows must have shown, or below what the stated noise of the sensors makes of them.
+GAP_LEFT_SHARE, LEAST_SHOWN = 1.0, 20
+
+#: What is guaranteed waits until what a gap has left is below this share of that, for so many initial-condition
+#: responses at most.
+GUARANTEED_SHARE, MOST_TRANSIENTS = 1e-3, 10
+
+SAMPLED_GAP = "gap is for continuous-time designs: for a sampled one missing rows follow from the time stamps."
+
+#: What goes from row to row.
+SAVED = (
+    *("z", "v", "row", "model", "fault", "inputs", "measured", "seen"),
+    *("moves", "reach"),
+    *("clear_at", "begun", "changes", "counted", "left", "held", "excess", "carried", "known_from", "bridged"),
+)
+
+_Part = TypeVar("_Part")
+
+
+class GapModel:
+    """The plant model that stands in for the sensors during a gap: faults held, unknown inputs zero, ``E = I``.
+    ``into (nx, nx_source)``: the dynamic states in an estimate of all states."""
+
+    def __init__(self, plant: DescriptorSystem, into: FloatArray) -> None:
+        self.plant, self.into = plant, into
+        self._hold = lru_cache(KEPT_INTERVALS)(partial(first_order_hold, plant.A, np.hstack([plant.B, plant.Bf])))
+
+    @classmethod
+    def of(cls, plant: DescriptorSystem) -> GapModel | None:
+        """Return the model of a plant; ``None`` where the plant cannot be propagated (index 2 or more)."""
+        if np.array_equal(plant.E, np.eye(plant.nx)):
+            return cls(plant, np.eye(plant.nx))
+        from obsynth.plants.transformations.elimination import eliminate_algebraic_states
+
+        try:
+            done = eliminate_algebraic_states(plant)
+        except PreconditionError:
+            return None
+        moving = plant.E @ done.recovery.from_state
+        return cls(done.plant, np.asarray(np.linalg.pinv(moving) @ plant.E))
+
+    def start(self, estimate: FloatArray, inputs: Iterable[FloatArray], fault: FloatArray) -> FloatArray:
+        """Return the dynamic states now from an estimate ``(nx_source,)`` and the inputs of the samples since."""
+        state = self.into @ estimate
+        for u in inputs:
+            state = self.after(state, 0.0, u, u, fault)
+        return np.asarray(state)
+
+    def after(
+        self, state: FloatArray, seconds: float, before: FloatArray, u: FloatArray, fault: FloatArray
+    ) -> FloatArray:
+        """Return the state a sample later, or after an interval along which inputs go from ``before`` to ``u``."""
+        plant = self.plant
+        if plant.dt > 0.0:
+            return np.asarray(plant.A @ state + plant.B @ before + plant.Bf @ fault)
+        if seconds <= 0.0:
+            return state
+        transition, constant, ramp = self._hold(seconds)
+        rise = np.concatenate([u - before, np.zeros(len(fault))])
+        return np.asarray(transition @ state + constant @ np.concatenate([before, fault]) + ramp @ rise)
+
+    def outputs(self, state: FloatArray, u: FloatArray, fault: FloatArray) -> FloatArray:
+        """Return the outputs ``(ny,)`` of a state."""
+        return np.asarray(self.plant.C @ state + self.plant.D @ u + self.plant.Df @ fault)
+
+    def miss(self, v: FloatArray, state: FloatArray | None = None, fault: FloatArray | None = None) -> float:
+        """Return the distance between measured outputs and those of a state; of rest and no fault by default."""
+        plant = self.plant
+        at = np.zeros(plant.nx) if state is None else state
+        f = np.zeros(plant.nf) if fault is None else fault
+        return float(np.linalg.norm(v[plant.nu :] - self.outputs(at, v[: plant.nu], f)))
+
+
+def _state_solver(design: ObserverDesign) -> FloatArray | None:
+    """Return what gives states from an observer that estimates none, as filters of faults do: the smallest that explain
+    its own state ``z = T E x`` and the outputs, ``(nx, nz + ny)``; ``None`` where faults are not all estimated."""
+    from obsynth.methods.registry import error_model
+
+    plant, observer = design.linear
+    if observer.fault_names != plant.fault_names:
+        # The model needs every fault of the plant: an observer of some of them begins again after a gap.
+        return None
+    try:
+        own = error_model(design).own
+    except SpecError:
+        return None
+    return np.asarray(np.linalg.pinv(np.vstack([own[:, : plant.nx] @ plant.E, plant.C])))
+
+
+def _running(part: _Part | None) -> _Part:
+    """Return a part that is there while the observer runs."""
+    if part is None:
+        raise ObsynthError(
+            "The saved state is incomplete: its observer or plant model is missing. Start the run again."
+        )
+    return part
+
+
+class LinearLogObserver(LogObserver):
+    """A linear observer on a log; ``gap`` and ``warm_up`` in seconds, see `run_on_data`."""
+
+    plant: DescriptorSystem
+    saved: ClassVar = dict(zip(SAVED, SAVED, strict=True))
+
+    def __init__(self, design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None) -> None:
+        self.plant, self.observer = design.linear
+        if gap is not None:
+            real_number(gap, "gap", "seconds, a positive number", above=0.0)
+        if gap is not None and self.observer.dt > 0.0:
+            raise SpecError(SAMPLED_GAP, path="gap")
+        super().__init__(self.observer, warm_up, transient(self.observer))
+        self.options["gap"], self.input_delay = gap, design.input_delay
+        self.input_names, self.output_names = self.observer.input_names, self.observer.output_names
+        self.point, self.scales = self.plant.operating_point, self.plant.scales
+        self.columns = self.observer.row_names
+        lags = set(self.observer.state_delays) or {0}
+        states = len(self.observer.state_names) == self.plant.nx
+        self.solver = None if states else _state_solver(design)
+        known = states or self.solver is not None
+        self.gap_model = None if len(lags) > 1 or not known else GapModel.of(self.plant)
+        self.nu = len(self.input_names)
+        self.b = np.hstack([self.observer.Bu, self.observer.By])
+        self.d = np.hstack([self.observer.Du, self.observer.Dy])
+        self._hold = lru_cache(KEPT_INTERVALS)(partial(first_order_hold, self.observer.Az, self.b))
+        self.z: FloatArray | None = None
+        self.v = np.zeros(self.b.shape[1])
+        self.row = np.full(len(self.observer.Cz), np.nan)
+        self.model: FloatArray | None = None
+        # What is known of the plant's states at the last measured row, from which the model starts.
+        width = len(self.observer.state_names) if self.solver is None else self.plant.nx
+        self.seen = np.full(width, np.nan)
+        # Since when nothing is left of a gap: bounds that are never passed hold from there on.
+        self.clear_at, self.begun = -math.inf, False
+        # Since when the initial-condition response has settled, and whether the model has stood in for all that was
+        # missing from there on.
+        self.known_from, self.bridged = math.inf, False
+        # Squares of changes of fault estimates and residuals from row to row, summed up, and how many there are.
+        self.shown = slice(len(self.observer.state_names), None)
+        self.changes, self.counted = np.zeros(len(self.observer.Cz[self.shown])), 0
+        # Variances that the stated noise of the sensors gives them.
+        noisy = self.observer.dt > 0.0 and self.observer.By.shape[1] == self.plant.ny
+        self.noise = noise_variances(self.observer, self.plant.Dw)[self.shown] if noisy else np.zeros_like(self.changes)
+        # What a unit error of each input that was held, and of each output that the model told, has left in z.
+        self.left, self.held = np.zeros(self.b.shape), np.zeros(self.nu)
+        # How inputs have moved, and how far those that are missing may have moved since they were known.
+        self.moves, self.reach = no_inputs(self.nu), np.zeros(self.nu)
+        # What the errors of the last gap have left in z, and what those of the gaps before it had in the columns.
+        self.excess, self.carried = np.zeros(self.b.shape), np.zeros(len(self.columns))
+        self.transient = transient(self.observer)
+        # Of every fault of the plant; those of which nothing is estimated are held to be absent.
+        self.fault = np.zeros(self.plant.nf)
+        self.told_faults = [self.plant.fault_names.index(name) for name in self.observer.fault_names]
+        self.measured = self.v
+        # The last of them: from the moment on of which the estimates are.
+        self.kept_inputs = max(lags) + 1
+        self.inputs = np.zeros((0, self.nu))
+
+    def _usual(self) -> FloatArray | None:
+        """Return what a gap may have left in fault estimates and residuals; nothing where that is not known yet."""
+        shown = self.counted >= LEAST_SHOWN
+        if not shown and not self.noise.all():
+            return None
+        changes = self.changes / self.counted if shown else np.zeros_like(self.changes)
+        return np.asarray(np.sqrt(np.maximum(GAP_LEFT_SHARE**2 * changes, self.noise)))
+
+    def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
+        """Take one row."""
+        since = seconds
+        good = bool(np.isfinite(values).all())
+        previous = self.row if self.model is None and self.z is not None else None
+        u = values[: self.nu]
+        u = np.where(np.isfinite(u), u, self.v[: self.nu])
+        # A number that overflows in what follows is a bad sample like any other: the state is looked at below.
+        with np.errstate(over="ignore", invalid="ignore"):
+            if missing:
+                self._bridge_interval(seconds, missing, u)
+                seconds = 0.0 if self.observer.dt == 0.0 else seconds
+            recovered = unsure = self.warm_up
+            if good and self.model is not None:
+                self._propagate(seconds, u)
+                recovered, unsure = self._recovering(seconds, values, longest)
+                # What has become usual before a new start would have settled needs none.
+                if recovered >= self.warm_up and self._lost(values):
+                    self._restart()
+            first = self.z is None
+            if good and first:
+                self.z, self.phase = np.zeros(self.observer.order), WARM_UP
+                self.settled_at = self._after(time, self.warm_up)
+                self.known_from = self._after(time, max(self.warm_up, self.transient))
+                if self.begun:
+                    self.clear_at = self.known_from
+                self.begun = True
+                self.inputs = self.inputs[:0]
+                seconds = 0.0
+            if good:
+                if self.model is None:
+                    self._advance_excess(seconds)
+                self.moves = taken_inputs(self.moves, self.v[: self.nu], u, is_first=first).history
+                found = self._measured(seconds, values)
+                if self.model is not None:
+                    self.model, self.left, self.reach = None, np.zeros_like(self.left), np.zeros(self.nu)
+                    # The initial-condition response settles in as many measured rows as without a gap: what the gap
+                    # adds is no larger than what is left of the start then, and goes with it.
+                    self.settled_at += since * missing / (missing + 1)
+                    if self.phase != WARM_UP or time >= self.settled_at:
+                        self.settled_at, self.phase = self._after(time, recovered), RECOVERING
+                    self.clear_at = self._after(time, max(self.warm_up, self.transient, unsure))
+                status = OK if time >= self.settled_at else self.phase
+            else:
+                found, status = self._unmeasured(seconds, u, values), GAP
+        if status == GAP:
+            self.settled_at += since if self.phase == WARM_UP else 0.0
+            return Row(GAP, found, missing, bridged=self.bridged)
+        if self.z is None or not (np.isfinite(self.z).all() and np.isfinite(found).all()):
+            self._restart()
+            return Row(GAP, self._held(), missing)
+        self.fault = self._faults_in(found)
+        # Until enough is known of what is usual, rows after a gap tell it, too: others may never come.
+        counts = status == OK or (status == RECOVERING and self.counted < LEAST_SHOWN)
+        if previous is not None and counts and not missing:
+            self._count((found - previous)[None])
+        sample = LinearSample(found, values[: self.nu], values[self.nu :], len(self.state_names))
+        return self._complete_row(status, found, missing, sample, time)
+
+    def _complete_row(
+        self, status: str, found: FloatArray, missing: int, sample: LinearSample, time: float, *, clear: bool = False
+    ) -> Row:
+        """Return a complete row; ``clear`` where it is known that gaps have left nothing."""
+        settled = time >= self.clear_at
+        self.bridged |= settled and time >= self.known_from
+        return Row(status, found, missing, sample, settled, None if clear else self._excess_in(status), self.bridged)
+
+    def _excess_in(self, status: str) -> FloatArray | None:
+        """Return what gaps can have left in the columns of a complete row, of one that is recovering."""
+        if status != RECOVERING:
+            self.excess, self.carried = np.zeros_like(self.excess), np.zeros_like(self.carried)
+            return None
+        found = self._shown_excess()
+        if self.observer.dt > 0.0:
+            self.excess = self.observer.Az @ self.excess
+        return found
+
+    def _shown_excess(self) -> FloatArray:
+        return np.asarray(self.carried + np.abs(self.observer.Cz @ self.excess).sum(axis=1))
+
+    def _advance_excess(self, seconds: float) -> None:
+        """Bring what a gap has left in a continuous observer to this row; in a sampled one it is there already."""
+        if self.observer.dt == 0.0 and seconds > 0.0 and self.excess.any():
+            self.excess = self._hold(seconds)[0] @ self.excess
+
+    @property
+    def takes_pieces(self) -> bool:
+        """Whether the observer runs, and no model stands in for missing samples."""
+        return self.z is not None and self.model is None
+
+    def take_piece(self, times: Sequence[float], values: FloatArray, intervals: Sequence[float]) -> list[Row]:
+        """Take complete rows that follow each other without a gap; end before a number overflows."""
+        count, observer = len(intervals), self.observer
+        z, before, sampled = _running(self.z), self.v, observer.dt > 0.0
+        states, rows = np.empty((count, observer.order)), np.empty((count, len(observer.Cz)))
+        # The products of `step`, in the same order: results do not depend on where a piece ends.
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k, v in enumerate(values[:count]):
+                if not sampled:
+                    transition, constant, ramp = self._hold(intervals[k])
+                    z = transition @ z + constant @ before + ramp @ (v - before)
+                    before = v
+                states[k] = z
+                rows[k] = observer.Cz @ z + self.d @ v + observer.added
+                if sampled:
+                    z = observer.Az @ z + self.b @ v
+        after = np.vstack([states[1:], z]) if sampled else states
+        known = np.isfinite(after).all(axis=1) & np.isfinite(rows).all(axis=1)
+        if not known.all():
+            count = int(np.argmin(known))
+            if not count:
+                return []
+        last = count - 1
+        counts = np.array(times[:count]) >= self.settled_at
+        if self.phase == RECOVERING:
+            counts |= self.counted + np.cumsum(~counts) <= LEAST_SHOWN
+        self._count(np.diff(np.vstack([self.row, rows[:count]]), axis=0)[counts])
+        self.moves = over_samples(self.moves, self.v[: self.nu], values[:count, : self.nu])
+        self.z, self.v, self.row, self.measured = np.array(after[last]), values[last], rows[last], values[last]
+        self.fault = self._faults_in(rows[last])
+        self.seen = self._states(states[last], values[last], rows[last], self.fault)
+        self.inputs = np.vstack([self.inputs, values[:count, : self.nu]])[-self.kept_inputs :]
+        settled, phase = self.settled_at, self.phase
+        nu, nx, found, clear = self.nu, len(self.state_names), list[Row](), False
+        for time, seconds, row, v in zip(times[:count], intervals[:count], rows[:count], values[:count], strict=True):
+            if not clear:
+                self._advance_excess(seconds)
+            status, said = OK if time >= settled else phase, LinearSample(row, v[:nu], v[nu:], nx)
+            found.append(self._complete_row(status, row, 0, said, time, clear=clear))
+            clear = status != RECOVERING
+        return found
+
+    def _measured(self, seconds: float, v: FloatArray) -> FloatArray:
+        if self.observer.dt == 0.0:
+            self._flow(seconds, v)
+        z = _running(self.z)
+        self.row = np.asarray(self.observer.Cz @ z + self.d @ v + self.observer.added)
+        self.measured = v
+        faults = self._faults_in(self.row)
+        self.seen = self._states(z, v, self.row, faults)
+        self._taken(v)
+        return self.row
+
+    def _states(self, z: FloatArray, v: FloatArray, row: FloatArray, fault: FloatArray) -> FloatArray:
+        """Return the estimates of states at a sample with inputs and outputs ``v``."""
+        if self.solver is None:
+            return row[self.observer.state_rows]
+        outputs = v[self.nu :] - self.plant.D @ v[: self.nu] - self.plant.Df @ fault
+        return np.asarray(self.solver @ np.concatenate([z, outputs]))
+
+    def _faults_in(self, row: FloatArray) -> FloatArray:
+        """Return every fault of the plant ``(nf,)`` as a row of estimates says."""
+        faults = np.zeros(len(self.fault))
+        faults[self.told_faults] = row[self.observer.fault_rows]
+        return faults
+
+    def _count(self, changes: FloatArray) -> None:
+        """Sum up changes ``(n, rows)``, one after the other, so that results do not depend on pieces."""
+        with np.errstate(over="ignore"):
+            squares = np.nan_to_num(changes[:, self.shown] ** 2, nan=0.0, posinf=0.0)
+        self.changes = np.cumsum(np.vstack([self.changes, squares]), axis=0)[-1]
+        self.counted += len(changes)
+
+    def _recovering(self, seconds: float, v: FloatArray, longest: float) -> tuple[float, float]:
+        """Return the seconds after a gap in which nothing may be decided, and those in which nothing is guaranteed; the
+        model stands at this row already.
+
+        The outputs of the model missed those of the plant by no more during the gap than they do now, as errors of a
+        model grow: what that can have left in fault estimates and residuals is followed until it is usual.
+        """
+        gap_model, nu = _running(self.gap_model), self.nu
+        missed = np.abs(v[nu:] - gap_model.outputs(_running(self.model), v[:nu], self.fault))
+        # An input that was held was off by no more than it has changed since, or may have by how it moved before.
+        missed = np.concatenate([np.maximum(np.abs(v[:nu] - self.held), self.reach), missed])
+        usual, step = self._usual(), self.observer.dt or longest
+        if not (np.isfinite(self.left).all() and step > 0.0):
+            self.carried = np.full_like(self.carried, np.inf)
+            return self.warm_up, self.warm_up
+        a, left = self.observer.Az, self.left
+        if self.observer.dt == 0.0:
+            transition, constant, _ = self._hold(seconds or step)
+            told = left.any(axis=0) & np.repeat([False, True], [nu, len(self.output_names)])
+            a, left = self._hold(step)[0], transition @ left + constant * told
+        self.excess = left * missed
+        if usual is None:
+            return self.warm_up, self.warm_up
+        rows, waited, recovered = self.observer.Cz[self.shown], 0.0, self.warm_up
+        longest_wait = MOST_TRANSIENTS * self.transient
+        # The first row after a gap always counts as recovering.
+        while waited < max(self.warm_up, longest_wait if np.isfinite(longest_wait) else 0.0):
+            left, waited = a @ left, waited + step
+            kept = np.abs(rows @ left) @ missed
+            if np.all(kept <= usual):
+                recovered = min(recovered, waited)
+            if np.all(kept <= GUARANTEED_SHARE * usual):
+                break
+        return recovered, waited
+
+    def _lost(self, v: FloatArray) -> bool:
+        """Whether the model, after a gap in which it stood in for outputs, misses them by more than their whole size
+        before and after it."""
+        gap_model = _running(self.gap_model)
+        if not self.left[:, self.nu :].any():
+            return False
+        # The outputs and the model may both be huge; a miss that is not finite is lost as well.
+        return not gap_model.miss(v, self.model, self.fault) <= gap_model.miss(self.measured) + gap_model.miss(v)
+
+    def _taken(self, v: FloatArray) -> None:
+        if self.observer.dt > 0.0:
+            self.z = np.asarray(self.observer.Az @ _running(self.z) + self.b @ v)
+        self.v = v
+        self.inputs = np.vstack([self.inputs, v[: self.nu]])[-self.kept_inputs :]
+
+    def _flow(self, seconds: float, v: FloatArray) -> None:
+        """Bring z of a continuous observer to the time of ``v``, which is reached along a straight line."""
+        if seconds > 0.0:
+            transition, constant, ramp = self._hold(seconds)
+            self.z = np.asarray(transition @ _running(self.z) + constant @ self.v + ramp @ (v - self.v))
+
+    def _bridge_interval(self, seconds: float, missing: int, u: FloatArray) -> None:
+        """Cross the rows that are not there, in continuous time up to and including this row's time; start again where
+        they are too many."""
+        if self.z is None:
+            return
+        if missing > LONGEST_BRIDGE:
+            self._restart()
+            return
+        nothing = np.full_like(self.v, np.nan)
+        begin, part = self.v[: self.nu].copy(), seconds / (missing + 1)
+        for i in range(missing + 1):
+            share = (i + 1) / (missing + 1)
+            self._unmeasured(part, begin + (u - begin) * share, nothing)
+
+    def _unmeasured(self, seconds: float, u: FloatArray, values: FloatArray) -> FloatArray:
+        """Let the plant model stand in for what is missing in ``values (nu + ny,)`` of one sample; return the
+        estimates, faults held. ``u (nu,)``: the inputs, held where they are not known."""
+        if self.z is None:
+            return self._held()
+        if self.gap_model is None:
+            self._restart()
+            return self._held()
+        if self.model is None:
+            self.carried, self.excess = self._shown_excess(), np.zeros_like(self.excess)
+            known = self.inputs if self.observer.dt > 0.0 else ()
+            self.model, self.held = self.gap_model.start(self.seen, known, self.fault), self.v[: self.nu]
+            if self.observer.dt == 0.0:
+                self._propagate(seconds, u)
+        else:
+            self._propagate(seconds, u)
+        # What is measured is taken; what is not, the model says.
+        told = ~np.isfinite(values)
+        self.bridged &= not told[: self.nu].any()
+        v = np.where(told, np.concatenate([u, self.gap_model.outputs(self.model, u, self.fault)]), values)
+        self._unknown_inputs(np.where(told, np.nan, values)[: self.nu])
+        if self.observer.dt == 0.0:
+            self._flow(seconds, v)
+            transition, constant, _ = self._hold(seconds)
+            self.left = transition @ self.left + constant * told
+        else:
+            self.left = self.observer.Az @ self.left + self.b * told
+        row = np.asarray(self.observer.Cz @ self.z + self.d @ v + self.observer.added)
+        self._taken(v)
+        row[self.observer.fault_rows] = self.fault[self.told_faults]
+        row[self.observer.residual_rows] = np.nan
+        if not np.isfinite(self.z).all():
+            self._restart()
+            return self._held()
+        return row
+
+    def _unknown_inputs(self, u: FloatArray) -> None:
+        """Follow how far inputs may have moved that are missing (NaN in ``u (nu,)``)."""
+        before, known = self.v[: self.nu], taken_inputs(self.moves, self.v[: self.nu], u, is_first=False)
+        lowest, highest, change, count, _ = known.history
+        returned = np.where((count == 0.0) & (self.moves[3] > 0.0), np.abs(known.u - before), 0.0)
+        # In one sample an input is off by what it has changed since; in several it may have come and gone.
+        moved = np.where(count > 1.0, np.minimum(count * change, highest - lowest), returned)
+        self.moves, self.reach = known.history, np.maximum(self.reach, moved)
+
+    def _propagate(self, seconds: float, u: FloatArray) -> None:
+        before, model = self.v[: self.nu], _running(self.model)
+        self.model = _running(self.gap_model).after(model, seconds, before, u, self.fault)
+
+    def _restart(self) -> None:
+        self.z = self.model = None
+        self.v, self.left, self.reach = np.zeros_like(self.v), np.zeros_like(self.left), np.zeros_like(self.reach)
+        self.inputs = self.inputs[:0]
+        self.excess, self.carried = np.zeros_like(self.excess), np.zeros_like(self.carried)
+        self.settled_at, self.phase = math.inf, WARM_UP
+        self.known_from, self.bridged = math.inf, False
+
+    def _held(self) -> FloatArray:
+        row = np.full(len(self.observer.Cz), np.nan)
+        row[self.observer.fault_rows] = self.fault[self.told_faults]
+        return row
+
+
+def log_observer(
+    design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None, outliers: str | None = None
+) -> LogObserver:
+    """Return the observer of a design on a log, at its start; ``outliers`` replace what the design says."""
+    if isinstance(design.observer, LinearObserver):
+        if outliers not in (None, "none"):
+            raise SpecError(
+                "outliers is for recursive and nonlinear designs, which know how far a sample may be from "
+                "its prediction.",
+                path="outliers",
+            )
+        return LinearLogObserver(design, gap=gap, warm_up=warm_up)
+    if gap is not None:
+        raise SpecError(SAMPLED_GAP, path="gap")
+    if isinstance(design.observer, WindowObserver):
+        if outliers not in (None, "none"):
+            raise SpecError("outliers is for recursive and nonlinear designs: leave it out.", path="outliers")
+        return WindowLogObserver(design, design.observer, warm_up=warm_up)
+    return SteppingLogObserver(design, warm_up=warm_up, outliers=outliers)

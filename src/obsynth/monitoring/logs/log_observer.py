@@ -1,0 +1,292 @@
+"""An observer on rows of a log: what it says of each, and what every kind of observer has there; and the clock."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple
+
+from obsynth.errors import SpecError
+from obsynth.monitoring.thresholds.monitor import Evidence, LinearSample
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.derived import checked_warm_up
+from obsynth.observers.running import state_as_data, state_from_data
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: What a row of estimates is.
+OK, WARM_UP, PARTIAL, GAP, RECOVERING = "ok", "warm-up", "partial", "gap", "recovering"
+
+#: Rows whose stamps do not rise: they are left out, and say nothing.
+REPEATED_STAMP, OUT_OF_ORDER = "repeated stamp", "out of order"
+
+STALE = (REPEATED_STAMP, OUT_OF_ORDER)
+
+#: Rows in which a decision may be taken.
+DECIDING = (OK, PARTIAL)
+
+#: Gaps longer than this many samples are not bridged: the observer starts again.
+LONGEST_BRIDGE = 10_000
+
+#: A sampled design takes a stamp as the sample that it is nearest to: it is off by up to this share of dt.
+STAMP_SHARE = 0.45
+
+#: Continuous designs: a gap of so little more than a number of intervals has no further row in it.
+COUNTING_SHARE = 0.01
+
+#: What remains of a deviation from the samples in the next one: a clock that is a little fast is followed.
+FOLLOWING_SHARE = 0.9
+
+#: Stamps that are this far from the samples on average are of another sampling time; the average takes this share of
+#: each new row, and begins with nothing.
+OTHER_SHARE, AVERAGED_SHARE = 0.25, 0.05
+
+#: So many rows in a row whose stamps do not rise are no slip of a clock.
+MOST_STALE = 10
+
+#: One that differs by this share of dt is one of dt for certain.
+SURE_SHARE = 0.009
+
+#: Without another word, an interval is a gap when it is longer than this many times the longest one before.
+GAP_FACTOR = 10.0
+
+#: Waiting ends with a sample that rounding, of this share of dt, calls earlier; without dt, of so many roundings.
+SETTLING_SLACK, SETTLING_ULPS = 1e-6, 4.0
+
+#: A gap of more samples than this cannot be counted in double precision.
+MOST_COUNTED_SAMPLES = 2.0**53
+
+
+class Row(NamedTuple):
+    """A row of a log, and the estimates at it."""
+
+    status: str  # ``ok``, ``warm-up``, ``partial``, ``gap`` or ``recovering``
+    values: FloatArray  # one for each column of the observer; deviations, NaN where nothing is known
+    skipped: int = 0  # how many rows were missing before this one that nothing stands for
+    evidence: Evidence | LinearSample | None = None  # what was learnt from this row, for decisions
+    settled: bool = True  # whether nothing is left of gaps: bounds that are never passed hold
+    # What a gap has left in each value of a row that is recovering, where the model missed by no more all through it
+    # than at its end; infinite where that is not known.
+    excess: FloatArray | None = None
+    bridged: bool = False  # whether the plant's model stood in for all that was missing since the warm-up
+    # By how many times fault estimates are less certain than before samples were missing ``(nf,)``; ``None``: no less.
+    unsure: FloatArray | None = None
+    time: float = math.nan  # in seconds
+    deviations: FloatArray | None = None  # ``(nu + ny,)`` as read
+    at: float = math.nan  # the time of its sample since the first one; of continuous designs that of its stamp
+    # Rows of a sampled design that were missing before this one: as the observer went through them, without signals.
+    missed: tuple[Row, ...] = ()
+
+
+class Clock:
+    """Checks one time stamp after the other; ``dt`` is 0 in continuous time, with gaps longer than ``gap`` seconds."""
+
+    def __init__(self, dt: float, gap: float | None) -> None:
+        self.dt, self.gap = dt, gap
+        # Sampled designs: the time of the last sample, near which its stamp lies.
+        self.last: float | None = None
+        self.longest = 0.0
+        self.stamp, self.away, self.left_out = -math.inf, 0.0, 0
+        # Of sampled designs: the number of the last sample, from that of the first row.
+        self.count = 0
+        self.is_resumed = False  # and no row has been taken since
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what goes from row to row, as data."""
+        return {name: getattr(self, name) for name in ("last", "longest", "stamp", "away", "left_out", "count")}
+
+    def resume(self, data: Mapping[str, Any]) -> None:
+        """Go on from what `as_dict` returned."""
+        vars(self).update(data)
+        self.is_resumed = True
+
+    def at(self, time: float, before: int = 0) -> float:
+        """Return the time of the last sample, with this stamp, or of one so many before it: sampled designs count
+        samples, whatever their stamps are off by."""
+        return (self.count - before) * self.dt if self.dt > 0.0 else time
+
+    def advance(self, time: float, row: int) -> tuple[float, int]:
+        """Take the stamp of the next row."""
+        if not math.isfinite(time):
+            raise SpecError(f"Row {row} has no time: each row needs a finite number of seconds.", path=f"row {row}")
+        last = self.last
+        if last is None:
+            self.last = self.stamp = time
+            return 0.0, 0
+        if time == last:
+            raise SpecError(f"Row {row} repeats the time {time:.17g} s of the row before.", path=f"row {row}")
+        if time < last:
+            raise SpecError(f"Row {row}: the time falls from {last:.17g} to {time:.17g} s.", path=f"row {row}")
+        step = interval(last, time)
+        missing = self._sampled(step, row) if self.dt > 0.0 else self._continuous(step, row)
+        self.last = time
+        self.count += missing + 1
+        if self.dt > 0.0:
+            away = step - (missing + 1) * self.dt
+            # Regular stamps are taken as they are, and not as they are summed up.
+            self.last = time if abs(away) <= SURE_SHARE * self.dt else time - FOLLOWING_SHARE * away
+        self.stamp, self.left_out, self.is_resumed = time, 0, False
+        if not missing:
+            self.longest = max(self.longest, step)
+        return step, missing
+
+    def stale(self, time: float) -> str:
+        """Return the status of a row whose stamp does not rise, which is left out; empty for others. A run that goes on
+        from a saved state may begin with the rows that the state has, however many they are."""
+        last = self.last
+        if last is None or not math.isfinite(time) or (self.left_out >= MOST_STALE and not self.is_resumed):
+            return ""
+        # Of a sampled design the last sample may be told a little later than its stamp.
+        before = max(self.stamp, last - STAMP_SHARE * self.dt) if self.dt > 0.0 else last
+        if time > before and time != last:
+            return ""
+        self.left_out += 1
+        return REPEATED_STAMP if time in (self.stamp, last) else OUT_OF_ORDER
+
+    def regular(self, times: Sequence[float]) -> list[float]:
+        """Return the intervals to the first of these stamps that certainly follow each other without a gap; nothing is
+        taken."""
+        found: list[float] = []
+        if self.last is None or not self.longest > 0.0:
+            return found
+        before, longest = self.last, GAP_FACTOR * self.longest if self.gap is None else self.gap
+        lowest, highest = 0.0, longest
+        if self.dt > 0.0:
+            # Narrower than what fits, so that no rounding of an interval counts.
+            lowest, highest = (1.0 - SURE_SHARE) * self.dt, (1.0 + SURE_SHARE) * self.dt
+        for time in times:
+            step = interval(before, time) if time > before and time < math.inf else 0.0
+            if not lowest <= step <= highest or step <= 0.0:
+                break
+            found.append(step)
+            before = time
+        return found
+
+    def take(self, times: Sequence[float], steps: Sequence[float]) -> None:
+        """Take stamps that `regular` found to follow each other, with their intervals."""
+        self.last, self.longest = times[-1], max(self.longest, *steps)
+        self.stamp, self.left_out, self.away = times[-1], 0, 0.0
+        self.count += len(times)
+
+    def _sampled(self, step: float, row: int) -> int:
+        count = _counted(step / self.dt, step, row)
+        away = abs(step - count * self.dt) / self.dt
+        average = (1.0 - AVERAGED_SHARE) * self.away + AVERAGED_SHARE * away
+        if count < 1 or away > STAMP_SHARE or average > OTHER_SHARE:
+            raise SpecError(
+                f"Row {row} comes {step:.10g} s after the row before, but the design has dt = {self.dt:.10g} s: "
+                "a time stamp may be off by 45 % of dt, and all of them by 25 % on average; irregular time stamps "
+                "need a continuous-time design.",
+                path=f"row {row}",
+            )
+        # One gap may be the first interval of a log.
+        if count > 1 and self.longest == 0.0 and self.count > 0:
+            raise SpecError(
+                f"Row {row}: the data begin with intervals of {step:.10g} s and the like, but the design has dt = "
+                f"{self.dt:.10g} s: the sampling time does not fit.",
+                path=f"row {row}",
+            )
+        self.away = average
+        return count - 1
+
+    def _continuous(self, step: float, row: int) -> int:
+        typical = self.longest or step
+        if step <= (GAP_FACTOR * typical if self.gap is None else self.gap):
+            return 0
+        unit = typical if self.longest else min(step, self.gap or step)
+        _counted(step / unit, step, row)
+        return max(math.ceil(step / unit * (1.0 - COUNTING_SHARE)) - 1, 1)
+
+
+def _counted(samples: float, step: float, row: int) -> int:
+    """Return a whole number of samples; more than can be counted are no gap but a mistake."""
+    if not samples < MOST_COUNTED_SAMPLES:
+        raise SpecError(
+            f"Row {row} comes {step:.10g} s after the row before, {samples:.3g} samples: are the times in seconds?",
+            path=f"row {row}",
+        )
+    return round(samples)
+
+
+def interval(before: float, after: float) -> float:
+    """Return ``after - before``, rounded to what the two stamps can resolve, so that equal intervals are equal."""
+    resolution = 2.0 * max(math.ulp(before), math.ulp(after))
+    digits = -math.ceil(math.log10(resolution))
+    rounded = round(after - before, digits)
+    return rounded if rounded > 0.0 else after - before
+
+
+class LogObserver(ABC):
+    """The observer of a design on rows of a log: what it reads and estimates, and its state from row to row. Samples
+    that are missing are its business, time stamps are that of the run."""
+
+    input_names: tuple[str, ...]  # what is read from each row, in order
+    output_names: tuple[str, ...]
+    columns: tuple[str, ...]  # of estimates: states and faults first
+    point: Mapping[str, float] = MappingProxyType({})  # operating point by name of the signal
+    scales: Mapping[str, float] = MappingProxyType({})  # factor of inputs and outputs by name
+    notes: tuple[str, ...] = ()  # what a user should know before anything is run
+    plant: DescriptorSystem | None = None  # of a linear design
+    input_delay: int = 0  # rows of a log by which inputs act later than the design takes them
+    saved: ClassVar[Mapping[str, str]] = {}  # attributes that go from row to row, by their names in a saved state
+
+    def __init__(self, observer: Any, warm_up: float | None, default_warm_up: float) -> None:
+        self.state_names, self.fault_names = observer.state_names, observer.fault_names
+        self.state_delays, self.fault_delays = observer.state_delays, observer.fault_delays
+        self.dt: float = observer.dt
+        self.warm_up = checked_warm_up(warm_up, default_warm_up)
+        self.settled_at, self.phase = math.inf, WARM_UP
+        self.options: dict[str, float | None] = {"warm_up": self.warm_up}
+
+    @property
+    def estimated(self) -> tuple[str, ...]:
+        """Columns of the estimates of states and faults."""
+        return (*(f"xhat[{name}]" for name in self.state_names), *(f"fhat[{name}]" for name in self.fault_names))
+
+    @property
+    def lags(self) -> list[tuple[str, int]]:
+        """Name and delay in samples of what lags: the states (together where they lag alike), and each fault."""
+        found = list(zip(self.estimated, (*self.state_delays, *self.fault_delays), strict=True))
+        if len(set(self.state_delays)) == 1:
+            found[: len(self.state_names)] = [("xhat", self.state_delays[0])]
+        return [(name, delay) for name, delay in found if delay]
+
+    @abstractmethod
+    def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
+        """Take one row: its time (of a sampled design that of its sample), deviations ``(nu + ny,)``, how many seconds
+        and missing rows are between it and the row before, and the longest interval so far."""
+
+    def follows(self, missing: int) -> bool:
+        """Whether rows that are missing are taken one by one, as if they stood in the log without signals."""
+        return self.dt > 0.0 and missing <= LONGEST_BRIDGE
+
+    def _after(self, time: float, seconds: float) -> float:
+        """Return from when on ``seconds`` after a time are over."""
+        slack = SETTLING_SLACK * self.dt if self.dt > 0.0 else SETTLING_ULPS * math.ulp(abs(time) + seconds)
+        return time + seconds - slack
+
+    @property
+    def takes_pieces(self) -> bool:
+        """Whether `take_piece` can go on from where the observer is."""
+        return False
+
+    def take_piece(self, times: Sequence[float], values: FloatArray, intervals: Sequence[float]) -> list[Row]:
+        """Take rows that follow each other without a gap, ``values (rows, nu + ny)``, or the first of them."""
+        raise NotImplementedError
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the state that goes from row to row, as data."""
+        own = {key: getattr(self, name) for key, name in self.saved.items()}
+        plain = {key: state_as_data(value) if hasattr(value, "_asdict") else value for key, value in own.items()}
+        return {"settled_at": self.settled_at, "phase": self.phase, **self.options, **plain}
+
+    def resume(self, data: Mapping[str, Any]) -> None:
+        """Go on from what `as_dict` returned."""
+        if any(data[name] != value for name, value in self.options.items()):
+            told = " or ".join(name.replace("_", "-") for name in sorted(self.options))
+            raise SpecError(f"The saved state is of a run with another {told}: use the same options.", path="state")
+        self.settled_at, self.phase = data["settled_at"], data["phase"]
+        for key, name in self.saved.items():
+            own = getattr(self, name)
+            setattr(self, name, state_from_data(own, data[key]) if hasattr(own, "_asdict") else data[key])

@@ -1,0 +1,498 @@
+"""What runs a log: rows of data to rows of output, what is counted, and the saved state with which it goes on."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import ObsynthError, SpecError
+from obsynth.files.inputs import read_json
+from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.monitoring.alarms.events import NO_DECISION, AlarmEvent, AlarmLog
+from obsynth.monitoring.logs.linear_observer import log_observer
+from obsynth.monitoring.logs.log_observer import DECIDING, GAP, RECOVERING, STALE, Clock, Row
+from obsynth.monitoring.logs.recovered_states import FIRST_SECONDS, MOST_FIRST_ROWS, RecoveredStates
+from obsynth.monitoring.logs.signals import TIME_HEADER, Signals
+from obsynth.monitoring.logs.stamps import Stamps
+from obsynth.monitoring.logs.stuck_sensors import RepeatedValues
+from obsynth.monitoring.thresholds.learned import LearnedRule, as_learned
+from obsynth.monitoring.thresholds.learned_levels import HOLD
+from obsynth.monitoring.thresholds.monitor import LinearSample, Monitor, Sample
+from obsynth.numerics.arguments import is_finite_number, is_number, real_number
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.derived import SETTLED_TO, transient
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.running import BY_COLUMNS
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.certificate_files import sealed
+from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_set_writing import digest_of, plain, restored
+
+#: Its column says of which time the recovered states are.
+LATE = "recovered states"
+
+#: Rows that are taken in one piece at most.
+ROWS_AT_ONCE = 4096
+
+#: A signal is far from its operating point when its mean differs by this share of it.
+FAR_FROM_POINT = 0.2
+
+
+RUN_STATE_KIND = "obsynth run state"
+
+RUN_STATE_VERSION = 12
+
+STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"', suffix=".json")
+
+#: Parts that are seconds, or nothing before the first row.
+_TIME_PARTS = frozenset({"last", "longest"})
+
+
+class OperatingPointCheck:
+    """Gathers the first second of data, to tell whether they begin near the operating point."""
+
+    def __init__(self, signals: Signals) -> None:
+        self._signals = signals
+        self._begin: float | None = None
+        self.status = ""  # of the first row
+        self._taken = 0
+        self._start = np.full(len(signals.names), np.nan)
+        self._sum, self._count = np.zeros(len(signals.names)), np.zeros(len(signals.names))
+
+    def take(self, times: Sequence[float], deviations: FloatArray) -> None:
+        """Take rows: seconds, and deviations ``(n, nu + ny)`` of which some may be missing."""
+        for time, row in zip(times, deviations, strict=True):
+            if self._begin is None:
+                self._begin, self._start = time, np.array(row)
+            if not (time - self._begin <= FIRST_SECONDS and self._taken < MOST_FIRST_ROWS):
+                break
+            self._taken += 1
+            known = np.isfinite(row)
+            self._sum[known] += row[known]
+            self._count[known] += 1.0
+
+    def alarm_of_the_start(self, design: ObserverDesign, alarms: Sequence[AlarmEvent]) -> tuple[str, ...]:
+        """Return a text where an alarm of a linear design may be its initial-condition response: when the warm-up
+        ends, `SETTLED_TO` of it are left, which is more than the noise where the outputs begin far from the start.
+        Other designs leave out the first row as an outlier where it is so far away."""
+        observer, plant = design.observer, design.plant
+        refused = self.status == GAP and bool(np.isfinite(self._start).all())
+        if refused and any(event.first_row <= HOLD for event in alarms):
+            return (
+                f"All outputs of the first row are left out as outliers, and an alarm comes within {HOLD} rows: the "
+                "log may begin at other states than the design. State those at which it begins (states, or "
+                "initial_state), or a larger initial_covariance.",
+            )
+        if not (isinstance(observer, LinearObserver) and isinstance(plant, DescriptorSystem)) or self._begin is None:
+            return ()
+        noise = np.linalg.norm(plant.Dw, axis=1)
+        started = np.abs(self._start[len(self._start) - observer.By.shape[1] :])
+        if len(noise) != len(started) or not np.any(known := np.isfinite(started) & (noise > 0.0)):
+            return ()
+        shares = np.where(known, started, 0.0) / np.where(known, noise, 1.0)
+        worst = int(np.argmax(shares))
+        if shares[worst] * SETTLED_TO <= 1.0:
+            return ()
+        lasting = transient(observer) * math.log(shares[worst]) / -math.log(SETTLED_TO)
+        if not any(event.start < self._begin + lasting for event in alarms):
+            return ()
+        name = plant.output_names[worst]
+        is_stated = name in self._signals.point
+        where = "its operating point" if is_stated else "zero (no operating point is stated)"
+        advice = "Give" if is_stated else "State the operating point at which the log begins, or give"
+        return (
+            f"An alarm in the first {lasting:.3g} s may be the initial-condition response: {name} begins "
+            f"{shares[worst]:.3g} deviations of its noise from {where}, and when the warm-up ends "
+            f"{100.0 * SETTLED_TO:g} % of that response are left. {advice} a longer warm-up (--warm-up {lasting:.3g}).",
+        )
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return a text for each signal with a stated operating point, not zero, that begins far from it."""
+        texts = []
+        for i, name in enumerate(self._signals.names):
+            point = self._signals.point.get(name, 0.0)
+            if point == 0.0 or self._count[i] == 0.0:
+                continue
+            away = self._sum[i] / self._count[i]
+            if abs(away) > FAR_FROM_POINT * abs(point):
+                texts.append(
+                    f"{name} begins at {point + away:.6g}, far from its operating point {point:.6g}: the linear model "
+                    "may not hold there, or the data are deviations already, or in another unit."
+                )
+        return tuple(texts)
+
+
+def damaged_state(path: Path) -> SpecError:
+    """Return the error for a saved state whose parts do not fit."""
+    return SpecError(f"{path} is damaged: it is no state of this design and these options.", path=str(path))
+
+
+class LogRun:
+    """A design over a log, from its start: rows of data to estimates (`read`), and to rows of output (`take`).
+
+    ``thresholds`` are levels by column; ``recovered`` is which states of the plant as written stand beside the others;
+    other options are those of `run_on_data`.
+    """
+
+    def __init__(
+        self,
+        design: ObserverDesign,
+        columns: Mapping[str, str] | None = None,
+        scales: Mapping[str, float] | None = None,
+        *,
+        gap: float | None = None,
+        warm_up: float | None = None,
+        outliers: str | None = None,
+        thresholds: Mapping[str, float] = MappingProxyType({}),
+        monitor: Monitor | None = None,
+        recovered: str | Sequence[str] | None = "none",
+        stamps: Stamps | None = None,
+    ) -> None:
+        if monitor is not None and isinstance(monitor.rule, LearnedRule):
+            design = design.replace(observer=as_learned(design.observer, monitor.rule.learned))
+        self.observer = observer = log_observer(design, gap=gap, warm_up=warm_up, outliers=outliers)
+        self.clock, self.signals = Clock(observer.dt, gap), Signals.of(observer, columns, scales)
+        self.stamps, self.monitor = stamps, monitor
+        #: What rows wait in for those after them, if they do.
+        self.later: Any = None
+        self._watching: Any = None if monitor is None else monitor.init()
+        self.recovered = RecoveredStates.of(design.recovery, observer, recovered)
+        extra = () if self.recovered is None else self.recovered.columns
+        names = (*observer.columns, *extra)
+        for name, level in thresholds.items():
+            if name not in names:
+                raise SpecError(
+                    f"There is no column {name!r} to monitor: there are {', '.join(names)}.", path="thresholds"
+                )
+            real_number(level, f"The threshold of {name!r}", "a positive number", above=0.0, path="thresholds")
+        self._levels = tuple((name, names.index(name), level) for name, level in thresholds.items())
+        lags = observer.lags
+        if self.recovered is not None and self.recovered.delay:
+            lags.append((LATE, self.recovered.delay))
+        self._lags = [delay * observer.dt for _, delay in lags]
+        self._point = self.signals.estimates_point(observer)
+        if self.recovered is not None:
+            self._point = np.concatenate([self._point, self.recovered.point])
+        states, faults = len(observer.state_names), len(observer.fault_names)
+        self._faults = slice(states, states + faults)
+        residuals = [i for i, name in enumerate(observer.columns) if name.startswith("r[")]
+        self._residuals = slice(residuals[0], residuals[-1] + 1) if residuals else slice(0, 0)
+        if monitor is not None:
+            monitor.require_fit(len(residuals), observer.fault_names)
+        self.header = (
+            TIME_HEADER,
+            "status",
+            *(f"time of {name}" for name, _ in lags),
+            *names,
+            *((*monitor.columns, "statistic", "threshold") if monitor is not None else ()),
+            *(("alarm",) if thresholds or monitor is not None else ()),
+        )
+        # Intervals of faults are in their own units, like the estimates.
+        point = dict(zip(observer.fault_names, self._point[self._faults].tolist(), strict=True))
+        ends = {f"{end} {name}": value for name, value in point.items() for end in ("lowest", "highest")}
+        self._shifts = np.array([ends.get(name, 0.0) for name in (() if monitor is None else monitor.columns)])
+        self.first, self.rows = OperatingPointCheck(self.signals), 0
+        #: The file of the state that the first rows go on from: only they show whether its parts fit together.
+        self.resumed_from: Path | None = None
+        self.statuses, self.alarms, self.isolated = Counter[str](), dict[str, float](), ""
+        self.alarm_rows = dict[str, int]()
+        self.events = AlarmLog(self.header)
+        self.repeated = RepeatedValues(len(observer.output_names))
+
+    def take(self, chunk: FloatArray) -> list[list[Any]]:
+        """Take rows ``[time, u, y]`` as read; return rows of output (``chunk (rows, 1 + nu + ny)``)."""
+        if self.resumed_from is None:
+            return self._taken(chunk)
+        try:
+            found = self._taken(chunk)
+        except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError) as error:
+            raise damaged_state(self.resumed_from) from error
+        self.resumed_from = None
+        return found
+
+    def _taken(self, chunk: FloatArray) -> list[list[Any]]:
+        if self.later is None:
+            return self._shown(self.read(chunk))
+        # What waits for a row is smoothed by it before the next one is taken.
+        return self._shown(
+            [ready for row in chunk for took in self.read(row[None]) for ready, *_ in self.later.take(took)]
+        )
+
+    def read(self, chunk: FloatArray) -> list[Row]:
+        """Take rows ``[time, u, y]`` as read; return the estimates at them (``chunk (rows, 1 + nu + ny)``)."""
+        return self.estimates(chunk[:, 0].tolist(), self.signals.deviations(chunk))
+
+    def estimates(self, times: Sequence[float], values: FloatArray) -> list[Row]:
+        """Return the estimates at rows as they come, deviations ``values (rows, nu + ny)``; those whose stamps do not
+        rise are left out."""
+        found, at = list[Row](), list[float]()
+        complete = np.asarray(np.isfinite(values).all(axis=1))
+        while (done := len(found)) < len(times):
+            status = self.clock.stale(times[done])
+            if status:
+                found.append(Row(status, np.full(len(self.observer.columns), np.nan)))
+                at.append(math.nan)
+                continue
+            if self.observer.takes_pieces and complete[done]:
+                bad = np.flatnonzero(~complete[done : done + ROWS_AT_ONCE])
+                end = done + (int(bad[0]) if bad.size else ROWS_AT_ONCE)
+                intervals = self.clock.regular(times[done:end])
+                own = [self.clock.at(time, -i) for i, time in enumerate(times[done : done + len(intervals)], 1)]
+                taken = self.observer.take_piece(own, values[done:end], intervals) if intervals else []
+                if taken:
+                    self.clock.take(times[done : done + len(taken)], intervals[: len(taken)])
+                    found += taken
+                    at += own[: len(taken)]
+                    continue
+            found.append(self._single(times[done], values[done], self.rows + done + 1))
+            at.append(self.clock.at(times[done]))
+        if found and self.rows == 0:
+            self.first.status = found[0].status
+        self.rows += len(found)
+        self.first.take(times, values)
+        return [
+            row._replace(time=time, deviations=v, at=own)
+            for row, time, v, own in zip(found, times, values, at, strict=True)
+        ]
+
+    def _single(self, time: float, values: FloatArray, number: int) -> Row:
+        """Take one row; one that is refused leaves nothing behind, so that a run may go on after it."""
+        parts = (self.observer, self.clock)
+        before = [dict(vars(part)) for part in parts]
+        try:
+            seconds, missing = self.clock.advance(time, number)
+            missed = tuple(self._missed(time, missing)) if missing and self.observer.follows(missing) else ()
+            if self.clock.dt > 0.0:
+                missing -= len(missed)
+                seconds = (missing + 1) * self.clock.dt
+            own, longest = self.clock.at(time), self.clock.longest
+            row = self.observer.take(own, values, seconds=seconds, missing=missing, longest=longest)
+            return row._replace(missed=missed) if missed else row
+        except ObsynthError as error:
+            for part, kept in zip(parts, before, strict=True):
+                vars(part).update(kept)
+            place = f"row {number}"
+            if isinstance(error, SpecError):
+                if error.path == place:
+                    raise
+                error.path = place
+            error.args = (f"Row {number}: {error}",)
+            raise
+
+    def _missed(self, time: float, missing: int) -> Iterator[Row]:
+        """Take rows of a sampled design that are missing before one, as if they stood in the log without signals."""
+        nothing = np.full(len(self.signals.names), np.nan)
+        for before in range(missing, 0, -1):
+            at = self.clock.at(time, before)
+            row = self.observer.take(at, nothing, seconds=self.clock.dt, missing=0, longest=self.clock.longest)
+            yield row._replace(time=time, deviations=nothing, at=at)
+
+    def finish(self) -> list[list[Any]]:
+        """Return the rows of output that waited for what does not come any more."""
+        return [] if self.later is None else self._shown([ready for ready, *_ in self.later.flush()])
+
+    def _shown(self, taken: Sequence[Row]) -> list[list[Any]]:
+        if not taken:
+            return []
+        estimates = [row.values for row in taken]
+        if self.recovered is not None:
+            estimates = [np.concatenate([row.values, self._recovered_in(row)]) for row in taken]
+        self.statuses.update(row.status for row in taken)
+        self.repeated.take(np.array([self._outputs_of(row) for row in taken]))
+        shown: list[list[float]] = (np.array(estimates) + self._point).tolist()
+        rows: list[list[Any]] = [
+            [row.time, row.status, *(row.time - lag for lag in self._lags), *cells]
+            for row, cells in zip(taken, shown, strict=True)
+        ]
+        if self._levels or self.monitor is not None:
+            first = self.rows - len(rows) + 1
+            for number, (row, values, cells) in enumerate(zip(taken, estimates, rows, strict=True), first):
+                cells.extend(self._decided(row, values, number, cells))
+        return rows
+
+    def _outputs_of(self, row: Row) -> FloatArray:
+        """Return what was measured of the outputs ``(ny,)``, nothing in a row that is left out."""
+        count = len(self.observer.output_names)
+        if row.deviations is None or row.status in STALE:
+            return np.full(count, np.nan)
+        return row.deviations[len(row.deviations) - count :]
+
+    def _recovered_in(self, row: Row) -> FloatArray:
+        if self.recovered is None or row.status in STALE:
+            return np.full(0 if self.recovered is None else len(self.recovered.columns), np.nan)
+        for missed in row.missed:
+            self.recovered.take(missed)
+        return self.recovered.take(row)
+
+    def _decided(self, row: Row, values: FloatArray, number: int, before: Sequence[Any]) -> list[Any]:
+        """Return statistic and threshold, if there is a monitor, and what alarms there are; ``before``: other cells."""
+        time = row.time
+        if row.status in STALE:
+            self.events.silent[row.status] += 1
+            return [*([math.nan] * (0 if self.monitor is None else len(self.monitor.columns) + 2)), ""]
+        self.events.advance(row.skipped + len(row.missed))
+        deciding = row.status in DECIDING
+        above = [
+            (name, abs(float(values[i])) / grown)
+            for name, i, level in self._levels
+            if math.isfinite(grown := level * self._share(row, i) + self._excess(row, i))
+        ]
+        passed = [(name, evidence) for name, evidence in above if evidence > 1.0]
+        names = [name for name, _ in passed]
+        for name in names:
+            self.alarms.setdefault(name, time)
+            self.alarm_rows.setdefault(name, number)
+        cells: list[Any] = []
+        undecided = not deciding and not above
+        if self.monitor is not None:
+            for missed in row.missed:
+                self._watching, _ = self.monitor.step(self._watching, self._sample(self.monitor, missed))
+            self._watching, seen = self.monitor.step(self._watching, self._sample(self.monitor, row))
+            more = seen.more or (math.nan,) * len(self.monitor.columns)
+            cells = [*(np.array(more) + self._shifts).tolist(), seen.statistic, seen.threshold]
+            undecided = math.isnan(seen.statistic) and (undecided or not self._levels)
+            if seen.alarm:
+                evidence = seen.statistic / seen.threshold if seen.threshold else math.inf
+                kind, known = self.monitor.kind, bool(seen.fault) or not self.monitor.fault_names
+                self.events.take(kind, seen.fault, evidence, time, number, [*before, *cells], distinguished=known)
+                self.alarms.setdefault(self.monitor.kind, time)
+                self.isolated = self.isolated or seen.fault
+                self.alarm_rows.setdefault(self.monitor.kind, number)
+                names.append(f"{self.monitor.kind}: {seen.fault}" if seen.fault else self.monitor.kind)
+        for name, evidence in passed:
+            fault = name[5:-1] if name.startswith("fhat[") else ""
+            self.events.take(name, fault, evidence, time, number, [*before, *cells])
+        if undecided:
+            self.events.silent[row.status if row.status not in DECIDING else NO_DECISION] += 1
+        return [*cells, "; ".join(names)]
+
+    def _sample(self, monitor: Monitor, row: Row) -> Sample:
+        """Return what a monitor takes of a row."""
+        deciding = row.status in DECIDING and (row.settled or not monitor.guarantees)
+        if monitor.rule.bridges and row.bridged:
+            deciding = row.status in (*DECIDING, RECOVERING)
+        residuals, faults = row.values[self._residuals], row.values[self._faults]
+        return Sample(row.at, residuals, faults, self._evidence(row), deciding, row.skipped, row.bridged)
+
+    def _share(self, row: Row, column: int) -> float:
+        """Return by how many times a level is higher than stated: as less certain as a fault estimate is."""
+        place = column - self._faults.start
+        return 1.0 if row.unsure is None or not 0 <= place < len(row.unsure) else float(row.unsure[place])
+
+    def _excess(self, row: Row, column: int) -> float:
+        """Return by how much more than its level a column must be for an alarm: infinite where nothing is decided."""
+        if row.status in DECIDING:
+            return 0.0
+        if row.status != RECOVERING or row.excess is None or column >= len(row.excess):
+            return math.inf
+        return float(row.excess[column])
+
+    def _evidence(self, row: Row) -> Any:
+        """Return what was learnt from a row; of one with missing samples, to who takes these, what there is."""
+        if row.evidence is not None or self.monitor is None or not self.monitor.rule.takes_gaps:
+            return row.evidence
+        nu, deviations = len(self.observer.input_names), row.deviations
+        if deviations is None:
+            return None
+        return LinearSample(row.values, deviations[:nu], deviations[nu:], len(self.observer.state_names))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the state that goes from row to row, as data."""
+        return {
+            "observer": self.observer.as_dict(),
+            "clock": self.clock.as_dict(),
+            "recovered": None if self.recovered is None else self.recovered.as_dict(),
+            "inputs": None if self.stamps is None else self.stamps.earlier,
+            "numeric": None if self.stamps is None else sorted(self.stamps.numeric),
+            "monitor": None if self.monitor is None else self.monitor.as_data(self._watching),
+        }
+
+    def resume(self, data: dict[str, Any]) -> None:
+        """Go on from what `as_dict` returned."""
+        if (data["monitor"] is None) != (self.monitor is None):
+            raise SpecError("The saved state is of a run with another monitor: use the same options.", path="state")
+        self.observer.resume(data["observer"])
+        self.clock.resume(data["clock"])
+        if self.stamps is not None:
+            self.stamps.earlier, self.stamps.numeric = data["inputs"], set(data["numeric"])
+        if self.recovered is not None:
+            self.recovered.resume(data["recovered"])
+        if self.monitor is not None:
+            self._watching = self.monitor.from_data(data["monitor"])
+
+
+def save_state(path: Path, run: LogRun, digest: str) -> None:
+    """Write what a run carries from row to row, atomically."""
+    body = plain({"gains": digest, "state": run.as_dict()})
+    write_atomically(path, sealed(RUN_STATE_KIND, RUN_STATE_VERSION, body, under="run"))
+
+
+def resume_state(path: Path, run: LogRun, digest: str) -> None:
+    """Let a run go on from a saved state."""
+    # The state is written again at the end, so it is no input that has to be kept.
+    document = read_json(path, is_protected=False)
+    known = isinstance(document, dict) and document.get("kind") == RUN_STATE_KIND
+    if not known or document.get("schema_version") != RUN_STATE_VERSION:
+        raise SpecError(f"{path} is no saved state of a run.", path=str(path))
+    body = document.get("run")
+    try:
+        intact = isinstance(body, dict) and document.get("sha256") == digest_of(body)
+    except (ValueError, RecursionError):  # a number too large for a float
+        intact = False
+    if not intact:
+        raise SpecError(f"{path} was changed after it was written: its digest does not match.", path=str(path))
+    if body.get("gains") != digest:
+        raise SpecError(f"{path} is the state of a run with another gain set.", path=str(path))
+    own = run.as_dict()
+    try:
+        state = restored(body.get("state"))
+        run.resume(state)
+        fits = _fits(own, state)
+    except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError):
+        fits = False
+    if not fits:
+        raise damaged_state(path)
+    run.resumed_from = path
+
+
+def _fits(own: Any, saved: Any) -> bool:
+    """Whether a saved state has the parts of a run's own one; what has no value yet may hold numbers and arrays."""
+    if isinstance(own, np.ndarray):
+        found = saved.get(BY_COLUMNS) if isinstance(saved, dict) else saved
+        return isinstance(found, np.ndarray) and _alike(own.shape, found.shape)
+    if isinstance(own, Mapping):
+        if not isinstance(saved, dict) or saved.keys() != own.keys():
+            return False
+        return all(
+            _fits(own[key], saved[key])
+            and (key not in _TIME_PARTS or saved[key] is None or is_finite_number(saved[key]))
+            for key in own
+        )
+    if isinstance(own, (bool, np.bool_)):
+        return isinstance(saved, bool)
+    if isinstance(own, str):
+        return isinstance(saved, str)
+    if isinstance(own, (list, tuple)):
+        return isinstance(saved, list)
+    return saved is None or is_number(saved) or (own is None and isinstance(saved, (np.ndarray, dict, list)))
+
+
+def _alike(own: tuple[int, ...], saved: tuple[int, ...]) -> bool:
+    """Whether an array can stand for another one: windows fill up, and factors of covariances change their width."""
+    if len(own) == 2 and len(saved) == 2:
+        return own[0] == saved[0] or own[1] == saved[1]
+    return own == saved
+
+
+def faults_on_rows(design: ObserverDesign, times: FloatArray, u: FloatArray, y: FloatArray) -> FloatArray:
+    """Return fault estimates ``(rows, nf)`` on rows of a log, as `run_on_data` has them; NaN where there is none."""
+    run = LogRun(design)
+    first = len(run.observer.state_names)
+    rows = run.estimates(times.tolist(), np.hstack([u, y]))
+    return np.array([row.values[first : first + len(run.observer.fault_names)] for row in rows])

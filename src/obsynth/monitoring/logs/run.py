@@ -1,0 +1,386 @@
+"""A design on measured data: a log or a stream in, estimates out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import chain, islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+from obsynth.errors import ObsynthError, SpecError
+from obsynth.files.outputs import check_output, remove_left_parts, require_distinct
+from obsynth.files.signals import HeldSignals, ending_signals
+from obsynth.methods.guaranteed_test.method import is_guaranteed
+from obsynth.methods.guaranteed_test.result import GuaranteedTest
+from obsynth.methods.guaranteed_test.tolerant import rows_before
+from obsynth.monitoring.alarms.events import AlarmEvent
+from obsynth.monitoring.logs.log_run import LogRun, resume_state, save_state
+from obsynth.monitoring.logs.signals import TIME_HEADER
+from obsynth.monitoring.logs.sinks import FrameSink, Sink, sink_for
+from obsynth.monitoring.logs.smoothing import LaterRows
+from obsynth.monitoring.logs.sources import CHUNK_ROWS, Data, chunks
+from obsynth.monitoring.logs.stamps import Stamps
+from obsynth.monitoring.logs.stuck_sensors import stuck_texts
+from obsynth.monitoring.thresholds.monitor import Monitor
+from obsynth.numerics.arguments import arguments_checked, require_kind, whole_number
+from obsynth.numerics.arrays import FloatArray
+from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_set_writing import gain_set_digest
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+#: Rows of a stream after which its state is saved.
+STATE_ROWS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class DataRun:
+    """What a run on measured data was.
+
+    Parameters
+    ----------
+    rows : int
+        Rows of data.
+    statuses : mapping of str to int
+        How many rows were ``ok``, ``warm-up``, ``partial``, ``gap``, ``recovering``, ``repeated stamp`` and
+        ``out of order``.
+    alarms : mapping of str to float
+        Time in seconds at which each column, or the monitor, first passed its threshold.
+    isolated : str
+        The fault that the monitor named first; empty without one, and where the evidence does not distinguish faults.
+    recovered : mapping of str to str
+        States of the plant as written that were recovered from the estimates, and what each of these estimates is:
+        ``exact``, ``needs the fault estimate`` (it is used) or ``biased by the disturbance``.
+    outliers : mapping of str to int
+        How many samples of each output were left out, or pulled to their limit; recursive and nonlinear designs.
+    warnings : tuple of str
+        What a user should know about the data.
+    digest : str
+        sha256 of the gain set.
+    table : pandas.DataFrame or None
+        The estimates, when they were not written anywhere.
+    measured : pandas.DataFrame or None
+        Time and the signals that were read, in their units, beside that table.
+    stamps : Stamps
+        Whether the log has seconds, or dates and times: ``stamps.shown(time)`` is a time as the log writes it.
+    thresholds : mapping of str to float
+        Those that were given.
+    alarm_rows : mapping of str to int
+        Numbers of the rows of these alarms, from 1.
+    events : tuple of AlarmEvent
+        All alarms: from when to when, which fault, how large.  Rows above a threshold that are less than 20 rows apart,
+        those that are missing among them, are one.
+    silent : mapping of str to int
+        How many rows were without a decision, by their status; ``undecided`` where the monitor decides nothing.
+    statement : str
+        What the threshold of its monitor promises, and what that rests on; empty without one.
+    stuck : mapping of str to tuple of (int, int)
+        First and last rows, from 1, in which an output repeats one value for longer than it otherwise does.
+    """
+
+    rows: int
+    statuses: Mapping[str, int]
+    alarms: Mapping[str, float]
+    isolated: str
+    recovered: Mapping[str, str]
+    outliers: Mapping[str, int]
+    warnings: tuple[str, ...]
+    digest: str
+    table: pd.DataFrame | None = field(default=None, repr=False)
+    measured: pd.DataFrame | None = field(default=None, repr=False)
+    stamps: Stamps = field(default_factory=Stamps, repr=False)
+    thresholds: Mapping[str, float] = field(default_factory=dict, repr=False)
+    alarm_rows: Mapping[str, int] = field(default_factory=dict)
+    events: tuple[AlarmEvent, ...] = ()
+    silent: Mapping[str, int] = field(default_factory=dict)
+    statement: str = ""
+    stuck: Mapping[str, tuple[tuple[int, int], ...]] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the summary as plain data, without the table."""
+        return {
+            "rows": self.rows,
+            "statuses": dict(self.statuses),
+            "alarms": dict(self.alarms),
+            "alarm_rows": dict(self.alarm_rows),
+            "alarm_stamps": {name: self.stamps.shown(time) for name, time in self.alarms.items()},
+            "events": [event.as_dict() for event in self.events],
+            "silent": dict(self.silent),
+            "isolated": self.isolated,
+            "recovered": dict(self.recovered),
+            "outliers": dict(self.outliers),
+            "stuck": {name: [list(run) for run in runs] for name, runs in self.stuck.items()},
+            "warnings": list(self.warnings),
+            "gains_sha256": self.digest,
+        }
+
+
+@arguments_checked
+def run_on_data(
+    design: ObserverDesign,
+    data: Data,
+    out: str | Path | TextIO | None = None,
+    *,
+    columns: Mapping[str, str] | None = None,
+    time_column: str | None = None,
+    scales: Mapping[str, float] | None = None,
+    thresholds: Mapping[str, float] | None = None,
+    monitor: Monitor | None = None,
+    gap: float | None = None,
+    warm_up: float | None = None,
+    outliers: str | None = None,
+    smooth: bool = False,
+    lag: int | None = None,
+    recovered: str | Sequence[str] | None = None,
+    state: str | Path | None = None,
+    state_every: int = STATE_ROWS,
+    chunk_rows: int = CHUNK_ROWS,
+    progress: Callable[[int], None] | None = None,
+) -> DataRun:
+    """Run a design on measured data, in constant memory.
+
+    Each row of data gives one row of estimates.  The operating point is subtracted from the data and added back to
+    the estimates.  An estimate with a delay has a column ``time of ...`` with the time that it is for.  If the design
+    is for a plant whose algebraic states were eliminated, these are recovered and have columns as well.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Of any method.
+    data : path, text stream or pandas.DataFrame
+        With a column ``time`` and a column for each known input and output.  Files are text (``.csv``, ``.tsv``),
+        Parquet, TDMS or MDF (``.mf4``, ``.mdf``, ``.dat``) by their suffix; a stream is text and is answered row by
+        row.  Columns of text are separated by commas, semicolons, tabs or bars, and numbers may have a decimal comma
+        where commas separate nothing.  The time is in seconds, or dates and times of ISO 8601 with or without a zone
+        (taken as UTC without one), which are written back as such; the index of a frame is the time where it is a
+        DatetimeIndex.
+    out : path or text stream, optional
+        CSV or Parquet file, written whole or not at all; or a stream for CSV.  By default a data frame is returned.
+    columns : mapping, optional
+        Column of a signal (or of ``time``) where their names differ.
+    time_column : str, optional
+        Column of the time, the same as ``columns={"time": ...}``.
+    scales : mapping, optional, signal's unit per column's unit
+        Factor of a signal's column; by default the plant's.
+    thresholds : mapping, optional
+        Level of the absolute value by column of the output, such as ``fhat[actuator]`` or ``r[speed]`` (of faults
+        with an operating point, of the deviation): the column ``alarm`` names those above their level.  Alarms are
+        suspended in rows that are not ``ok`` or ``partial``; while the stated deviation of a fault estimate is above
+        that before samples were missing, its level is as many times higher.
+    monitor : Monitor, optional
+        From `obsynth.online_monitor`: columns ``statistic`` and ``threshold``, and its alarms in ``alarm``, with the
+        fault that it points to.
+    gap : float, optional, seconds
+        Continuous-time designs: longer intervals are gaps; by default those ten times the longest one before.
+    warm_up : float, optional, seconds
+        After the start, and after gaps at most; by default until the slowest mode has shrunk to 2 %, and none for
+        recursive and nonlinear designs, whose deviations hold from the start.
+    outliers : {"gate", "huber", "none"}, optional
+        Recursive and nonlinear designs: what is done with a sample that its prediction excludes; by default what the
+        design says, and a gate of six deviations where it says nothing.
+    smooth : bool, optional
+        Recursive and nonlinear designs: estimates from the whole log, as `obsynth.smooth` makes them, instead of those
+        of the filter.  Residuals, outliers, monitors and statuses stay those of the filter.  All rows are written at
+        the end, and the log is held in memory.
+    lag : int, optional
+        The same with the ``lag`` samples after each row; each row is written, with its own time, when they are there.
+    recovered : {"all", "none"} or list of str, optional
+        Which states of the plant as written, before its algebraic states were eliminated, stand beside the estimates;
+        by default all of up to 300, and none of more.
+    state : path, optional
+        A saved state to go on from, if the file exists; the state at the end is written to it.
+    state_every : int, optional
+        Rows of a stream after which the state is written anew, whole or not at all: so many are lost at most when the
+        process is killed.
+    chunk_rows : int, optional
+        Rows that are read and written at a time; the results do not depend on it.
+    progress : callable, optional
+        Called with the number of rows done, after each chunk.
+
+    Returns
+    -------
+    DataRun
+        A summary, with the estimates if ``out`` is not given.
+
+    Raises
+    ------
+    SpecError
+        Columns are missing, a cell is no number, a time is missing, repeated, decreasing or
+        does not fit the design's dt (the row is named), or a file cannot be read or written.
+
+    Notes
+    -----
+    Continuous-time observers are advanced from row to row by a first-order hold over the interval as it is: exact for
+    signals that are linear between rows.  In a row with a missing sample, and in a gap, the outputs of the plant model
+    (faults held at their last estimate, unknown inputs zero, started from the last state estimate) stand in for the
+    measured ones, so that the observer's state follows the model's; fault estimates are held, residuals are empty and
+    the status is ``gap``.  The observer starts again after a gap of more than 10,000 samples, where the model has lost
+    the plant (it misses the outputs by more than their size before and after the gap, as an unstable one will in the
+    end, and by more than becomes usual within a warm-up), and after every gap of a plant of index 2 or more, whose
+    model cannot be propagated.  Intervals are rounded to the resolution of the time stamps.
+
+    Recursive and nonlinear designs take missing outputs themselves, with what they cost in the columns ``sd ...``
+    (standard deviations): a row without some outputs is ``partial``, one without all of them, or without an input, is a
+    ``gap``.  The first row is k = 0, of which recursive designs do not use the outputs.  Missing inputs are held,
+    within the largest changes that they have made before, by which deviations grow; the rows after that are
+    ``recovering`` until the warm-up is over.  ``r`` is the innovation at the parameters estimated one sample before
+    (whitened, for recursive designs).
+    """
+    whole_number(chunk_rows, "chunk_rows")
+    whole_number(state_every, "state_every")
+    _require_files(state=state, out=out, data=data)
+    if time_column is not None:
+        columns = {**(columns or {}), TIME_HEADER: time_column}
+    stamps = Stamps()
+    run = LogRun(
+        design,
+        columns,
+        scales,
+        gap=gap,
+        warm_up=warm_up,
+        outliers=outliers,
+        thresholds=thresholds or {},
+        monitor=monitor,
+        recovered=recovered,
+        stamps=stamps,
+    )
+    _smoothed(run, data, smooth=smooth, lag=lag, state=state)
+    digest = gain_set_digest(design)
+    resumed = state is not None and Path(state).exists()
+    if resumed:
+        resume_state(Path(str(state)), run, digest)
+    room = len(data) if isinstance(data, Sized) and not isinstance(data, str) else CHUNK_ROWS
+    kept = FrameSink((TIME_HEADER, *run.signals.names), stamps, room) if out is None else None
+    # What has left a stream cannot be taken back: there the state is saved however the run ends.
+    save = None
+    if not (state is None or out is None or isinstance(out, str | Path)):
+        save = partial(save_state, Path(state), run, digest)
+    rows = chunks(data, run.signals, stamps, chunk_rows)
+    if not hasattr(data, "readline"):
+        # What cannot be read leaves no header behind; of a stream the header comes before the first row.
+        rows = chain(list(islice(rows, 1)), rows)
+    gathered = FrameSink(run.header, stamps, room)
+    for file in (out, state):
+        if isinstance(file, str | Path):
+            remove_left_parts(Path(file))
+    with nullcontext(gathered) if out is None else sink_for(out, run.header, stamps) as sink:
+        _run_rows(run, rows, sink, kept, save, progress or bool, state_every)
+        if state is None and not hasattr(data, "readline"):
+            _require_a_window(design, run.rows)
+    if state is not None:
+        save_state(Path(state), run, digest)
+    table = gathered.frame() if out is None else None
+    shown = {} if run.recovered is None else dict(run.recovered.flags)
+    found = zip(run.observer.output_names, run.repeated.stuck(), strict=True)
+    stuck = {name: tuple((first + 1, last + 1) for first, last in runs) for name, runs in found if runs}
+    start = () if resumed else run.first.alarm_of_the_start(design, run.events.events())
+    return DataRun(
+        run.rows,
+        dict(run.statuses),
+        dict(run.alarms),
+        run.isolated,
+        shown,
+        dict(getattr(run.observer, "outliers", {})),
+        (*run.observer.notes, *stamps.warnings(), *run.first.warnings(), *start, *stuck_texts(stuck)),
+        digest,
+        table,
+        None if kept is None else kept.frame(),
+        stamps,
+        dict(thresholds or {}),
+        dict(run.alarm_rows),
+        run.events.events(),
+        dict(run.events.silent),
+        "" if monitor is None else monitor.statement,
+        stuck,
+    )
+
+
+def _require_files(*, state: Any, out: Any, data: object) -> None:
+    """Refuse files of `run_on_data` that are one, or cannot be written."""
+    if out is not None and not hasattr(out, "write"):
+        require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
+    require_distinct(
+        {
+            "state": state,
+            "data": data if isinstance(data, str | Path) else None,
+            "out": out if isinstance(out, str | Path) else None,
+        }
+    )
+    if state is not None:
+        check_output(state)
+
+
+def _require_a_window(design: ObserverDesign, rows: int) -> None:
+    """Raise `SpecError` where a log is shorter than the window of a guaranteed test, which then says nothing of it."""
+    if not is_guaranteed(design):
+        return
+    needed = max(map(rows_before, GuaranteedTest.of(design).tests)) + 1
+    if rows < needed:
+        raise SpecError(
+            f"The log has {rows} rows, but a window of {design.name!r} has {needed} samples: none of them has a "
+            "verdict. Design the test with fewer samples.",
+            path="samples",
+        )
+
+
+def _smoothed(run: LogRun, data: Data, *, smooth: bool, lag: int | None, state: str | Path | None) -> None:
+    """Let rows wait for those after them, if they shall."""
+    if not smooth and lag is None:
+        return
+    if smooth and lag is not None:
+        raise SpecError("smooth takes the whole record, and lag some samples of it: give one of them.", path="lag")
+    if smooth and hasattr(data, "readline"):
+        raise SpecError("A stream has no end to smooth from: give a lag, or the log as a file.", path="smooth")
+    if smooth and state is not None:
+        raise SpecError(
+            "smooth needs the whole record, but a saved state continues a part of it: give a lag, or "
+            "leave the state out.",
+            path="smooth",
+        )
+    run.later = LaterRows(run.observer, lag)
+
+
+def _run_rows(
+    run: LogRun,
+    rows: Iterator[FloatArray],
+    sink: Sink,
+    kept: FrameSink | None,
+    save: Callable[[], None] | None,
+    progress: Callable[[int], object],
+    state_every: int = STATE_ROWS,
+) -> None:
+    """Run over all rows: in chunks, or one by one where the state is to be saved after a stream."""
+    held, is_whole = HeldSignals(), True
+    if save is None:
+        for chunk in rows:
+            if kept is not None:
+                kept.keep([chunk[:, 0].tolist(), *run.signals.measured(chunk).T], len(chunk))
+            sink(run.take(chunk))
+            progress(run.rows)
+        sink(run.finish())
+        return
+    with ending_signals(), held.installed():
+        try:
+            for chunk in rows:
+                for row in chunk:
+                    with held:
+                        is_whole = False
+                        found = run.take(row[None])
+                        is_whole = True
+                        sink(found)
+                        if run.rows % state_every == 0:
+                            save()
+                progress(run.rows)
+        except ObsynthError:
+            # A refused row has changed nothing.
+            is_whole = True
+            raise
+        finally:
+            if is_whole and run.rows:
+                save()
+                sink(run.finish())

@@ -1,0 +1,167 @@
+"""The columns of a log: time stamps as seconds or dates, and signals as deviations from the operating point."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.monitoring.logs.log_observer import LogObserver
+from obsynth.monitoring.logs.stamps import WITH_UNIT
+from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.arrays import FloatArray, read_only
+
+#: A time of day without its date, as it stands beside one; hours, minutes and seconds since a log began.
+_TIME_OF_DAY = re.compile(
+    r"\d{1,2}:\d{2}(?::\d{2}\S*)?(?:\s*[AaPp]\.?[Mm]\.?)?(?:\s*(?:UTC|GMT|Z|[+-]\d\S*))?", re.IGNORECASE
+)
+
+
+#: The column of time stamps, in seconds.
+TIME_HEADER = "time"
+
+#: How the column of dates beside times of day may be called; that of a status beside a value, or behind its name.
+_DATE_NAMES = ("date", "datum", "day", "tag", "fecha")
+
+_STATUS_NAMES = ("status", "quality")
+
+#: How a status begins that says that a value is bad.
+_BAD_STATUS = ("bad", "invalid", "not good")
+
+
+#: How columns of time stamps are often called; a column of dates stands beside one of times of day.
+_TIME_NAMES = ("timestamp", "datetime", "zeit", "uhrzeit", "time", "date")
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """Which column holds which measured signal, and how its values become deviations."""
+
+    names: tuple[str, ...]  # signals: known inputs, then outputs
+    columns: tuple[str, ...]  # the columns that are read: time, then one for each signal
+    scale: FloatArray  # scale, offset: ``(nu + ny,)``: deviation = scale times the value in the column, minus offset
+    offset: FloatArray
+    point: Mapping[str, float]  # the operating point
+    one: int | None = None  # number of the signal that is one in every row and has no column, if there is such a one
+    inputs: int = 0  # columns of known inputs
+    delay: int = 0  # rows by which these act later than the design takes them; negative: earlier
+
+    @classmethod
+    def of(
+        cls, observer: LogObserver, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None
+    ) -> Signals:
+        """Return the signals that a running design reads."""
+        names = observer.input_names + observer.output_names
+        renamed, factors = dict(columns or {}), dict(scales or {})
+        unknown = [name for name in renamed if name not in (TIME_HEADER, *names)]
+        unknown += [name for name in factors if name not in names]
+        if unknown:
+            raise SpecError(
+                f"{unknown[0]!r} is no input or output of this observer, which has {', '.join(names)}.", path="columns"
+            )
+        for name, column in renamed.items():
+            require_kind(column, str, f"The column of {name!r}", "the name of a column", path="columns")
+        for name, factor in factors.items():
+            if not is_finite_number(factor) or factor == 0.0:
+                raise SpecError(f"The scale of {name!r} is {factor!r}: give a finite number, not zero.", path="scales")
+        uncertain = getattr(getattr(observer, "plant", None), "uncertainty", None)
+        shift = None if uncertain is None else uncertain.shift
+        return cls(
+            names,
+            tuple(renamed.get(name, name) for name in (TIME_HEADER, *names) if not shift or name != shift),
+            read_only(np.array([factors.get(name, observer.scales.get(name, 1.0)) for name in names])),
+            read_only(np.array([observer.point.get(name, 0.0) for name in names])),
+            dict(observer.point),
+            names.index(shift) if shift and shift in names else None,
+            len(observer.input_names) - int(bool(shift) and shift in observer.input_names),
+            observer.input_delay,
+        )
+
+    def measured(self, rows: FloatArray) -> FloatArray:
+        """Return signals in their units ``(rows, nu + ny)`` from rows of time and columns."""
+        read = rows[:, 1:] if self.one is None else np.insert(rows[:, 1:], self.one, 1.0, axis=1)
+        return np.asarray(self.scale * read)
+
+    def deviations(self, rows: FloatArray) -> FloatArray:
+        """Return deviations ``(rows, nu + ny)`` from rows of time and columns."""
+        return self.measured(rows) - self.offset
+
+    def positions(self, header: tuple[str, ...]) -> list[int]:
+        """Return where in a header each column is that is read."""
+        found = [column_of(header, name) for name in self.columns]
+        missing = sorted({name for name, there in zip(self.columns, found, strict=True) if there is None})
+        if missing:
+            raise SpecError(
+                f"The data have no column {', '.join(map(repr, missing))}; they have "
+                f"{', '.join(map(repr, header)) or 'none'}. {_advice(header, missing)}",
+                path="data",
+            )
+        there = [name for name in found if name is not None]
+        repeated = sorted({name for name in there if header.count(name) > 1})
+        if repeated:
+            raise SpecError(
+                f"The data have more than one column {', '.join(map(repr, repeated))}: give each a name of its own.",
+                path="data",
+            )
+        return [header.index(name) for name in there]
+
+    def estimates_point(self, observer: LogObserver) -> FloatArray:
+        """Return what is added to the columns of estimates: the operating point of states and faults."""
+        biases = getattr(getattr(observer, "plant", None), "sensor_faults", ())
+        values = [self.point.get(name, 0.0) for name in observer.state_names]
+        values += [0.0 if name in biases else self.point.get(name, 0.0) for name in observer.fault_names]
+        return np.array(values + [0.0] * (len(observer.columns) - len(values)))
+
+
+def is_bad(status: str) -> bool:
+    """Whether the text of a status says that the value beside it is bad."""
+    return status.strip().lower().startswith(_BAD_STATUS)
+
+
+def column_of(header: Sequence[str], name: str) -> str | None:
+    """Return what a header calls a column: as it is called, or so with a unit in brackets behind it; `None` where no
+    column, or more than one of the latter, is called so."""
+    if name in header:
+        return name
+    found = [each for each in header if name in each and (unit := WITH_UNIT.fullmatch(each)) and unit[1] == name]
+    return found[0] if len(found) == 1 else None
+
+
+def date_place(header: Sequence[str], places: Sequence[int]) -> int | None:
+    """Return where dates stand that times of day, which are the first of the columns that are read, may lack."""
+    found = [i for i, name in enumerate(header) if name.strip().lower() in _DATE_NAMES and i not in places]
+    return found[0] if len(found) == 1 else None
+
+
+def with_date(date: str, text: str) -> str:
+    """Return a time of day with the date beside it; what is none as it is."""
+    # A frame may show midnight behind its dates.
+    return f"{date.strip().removesuffix(' 00:00:00')} {text.strip()}" if _TIME_OF_DAY.fullmatch(text.strip()) else text
+
+
+def status_places(header: Sequence[str], places: Sequence[int]) -> list[int | None]:
+    """Return where the status of each column stands that is read ``(1 + nu + ny,)``: a column that is called as it with
+    a word such as ``status`` behind, or right of it by such a word alone."""
+    found: list[int | None] = [None]
+    lower = [name.strip().lower() for name in header]
+    for place in places[1:]:
+        unit = WITH_UNIT.fullmatch(lower[place])
+        base = unit[1] if unit else lower[place]
+        own = [i for i, name in enumerate(lower)
+               if name.startswith(base) and name[len(base) :].strip(" ._-:()[]/") in _STATUS_NAMES]  # fmt: skip
+        beside = [place + 1] if place + 1 < len(lower) and lower[place + 1] in _STATUS_NAMES else []
+        found.append(next((i for i in (*own, *beside) if i not in places), None))
+    return found
+
+
+def _advice(header: tuple[str, ...], missing: list[str]) -> str:
+    if len(header) == 1 and any(mark in header[0] for mark in ":#~^ "):
+        return "Separate columns by commas, semicolons, tabs or bars."
+    found = next((name for kind in _TIME_NAMES for name in header if name.lower().startswith(kind)), None)
+    found = found or next((name for name in header if name.lower() == "t"), None)
+    if TIME_HEADER in missing and found is not None:
+        return f"If {found!r} is the time: --time-column {found!r}, or columns={{'time': {found!r}}}."
+    return "Map signals to columns where their names differ."

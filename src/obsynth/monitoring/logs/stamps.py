@@ -1,0 +1,353 @@
+"""The columns of a log: time stamps as seconds or dates, and signals as deviations from the operating point."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta, tzinfo
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import number_in_text
+from obsynth.numerics.arrays import FloatArray
+
+if TYPE_CHECKING:
+    pass
+
+
+#: What a missing sample may look like in a log.
+MISSING_TEXTS = frozenset({"", "nan", "na", "n/a", "null", "none"})
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+_EXPECTED_TIMES = "seconds, such as 12.5, or a date and a time, such as 2026-05-01T08:30:00.5+02:00"
+
+#: Dates with points, which have the day first wherever they are written, and with slashes or dashes, which have no such
+#: rule but where the year is first; those with the name of a month.
+_POINTED = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4}|\d{2})(?!\d)(.*)")
+
+_SLASHED = re.compile(r"(\d{1,4})([/-])(\d{1,2})\2(\d{1,4})(.*)")
+
+_NAMED_MONTH = re.compile(
+    r"(?=.*\b\d{4}\b).*\b(?:jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*\b.*", re.IGNORECASE
+)
+
+#: A year of two digits is one of these hundred.
+_CENTURY = 2000
+
+#: A time of day that names its zone behind it.
+_ZONE = re.compile(
+    r"(.*?:\d{2}[^A-Za-z+-]*?(?:\s*[AaPp]\.?[Mm]\.?)?)\s*(UTC|GMT|Z)?\s*(?:([+-])(\d{1,2})(?::?(\d{2}))?)?",
+    re.IGNORECASE,
+)
+
+_ELAPSED = re.compile(r"(\d+):([0-5]\d):([0-5]\d(?:[.,]\d+)?)")
+
+#: A time of day, with AM or PM where the hours are counted to twelve.
+_CLOCK = re.compile(r"[ T]+(\d{1,2})(:\d{2}\S*?)(?:\s*([AaPp])\.?[Mm]\.?)?")
+
+_HALF_DAY = 12
+
+#: A part of a second in a date.
+_PART_OF_A_SECOND = re.compile(r":\d{2}[.,]\d")
+
+#: The part of a date that is larger is its day.
+_MONTHS = 12
+
+#: Seconds since 1970 reach this in the year 5138: larger numbers count parts of a second.
+_LARGEST_SECONDS = 1e11
+
+#: How many of them are in a second: milliseconds, microseconds, nanoseconds.
+_PARTS = (1e3, 1e6, 1e9)
+
+_MICROSECOND = timedelta(microseconds=1)
+
+#: Seconds in a nanosecond, a microsecond and a day; microseconds in a second.
+_NANO, _MICRO, _DAY_SECONDS, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
+
+
+#: What the unit of the time may be called in a line of units, and how many of them are a second; empty: seconds.
+_UNITS_OF_TIME = {
+    **dict.fromkeys(("", "-", "s", "sec", "secs", "second", "seconds", "sek"), 1.0),
+    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e3),
+    **dict.fromkeys(("us", "µs", "μs", "usec", "microsecond", "microseconds"), 1e6),
+    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e9),
+    **dict.fromkeys(("min", "minute", "minutes"), 1 / 60),
+    **dict.fromkeys(("h", "hr", "hour", "hours"), 1 / 3600),
+}
+
+
+#: A name of a column with a unit in brackets behind it.
+WITH_UNIT = re.compile(r"(.*\S)\s*[\[(]([^\[\]()]*)[\])]")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        number_in_text(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _clock(text: str) -> str:
+    """Return a time of day, with what stands before it, as ISO 8601 writes it; other texts as they are."""
+    found = _CLOCK.fullmatch(text)
+    if found is None:
+        return text
+    hour, rest, half = int(found.group(1)), found.group(2), (found.group(3) or "").lower()
+    if half and not 1 <= hour <= _HALF_DAY:
+        return text
+    return f"T{hour % _HALF_DAY + _HALF_DAY * (half == 'p') if half else hour:02}{rest}"
+
+
+def _with_named_month(text: str) -> str:
+    """Return a date with the name of a month as ISO 8601 writes it; what is none as it is."""
+    import pandas as pd
+
+    try:
+        return str(pd.to_datetime(text).isoformat())
+    except ValueError:
+        return text
+
+
+def _zone(text: str) -> tuple[str, str]:
+    """Return a date and time without its zone, and the zone as ISO 8601 writes it, empty where there is none."""
+    clock = text.partition(":")[2]
+    if not clock or (clock[-1].isdigit() and "+" not in clock and "-" not in clock):
+        return text, ""
+    found = _ZONE.fullmatch(text)
+    if found is None or not any(found.groups()[1:]):
+        return text, ""
+    body, _, sign, hours, minutes = found.groups()
+    return body, f"{sign or '+'}{hours or '0':0>2}:{minutes or '00'}"
+
+
+class Stamps:
+    """Which kind of stamps a log has, decided by its first one, and the zone in which they are written back."""
+
+    def __init__(self) -> None:
+        self.is_dated: bool | None = None
+        self.are_missing = False  # of a log without stamps, whose rows are counted by who reads it
+        self.zone: tzinfo | None = None  # of the first stamp, `None` where it names none (taken as UTC)
+        self.digits = "auto"  # how dates are written back: with a fraction in every row where the log has one
+        self.day_first: bool | None = None  # of dates with slashes, by the first one
+        self.per_second: float | None = None  # how many of the numbers of the log are a second, by the first one
+        self.notes: list[str] = []  # what is to be said of the file
+        #: Cells that hold a word instead of a number, which are missing, by column: how many; first row and text.
+        self.words: dict[str, tuple[int, int, str]] = {}
+        #: Cells beside which a status says that they are bad, by column: how many; first row, text and its column.
+        self.bad: dict[str, tuple[int, int, str, str]] = {}
+        #: The decimal mark that numbers of a column have shown, and rows of cells that may group thousands instead.
+        self.decimals: dict[str, str] = {}
+        self.groups: dict[tuple[str, str], tuple[int, str]] = {}
+        #: Columns that have shown a number: of the others words are no bad samples, but another kind of column.
+        self.numeric: set[str] = set()
+        #: Inputs ``(delay, nu)`` of the latest rows, where inputs act later than they are written.
+        self.earlier: FloatArray | None = None
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what is to be said of the file, and a text for each column with words in it."""
+        return (
+            *self.notes,
+            *(
+                f"{count} cell(s) of {column!r} hold no number and count as missing, first {text!r} in row {row}."
+                for column, (count, row, text) in self.words.items()
+            ),
+            *(
+                f"{count} cell(s) of {column!r} count as missing, as {status!r} says so, first {text!r} in row {row}."
+                for column, (count, row, text, status) in self.bad.items()
+            ),
+        )
+
+    def take_bad(self, column: str, row: int, text: str, status: str, *, count: int = 1) -> None:
+        """Count cells that are bad by the column of their status, the first of which is in a row and says a text."""
+        known, first_row, first_text, _ = self.bad.get(column, (0, row, text, status))
+        self.bad[column] = (known + count, first_row, first_text, status)
+
+    def take_mark(self, column: str, row: int, cell: str, mark: str, *, may_group: bool) -> None:
+        """Take which decimal mark a number of a column has, or one that may group thousands instead: a log in which it
+        may mean both means neither."""
+        if may_group and (column, mark) not in self.groups:
+            self.groups[column, mark] = row, cell
+        elif not may_group and column not in self.decimals:
+            self.decimals[column] = mark
+        else:
+            return
+        for (name, seen), (first_row, first) in self.groups.items():
+            known = {self.decimals[name]} if name in self.decimals else set(self.decimals.values())
+            if known and seen not in known:
+                raise SpecError(
+                    f"Row {first_row}, column {name!r}: in {first!r} the mark may group thousands, as the decimals of "
+                    f"other numbers begin with {min(known)!r}. Leave out what groups thousands.",
+                    path=f"row {first_row}",
+                )
+
+    def take_header(self, header: Sequence[str], wanted: Sequence[str], places: Sequence[int]) -> None:
+        """Take the units that stand behind names of columns, which are called otherwise where they are ``wanted``."""
+        found = WITH_UNIT.fullmatch(header[places[0]])
+        per_second = None if found is None else _UNITS_OF_TIME.get(found.group(2).strip().lower())
+        if per_second not in (None, 1.0):
+            self.per_second = per_second
+        named = [repr(header[place]) for name, place in zip(wanted, places, strict=True) if header[place] != name]
+        if named:
+            self.notes.append(f"Columns are found by their names without units: {', '.join(named)}.")
+
+    def take_word(self, column: str, row: int, text: str) -> None:
+        """Count a cell that holds a word instead of a number."""
+        count, first_row, first_text = self.words.get(column, (0, row, text))
+        self.words[column] = (count + 1, first_row, first_text)
+
+    def take_units(self, cells: Sequence[str]) -> bool:
+        """Whether the line below the header holds units, of which that of the time counts: its cell is one of time, or
+        is empty, and no other is a number.  ``cells`` are those that are read, the time first."""
+        if not cells or not any(cells) or any(map(_is_number, cells)):
+            return False
+        unit = cells[0].strip("[]()").lower()
+        per_second = _UNITS_OF_TIME.get(unit)
+        if per_second is None or not any(cell.lower() not in MISSING_TEXTS for cell in cells):
+            return False
+        if unit:
+            self.per_second = per_second
+        self.notes.append(f"The line below the header is taken as units: {', '.join(map(repr, cells))}.")
+        return True
+
+    def require_numbers(self) -> None:
+        """Raise `SpecError`, at the end of a log, for a column of words in which no row holds a number."""
+        for column, (_, row, text) in self.words.items():
+            if column not in self.numeric:
+                advice = " Write 1 and 0." if text.lower() in ("true", "false") else ""
+                raise SpecError(
+                    f"The column {column!r} holds no number: row {row} has {text!r}.{advice}", path=f"columns.{column}"
+                )
+
+    def read(self, text: str, row: int, column: str, *, comma: bool = False) -> float:
+        """Return the seconds of one cell; ``comma`` takes a decimal comma."""
+        cell = text.strip()
+        if self.are_missing or cell.lower() in MISSING_TEXTS:
+            return math.nan
+        if self.is_dated is not True:
+            try:
+                seconds = number_in_text(cell.replace(",", ".") if comma else cell)
+            except ValueError:
+                seconds = None
+            if seconds is not None:
+                self.is_dated = False
+                return float(self.seconds(np.array([seconds]))[0])
+            elapsed = _ELAPSED.fullmatch(cell)
+            if elapsed is not None:
+                self.is_dated = False
+                hours, minutes, rest = elapsed.groups()
+                return 3600.0 * int(hours) + 60.0 * int(minutes) + float(rest.replace(",", "."))
+        if self.is_dated is not False:
+            text_of_date, found = cell, None
+            if cell[4:5] == "-":
+                with suppress(ValueError):
+                    found = datetime.fromisoformat(cell)
+            if found is None:
+                text_of_date = self._as_iso(cell, row, column)
+                with suppress(ValueError):
+                    found = datetime.fromisoformat(text_of_date)
+            if found is not None:
+                if self.is_dated is None and _PART_OF_A_SECOND.search(text_of_date):
+                    self.digits = "microseconds"
+                return self._seconds(found, row, column)
+        raise SpecError(
+            f"Row {row}, column {column!r}: {text!r} is no time stamp: {self._expected()}.", path=f"row {row}"
+        )
+
+    def seconds(self, numbers: FloatArray) -> FloatArray:
+        """Return seconds from stamps that are numbers ``(rows,)``: those too large for seconds since 1970 count parts
+        of one."""
+        known = np.abs(numbers[np.isfinite(numbers)])
+        if self.per_second is None and known.size:
+            first = float(known[0])
+            self.per_second = 1.0
+            if _LARGEST_SECONDS <= first < _LARGEST_SECONDS * _PARTS[-1]:
+                self.per_second = next(parts for parts in _PARTS if first < _LARGEST_SECONDS * parts)
+        return numbers if self.per_second in (None, 1.0) else np.asarray(numbers / self.per_second)
+
+    def _as_iso(self, cell: str, row: int, column: str) -> str:
+        """Return a date as ISO 8601 writes it: one with points, such as 5.3.2026 08:30:00,5, has the day first; of one
+        with slashes the first of the log must say what its parts are."""
+        cell, zone = _zone(cell)
+        pointed, slashed = _POINTED.fullmatch(cell), _SLASHED.fullmatch(cell)
+        if pointed is not None:
+            day, month, year, time = pointed.groups()
+            year = year if len(year) > 2 else str(_CENTURY + int(year))
+        elif slashed is not None and len(slashed.group(1)) > 2:
+            year, _, month, day, time = slashed.groups()
+        elif slashed is not None:
+            one, _, two, year, time = slashed.groups()
+            if self.day_first is None and max(int(one), int(two)) > _MONTHS:
+                self.day_first = int(one) > _MONTHS
+            if self.day_first is None and one != two:
+                raise SpecError(
+                    f"Row {row}, column {column!r}: {cell!r} may begin with the day or the month: write dates with "
+                    f"the year first, such as {year}-12-31.",
+                    path=f"row {row}",
+                )
+            day, month = (one, two) if self.day_first else (two, one)
+        elif _NAMED_MONTH.fullmatch(cell):
+            return _with_named_month(cell) + zone
+        else:
+            return cell[:10] + _clock(cell[10:]) + zone
+        return f"{year}-{month:0>2}-{day:0>2}{_clock(time)}{zone}"
+
+    def read_column(self, column: Any) -> FloatArray | None:
+        """Return the seconds of a column of a data frame that holds dates, or no stamps; else `None`."""
+        if self.are_missing:
+            return np.full(len(column), np.nan)
+        kind = getattr(column.dtype, "kind", "O")
+        if kind not in "Mm":
+            return None
+        missing = np.asarray(column.isna())
+        if kind == "m":
+            self.is_dated = False
+            seconds = np.asarray(column.dt.total_seconds(), dtype=np.float64)
+        else:
+            zone = column.dt.tz
+            if self.is_dated is None:
+                self.is_dated, self.zone = True, zone
+            moments = (column if zone is None else column.dt.tz_convert("UTC").dt.tz_localize(None)).to_numpy()
+            # Apart, so that the fraction keeps its digits, and in seconds, of which no date has too many.
+            whole = moments.astype("datetime64[s]")
+            parts = np.where(missing, 0, (moments - whole).astype("timedelta64[ns]").astype(np.int64))
+            if np.any(parts):
+                self.digits = "microseconds"
+            seconds = whole.astype(np.int64) + parts * _NANO
+        return np.where(missing, np.nan, seconds)
+
+    def shown(self, seconds: float) -> str:
+        """Return a time as the log writes it."""
+        if not self.is_dated or not math.isfinite(seconds):
+            return f"{seconds:g} s"
+        return self.date(seconds)
+
+    def date(self, seconds: float) -> str:
+        """Return the date and time of some seconds, ISO 8601, in the zone of the log."""
+        return self.moment(seconds).isoformat(timespec=self.digits)
+
+    def moment(self, seconds: float) -> datetime:
+        """Return the date and time of some seconds, to the microsecond, with the log's zone if it names one."""
+        found = _EPOCH + timedelta(seconds=math.floor(seconds)) + round((seconds % 1.0) * _MICROSECONDS) * _MICROSECOND
+        return found.replace(tzinfo=None) if self.zone is None else found.astimezone(self.zone)
+
+    def _seconds(self, found: datetime, row: int, column: str) -> float:
+        if self.is_dated is None:
+            self.is_dated, self.zone = True, found.tzinfo
+        if (found.tzinfo is None) != (self.zone is None):
+            raise SpecError(
+                f"Row {row}, column {column!r}: stamps with a time zone and without one cannot be mixed in one log.",
+                path=f"row {row}",
+            )
+        past = (found if found.tzinfo is not None else found.replace(tzinfo=UTC)) - _EPOCH
+        return past.days * _DAY_SECONDS + past.seconds + past.microseconds * _MICRO
+
+    def _expected(self) -> str:
+        if self.is_dated is None:
+            return f"give {_EXPECTED_TIMES}"
+        return "the rows before hold dates and times" if self.is_dated else "the rows before hold seconds"

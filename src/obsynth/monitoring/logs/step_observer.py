@@ -1,0 +1,194 @@
+"""Observers that take missing outputs themselves, on a log: held inputs, new starts, status."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+
+from obsynth.errors import ObsynthError, SolverError, SpecError
+from obsynth.monitoring.logs.log_observer import GAP, OK, PARTIAL, RECOVERING, WARM_UP, LogObserver, Row
+from obsynth.monitoring.thresholds.learned import innovation_names
+from obsynth.monitoring.thresholds.monitor import Evidence
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.running import as_run
+from obsynth.observers.smoothing import Chain
+from obsynth.results.design import ObserverDesign
+
+
+class SteppingLogObserver(LogObserver):
+    """An observer with deviations on a log (nonlinear plants: absolute values); the first row is k = 0.
+    By default no warm-up, as covariances of the start say how uncertain the estimates are, and a gate for outliers
+    where the observer says nothing of them."""
+
+    saved: ClassVar = {"observer": "state", "u": "u", "spread": "spread", "usual": "usual"}
+
+    def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:
+        observer: Any = design.observer
+        self.observer: RecursiveObserver | DAEObserver = as_run(observer, outliers)
+        plant = design.plant
+        super().__init__(self.observer, warm_up, 0.0)
+        self.input_names, self.output_names = plant.input_names, plant.output_names
+        self.input_delay = design.input_delay
+        self.is_recursive, self.may_restart = isinstance(self.observer, RecursiveObserver), True
+        residuals = innovation_names(self.observer)
+        if isinstance(self.observer, RecursiveObserver):
+            model, Q, R = self.observer.plant, self.observer.Q, self.observer.R
+            self.point, self.scales = model.operating_point, model.scales
+            constant = model.is_time_invariant and Q.is_constant and R.is_constant
+            self.may_restart = constant and model.horizon is None
+        self.columns = (
+            *self.estimated,
+            *(f"sd {name}" for name in self.estimated),
+            *(f"r[{name}]" for name in residuals),
+        )
+        self.directions = len(residuals)
+        late = ", ".join(name for name, entry in (self.observer.sensors or {}).items() if entry["delay"])
+        if late:
+            self.notes = (
+                f"Values of {late} are delayed: no row holds their innovations, and monitors use them through the "
+                "estimates alone.",
+            )
+        #: Of a smoother: the samples since the observer last started.
+        self.chain: Chain | None = None
+        self.state: Any = self.observer.init()
+        self.u: FloatArray | None = None
+        # Deviations of the faults at the last row, and before samples were missing: zero where nothing is left of that.
+        self.spread = self.usual = np.zeros(len(self.fault_names))
+
+    def follows(self, missing: int) -> bool:
+        """Whether rows that are missing are taken one by one: always where the plant changes with k."""
+        return super().follows(missing) or not self.may_restart
+
+    def _begin(self) -> None:
+        """Start the observer again."""
+        self.state = self.observer.init()
+        if self.chain is not None:
+            self.chain = Chain(self.chain.links)
+
+    @property
+    def gates(self) -> bool:
+        """Whether a gate judges each sample in its own row."""
+        return self.observer.outliers == "gate" and not self.observer.timing.longest
+
+    @property
+    def outliers(self) -> dict[str, int]:
+        """How many samples of each output were outliers, since the observer last started."""
+        counts = self.state.refused[1]
+        return {name: int(count) for name, count in zip(self.output_names, counts, strict=True) if count}
+
+    def _begun(self, u: FloatArray) -> FloatArray:
+        """Return inputs ``(nu,)`` with those of the row before where they are missing: an observer begins with known
+        ones."""
+        return np.where(np.isnan(u), 0.0 if self.u is None else self.u, u)
+
+    def _taken(self, y: FloatArray, u: FloatArray) -> Evidence | None:
+        """Take one sample, or none of it: `None` where numbers are no finite ones any more."""
+        before = self.state
+        u = u if self.state.k else self._begun(u)
+        found: Evidence
+        try:
+            with np.errstate(all="ignore"):
+                kept = None if self.chain is None else self.chain.add
+                self.state, found = self.observer.accept(self.state, y, u, kept)
+        except (np.linalg.LinAlgError, ValueError):
+            return None
+        if found.is_finite:
+            return found
+        self.state = before
+        return None
+
+    def _values(self, found: Evidence) -> FloatArray:
+        """Return a row: estimates, standard deviations, innovation at the parameters of one sample before."""
+        residual = np.full(self.directions, np.nan)
+        # The correction of the start by early constraints has no more directions, but may have fewer.
+        residual[: min(len(found.gap), self.directions)] = found.gap[: self.directions]
+        deviations = np.sqrt(np.diag(found.parameter_covariance))
+        return np.concatenate([found.x, found.theta, found.state_deviations, deviations, residual])
+
+    def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
+        """Take one row."""
+        nu, fresh = len(self.input_names), self.u is None
+        known = np.isfinite(values)
+        if self.u is None and not self.is_recursive and not known[:nu].all():
+            # A nonlinear model has no zero to begin with: it begins when all inputs are known.
+            return Row(GAP, np.full(len(self.columns), np.nan), missing)
+        u, y = (np.where(known, values, np.nan)[part] for part in (slice(nu), slice(nu, None)))
+        if missing:
+            self._begin()
+            fresh = True
+        total = self.state.refused[1]
+        found, spoiled, restarted = self._found(y, u, may_restart=self.may_restart and not fresh)
+        self.u, fresh = self._begun(u), fresh or restarted
+        if fresh:
+            self.settled_at, self.phase = self._after(time, self.warm_up), WARM_UP
+        elif nu and not known[:nu].all():
+            # A step took inputs that nobody measured.
+            self.settled_at = self._after(time, self.warm_up)
+            self.phase = WARM_UP if self.phase == WARM_UP else RECOVERING
+        # A filter that begins with y(1) does not miss y(0).
+        received = (known[nu:] & ~self._refused(total)) | ~self.observer.timing.expected(self.state.k - 1)
+        if fresh and self.is_recursive:
+            received = np.ones_like(received)
+        status = self._status(time, known[:nu], received, spoiled=spoiled)
+        whole = not spoiled and bool(known[:nu].all() and received.all())
+        return Row(status, self._values(found), missing, found, unsure=self._unsure(found, whole=whole, fresh=fresh))
+
+    def _unsure(self, found: Evidence, *, whole: bool, fresh: bool) -> FloatArray | None:
+        """Return by how many times the deviations of faults are above those before samples were missing, after a row
+        that is ``whole`` or lacks some; ``None`` where none is."""
+        before, self.spread = self.spread, np.sqrt(np.diag(found.parameter_covariance))
+        if fresh:
+            self.usual = np.zeros_like(before)
+        elif not whole:
+            self.usual = np.where(self.usual > 0.0, self.usual, before)
+        self.usual = np.where(self.spread > self.usual, self.usual, 0.0)
+        if not self.usual.any():
+            return None
+        return np.divide(self.spread, self.usual, out=np.ones_like(before), where=self.usual > 0.0)
+
+    def _refused(self, total: FloatArray) -> np.ndarray:
+        """Return which outputs of the last sample were left out as outliers: of which more are than before it."""
+        return np.asarray(self.state.refused[1] > total) & (self.observer.outliers == "gate")
+
+    def _found(self, y: FloatArray, u: FloatArray, *, may_restart: bool) -> tuple[Evidence, bool, bool]:
+        """Take one sample; return also whether its outputs were left out, and whether the observer started again."""
+        found = self._safe(y, u)
+        if found is not None:
+            return found, False, False
+        try:
+            return self._required(u), True, False
+        except ObsynthError:
+            # An outlier may have led where the model cannot go on.
+            if not may_restart:
+                raise
+        self._begin()
+        found = self._safe(y, u)
+        return (self._required(u), True, True) if found is None else (found, False, True)
+
+    def _status(self, time: float, inputs: np.ndarray, outputs: np.ndarray, *, spoiled: bool) -> str:
+        if spoiled or not inputs.all() or not outputs.any():
+            return GAP
+        if time < self.settled_at:
+            return self.phase
+        self.phase = OK
+        return OK if outputs.all() else PARTIAL
+
+    def _safe(self, y: FloatArray, u: FloatArray) -> Evidence | None:
+        """Take one sample, or none of it where there is no solution either."""
+        try:
+            return self._taken(y, u)
+        except SolverError:
+            return None
+
+    def _required(self, u: FloatArray) -> Evidence:
+        """Take one sample without outputs."""
+        found = self._taken(np.full(len(self.output_names), np.nan), u)
+        if found is None:
+            raise SpecError(
+                "the estimates are no finite numbers any more: the model is unstable, or the inputs are too large.",
+                path="inputs",
+            )
+        return found

@@ -1,0 +1,446 @@
+"""From a design with tolerances to an adaptive threshold, and the sentence that says what it promises.
+
+Thresholds over a box for continuous designs on samples, for ``eps = z - Gamma_1 v - T x`` at these.
+
+``eps+ = Az eps + (Az T + By C - T Phi) x + (Bu + By D - T Gamma) u + (By Dd d - T q) + By v``, q of d of any time
+course; what the brackets leave at the nominal plant acts like one more constant, ``sampling``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.methods.tracking import structure_of, tracking_of
+from obsynth.monitoring.thresholds.adaptive_rule import AdaptiveRule
+from obsynth.monitoring.thresholds.monitor import Rule
+from obsynth.monitoring.thresholds.residual_model import noisy_plant, watches_estimates
+from obsynth.monitoring.thresholds.rules import NormRule
+from obsynth.numerics.arguments import is_finite_number, require_mapping
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.continuous import first_order_hold
+from obsynth.observers.linear.derived import sample_observer
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.constants import ConstantsBox, shown
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.signal_names import require_known
+from obsynth.plants.transformations.elimination import algebraic_coordinates, eliminate_algebraic_states
+from obsynth.plants.transformations.sampling import discretise
+from obsynth.plants.transformations.uncertain_plant import AffinePlant, affine_plant, reduced_family
+from obsynth.plants.uncertainty import ELIMINATED, SAMPLED, Uncertainty
+from obsynth.proofs.affine import AffineMatrix, affine_block, affine_zero_order_hold
+from obsynth.proofs.balls import rounded_up
+from obsynth.results.design import ObserverDesign
+from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.signals import resolve
+from obsynth.verification.assumptions import Assumptions
+from obsynth.verification.over_tolerances.adaptive_bound import Start, adaptive_bound
+from obsynth.verification.over_tolerances.adaptive_record import AdaptivePlan
+from obsynth.verification.over_tolerances.error_structure import ErrorStructure, Tracking, error_structure
+from obsynth.verification.over_tolerances.plants_of_the_box import EXACT_MODEL, with_tolerances
+from obsynth.verification.over_tolerances.responses import loop_radius
+from obsynth.verification.over_tolerances.subdivision import index_one_on_box, values_at
+
+#: Pieces of an interval in which a disturbance has a sign of its own.
+SIGNED_PIECES = 16
+
+#: Covers the rounding of a matrix exponential in double precision, and of a few sums.
+SERIES_SLACK, SUM_SLACK = 1.0 + 1e-9, 1.0 + 1e-12
+
+#: The name under which what the sampled observer misses counts among the constants.
+SAMPLING = "sampling"
+
+
+#: Radii of a set are made larger by this share: more than the rounding of their sums.
+RADIUS_OUTWARD = 1e-12
+
+#: What a statement adds where no tolerance is known.
+NO_TOLERANCE = f"; {EXACT_MODEL}"
+
+
+class SampledProblem(NamedTuple):
+    """The error system of a continuous design at the samples of its data."""
+
+    affine: AffinePlant
+    observer: LinearObserver
+    tracking: Tracking
+    bounds: FloatArray  # of all pieces
+    reading: FloatArray  # ``(n, nx)``: the dynamic state from the plant's
+    first: FloatArray  # ``(nz, nu)``: first inputs to eps at the start
+    ramp: FloatArray
+    unknown: FloatArray  # ``(nz,)``: first disturbance and noise to eps at the start, at most
+
+    def start(self, known: Start, box: tuple[FloatArray, FloatArray] | None) -> Start:
+        """Return what is known of eps at the start; ``box`` of the plant's state, middle and half width."""
+        z, t = known.state, self.tracking.T
+        if box is None:
+            if known.stated and not self.affine.C.is_certain:
+                raise PreconditionError(
+                    "A constant with a tolerance is in C: the norm of the error at the start bounds too little; give "
+                    "initial_set (--initial).",
+                    condition="start",
+                )
+            radius = self.unknown if known.stated else np.zeros(len(z))
+            return Start(len(z), norm=known.norm, radius=radius, state=z)
+        center, radius = self.reading @ box[0], np.abs(self.reading) @ box[1]
+        moved = self.affine.C.spread + self.affine.C.radius
+        seen = np.abs(self.ramp) @ (moved @ (np.abs(center) + radius))
+        size = np.abs(t) @ radius + seen + self.unknown
+        followed = (t + self.ramp @ self.affine.C.center) @ center
+        far = np.abs(self.ramp) @ (np.abs(self.affine.C.center) @ radius)
+        return Start(len(z), center=z - followed, radius=(size + far) * SUM_SLACK, state=z)
+
+
+def sampled_problem(design: ObserverDesign, dt: float, bounds: FloatArray, noise_bound: float) -> SampledProblem:
+    """Return the sampled error system of a continuous design; `PreconditionError` where there is none."""
+    plant, observer = design.linear
+    uncertain = plant.uncertainty if plant.uncertainty is not None else Uncertainty(ConstantsBox({}), {})
+    if uncertain.box.variation == "varying":
+        raise PreconditionError(
+            "The constants may vary, and the design is continuous in time: their values between samples have no "
+            "bound. Sample the plant first (transform: sample_time), or state constants that stay the same.",
+            condition="discrete time",
+        )
+    exact = AffinePlant(plant, uncertain.box, {}, np.eye(plant.nx))
+    followed = tracking_of(design, exact).T
+    reduced, basis = reduced_family(plant, uncertain)
+    # The plant's state from its dynamic part, the algebraic one left out.
+    is_eliminated = any(kind == ELIMINATED for kind, _ in uncertain.steps)
+    into = np.eye(plant.nx) if is_eliminated else algebraic_coordinates(plant)[1]
+    back = 2.0 * np.eye(len(basis)) - basis
+    reading = back @ np.linalg.pinv(into)
+    smooth = eliminate_algebraic_states(plant).plant
+    moving, held = affine_zero_order_hold(reduced["A"], reduced["B"], dt)
+    pieces = _pieces(reduced["A"], reduced["Bd"], dt)
+    nd, nf = plant.nd, plant.nf
+    zero = AffineMatrix.exact(np.zeros((len(basis), nd)), moving.count)
+    blind = AffineMatrix.exact(np.zeros((plant.ny, nd * SIGNED_PIECES)), moving.count)
+    bd, dd = affine_block([[*pieces, zero]]), affine_block([[blind, reduced["Dd"]]])
+    bw, dw = _noise(smooth, back, dt)
+    matrices = {
+        "E": AffineMatrix.exact(np.eye(len(basis)), moving.count),
+        "A": moving,
+        "B": held,
+        "C": reduced["C"],
+        "D": reduced["D"],
+        "Bd": bd,
+        "Dd": dd,
+        "Bf": AffineMatrix.exact(np.zeros((len(basis), nf)), moving.count),
+        "Df": reduced["Df"],
+    }
+    offsets = uncertain.box.offsets
+    sampled = DescriptorSystem(
+        None,
+        moving.at(offsets),
+        held.at(offsets),
+        C=reduced["C"].at(offsets),
+        D=reduced["D"].at(offsets),
+        Bd=bd.at(offsets),
+        Dd=dd.at(offsets),
+        Bw=bw,
+        Dw=dw,
+        dt=dt,
+    )
+    affine = AffinePlant(sampled, uncertain.box, matrices, np.eye(len(basis)))
+    inputs = np.hstack([observer.Bu, observer.By])
+    ramp = first_order_hold(observer.Az, inputs, dt)[2]
+    through_u, through_y = ramp[:, : plant.nu], ramp[:, plant.nu :]
+    t = followed @ plant.E @ into @ basis - through_y @ affine.C.center
+    if plant.nu and not affine.D.is_certain:
+        raise PreconditionError(
+            "A constant with a tolerance is in D, and the design is continuous in time: sample the plant first "
+            "(transform: sample_time).",
+            condition="discrete time",
+        )
+    unknown = np.abs(through_y) @ (reduced["Dd"].magnitude @ bounds + np.abs(dw).sum(axis=1) * noise_bound)
+    first = -(through_u + through_y @ affine.D.center)
+    sizes = np.concatenate([np.tile(bounds, SIGNED_PIECES), bounds])
+    empty = np.zeros((len(observer.Cz), len(basis)))
+    return SampledProblem(
+        affine, sample_observer(observer, dt), Tracking(t, empty), sizes, reading, first, through_y, unknown
+    )
+
+
+def _pieces(a: AffineMatrix, bd: AffineMatrix, dt: float) -> list[AffineMatrix]:
+    """Return what a disturbance of one sign does in each piece of an interval, newest first ``(n, nd)``.
+    The remainder holds a change of sign inside a piece: at most a quarter of its length, squared, times the slope."""
+    from scipy.linalg import expm
+
+    width = dt / SIGNED_PIECES
+    step, gathered = affine_zero_order_hold(a, bd, width)
+    size = a.magnitude
+    # ``exp(S)`` bounds ``sum_k S^k / (k + 1)!`` for ``S >= 0``.
+    growth = np.eye(len(size)) + size * width @ (expm(size * width) * SERIES_SLACK)
+    found, piece, value = [], gathered, bd
+    for _ in range(SIGNED_PIECES):
+        slope = size @ (growth @ value.magnitude)
+        found.append(piece.enlarged(rounded_up(0.25 * width**2 * slope, 6)))
+        piece, value = step @ piece, step @ value
+    return found
+
+
+def _noise(smooth: DescriptorSystem, back: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+    """Return the noise of the plant gathered in a sample, and that of the sensors, as columns side by side."""
+    process, sensors = smooth.Bw.any(axis=0), smooth.Dw.any(axis=0)
+    if (process & sensors).any():
+        raise PreconditionError(
+            "One noise acts on the plant and on a sensor, which has no model between samples.", condition="noise"
+        )
+    gathered = np.zeros((smooth.nx, 0))
+    if process.any():
+        whole = DescriptorSystem(None, smooth.A, C=np.eye(smooth.nx), Bw=smooth.Bw[:, process])
+        gathered = back @ discretise(whole, dt).plant.Bw
+    measurement_noise = smooth.Dw[:, sensors]
+    return (
+        np.hstack([gathered, np.zeros((smooth.nx, measurement_noise.shape[1]))]),
+        np.hstack([np.zeros((smooth.ny, gathered.shape[1])), measurement_noise]),
+    )
+
+
+def adaptive_plan(
+    design: ObserverDesign,
+    bounds: FloatArray,
+    noise_bound: float,
+    *,
+    initial_error: float | None,
+    initial_set: Mapping[str, Any] | None,
+    observer_state: FloatArray | None = None,
+    sample_time: float | None = None,
+) -> tuple[AdaptivePlan, AdaptivePlan]:
+    """Return the plans from the first start on and after a later one, over the plant's box, if there is a bound."""
+    plant, observer = design.linear
+    if plant.uncertainty is not None and plant.uncertainty.box.names:
+        found = index_one_on_box(plant)
+        if found.verdict == "refuted" and found.at is not None:
+            values = values_at(plant.uncertainty.box, found.at)
+            where = ", ".join(f"{name} = {value:.6g}" for name, value in values.items())
+            raise PreconditionError(
+                f"The plant is singular, or not of index 1, inside the box: at {where}. Give smaller tolerances.",
+                condition="regularity",
+            )
+    if not plant.is_discrete:
+        return _sampled_plan(design, bounds, noise_bound, initial_error, initial_set, observer_state, sample_time)
+    affine = affine_plant(plant)
+    tracking = tracking_of(design, affine)
+    varying = affine.box.variation == "varying"
+    noise = noise_bound if plant.nw else 0.0
+    sizes = np.where(np.isfinite(bounds), bounds, 0.0)
+    structure = structure_of(design, affine, tracking, bounds=sizes, noise_bound=noise)
+    _require_bounds(structure, bounds, plant)
+    z = np.zeros(observer.order) if observer_state is None else observer_state
+    start = start_of(affine, tracking, initial_error, initial_set, z)
+    later = Start(observer.order, norm=initial_error, state=z)
+    reason, faults, same = "", None, False
+    try:
+        with_faults = structure_of(design, affine, tracking, bounds=sizes, noise_bound=noise, faults=True)
+        same = affine.Bf.is_certain and affine.Df.is_certain
+        faults = None if same else with_faults
+    except PreconditionError as error:
+        reason = str(error)
+
+    def plan(begin: Start) -> AdaptivePlan:
+        return AdaptivePlan(
+            adaptive_bound(structure, observer, begin, varying=varying),
+            None if faults is None else adaptive_bound(faults, observer, begin, varying=varying),
+            same,
+            reason,
+            begin.norm is None,
+            watches_estimates(design) or not observer.residual_names,
+            affine.box.names,
+            observer.fault_names,
+            observer.residual_names,
+        )
+
+    return plan(start), plan(later)
+
+
+def _sampled_plan(
+    design: ObserverDesign,
+    bounds: FloatArray,
+    noise_bound: float,
+    initial_error: float | None,
+    initial_set: Mapping[str, Any] | None,
+    observer_state: FloatArray | None,
+    sample_time: float | None,
+) -> tuple[AdaptivePlan, AdaptivePlan]:
+    """Return the plans of a continuous design, whose observer runs on samples."""
+    plant, observer = design.linear
+    if sample_time is None:
+        raise SpecError("A continuous design needs the sample_time of its data.", path="sample_time")
+    noise = noise_bound if plant.nw else 0.0
+    problem = sampled_problem(design, sample_time, np.where(np.isfinite(bounds), bounds, 0.0), noise)
+    structure = error_structure(
+        problem.observer, problem.affine, problem.tracking, problem.bounds, noise, reading=problem.reading
+    )
+    _require_bounds(structure, np.tile(bounds, SIGNED_PIECES + 1), plant)
+    z = np.zeros(observer.order) if observer_state is None else observer_state
+    box = None if initial_set is None else initial_box(plant, initial_set)
+    stated = Start(observer.order, norm=initial_error, state=z)
+    why = "the fault is estimated through the dynamics of a continuous design, which a change of it takes time to pass"
+
+    def plan(begin: Start) -> AdaptivePlan:
+        bound = adaptive_bound(structure, problem.observer, begin, varying=False)
+        return AdaptivePlan(
+            replace(bound, first=problem.first),
+            None,
+            False,
+            why,
+            True,
+            watches_estimates(design),
+            (*problem.affine.box.names, SAMPLING),
+            observer.fault_names,
+            observer.residual_names,
+            sample_time,
+        )
+
+    return plan(problem.start(stated, box)), plan(problem.start(stated, None))
+
+
+def _require_bounds(structure: ErrorStructure, bounds: FloatArray, plant: DescriptorSystem) -> None:
+    """Raise `SpecError` where a disturbance without a bound reaches the error."""
+    reached = structure.disturbances.magnitude.max(axis=0, initial=0.0)[: len(bounds)] > 0.0
+    lacking = sorted({int(i) % plant.nd for i in np.flatnonzero(reached & ~np.isfinite(bounds))})
+    if lacking:
+        names = ", ".join(plant.disturbance_names[i] for i in lacking)
+        raise SpecError(
+            f"No bound is given on {names}: give disturbance_bounds (--disturbance).", path="disturbance_bounds"
+        )
+
+
+def start_of(
+    affine: AffinePlant,
+    tracking: Tracking,
+    initial_error: float | None,
+    initial_set: Mapping[str, Any] | None,
+    z: FloatArray,
+) -> Start:
+    """Return what is known of eps at the start, ``z - T E(q) x`` for x in a box."""
+    plant = affine.plant
+    if initial_set is None:
+        return Start(len(z), norm=initial_error, state=z)
+    center, radius = initial_box(plant, initial_set)
+    back = 2.0 * np.eye(plant.nx) - affine.coordinates
+    followed = affine.E.after(tracking.T) @ back
+    offset = followed.center @ center
+    size = np.abs(followed.center) @ radius + (followed.spread + followed.radius) @ (np.abs(center) + radius)
+    return Start(len(z), center=z - offset, radius=size * (1.0 + RADIUS_OUTWARD), state=z)
+
+
+def initial_box(plant: DescriptorSystem, given: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
+    """Return middle and half width ``(nx,)`` of the plant's start; states that E does not see need no entry."""
+    require_mapping(given, "initial_set")
+    center, radius = np.zeros(plant.nx), np.zeros(plant.nx)
+    needed = np.abs(plant.E).max(axis=0, initial=0.0) > 0.0
+    require_known(given, plant.state_names, what="initial_set", kind="state")
+    for i, name in enumerate(plant.state_names):
+        if name not in given:
+            if needed[i]:
+                raise SpecError(
+                    f"initial_set has no entry for the state {name!r}: give a bound, or [low, high].",
+                    path="initial_set",
+                )
+            continue
+        value = given[name]
+        ends = list(value) if isinstance(value, (list, tuple, np.ndarray)) else [value]
+        if len(ends) == 1 and is_finite_number(value):
+            ends = [-value, value]
+        if len(ends) != 2 or not all(map(is_finite_number, ends)) or not ends[0] <= ends[1]:
+            raise SpecError(
+                f"initial_set of {name!r} is {value!r}: give a bound of its absolute value, or [low, high].",
+                path="initial_set",
+            )
+        low, high = map(float, ends)
+        center[i], radius[i] = (low + high) / 2.0, (high - low) / 2.0
+    return center, radius
+
+
+def adaptive_statement(plan: AdaptivePlan, assumed: Assumptions) -> str:
+    """Return what an alarm proves, what it rests on, and what bounds may do in the long run."""
+    uncertain, box = assumed.plant.uncertainty, assumed.box
+    kept = assumed.bounds_phrase if box is None else assumed.phrase()
+    outside = "" if box is None else f": an alarm is a fault, or {box.sentence}"
+    text = f"never passed without a fault{f', with {kept}' if kept else ''}{outside}"
+    if box is None:
+        return text + NO_TOLERANCE
+    steps = () if uncertain is None else uncertain.steps
+    sampled = any(kind == SAMPLED for kind, _ in steps)
+    kept = ""
+    if box.variation != "constant":
+        kept = "; the state does not jump" if sampled else "; the value at k + 1 multiplies x(k+1)"
+    radius = loop_radius(plan.bound.responses)
+    ever = "" if radius < 1.0 else (f"; it holds at each sample, but may grow (loop radius {radius:.3g})")
+    held = "; inputs and disturbances are held between samples" if sampled else ""
+    if plan.sample_time is not None:
+        apart = shown(plan.sample_time)
+        held = f"; known inputs are held between rows, {apart} s apart, disturbances may move in between"
+    why = (plan.reason[:1].lower() + plan.reason[1:]).partition(": ")[0].rstrip(".")
+    missing = "" if plan.intervals or not plan.fault_names else f"; no guaranteed interval of faults: {why}"
+    linear = "" if uncertain is None or not uncertain.not_covered else f"; {uncertain.not_covered}"
+    return f"{text}{kept}{held}{ever}{missing}{linear}"
+
+
+def tolerances_of(
+    design: ObserverDesign,
+    constants: Any,
+    initial_set: Mapping[str, Any] | None,
+    initial_error: float | None,
+) -> tuple[ObserverDesign, bool]:
+    """Return the design with the tolerances asked for, and whether its threshold adapts to the signals."""
+    asked = constants is not None or initial_set is not None
+    if initial_set is not None and initial_error is not None:
+        raise SpecError("Give initial_set or initial_error, not both.", path="initial_set")
+    return with_tolerances(design, constants)[0], asked
+
+
+def noisy_design(design: ObserverDesign, scenario: Scenario | None) -> ObserverDesign:
+    """Return a design whose plant has the noise of a scenario; tolerances stay."""
+    if scenario is None:
+        return design
+    plant, _ = design.linear
+    noise = noisy_plant(plant, scenario, resolve(plant, scenario))
+    kept = noise.Bw.any(axis=0) | noise.Dw.any(axis=0)
+    return design.replace(plant=noise.replace(Bw=noise.Bw[:, kept], Dw=noise.Dw[:, kept], noise_names=None))
+
+
+def over_box(
+    noisy: ObserverDesign,
+    nominal: NormRule | None,
+    bounds: FloatArray,
+    noise_bound: float | None,
+    initial_error: float | None,
+    initial_set: Mapping[str, Any] | None,
+    *,
+    sample_time: float | None = None,
+    scenario: Scenario | None = None,
+) -> tuple[Rule, str]:
+    """Return the pointwise rule over the box of the plant of a design with the noise that is bounded, and what it
+    promises: for a record of a scenario, from its start unless one is given, or for data, which may have gaps."""
+    plant, _ = noisy.linear
+    state = None
+    if scenario is not None:
+        if not plant.is_discrete and scenario.inputs:
+            raise PreconditionError(
+                "The design is continuous in time, and the inputs of a scenario move between its samples: thresholds "
+                "over tolerances need inputs that are held. Sample the plant first (transform: sample_time).",
+                condition="discrete time",
+            )
+        state = None if scenario.observer_state is None else np.array(scenario.observer_state)
+        sample_time = None if plant.is_discrete else scenario.sample_time
+        if initial_set is None and initial_error is None:
+            initial_set = {name: (scenario.initial_state.get(name, 0.0),) * 2 for name in plant.state_names}
+    first, later = adaptive_plan(
+        noisy,
+        bounds,
+        noise_bound or 0.0,
+        initial_error=initial_error,
+        initial_set=initial_set,
+        observer_state=state,
+        sample_time=sample_time,
+    )
+    assumed = Assumptions(plant, bounds, noise_bound or 0.0, initial_set, initial_error=initial_error)
+    rule = AdaptiveRule(first, later if scenario is None else first, nominal)
+    return rule, adaptive_statement(first, assumed)

@@ -1,0 +1,205 @@
+"""The adaptive threshold as a rule: row by row with its state as plain arrays, and over many runs at once."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.monitoring.thresholds.adaptive_screening import Screening
+from obsynth.monitoring.thresholds.monitor import Judged, LinearSample, Rule, Sample
+from obsynth.monitoring.thresholds.rules import FITTING_SHARE, NormRule, NormState, norm_of
+from obsynth.numerics.arrays import FloatArray
+from obsynth.simulation.benches import Runs
+from obsynth.verification.over_tolerances.adaptive_bound import AdaptiveBound
+from obsynth.verification.over_tolerances.adaptive_record import THRESHOLD_ROUNDING, AdaptivePlan, Thresholds
+
+#: Rings after which an error that nothing is known of has decayed to a millionth.
+FORGETTING_RINGS = 3
+
+
+class AdaptiveState(NamedTuple):
+    """What goes from sample to sample, rings with the oldest first."""
+
+    psi: FloatArray  # ``(p, nz)``: sensitivities
+    ring: FloatArray  # ``(L, w)``
+    eps: FloatArray  # ``(L, nz)``
+    largest: FloatArray
+    past: FloatArray  # ``(L, nv)``: signals, for varying constants
+    moved: FloatArray  # ``(L, nz)``: bounds, for varying constants
+    k: int = 0  # samples since the start
+
+    @classmethod
+    def of(cls, bound: AdaptiveBound) -> AdaptiveState:
+        """Return the state before the first sample."""
+        (p, nz, *_), length = bound.counts, bound.length
+        shapes = (p, nz), (length, bound.width), (length, nz)
+        largest = np.zeros(bound.rounding.shape[1])
+        largest[-1] = 1.0
+        memory = ((length, bound.drive.shape[2]), (length, nz)) if bound.varying else ((0, 0), (0, 0))
+        psi, ring, eps, past, moved = (np.zeros(shape) for shape in (*shapes, *memory))
+        return cls(psi, ring, eps, largest, past, moved)
+
+
+def adaptive_step(
+    bound: AdaptiveBound, state: AdaptiveState, estimates: FloatArray, inputs: FloatArray, outputs: FloatArray
+) -> tuple[AdaptiveState, Thresholds]:
+    """Take one sample: ``estimates (n,)`` as `ErrorStructure.reading` gives them; return the state after it as well."""
+    *_, m, no = bound.counts
+    v = np.concatenate([estimates, inputs])
+    if bound.first is not None and state.k == 0:
+        state = state._replace(psi=np.vstack([state.psi[:-1], bound.first @ inputs]))
+    moved, first, shift = np.zeros(bound.counts[2]), np.zeros((0, no)), np.zeros(no)
+    if bound.counts[0]:
+        state, moved, first, shift = (_varying if bound.varying else _constant)(bound, state, v)
+    sizes = np.abs(np.concatenate([inputs, outputs, estimates, np.ones(1)]))
+    state = state._replace(largest=np.maximum(state.largest, sizes))
+    known = bound.known(estimates, inputs)
+    start = bound.start_at(state.k)
+    rounding = bound.rounding @ state.largest
+    older = state.ring.reshape(-1) @ bound.kernels + bound.tail @ state.eps[0]
+    fixed = rounding + known @ bound.same + bound.nominal + start
+    h = known.copy()
+    h[:m] += older[:m] + fixed[:m] + bound.solved @ bound.structure.seen(moved)
+    rest = older[m : m + no] + rounding[m:] + h @ bound.same[:, m:]
+    total = (bound.nominal[m:] + start[m:] + first.sum(axis=0) + np.abs(shift) + rest) * THRESHOLD_ROUNDING
+    ring, eps = np.vstack([state.ring[1:], h]), np.vstack([state.eps[1:], older[m + no :]])
+    after = state._replace(ring=ring, eps=eps, k=state.k + 1)
+    return after, Thresholds(total, first, shift, start[m:], rest)
+
+
+_First: TypeAlias = tuple[AdaptiveState, FloatArray, FloatArray, FloatArray]
+
+
+def _constant(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _First:
+    _, nz, rows, _, no = bound.counts
+    w = bound.drive @ v
+    seen = w[:, nz:] + state.psi @ bound.shown.T
+    state = state._replace(psi=state.psi @ bound.structure.Az.T + w[:, :nz])
+    sizes, offsets = np.abs(seen), bound.structure.offsets
+    moved, shift = sizes[:, :rows].sum(axis=0), np.zeros(no)
+    if offsets.any():
+        middle = offsets @ seen
+        moved, shift = moved + np.abs(middle[:rows]), -middle[rows:]
+    return state, moved, sizes[:, rows:], shift
+
+
+def _varying(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _First:
+    p, nz, rows, _, no = bound.counts
+    eps = np.abs(np.einsum("jprv,jv->jpr", bound.memory, state.past)).sum(axis=0) * bound.spans[:, None]
+    sizes = np.abs(bound.drive[:, nz:] @ v) * bound.spans[:, None] + eps[:, : rows + no]
+    older = state.moved[0]
+    into = eps[:, rows + no :].sum(axis=0) + bound.responses.tail_eps @ older
+    state = state._replace(past=np.vstack([state.past[1:], v]), moved=np.vstack([state.moved[1:], into]))
+    tail = bound.tail_rows @ older
+    first = sizes[:, rows:] + (bound.responses.tail_outputs @ older) / p
+    return state, sizes[:, :rows].sum(axis=0) + tail, first, np.zeros(no)
+
+
+class AdaptiveRuleState(NamedTuple):
+    """The state of `AdaptiveRule`."""
+
+    nominal: NormState | None  # of the bound without the box, where there is one
+    without: AdaptiveState  # without a fault, and for fault estimates during one where that is another
+    during: AdaptiveState | None
+    first: bool = True  # whether this is the first start, of which more may be known than of later ones
+    last: float | None = None
+    waiting: int = 0
+
+
+class AdaptiveRule(Rule):
+    """The norm of the residual against the nominal bound and what the box adds; rows and fault estimates beside it."""
+
+    GUARANTEES = True
+
+    def __init__(self, plan: AdaptivePlan, later: AdaptivePlan, nominal: NormRule | None) -> None:
+        self.plan, self._later, self.nominal = plan, later, nominal
+        self.table, self.columns = None if nominal is None else nominal.table, plan.columns
+
+    def init(self) -> AdaptiveRuleState:
+        """Return the state before the first sample."""
+        return self._begun(None if self.nominal is None else self.nominal.init(), self.plan)
+
+    def _begun(self, nominal: NormState | None, plan: AdaptivePlan) -> AdaptiveRuleState:
+        during = None if plan.faults is None else AdaptiveState.of(plan.faults)
+        return AdaptiveRuleState(nominal, AdaptiveState.of(plan.bound), during, plan is self.plan)
+
+    def restart(self, state: AdaptiveRuleState, skipped: int = 0) -> AdaptiveRuleState:
+        """Begin again: what is known of the error at the first start holds for no other one, but its norm."""
+        nominal = state.nominal
+        if self.nominal is not None and nominal is not None:
+            nominal = self.nominal.restart(nominal)
+        return self._begun(nominal, self._later)._replace(first=False, last=state.last, waiting=state.waiting)
+
+    def step(self, state: AdaptiveRuleState, sample: Sample) -> tuple[AdaptiveRuleState, Judged]:
+        """Return the state, statistic and threshold: those of the residual's norm, or of the row passed most."""
+        said, dt = sample.said, self.plan.sample_time
+        if not isinstance(said, LinearSample):
+            return self.restart(state), Judged(math.nan, math.nan, None, (math.nan,) * len(self.columns))
+        last, state = state.last, state._replace(last=sample.time)
+        if dt is not None and last is not None and abs(sample.time - last - dt) > FITTING_SHARE * dt:
+            # What the observer did over another interval is an error of its own, which must decay first.
+            state = self.restart(state)._replace(waiting=FORGETTING_RINGS * self._later.bound.length)
+        plan = self.plan if state.first else self._later
+        signals, bound = (said.inputs, said.outputs), plan.bound
+        without, found = adaptive_step(bound, state.without, bound.structure.reading @ said.rows, *signals)
+        during, error = state.during, found
+        if plan.faults is not None and during is not None:
+            during, error = adaptive_step(plan.faults, during, plan.faults.structure.reading @ said.rows, *signals)
+        state = state._replace(without=without, during=during, waiting=max(state.waiting - 1, 0))
+        values, at = said.rows[len(said.rows) - len(found.total) :], plan.residuals
+        if dt is None and self.nominal is not None and state.nominal is not None:
+            nominal, (statistic, threshold, *_) = self.nominal.step(state.nominal, sample)
+            state = state._replace(nominal=nominal)
+            # What box, start and rounding add to the norm of the residual.
+            parts = [found.shift[at], found.rest[at], plan.bound.more[at], *found.first[:, at]]
+            if plan.start_beyond_nominal:
+                parts.append(found.start[at])
+            threshold = (threshold + math.fsum(math.hypot(*part) for part in parts)) * THRESHOLD_ROUNDING
+        else:
+            statistic, threshold = math.hypot(*values[at]), math.hypot(*found.total[at])
+        nf = len(plan.fault_names)
+        cells = self._cells(values[:nf], found, error)
+        if state.waiting or not sample.deciding:
+            return state, Judged(math.nan, math.nan if state.waiting else threshold, None, cells)
+        ratios = np.abs(values) / found.total
+        worst = int(np.argmax(ratios)) if len(ratios) else 0
+        if statistic <= threshold and len(ratios) and ratios[worst] > 1.0:
+            # The row is passed although the norm is not: it decides, in the scale of the norm's threshold.
+            value = threshold * float(ratios[worst])
+            return state, Judged(value, threshold, worst if worst < nf else None, cells)
+        passed = int(np.argmax(ratios[:nf])) if nf and ratios[:nf].max() > 1.0 else None
+        return state, Judged(statistic, threshold, passed, cells)
+
+    def _cells(self, faults: FloatArray, found: Thresholds, error: Thresholds) -> tuple[float, ...]:
+        nf = len(faults)
+        cells = found.total.tolist()
+        if self.plan.intervals:
+            width = error.total[:nf] - np.abs(error.shift[:nf])
+            middle = faults - error.shift[:nf]
+            cells += np.stack([middle - width, middle + width], axis=1).ravel().tolist()
+        watched = slice(0, nf) if nf else self.plan.residuals
+        count = len(self.plan.names)
+        first = error.first.reshape(-1, count, len(error.total)).sum(axis=0) if count else error.first
+        shares = (first[:, watched] / error.total[watched]).mean(axis=1) if count else np.zeros(0)
+        return (*cells, *shares.tolist())
+
+    def options(self) -> list[Any]:
+        """Return names of constants, how they vary, the size of the nominal bound, and the limit without the box."""
+        bound, limit = self.plan.bound, None if self.nominal is None else self.nominal.options()
+        return [list(self.plan.names), bound.varying, float(bound.nominal.sum()), limit]
+
+    def statistics(self, residuals: FloatArray) -> FloatArray:
+        """Return the norm of the residual in records."""
+        return np.asarray(norm_of(residuals))
+
+    @cached_property
+    def _screening(self) -> Screening:
+        return Screening.of(self.plan)
+
+    def passed_in(self, runs: Runs, norm: FloatArray, limits: FloatArray, onset: int | None) -> NDArray[np.bool_]:
+        """Return where runs pass a threshold; nothing is computed in full that bounds decide."""
+        return self._screening.passed_in(runs, norm, limits, onset)

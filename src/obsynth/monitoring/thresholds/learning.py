@@ -1,0 +1,311 @@
+"""Rows without faults: what a design says of them, and the thresholds that are learned from that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.errors import SpecError
+from obsynth.monitoring.logs.log_observer import DECIDING, STALE, Row
+from obsynth.monitoring.logs.log_run import LogRun
+from obsynth.monitoring.logs.log_tables import parsed_rows
+from obsynth.monitoring.logs.signals import TIME_HEADER
+from obsynth.monitoring.logs.sources import CHUNK_ROWS, Data, chunks
+from obsynth.monitoring.logs.stamps import Stamps
+from obsynth.monitoring.logs.step_observer import SteppingLogObserver
+from obsynth.monitoring.logs.stuck_sensors import stuck_rows, without_repeats
+from obsynth.monitoring.thresholds.learned import (
+    LEAST_NORMAL,
+    NO_PAIRS,
+    LearnedThresholds,
+    WrongPairs,
+    divided_at_starts,
+    has_innovations_by_sensor,
+    raised_levels,
+    rows_per_alarm,
+    settling_rows,
+    thresholds_from_rows,
+    watched_names,
+    watched_rows,
+    watched_values,
+)
+from obsynth.monitoring.thresholds.learned_levels import AGES
+from obsynth.monitoring.thresholds.monitor import Evidence
+from obsynth.monitoring.thresholds.normal_notes import notes_of_normal_rows, notes_of_sizes, notes_of_starts
+from obsynth.monitoring.thresholds.parameter_scores import Scores, before_any, parameter_walk, sample_score
+from obsynth.monitoring.thresholds.wrong_pairs import LEAST_WRONG, NEARER, Pair, believed_pairs, taken_back, without
+from obsynth.numerics.arguments import Seed, arguments_checked
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.outliers import checked_limit
+from obsynth.observers.running import changed
+from obsynth.results.design import ObserverDesign
+
+#: Pairs may take this share of the rate of false alarms; where they would take more the levels are to hold with them.
+MOST_OF_RATE = 0.5
+
+
+#: Probability below which so many pairs are no chance: wrong samples, or something else, come in a row here.
+CHANCE = 0.01
+
+
+#: One false alarm in so many rows, where nothing else is asked for.
+FALSE_ALARM_RATE = "1 per 1000 rows"
+
+
+@arguments_checked
+def learn_thresholds(
+    design: ObserverDesign,
+    data: Data,
+    *,
+    false_alarms: str | float = FALSE_ALARM_RATE,
+    rows: str | slice | Sequence[int] | None = None,
+    columns: Mapping[str, str] | None = None,
+    time_column: str | None = None,
+    scales: Mapping[str, float] | None = None,
+    gap: float | None = None,
+    warm_up: float | None = None,
+    seed: Seed = 0,
+) -> LearnedThresholds:
+    """Learn the thresholds of a design from rows of its plant without faults.
+
+    Offsets, covariance and colour of the fault estimates and residuals are taken from the rows, whatever the design
+    assumes of them: they are whitened by a fitted autoregression and watched by Hotelling's T2, exponentially weighted
+    means and likelihood ratios of steps; where faults are parameters that walk, by likelihood ratios of a change of
+    each fault and by its estimate, too.  Levels come from a bootstrap of all that is estimated, so that a short log
+    gives higher ones.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Of any method.
+    data : path, text stream or pandas.DataFrame
+        As for `obsynth.run_on_data`: a log without faults.
+    false_alarms : str or float, optional
+        Rate of false alarms, such as ``"1 per week"`` or ``"2 per 1000 rows"``, or a number of them per row.  Alarms
+        closer than 20 rows are one.
+    rows : str, slice or pair of int, optional
+        Rows of the log that are free of faults, as Python counts; all by default.  The observer runs over all before.
+    columns, time_column, scales, gap, warm_up
+        As for `obsynth.run_on_data`.
+    seed : int, optional
+        Of the bootstrap.
+
+    Returns
+    -------
+    LearnedThresholds
+        For `obsynth.online_monitor`; ``statement`` says what they mean, and ``holds`` whether the rows suffice;
+        ``notes`` name rows to be looked at: events that raise the levels, outputs that are stuck, and whether errors of
+        the model where inputs move raise them.
+
+    Raises
+    ------
+    SpecError
+        The log cannot be read, holds too few rows, or nothing moves in it; the rate is none.
+
+    References
+    ----------
+    Alwan & Roberts (1988), Lowry et al. (1992), Willsky & Jones (1976), Politis & Romano (1994), Gandy & Kvaloy (2013).
+    """
+    # Both are refused before the log is read.
+    watched_names(design)
+    rows_per_alarm(false_alarms, 1.0 if design.observer.dt == 0.0 else design.observer.dt)
+    if time_column is not None:
+        columns = {**(columns or {}), TIME_HEADER: time_column}
+
+    def started(sizes: FloatArray | None = None) -> LogRun:
+        known = design if sizes is None else design.replace(observer=changed(design.observer, outlier_sizes=sizes))
+        return LogRun(known, columns, scales, gap=gap, warm_up=warm_up)
+
+    first_run, stamps = started(), Stamps()
+    log = np.vstack(
+        [np.zeros((0, 1 + len(first_run.signals.names))), *chunks(data, first_run.signals, stamps, CHUNK_ROWS)]
+    )
+    if len(log) < LEAST_NORMAL:
+        raise SpecError(f"The log has {len(log)} rows: give {LEAST_NORMAL} and more.", path="normal")
+    before = 1 + first_run.signals.inputs
+    stuck = [stuck_rows(column) for column in log[:, before:].T]
+    log = np.hstack([log[:, :before], without_repeats(log[:, before:], stuck)])
+    said, sizes = _sized(design, started, log)
+    dt = design.observer.dt or float(np.median(np.diff(said.times)))
+    every = rows_per_alarm(false_alarms, dt)
+    said, pairs = _without_pairs(design, lambda: started(sizes), log, said, every)
+    first, last = parsed_rows(rows, int(said.numbers[-1]) + 1)
+    chosen = (first <= said.numbers) & (said.numbers < last)
+    dt = design.observer.dt or float(np.median(np.diff(said.times[chosen])))
+    watched, scores = said.watched[chosen], None if said.scores is None else said.scores.chosen(chosen)
+    squares = said.squares[chosen]
+    squares = squares[np.isfinite(squares) & (squares > 0.0)]
+    given: dict[str, Any] = {"every": rows_per_alarm(false_alarms, dt), "dt": dt, "seed": seed, "pairs": pairs}
+    found = thresholds_from_rows(
+        design,
+        watched,
+        scores=scores,
+        innovation=float(np.sqrt(squares.mean())) if squares.size else 1.0,
+        outlier_sizes=sizes,
+        **given,
+    )
+    raised = raised_levels(design, found, watched, scores, **given)
+    outputs = first_run.signals.names[first_run.signals.inputs :]
+    by_name = dict(zip(outputs, stuck, strict=True))
+    notes = notes_of_normal_rows(raised, said.numbers[chosen], log[:, 0], slice(first, last), by_name, stamps)
+    white = found.statistics.model.whitened(watched_rows(design, found, watched))
+    inputs = log[said.numbers[chosen], 1 : 1 + first_run.signals.inputs]
+    divided = notes_of_starts(divided_at_starts(design.observer, scores if found.statistics.estimates else None))
+    return replace(found, notes=(*notes, *notes_of_sizes(white, inputs), *divided))
+
+
+def _sized(
+    design: ObserverDesign, started: Callable[[FloatArray | None], LogRun], log: FloatArray
+) -> tuple[_Said, FloatArray | None]:
+    """Return what a design says of rows without faults, and how far off outliers are by these rows ``(ny,)``; `None`
+    where that is what the design says."""
+    run = started(None)
+    if not (isinstance(run.observer, SteppingLogObserver) and run.observer.gates
+            and has_innovations_by_sensor(design.observer)):  # fmt: skip
+        return _said(design, run, log), None
+    ny = len(run.observer.output_names)
+    stated = run.observer.observer.outlier_sizes
+    whole = _said(design, started(np.zeros(ny)), log)
+    usual = checked_limit("gate", run.observer.observer.outlier_limit) * np.sqrt(
+        np.nanmean(whole.watched[:, -ny:] ** 2, axis=0)
+    )
+    inputs = np.asarray(np.isfinite(log[:, 1:-ny]).all(axis=1))
+    sizes = learned_sizes(wrong_samples(whole.refused, inputs), usual, np.zeros(ny) if stated is None else stated)
+    if not sizes.any():
+        return (whole, None) if stated is None else (whole, sizes)
+    return _said(design, started(sizes), log), None if stated is not None and np.array_equal(sizes, stated) else sizes
+
+
+def wrong_samples(refused: Sequence[FloatArray], known: NDArray[np.bool_]) -> list[FloatArray]:
+    """Return how far off the samples of each output were that a gate left out, and none of which it believed later, by
+    its memory after each row ``(4, ny)``; ``known (n,)``: whether the inputs of the row were."""
+    memory = np.array(refused)
+    found = []
+    for row, total, left, believed in np.moveaxis(memory, 2, 0).transpose(0, 2, 1):
+        gone, count = np.diff(total, prepend=0.0) > 0.0, np.abs(row)
+        # A run of samples that are far ends where the next one is near.
+        run = np.cumsum((count == 0.0) | ((count == 1.0) & (np.concatenate([[0.0], count[:-1]]) != 1.0)))
+        moved = np.isin(run, run[believed != 0.0])
+        found.append(np.abs(left[gone & ~moved & known & (left != 0.0)]))
+    return found
+
+
+def learned_sizes(wrong: Sequence[FloatArray], usual: FloatArray, stated: FloatArray) -> FloatArray:
+    """Return how far off outliers of each output are at least ``(ny,)``, of which some were so far off ``wrong``: what
+    is ``stated`` where these are few and further off.
+
+    Their logarithms are taken as normal: one more is nearer with the probability `NEARER`, as its distance from their
+    mean in units of their deviation follows Student's t. Where that is within what any sample reaches (``usual``), it
+    says nothing of a sample that it is further off: the gate alone judges then. What is stated is not raised, and
+    without it the size stands half the way on a logarithmic scale: while a fault is followed, innovations are wider
+    than in rows without faults, and an outlier may be nearer than in these.
+    """
+    from scipy.special import stdtrit
+
+    found = stated.copy()
+    for i, sizes in enumerate(wrong):
+        n = len(sizes)
+        if n >= LEAST_WRONG:
+            logarithms = np.log(sizes)
+            reach = float(stdtrit(n - 1, 1.0 - NEARER)) * np.sqrt(1.0 + 1.0 / n) * float(logarithms.std(ddof=1))
+            least = max(float(np.exp(logarithms.mean() - reach)), usual[i])
+            found[i] = min(stated[i], least) if stated[i] > 0.0 else np.sqrt(usual[i] * least)
+        elif n and sizes.min() < stated[i]:
+            found[i] = usual[i]
+    return found
+
+
+class _Said(NamedTuple):
+    """What a design says of a log."""
+
+    numbers: NDArray[np.int64]  # ``(n,)``: of rows, from 0
+    times: FloatArray  # ``(n,)`` seconds
+    watched: FloatArray  # ``(n, m)``: NaN where nothing is decided, or rows are missing
+    squares: FloatArray  # ``(n,)``: mean squares of innovations in the observer's own deviations, where it has these
+    scores: Scores | None  # of the faults, where it is known what samples say of these
+    refused: list[FloatArray]  # ``(4, ny)`` each: what a gate remembers after each row; empty without a gate
+
+
+def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _Said:
+    """Return what a design says of rows ``(n, 1 + nu + ny)``."""
+    nothing = np.full(len(watched_names(design)), np.nan)
+    residuals = [i for i, name in enumerate(run.observer.columns) if name.startswith("r[")]
+    found, refused = list[tuple[int, float, FloatArray, float, Scores]](), list[FloatArray]()
+    walk, taken = parameter_walk(design.observer), 0
+    faults = len(design.observer.fault_names)
+    before, nothing_of_faults = before_any(faults), np.full(faults, np.nan)
+    silent = Scores(np.zeros(faults), np.zeros((faults, faults)), nothing_of_faults, nothing_of_faults)
+    settling = settling_rows(design)
+    gate = run.observer if isinstance(run.observer, SteppingLogObserver) and run.observer.gates else None
+    for count, last in enumerate(_rows(run, log, CHUNK_ROWS if gate is None else 1)):
+        if gate is not None:
+            refused.append(gate.state.refused)
+        # Rows that are missing are among those that a monitor takes.
+        for row in () if last.status in STALE else (*last.missed, last):
+            said = watched_values(row.values[residuals], row.evidence)
+            taken += 1
+            if row.status not in DECIDING or taken <= settling:
+                said = None
+            square, score = np.nan, silent
+            if walk is not None and isinstance(row.evidence, Evidence):
+                before, score = sample_score(before, row.evidence, walk, row.skipped + 1)
+            if said is not None and isinstance(row.evidence, Evidence) and np.isfinite(said).all():
+                own = row.evidence.whitened
+                square = float(np.mean(own**2)) if own.size else np.nan
+            # Longer gaps than the statistics look back are all the same.
+            missing = min(row.skipped, max(AGES))
+            found += [(count, row.time, nothing, np.nan, silent)] * missing
+            found.append((count, row.time, nothing if said is None else said, square, score))
+        if len(last.missed) > max(AGES):
+            del found[-1 - len(last.missed) : -1 - max(AGES)]
+    numbers, times, rows, squares, scores = zip(*found, strict=True) if found else ((),) * 5
+    both = [np.array([getattr(one, part.name) for one in scores]) for part in fields(Scores)]
+    return _Said(
+        np.array(numbers),
+        np.array(times),
+        np.array(rows),
+        np.array(squares),
+        None if walk is None or not scores else Scores(*both),
+        refused,
+    )
+
+
+def _rows(run: LogRun, log: FloatArray, together: int) -> Iterator[Row]:
+    """Yield the rows of a log, so many taken together."""
+    for begin in range(0, len(log), together):
+        yield from run.read(log[begin : begin + together])
+
+
+def _without_pairs(
+    design: ObserverDesign, started: Callable[[], LogRun], log: FloatArray, said: _Said, every: float
+) -> tuple[_Said, WrongPairs]:
+    """Return what a design says of rows without pairs of wrong samples, and what there was of these."""
+    from scipy.special import pdtrc
+
+    if not said.refused:
+        return said, NO_PAIRS
+    before = log.shape[1] - said.refused[0].shape[1]
+    y = log[:, before:]
+    pairs = believed_pairs(said.refused, y)
+    if not pairs:
+        return said, NO_PAIRS
+
+    def again(chosen: Sequence[Pair]) -> _Said:
+        return _said(design, started(), np.hstack([log[:, :before], without(y, chosen)]))
+
+    hidden = again(pairs)
+    wrong = taken_back(pairs, hidden.refused, y)
+    seen = np.isfinite(y).sum(axis=0)
+    # All of a pair are wrong samples: those that were believed too.
+    refused = hidden.refused[-1][1] + 2.0 * np.bincount([output for _, _, output in wrong], minlength=len(seen))
+    # A second comes with the same probability as the first, and in half of the cases on the same side.
+    chance = float(0.5 * np.sum((refused / np.maximum(seen, 1)) ** 2))
+    # So many pairs are what single wrong samples make at this rate, and leave most of the alarms to others.
+    are_chance = chance * every <= MOST_OF_RATE and float(pdtrc(len(wrong) - 1, chance * len(y))) >= CHANCE
+    if not wrong or not are_chance:
+        return said, NO_PAIRS
+    return hidden if len(wrong) == len(pairs) else again(wrong), WrongPairs(len(wrong), chance)

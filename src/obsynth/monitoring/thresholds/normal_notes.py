@@ -1,0 +1,99 @@
+"""What in rows without faults is to be looked at before a monitor is learned from them: events that raise the levels,
+outputs that are stuck, and residuals that are larger where inputs move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.monitoring.logs.stamps import Stamps
+from obsynth.monitoring.logs.stuck_sensors import stuck_texts
+from obsynth.monitoring.thresholds.learned import Raised
+from obsynth.monitoring.thresholds.learned_levels import CHANCE_DEVIATIONS, normal_scores
+from obsynth.numerics.arrays import FloatArray
+
+#: An input moves where it changes by more than so many times what is usual for it: one that is held moves where it
+#: changes at all, a sine nowhere.
+MOVES = 5.0
+
+#: Rows from a move on whose residuals are compared with those of as many rows without one, the least number of moves,
+#: the share of the residuals that counts as large, and how many times as large these must be to be told.
+AFTER_A_MOVE, LEAST_MOVES, LARGE_SHARE, LARGER = 3, 20, 0.1, 2.0
+
+
+def notes_of_normal_rows(
+    raised: Raised,
+    numbers: NDArray[np.int64],
+    times: FloatArray,
+    rows: slice,
+    stuck: Mapping[str, Sequence[tuple[int, int]]],
+    stamps: Stamps,
+) -> tuple[str, ...]:
+    """Return the notes on ``rows`` of a log with ``times (n,)``, from 0: on events that stand in rows of these
+    ``numbers``, and on outputs, by name, that are stuck."""
+
+    def shown(first: int, last: int) -> str:
+        begin, end = (stamps.shown(float(times[row])) for row in (first, last))
+        return f"row {first} ({begin})" if first == last else f"rows {first} to {last} ({begin} to {end})"
+
+    def found() -> Iterator[str]:
+        if raised.events:
+            where = ", ".join(
+                f"{event.signal} in {shown(int(numbers[event.first]), int(numbers[event.last]))}"
+                for event in raised.events
+            )
+            yield (
+                f"What stands out of {where} raises the levels: without these rows, a change {raised.factor:.2g} times "
+                f"smaller would pass that of {raised.statistic!r}. Look whether the plant was as usual there; if it "
+                "was not, blank its outputs in these rows, or give another log."
+            )
+        told = {
+            name: [(begin, end) for begin, end in runs if end >= rows.start and begin < rows.stop]
+            for name, runs in stuck.items()
+        }
+        yield from stuck_texts(told, shown, ": what it repeats there counts as not measured")
+
+    return tuple(found())
+
+
+def notes_of_sizes(white: FloatArray, inputs: FloatArray) -> tuple[str, ...]:
+    """Return what is to be known where whitened residuals ``(n, m)`` are larger after moves of ``inputs (n, nu)``."""
+    count, ratio = _larger_at_moves(np.sum(white**2, axis=1), inputs)
+    if ratio < LARGER:
+        return ()
+    return (
+        f"Where inputs move, and in the {AFTER_A_MOVE - 1} rows after, large residuals are {ratio:.2g} times as "
+        f"large as elsewhere ({count} moves): errors of the model raise the levels, more than noise does. A "
+        "design that follows the plant there has lower levels: with calibrated constants, or a nonlinear observer "
+        "in place of that of a linearised plant.",
+    )
+
+
+def notes_of_starts(divided: Mapping[str, float]) -> tuple[str, ...]:
+    """Return what is to be known of faults that are ``divided`` from the offset of a sensor anew at each start."""
+    return tuple(
+        f"The estimate of {name} stays what the start of this log made of it and of the unknown offset of a sensor: it "
+        f"varies by {share:.2g} of its standard deviation here. A run with another start may alarm without a fault: go "
+        "on from the state of this log (--state), or state the offset."
+        for name, share in divided.items()
+    )
+
+
+def _larger_at_moves(sizes: FloatArray, inputs: FloatArray) -> tuple[int, float]:
+    """Return how many moves of ``inputs (n, nu)`` there are, and how many times as large residuals of squares ``sizes
+    (n,)`` are after these; zero where that may be chance."""
+    windows = np.lib.stride_tricks.sliding_window_view(sizes, AFTER_A_MOVE).mean(axis=1)
+    changes = np.abs(np.diff(inputs, axis=0, prepend=inputs[:1]))
+    moves = np.any(changes > MOVES * np.nanmedian(changes, axis=0), axis=1)
+    close = np.convolve(moves, np.ones(2 * AFTER_A_MOVE - 1), mode="same") > 0.0
+    known = np.isfinite(windows)
+    after, others = windows[known & moves[: len(windows)]], windows[known & ~close[: len(windows)]]
+    count = len(after)
+    if min(count, len(others)) < LEAST_MOVES:
+        return count, 0.0
+    lead = float(normal_scores(np.concatenate([after, others]))[:count].mean() * np.sqrt(count))
+    large = 1.0 - LARGE_SHARE
+    return count, float(np.sqrt(np.quantile(after, large) / np.quantile(others, large))) * (lead > CHANCE_DEVIATIONS)

@@ -1,0 +1,346 @@
+"""From a design to a monitor for data of any length."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.methods.guaranteed_test.method import is_guaranteed
+from obsynth.monitoring.thresholds.adaptive_monitor import NO_TOLERANCE, noisy_design, over_box, tolerances_of
+from obsynth.monitoring.thresholds.gap_growth import GapGrowth, gap_growth
+from obsynth.monitoring.thresholds.guaranteed import data_monitor
+from obsynth.monitoring.thresholds.learned import LearnedThresholds, learned_monitor, load_thresholds
+from obsynth.monitoring.thresholds.learning import learn_thresholds
+from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
+from obsynth.monitoring.thresholds.options import LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options
+from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model, watches_estimates
+from obsynth.monitoring.thresholds.residual_monitor import RESIDUAL_ROUNDING_SHARE, bounds_of
+from obsynth.monitoring.thresholds.rules import ANY_LENGTH, NormRule, WhitenedRule, parameter_monitor
+from obsynth.monitoring.thresholds.stated_noise import samples_of, scaled_inputs, unlimited_bound, unlimited_paper
+from obsynth.monitoring.thresholds.whitening import steady_mean, whitened
+from obsynth.numerics.arguments import arguments_checked, is_finite_number
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.continuous import first_order_hold
+from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.constants import shown
+from obsynth.plants.noise import require_noise
+from obsynth.results.design import ObserverDesign, require_verified
+from obsynth.simulation.scenario import Scenario
+from obsynth.verification.assumptions import Assumptions
+
+_AFTER_WARM_UP = "; it holds once the initial-condition response has settled (the warm-up)"
+
+_AFTER_A_GAP = " (after a gap likewise)"
+
+_FROM_THE_FIRST = "; from the first row on; after a gap, once settled"
+
+_GROWS = "; after missing outputs it is larger by the possible error of the plant's model"
+
+_WAITS = "; until the effect of a gap has settled nothing is decided, as {reason}"
+
+_NOT_CLOSER = "; rows are no closer than {dt} s"
+
+_JITTERING = "; stamps that jitter by up to a fifth of the interval are taken as regular"
+
+_UNEVEN = "; while rows are not equally far apart there is no bound"
+
+_REGULAR = "; no row is further than {dt} s from the last"
+
+
+@arguments_checked
+def online_monitor(
+    design: ObserverDesign,
+    kind: str = "pointwise",
+    *,
+    scenario: Scenario | None = None,
+    disturbance_bounds: Mapping[str, float] | None = None,
+    noise_bound: float | None = None,
+    initial_error: float | None = None,
+    gamma: float | None = None,
+    window: int | None = None,
+    false_alarms: float | None = None,
+    change: float | None = None,
+    nominal: Mapping[str, float] | None = None,
+    sample_time: float | None = None,
+    constants: Any = None,
+    initial_set: Mapping[str, Any] | None = None,
+    normal: Any = None,
+    unverified: bool = False,
+) -> Monitor:
+    """Return a monitor for measured data, for `run_on_data`: its threshold holds however long the data are.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Of any method.  Linear ones are monitored by their residual, recursive ones by their parameters and innovations,
+        nonlinear ones likewise (to first order, as their covariances).
+    kind : {"pointwise", "paper", "window", "chi-square", "cusum", "nis", "learned"}, optional
+        The first three for linear designs, as for `obsynth.monitor`; ``nis`` for the others (all that the model does
+        not explain), where ``chi-square`` is on the parameters against their nominal values.  ``learned``, for every
+        design: from rows without faults, whatever the model assumes of noise.
+    scenario : Scenario, optional
+        Linear designs: whose disturbances and noise are those to be expected; its length, start, inputs and faults do
+        not count.  Without one, the noise is the plant's own, once, and disturbances need bounds.
+    disturbance_bounds, noise_bound, gamma
+        As for `obsynth.monitor`.
+    initial_error : float, optional
+        Bound on the norm of the observer's error at the start, and after each gap; without one the bounds hold once its
+        effect has settled.
+    window : int, optional
+        Samples that ``window``, ``chi-square`` and ``cusum`` of linear designs look back; 20 by default.
+    false_alarms : float, optional
+        For the statistical kinds: probability of a false alarm in a whole run, at most, however long it is; 0.01 by
+        default.
+    change : float, optional
+        For ``cusum``: shift it is tuned for, in standard deviations of the whitened residual (linear designs), or in
+        parameter units; 1 by default.
+    nominal : mapping, optional
+        Nominal value of parameters by name; those at the observer's start by default.
+    sample_time : float, optional, seconds
+        Continuous designs: between the rows of the data; the scenario's by default.
+    constants : mapping, ConstantsBox, Uncertainty or DescriptorSystem, optional
+        ``pointwise``, linear designs: tolerances as `obsynth.uncertain_system` takes them; those of the
+        design's plant by ``plant.uncertainty``.  The threshold adapts to the signals and holds for every plant within
+        them; without, it assumes an exact model (but ``obsynth run`` takes the plant's own).  Continuous designs need
+        rows ``sample_time`` apart and known inputs that are held between them.  Columns of `run_on_data` tell
+        thresholds, guaranteed intervals of faults, and shares of the constants.
+    initial_set : mapping, optional
+        ``pointwise``, linear designs: bounds of the plant's states at the first row (deviations), each a
+        number or ``[low, high]``; the threshold then holds from the first row on, for the plant's own tolerances where
+        no others are given.
+    normal : LearnedThresholds, path or pandas.DataFrame, optional
+        ``learned``: from `obsynth.learn_thresholds`, the file in which they were saved (``.json``), or a log without
+        faults, whose rate is one false alarm per 1,000 rows.
+    unverified : bool, optional
+        Whether a design whose report fails is watched all the same; nothing is promised then.
+
+    Returns
+    -------
+    Monitor
+        With a sentence that says what its threshold means.
+
+    Raises
+    ------
+    SpecError
+        The kind does not go with the design, an option is out of range or does nothing for this kind, or a signal has
+        no bound or covariance.
+    PreconditionError
+        No bound exists over the tolerances: the message says why.
+    VerificationError
+        The report of the design fails.
+    """
+    require_verified(design, unverified=unverified)
+    recursive = isinstance(design.observer, (RecursiveObserver, DAEObserver))
+    given = {
+        "scenario": scenario, "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound,
+        "initial_error": initial_error, "gamma": gamma, "window": window, "false_alarms": false_alarms,
+        "change": change, "sample_time": sample_time, "constants": constants, "initial_set": initial_set,
+        "normal": normal,
+    }  # fmt: skip
+    window, false_alarms, change = checked_options(PARAMETER_OPTIONS if recursive else LINEAR_OPTIONS, kind, given)
+    if kind == "learned":
+        return _learned(design, normal)
+    if isinstance(design.observer, (RecursiveObserver, DAEObserver)):
+        return parameter_monitor(design.observer, kind, nominal or {}, change, false_alarms)
+    _require_linear_kind(kind, nominal)
+    if is_guaranteed(design):
+        return data_monitor(design, kind, given)
+    design, adaptive = tolerances_of(design, constants, initial_set, initial_error)
+    estimates = watches_estimates(design) and kind in ("pointwise", "window")
+    model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
+    require_noise(noise_bound, noisy=model.noisy)
+    bounds = bounds_of(design, model, disturbance_bounds)
+    if scenario is None:
+        # Only those that are given are known.
+        stated = [name in (disturbance_bounds or {}) for name in design.linear[0].disturbance_names]
+        bounds = np.where(np.array(stated, dtype=bool), bounds, np.inf)
+    noisy = noisy_design(design, scenario)
+    limited = kind in ("pointwise", "window")
+
+    def made(statement: str, rule: Rule) -> Monitor:
+        return Monitor(
+            kind,
+            statement,
+            rule,
+            residuals=len(design.linear[1].residual_names),
+            fault_names=design.linear[1].fault_names,
+            fault_scales=model.fault_scales(),
+        )
+
+    rule: Rule
+    if limited or kind == "paper":
+        start = 0.0 if initial_error is None else float(initial_error)
+        norm, limit = _norm_rule(design, kind, model, bounds, noise_bound, start, gamma, window, dt, estimates)
+        if adaptive:
+            rule, told = over_box(noisy, norm, bounds, noise_bound, initial_error, initial_set, sample_time=dt)
+            first = _AFTER_WARM_UP if initial_error is None else _AFTER_A_GAP
+            return made(told + (first if initial_set is None else _FROM_THE_FIRST), rule)
+        _require_above_rounding(kind, limit, model, bounds)
+        gaps = gap_growth(model, bounds, noise_bound) if kind == "pointwise" else ""
+        rule = norm.over_gaps(gaps) if isinstance(gaps, GapGrowth) else norm
+        ending = (_AFTER_WARM_UP if initial_error is None else _AFTER_A_GAP) + _more_words(kind, model, limit, dt)
+        ending += _UNEVEN * bool(norm.irregular is not None and np.isinf(norm.irregular[1]))
+        ending += _WAITS.format(reason=gaps) if isinstance(gaps, str) and gaps else _GROWS * bool(gaps)
+    else:
+        rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
+        ending = ANY_LENGTH + (_JITTERING if model.continuous is not None else "")
+    numbers = {"window": window, "false_alarms": false_alarms, "change": change, "dt": dt}
+    assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=initial_error) if limited else None
+    return made(statement_of(kind, model, assumed, estimates=estimates, **numbers) + ending + NO_TOLERANCE, rule)
+
+
+def _learned(design: ObserverDesign, normal: Any) -> Monitor:
+    """Return the monitor of thresholds that were learned, or are to be."""
+    if normal is None:
+        raise SpecError(
+            "learned needs rows without faults: give a log, or what obsynth thresholds wrote (normal, --normal).",
+            path="normal",
+        )
+    if isinstance(normal, (str, Path)) and Path(normal).suffix.lower() == ".json":
+        normal = load_thresholds(normal)
+    if not isinstance(normal, LearnedThresholds):
+        normal = learn_thresholds(design, normal)
+    return learned_monitor(design, normal)
+
+
+def _require_linear_kind(kind: str, nominal: Mapping[str, float] | None) -> None:
+    if kind not in MONITOR_KINDS:
+        hint = " glr is a decision on parameters, which a linear design has none of: cusum is nearest to it."
+        raise SpecError(
+            f"The monitor {kind!r} is not for this design: use one of {', '.join(MONITOR_KINDS)}, learned."
+            f"{hint if kind == 'glr' else ''}",
+            path="kind",
+        )
+    if nominal:
+        raise SpecError("nominal is for recursive designs, which estimate parameters.", path="nominal")
+
+
+def _require_above_rounding(kind: str, limit: float, model: ResidualModel, bounds: FloatArray) -> None:
+    """Refuse a bound that rounding of what it is made of would pass: of disturbances that cancel."""
+    plant = model.errors.plant
+    # They come by the states, of which a row may show others than those that they enter.
+    entering = np.abs(model.errors.own) @ np.abs(plant.Bd) @ np.where(np.isfinite(bounds), bounds, 0.0)
+    size = float(np.linalg.norm(model.C, 2) * np.linalg.norm(entering))
+    if not limit > RESIDUAL_ROUNDING_SHARE * size:
+        raise SpecError(
+            "As stated, no disturbance reaches the residual, and (66) bounds nothing else: use pointwise, which bounds "
+            "noise too, or give a threshold yourself (thresholds)."
+            if kind == "paper"
+            else "As stated, no disturbance and no noise reaches the residual: its bound would be zero but for "
+            "rounding, which exceeds it. State noise (noise_bound, sensor_noise of the plant), or give a threshold "
+            "yourself (thresholds).",
+            path="kind" if kind == "paper" else "noise_bound",
+        )
+
+
+def _norm_rule(
+    design: ObserverDesign,
+    kind: str,
+    model: ResidualModel,
+    bounds: FloatArray,
+    noise_bound: float | None,
+    start: float,
+    gamma: float | None,
+    window: int,
+    dt: float,
+    estimates: bool,
+) -> tuple[NormRule, float]:
+    """Return the rule of a bound on the norm of the residual, or of the fault estimates, and the bound in the end."""
+    irregular = None
+    if kind == "paper":
+        table, limit = unlimited_paper(model, bounds, start, gamma)
+    else:
+        names = design.linear[0].disturbance_names
+        table, limit = unlimited_bound(kind, model, scaled_inputs(model, bounds, noise_bound, names), start, window)
+        if model.continuous is not None:
+            inputs = scaled_inputs(model, bounds, noise_bound, names, any_stamps=True)
+            irregular = unlimited_bound(kind, model, inputs, start, window)
+    driven = None
+    if kind != "paper" and model.continuous is not None and design.linear[0].nu:
+        driven = model.continuous.between.input_response(model.continuous.observer)
+    rule = NormRule(
+        table,
+        limit,
+        window=window if kind == "window" else 1,
+        dt=dt,
+        irregular=irregular,
+        watched=design.linear[1].fault_rows if estimates else None,
+        driven=driven,
+    )
+    return rule, limit
+
+
+def _more_words(kind: str, model: ResidualModel, limit: float, dt: float) -> str:
+    """Return what else the sentence of a bound must say."""
+    if kind == "paper" or model.continuous is None:
+        return ""
+    # The noise of the plant itself is what is gathered between samples: the closer they are, the less, but in all the
+    # more of it that is of one sign.
+    is_gathered = bool(model.Bw[:, model.continuous.sensors.sum() :].any())
+    return (
+        _NOT_CLOSER.format(dt=shown(dt)) * is_gathered
+        + _REGULAR.format(dt=shown(dt))
+        + model.continuous.between.lasting_words(limit)
+    )
+
+
+def _endless_model(
+    design: ObserverDesign, scenario: Scenario | None, window: int, sample_time: float | None, *, estimates: bool
+) -> tuple[ResidualModel, float]:
+    """Return a model with as many samples as an error at the start needs to decay, and their distance."""
+    plant, observer = design.linear
+    if plant.is_discrete and sample_time is not None:
+        raise SpecError("sample_time is for continuous designs: this one is sampled already.", path="sample_time")
+    asked = sample_time if sample_time is not None or scenario is None else scenario.sample_time
+    dt = plant.dt if plant.is_discrete else asked
+    if dt is None or not (is_finite_number(dt) and dt > 0.0):
+        raise SpecError(
+            "A continuous design needs the sample_time of its data, in seconds, for a threshold.", path="sample_time"
+        )
+    transition = observer.Az if plant.is_discrete else first_order_hold(observer.Az, observer.By, dt)[0]
+    steps = samples_of(transition, window)
+    expected = Scenario(horizon=dt, noise=1.0 if plant.nw else 0.0) if scenario is None else scenario
+    expected = expected.replace(
+        horizon=(steps - 0.5) * dt,
+        sample_time=None if plant.is_discrete else dt,
+        inputs={},
+        faults={},
+        sensors={},
+        initial_state={},
+        observer_state=None,
+        stabilise=False,
+    )
+    return residual_model(design, expected, endless=True, estimates=estimates), dt
+
+
+def _whitened(
+    kind: str,
+    model: ResidualModel,
+    unknown: FloatArray | None,
+    window: int,
+    change: float,
+    false_alarms: float,
+    dt: float,
+) -> WhitenedRule:
+    reached = model.Bd.any(axis=0) | model.Dd.any(axis=0)
+    if unknown is not None and reached.any():
+        raise SpecError(
+            f"{kind} needs to know what disturbances are to be expected: give a scenario (a spec with one, --system), "
+            "or use pointwise with disturbance bounds.",
+            path="disturbances",
+        )
+    whitener, white = whitened(kind, model, window)
+    return WhitenedRule(
+        whitener,
+        steady_mean(model),
+        window=window,
+        change=None if kind == "chi-square" else change,
+        false_alarms=false_alarms,
+        dt=dt,
+        white=white,
+    )

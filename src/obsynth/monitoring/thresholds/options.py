@@ -1,0 +1,70 @@
+"""Which options act on which kind of monitor; what would do nothing is refused by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import real_number, whole_number
+from obsynth.numerics.arrays import require_no_overflow
+
+_BOUNDED = ("disturbance_bounds", "noise_bound", "initial_error", "scenario", "sample_time")
+
+_STATISTICAL = ("window", "false_alarms", "scenario", "sample_time")
+
+#: Options that act on the monitors of linear designs, by kind.
+LINEAR_OPTIONS: Mapping[str, tuple[str, ...]] = {
+    "pointwise": (*_BOUNDED, "initial_set", "constants"),
+    "window": (*_BOUNDED, "window"),
+    "paper": ("disturbance_bounds", "initial_error", "gamma", "scenario", "sample_time"),
+    "chi-square": _STATISTICAL,
+    "cusum": (*_STATISTICAL, "change"),
+    "learned": ("normal",),
+}
+
+#: The same of designs that estimate parameters.
+PARAMETER_OPTIONS: Mapping[str, tuple[str, ...]] = {
+    "chi-square": ("nominal", "false_alarms"),
+    "cusum": ("nominal", "false_alarms", "change"),
+    "nis": ("nominal", "false_alarms"),
+    "learned": ("normal",),
+}
+
+#: Samples that are looked back; probability of a false alarm in a whole run; the change that sums are tuned for.
+WINDOW, FALSE_ALARMS, CHANGE = 20, 0.01, 1.0
+
+
+def refuse_idle(
+    table: Mapping[str, tuple[str, ...]], kind: str, given: Mapping[str, Any], *, called: Callable[[str], str] = str
+) -> None:
+    """Raise `SpecError` where an option is given that does nothing for a kind of monitor, by what it is ``called``."""
+    used = table.get(kind)
+    if used is None:
+        return  # who makes the monitor says which kinds there are
+    for name, value in given.items():
+        # The command line gives a mapping without entries where nothing is stated.
+        if value is None or (isinstance(value, Mapping) and not value) or name in used:
+            continue
+        kinds = [other for other, names in table.items() if name in names]
+        where = f"the monitor {' or '.join(kinds)}" if kinds else "designs of another kind"
+        raise SpecError(f"{called(name)} is for {where}, not for {kind}: leave it out.", path=called(name))
+
+
+def checked_options(
+    table: Mapping[str, tuple[str, ...]], kind: str, given: Mapping[str, Any], isolation_delay: int = 0
+) -> tuple[int, float, float]:
+    """Return window, false_alarms and change as they are given, or by default; raise `SpecError` where an option does
+    nothing for a kind of monitor, or is out of range."""
+    refuse_idle(table, kind, given)
+    for name in ("noise_bound", "initial_error", "gamma"):
+        value = given[name]
+        if value is not None:
+            require_no_overflow(real_number(value, name, "a number, 0 or more", least=0.0), name, name)
+    defaults: dict[str, Any] = {"window": WINDOW, "false_alarms": FALSE_ALARMS, "change": CHANGE}
+    window, false_alarms, change = (defaults[name] if given[name] is None else given[name] for name in defaults)
+    for name, count, least in (("window", window, 1), ("isolation_delay", isolation_delay, 0)):
+        whole_number(count, name, "a whole number of samples", least=least)
+    real_number(false_alarms, "false_alarms", "a probability between 0 and 1", above=0.0, below=1.0)
+    real_number(change, "change", "a positive number of deviations", above=0.0)
+    return window, false_alarms, change

@@ -1,0 +1,255 @@
+"""From a design and a scenario to a monitor of the residual."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import numpy as np
+
+from obsynth.methods.guaranteed_test.method import is_guaranteed
+from obsynth.monitoring.thresholds.adaptive_monitor import NO_TOLERANCE, noisy_design, over_box, tolerances_of
+from obsynth.monitoring.thresholds.guaranteed import record_monitor
+from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
+from obsynth.monitoring.thresholds.options import LINEAR_OPTIONS, checked_options
+from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model, watches_estimates
+from obsynth.monitoring.thresholds.rules import NormRule, WhitenedRule
+from obsynth.monitoring.thresholds.stated_noise import (
+    norms_of_windows,
+    paper_threshold,
+    pointwise_threshold,
+    scaled_inputs,
+    window_threshold,
+)
+from obsynth.monitoring.thresholds.whitening import settled, steady_mean, whitened
+from obsynth.numerics.arguments import arguments_checked, chosen, real_number
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.outliers import chi_square_limit
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.signal_names import index_of
+from obsynth.results.design import ObserverDesign, require_verified
+from obsynth.simulation.benches import Bench, make_bench
+from obsynth.simulation.scenario import Scenario, observer_start
+from obsynth.verification.assumptions import Assumptions
+
+#: What rounding may add to a residual, relative to the terms it is made of.
+RESIDUAL_ROUNDING_SHARE = 1e-10
+
+
+@arguments_checked
+def monitor(
+    design: ObserverDesign,
+    scenario: Scenario,
+    kind: str = "pointwise",
+    *,
+    disturbance_bounds: Mapping[str, float] | None = None,
+    noise_bound: float | None = None,
+    initial_error: float | None = None,
+    gamma: float | None = None,
+    window: int | None = None,
+    false_alarms: float | None = None,
+    change: float | None = None,
+    isolation_delay: int = 0,
+    constants: Any = None,
+    initial_set: Mapping[str, Any] | None = None,
+    unverified: bool = False,
+) -> Monitor:
+    """Return a threshold for the residual of a linear design, and the statistic it belongs to.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Of a linear method, with residuals.
+    scenario : Scenario
+        Its length, sampling, inputs, start, disturbances and noise count; its faults do not.
+    kind : {"pointwise", "paper", "window", "chi-square", "cusum"}, optional
+        ``pointwise``: norm of the residual against its l1 (peak) bound, never passed without a fault.  ``paper``: the
+        same norm against (66) with the norm of the power, which is not a pointwise bound.  ``window``: l2 norm over a
+        window against the l2 gain and the energy of the error at its start.  ``chi-square``: a window of residuals in
+        the metric of its covariance.  ``cusum``: cumulative sums of the whitened residual, for small changes.
+    disturbance_bounds : mapping, optional
+        Largest absolute value of disturbances by name; those of the scenario by default.
+    noise_bound : float, optional
+        Standard deviations that no component of the noise exceeds; needed by ``pointwise`` and ``window`` where the
+        scenario has noise.
+    initial_error : float, optional
+        Bound on the norm of the observer's error at the start (``V E x - z``, with the tracking map V of the
+        certificate); that of the scenario by default.
+    gamma : float, optional
+        For ``paper``: l2 gain from the disturbances to the residual; computed by default.
+    window : int, optional
+        Samples that ``window``, ``chi-square`` and ``cusum`` look back; 20 by default.
+    false_alarms : float, optional
+        For ``chi-square`` and ``cusum``: probability of a false alarm in a whole run, at most; 0.01 by default.
+    change : float, optional
+        For ``cusum``: shift it is tuned for, in standard deviations of the whitened residual; 1 by default.
+    isolation_delay : int, optional
+        Samples from an alarm to the comparison of the fault estimates, where these answer later than the residual.
+    constants, initial_set : mapping, optional
+        ``pointwise``, discrete designs: tolerances and the plant's start, as for `obsynth.online_monitor`.  With either
+        of them the monitor adapts to the signals (see `obsynth.evaluate`); the start is the scenario's own by
+        default.
+    unverified : bool, optional
+        Whether a design whose report fails is watched all the same; nothing is promised then.
+
+    Returns
+    -------
+    Monitor
+        With a sentence that says what its threshold means.
+
+    Raises
+    ------
+    SpecError
+        A recursive design, an option out of range or one that does nothing for this kind, a signal without a bound (or
+        without a covariance), or a record that is too short; the paper's threshold for a continuous design.
+    VerificationError
+        The report of the design fails.
+
+    Notes
+    -----
+    Of a continuous design, the pointwise bound at the samples is for disturbances that may do anything within their
+    bounds at all times, between samples too: it depends on the sample time, and all its terms are rounded outwards.
+    What known inputs and the plant's start alone do to the sampled observer (which takes outputs as straight lines) is
+    computed and added.  Plants of index 2 and more have no such bound.  Where the residual does not see the faults that
+    are modelled (``ui-pi-observer``), ``pointwise`` and ``window`` are of the fault estimates.  The statistical kinds
+    use disturbances that are held between samples, and exact covariances of the noise.
+    """
+    require_verified(design, unverified=unverified)
+    chosen(kind, "kind", MONITOR_KINDS)
+    given = {
+        "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound, "initial_error": initial_error,
+        "gamma": gamma, "window": window, "false_alarms": false_alarms, "change": change, "constants": constants,
+        "initial_set": initial_set,
+    }  # fmt: skip
+    window, false_alarms, change = checked_options(LINEAR_OPTIONS, kind, given, isolation_delay)
+    if is_guaranteed(design):
+        return record_monitor(design, scenario, kind, given)
+    design, adaptive = tolerances_of(design, constants, initial_set, initial_error)
+    estimates = watches_estimates(design) and kind in ("pointwise", "window")
+    model = residual_model(design, scenario, estimates=estimates)
+    start = 0.0 if adaptive else model.initial_error
+    start = start if initial_error is None else float(initial_error)
+    bounds, bench = bounds_of(design, model, disturbance_bounds), make_bench(design, scenario)
+    observer = cast(LinearObserver, bench.observer)
+    rows = observer.fault_rows if estimates else observer.residual_rows
+    numbers: dict[str, Any] = {"window": window, "false_alarms": false_alarms, "change": change, "dt": bench.signals.dt}
+    rule: Rule
+    if kind in ("chi-square", "cusum"):
+        rule = _whitened_rule(kind, model, start, **numbers)
+    else:
+        threshold = _norm_threshold(
+            kind, model, bounds, start, design.linear[0].disturbance_names, gamma, noise_bound, window
+        )
+        if model.continuous is not None:
+            threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
+        rule = NormRule(threshold, np.inf, window=window if kind == "window" else 1, dt=bench.signals.dt)
+    noisy = noisy_design(design, scenario)
+    assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=start)
+    bounded = assumed if kind in ("pointwise", "window") else None
+    statement = statement_of(kind, model, bounded, estimates=estimates, **numbers) + NO_TOLERANCE
+    if adaptive:
+        nominal = cast(NormRule, rule)
+        rule, statement = over_box(noisy, nominal, bounds, noise_bound, initial_error, initial_set, scenario=scenario)
+    return Monitor(
+        kind,
+        statement,
+        rule,
+        residuals=len(observer.residual_names),
+        fault_names=design.linear[1].fault_names,
+        fault_scales=model.fault_scales(),
+        horizon=model.steps,
+        dt=bench.signals.dt,
+        floor=_floor(bench, design.linear[0], scenario, rows),
+        isolation_delay=isolation_delay,
+        watches_estimates=estimates,
+    )
+
+
+def _whitened_rule(
+    kind: str, model: ResidualModel, start: float, *, window: int, false_alarms: float, change: float, dt: float
+) -> WhitenedRule:
+    """Return the rule of a statistical kind."""
+    # A window that outlasts the scenario is refused before its covariance is factorised.
+    first = settled(model, start, window)
+    whitener, white = whitened(kind, model, window)
+    # Bonferroni's inequality over all looks (chi-square), or Ville's over all white sums.
+    table, looks, degrees = np.full(model.steps, np.inf), model.steps - first, len(whitener)
+    if kind == "chi-square":
+        table[first:] = chi_square_limit(degrees, false_alarms / looks)
+    else:
+        # Two signs for each component; a sum may start at every look.
+        sums = looks if white else looks * (looks + 1) / 2
+        table[first:] = math.log(2 * degrees * sums / false_alarms)
+    return WhitenedRule(
+        whitener,
+        steady_mean(model),
+        window=window,
+        change=None if kind == "chi-square" else float(change),
+        false_alarms=false_alarms,
+        dt=dt,
+        white=white,
+        table=table,
+    )
+
+
+def _norm_threshold(
+    kind: str,
+    model: ResidualModel,
+    bounds: FloatArray,
+    start: float,
+    disturbances: Sequence[str],
+    gamma: float | None,
+    noise_bound: float | None,
+    window: int,
+) -> FloatArray:
+    """Return the threshold of a norm at each sample, for what acts on the samples."""
+    if kind == "paper":
+        return paper_threshold(model, bounds, start, gamma)
+    inputs = scaled_inputs(model, bounds, noise_bound, disturbances)
+    threshold = pointwise_threshold(model, inputs, start)
+    return threshold if kind == "pointwise" else window_threshold(model, inputs, start, window)
+
+
+def bounds_of(design: ObserverDesign, model: ResidualModel, given: Mapping[str, float] | None) -> FloatArray:
+    """Return the largest absolute value of each disturbance ``(nd,)``: the scenario's, or what is given."""
+    bounds = model.bounds.copy()
+    for name, value in (given or {}).items():
+        place = index_of(name, design.linear[0].disturbance_names, what="disturbance_bounds")
+        bounds[place] = real_number(
+            value, f"The bound of {name!r}", "a number, 0 or more", least=0.0, path="disturbance_bounds"
+        )
+    return bounds
+
+
+def _floor(bench: Bench, plant: DescriptorSystem, scenario: Scenario, rows: slice) -> float:
+    """Return what rounding may add to the norm of the residual, from the size of what it is made of."""
+    runs, observer = bench.run([scenario.seed]), cast(LinearObserver, bench.observer)
+    # Of an unknown input that no output shows, the outputs themselves are rounding of what the states add up to.
+    outputs = np.abs(runs.outputs) + np.abs(runs.states) @ np.abs(plant.C).T
+    size = outputs @ np.abs(observer.Dy[rows]).T + np.abs(runs.inputs) @ np.abs(observer.Du[rows]).T
+    # Where no output enters directly, its rounding comes by the states.
+    state = observer.init(observer_start(scenario, observer.order))
+    for k, (y, u) in enumerate(zip(runs.outputs[:, 0], runs.inputs[:, 0], strict=True)):
+        size[k] += np.abs(observer.Cz[rows]) @ (np.abs(state.z) + np.abs(observer.By) @ outputs[max(k - 1, 0), 0])
+        state, _ = observer.advance(state, y, u)
+    return RESIDUAL_ROUNDING_SHARE * float(np.max(np.linalg.norm(size, axis=2)))
+
+
+def _straight_lines(
+    design: ObserverDesign, scenario: Scenario, model: ResidualModel, kind: str, window: int, rows: slice
+) -> FloatArray:
+    """Return what straight lines between samples add to a norm of the residual: known inputs and start alone."""
+    if kind not in ("pointwise", "window"):
+        return np.zeros(model.steps)
+    calm = scenario.replace(faults={}, sensors={}, disturbances={}, noise=0.0, sensor_noise={})
+    bench = make_bench(design, calm)
+    residuals = bench.run([scenario.seed]).rows[:, 0, rows]
+    sizes = np.array(
+        [
+            np.linalg.norm(residual - model.C @ power @ model.start)
+            for residual, power in zip(residuals, model.powers(), strict=True)
+        ]
+    )
+    return sizes if kind == "pointwise" else norms_of_windows(sizes, window)

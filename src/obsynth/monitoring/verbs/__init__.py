@@ -1,0 +1,1 @@
+"""The commands that read logs: their arguments and what they do."""

@@ -1,0 +1,75 @@
+"""The verb ``thresholds``: a gain set and a log without faults in, thresholds out."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from obsynth.cli.arguments import STREAM, columns_of, numbers_of
+from obsynth.cli.output import answer, gains_to_hand_on, output_file
+from obsynth.errors import SpecError
+from obsynth.files.outputs import require_distinct
+from obsynth.monitoring.verbs.data_arguments import protect_inputs, with_input_delay
+
+
+def run_thresholds(options: argparse.Namespace) -> int:
+    """Run ``thresholds``: 0 whether the rows suffice for the rate or not, which is told; every failure is an error."""
+    from obsynth.monitoring.thresholds.learned import LEARNED, expects_fault_courses
+    from obsynth.monitoring.thresholds.learning import FALSE_ALARM_RATE, learn_thresholds
+
+    is_stream = options.data == STREAM
+    require_distinct({"--gains": options.gains, "--out": options.out, "--data": None if is_stream else options.data})
+    protect_inputs(options)
+    target = None if options.out is None else output_file(options.out, LEARNED, options)
+    if target is not None and target.suffix.lower() != ".json":
+        raise SpecError(f"{target}: thresholds are written as JSON (.json).", path="--out")
+    design, _ = gains_to_hand_on(options.gains, unverified=options.unverified)
+    found = learn_thresholds(
+        with_input_delay(design, options),
+        sys.stdin if is_stream else Path(options.data),
+        false_alarms=options.false_alarms or FALSE_ALARM_RATE,
+        rows=options.rows,
+        columns=columns_of(options),
+        scales=numbers_of(options.scale),
+        gap=options.gap,
+        warm_up=options.warm_up,
+    )
+    file = None if target is None else found.save(target)
+    levels = dict(zip(found.statistics.names, found.levels.tolist(), strict=True))
+    if not found.holds:
+        print(
+            f"Warning: the rate needs {found.needed} rows without faults, and {found.rows} are given.", file=sys.stderr
+        )
+    lines = [f"{found.statement[0].upper()}{found.statement[1:]}.", f"Monitored: {', '.join(found.columns)}."]
+    if found.seldom:
+        lines.append(f"Not monitored, as most rows lack them: {', '.join(found.seldom)}.")
+    if dependent := [name for name in found.left_out if name not in found.seldom]:
+        lines.append(
+            f"Not monitored, as they depend on the others or are correlated for too long: {', '.join(dependent)}."
+        )
+    estimates_are_left_out = not any(name.startswith("fhat[") for name in found.columns)
+    if found.left_out and expects_fault_courses(design) and estimates_are_left_out:
+        lines.append(
+            "Once the estimate follows a fault, these return to zero: an alarm comes at the onset of the fault or "
+            "not at all. Give run a level for the estimate as well (--threshold)."
+        )
+    lines += found.notes
+    answer(
+        options,
+        {
+            "gains": options.gains,
+            "file": file,
+            "holds": found.holds,
+            "statement": found.statement,
+            "notes": list(found.notes),
+            "rows": found.rows,
+            "needed": found.needed,
+            "rows_per_alarm": found.every,
+            "watched": list(found.columns),
+            "left_out": list(found.left_out),
+            "levels": levels,
+        },
+        "\n".join(lines),
+    )
+    return 0

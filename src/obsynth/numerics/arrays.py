@@ -1,0 +1,161 @@
+"""Making plain input into checked, read-only float arrays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from functools import wraps
+from inspect import Parameter, signature
+from types import MappingProxyType
+from typing import Any, Concatenate, ParamSpec, TypeAlias, TypeVar
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.errors import SpecError
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+ComplexArray: TypeAlias = NDArray[np.complex128]
+
+#: Stands for a size that may be zero, where something is divided by it.
+SMALLEST = 1e-300
+
+#: Numbers of plants and scenarios are at most this: products of three of them, as in gains, norms and covariances of
+#: what was scaled, stay within double precision.
+LARGEST = 1e100
+
+KEYWORD = Parameter.KEYWORD_ONLY
+
+Given = ParamSpec("Given")
+
+Made = TypeVar("Made")
+
+
+#: More entries of matrices are not taken: of one in a file (of a sparse one, those that are stored), and along a
+#: horizon of all that change.
+MAXIMUM_ENTRIES = 50_000_000
+
+
+def remembered(make: Callable[Concatenate[Any, Given], Made]) -> Callable[Concatenate[Any, Given], Made]:
+    """Make something of an object that never changes once, for as long as it lives; it must not hold the object.
+    What else is given says what is made, and can be hashed."""
+    known: WeakKeyDictionary[Any, dict[object, Made]] = WeakKeyDictionary()
+    usual = {name: option.default for name, option in signature(make).parameters.items() if option.kind == KEYWORD}
+
+    @wraps(make)
+    def once(item: Any, /, *given: Given.args, **named: Given.kwargs) -> Made:
+        kept, key = known.setdefault(item, {}), (given, frozenset((usual | named).items()))
+        if key not in kept:
+            kept[key] = make(item, *given, **named)
+        return kept[key]
+
+    return once
+
+
+def read_only(array: NDArray[Any], dtype: Any = np.float64) -> NDArray[Any]:
+    """Return a private copy of ``array`` that nobody can write to."""
+    copy = np.array(array, dtype=dtype, order="C", copy=True)
+    copy.setflags(write=False)
+    return copy
+
+
+def freeze(record: Any, *names: str, **values: Any) -> None:
+    """Make arrays and mappings of a frozen record private and read-only: its own ones by name, or others given."""
+    for name, value in ({name: getattr(record, name) for name in names} | values).items():
+        kept = MappingProxyType(dict(value)) if isinstance(value, Mapping) else read_only(value)
+        object.__setattr__(record, name, kept)
+
+
+def largest_singular_value(matrix: NDArray[Any]) -> float:
+    """Return the spectral norm; zero of an empty matrix."""
+    # `numpy.linalg.norm` takes the same decomposition and half of its time again.
+    return float(np.linalg.svd(matrix, compute_uv=False)[0]) if matrix.size else 0.0
+
+
+def all_finite(vector: FloatArray) -> bool:
+    """Whether every entry of a short vector ``(n,)`` is finite; what is not is left in a sum of them."""
+    return math.isfinite(sum(vector.tolist())) or bool(np.isfinite(vector).all())
+
+
+def unmasked(value: Any) -> Any:
+    """Return masked numbers with NaN for what lies under the mask, and anything else as it is."""
+    # Asked first, since numpy loads its masked arrays when they are named.
+    if not hasattr(value, "mask") or not np.ma.isMaskedArray(value) or value.dtype.kind not in "fiu":
+        return value
+    return np.where(np.ma.getmaskarray(value), np.nan, np.ma.getdata(value))
+
+
+def holds_truth(value: Any) -> bool:
+    """Whether a list has True or False among its entries, which numpy would take for 1 and 0 beside numbers."""
+    return isinstance(value, (bool, np.bool_)) or (isinstance(value, (list, tuple)) and any(map(holds_truth, value)))
+
+
+def kind_of_entries(dtype: np.dtype[Any]) -> str:
+    """Return what an array holds that does not hold real numbers, for a message."""
+    return {"b": "booleans", "c": "complex numbers", "U": "text"}.get(dtype.kind, "entries that are no numbers")
+
+
+def require_no_overflow(numbers: Any, what: str, path: str) -> None:
+    """Raise `SpecError` where one of some finite numbers is beyond `LARGEST`; ``what`` has it, as a message says."""
+    given = np.ravel(np.asarray(numbers, dtype=np.float64))
+    if given.size and np.abs(given).max() > LARGEST:
+        raise SpecError(
+            f"{what} {'has' if np.ndim(numbers) else 'is'} {given[int(np.argmax(np.abs(given)))]:.3g}, but numbers "
+            f"beyond {LARGEST:g} overflow where they are multiplied: give it in other units.",
+            path=path,
+        )
+
+
+def as_given(value: Any, name: str, ragged: str) -> NDArray[Any]:
+    """Return what a caller gives as an array of any kind; raise `SpecError` where it is none, ``ragged`` where its rows
+    have different lengths."""
+    try:
+        return np.asarray(unmasked(value))
+    except ValueError:
+        raise SpecError(ragged, path=name) from None
+    except (TypeError, RuntimeError) as error:
+        # Arrays of other libraries may refuse, with a reason of their own.
+        raise SpecError(f"{name} is a {type(value).__name__} that is no array: {error}.", path=name) from error
+
+
+def require_readable(entries: float) -> None:
+    """Raise `ValueError` for more entries of a file than are read."""
+    if entries > MAXIMUM_ENTRIES:
+        raise ValueError(f"it is too large ({entries:.1e} entries)")
+
+
+def as_matrix(value: Any, name: str) -> FloatArray:
+    """Convert nested lists, an array or a scalar to a finite, read-only real matrix; raise `SpecError` naming it."""
+    raw = as_given(value, name, f"{name} has rows of different lengths: give a full matrix.")
+    truths = holds_truth(value)
+    if raw.dtype.kind not in "fiu" or truths:
+        if raw.size == 0:
+            raw = raw.astype(np.float64)
+        else:
+            kind = "booleans" if truths else kind_of_entries(raw.dtype)
+            raise SpecError(f"{name} holds {kind}: every entry must be a real number.", path=name)
+    if raw.ndim == 0:
+        raw = raw.reshape(1, 1)
+    if raw.ndim != 2:
+        raise SpecError(f"{name} has {raw.ndim} dimension(s): give a matrix (a list of rows).", path=name)
+    matrix = raw.astype(np.float64)
+    finite = np.isfinite(matrix)
+    if not finite.all():
+        row, column = (int(i) + 1 for i in np.argwhere(~finite)[0])
+        entry = matrix[row - 1, column - 1]
+        raise SpecError(f"{name} has {entry} in row {row}, column {column}: every entry must be finite.", path=name)
+    return read_only(matrix)
+
+
+def reachable(matrix: FloatArray) -> NDArray[np.bool_]:
+    """Return which entries some power of a matrix ``(n, n)`` may have, by its pattern alone; the power zero counts."""
+    found: NDArray[np.bool_] = np.eye(len(matrix), dtype=bool) | (matrix != 0.0)
+    while not found.all():
+        # Paths of twice the length.
+        further = found.astype(np.float64) @ found > 0.0
+        if np.array_equal(further, found):
+            break
+        found = further
+    return found

@@ -1,0 +1,266 @@
+"""Pole placement by a Sylvester equation, with repeated poles of any multiplicity.
+
+One Jordan chain for each repeated pole, which every observable pair allows: with L in real Jordan form and any G,
+``F' X - X L = C' G``, ``K = (G X^{-1})'`` gives ``spectrum(F - K C) = spectrum(L)`` (S. P. Bhattacharyya, E. de Souza,
+Systems & Control Letters 1, 1982); G by L-BFGS, its gradient by one adjoint equation.  scipy and python-control look
+for as many eigenvectors as the multiplicity: they refuse, or miss poles without a word (error 4.3 for the paper's).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SolverError, SpecError
+from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, largest_singular_value
+from obsynth.numerics.spectra import SAME_POLE, decay_rates, spectrum_error
+
+#: Random starts of the search, and fewer for large pairs; each step costs two Sylvester equations.
+STARTS, FEW_STARTS, LARGE_PAIR = 8, 2, 20
+
+#: Longest run of the search, and how often it is taken up again from where it ended, with eigenvectors of unit length,
+#: as long as the logarithm of the objective falls by more than this.
+MOST_PLACEMENT_STEPS, RESTARTS, LEAST_PROGRESS = 400, 8, 1e-3
+
+#: First steps of a search for good conditioning, and how many of the starts that are ahead after these go on.
+FIRST_SEARCH_STEPS, FINALISTS = 40, 3
+
+#: Seed of the starts: the same question gives the same gains.
+STARTS_SEED = 20240
+
+#: Spectra of F and L closer than this, relative to the size of F, make the Sylvester equation nearly singular: F is
+#: then shifted by a random gain first.
+OVERLAP = 1e-3
+
+#: Computed poles may miss the wanted ones by this, relative to their size.
+PLACEMENT_TOLERANCE = 1e-5
+
+
+#: Poles given as numbers count as a conjugate pair when they agree to this, relative to their size.
+PAIR_TOLERANCE = 1e-9
+
+_POLES_OPTION = "method.options.poles"
+
+
+def jordan_form(poles: Sequence[complex]) -> FloatArray:
+    """Return a real cyclic matrix ``(n, n)`` with these eigenvalues: one chain for each group of equal poles."""
+    upper = [pole for pole in poles if pole.imag >= 0.0]
+    groups: list[list[complex]] = []
+    for pole in sorted(upper, key=lambda value: (value.real, value.imag)):
+        home = next((group for group in groups if abs(group[0] - pole) <= SAME_POLE * max(abs(pole), SMALLEST)), None)
+        if home is not None and (pole.imag > 0.0) == (home[0].imag > 0.0):
+            home.append(pole)
+        else:
+            groups.append([pole])
+    result, start = np.zeros((len(poles), len(poles))), 0
+    for group in groups:
+        width = 2 if group[0].imag > 0.0 else 1
+        link = max(abs(group[0]), 1.0)
+        for place, pole in enumerate(group):
+            at = slice(start, start + width)
+            block = [[pole.real, pole.imag], [-pole.imag, pole.real]] if width == 2 else [[pole.real]]
+            result[at, at] = block
+            if place:
+                result[start - width : start, at] = link * np.eye(width)
+            start += width
+    return result
+
+
+def place(
+    f: FloatArray,
+    c: FloatArray,
+    poles: Sequence[complex],
+    *,
+    dt: float = 0.0,
+    objective: str = "conditioning",
+    weight: FloatArray | None = None,
+) -> tuple[FloatArray, float]:
+    """Return K ``(n, ny)`` such that ``F - K C`` has these poles, and the condition of the (generalised) eigenvectors;
+    ``f (n, n)``, ``c (ny, n)``, ``weight (m, n)``."""
+    n, outputs = f.shape[0], c.shape[0]
+    if n == 0:
+        return np.zeros((0, outputs)), 1.0
+    target = jordan_form(poles)
+    rng = np.random.default_rng(STARTS_SEED)
+    size = max(largest_singular_value(f), SMALLEST)
+    distance = np.min(np.abs(np.linalg.eigvals(f)[:, None] - np.asarray(poles)[None, :]))
+    first = np.zeros((n, outputs))
+    if distance <= OVERLAP * size:
+        first = rng.standard_normal((n, outputs)) * size / max(largest_singular_value(c), SMALLEST)
+    scale = np.eye(n) if weight is None else weight
+    problem = _Sylvester.of((f - first @ c).T, c.T, target, first.T, objective, scale.T @ scale)
+    best: tuple[float, FloatArray] | None = None
+    starts = [rng.standard_normal((outputs, n)) for _ in range(STARTS if n <= LARGE_PAIR else FEW_STARTS)]
+    if objective == "gain":
+        # Well-conditioned eigenvectors are a good place to start from.
+        other = replace(problem, objective="conditioning").minimised(starts[0])
+        starts = starts if other is None else [other[1], *starts]
+    if objective == "conditioning":
+        # All go a short way, and the best of them to the end.  Small gains are not predicted as early.
+        tried = [problem.minimised(start, steps=FIRST_SEARCH_STEPS, restarts=1) for start in starts]
+        ahead = sorted((found for found in tried if found is not None), key=lambda found: found[0])
+        starts = [start for _, start in ahead[:FINALISTS]]
+    for start in starts:
+        found = problem.minimised(start)
+        if found is not None and (best is None or found[0] < best[0]):
+            best = found
+    if best is None:
+        raise SolverError("No gain for these poles was found: the Sylvester equation stayed singular.")
+    x, gain = problem.solution(best[1])
+    k = first + gain.T
+    error = spectrum_error(f - k @ c, poles, dt)
+    if not error <= PLACEMENT_TOLERANCE:
+        raise SolverError(
+            f"The poles could not be placed: they are wrong by {error:.2g} of their size. The pair is "
+            "close to an unobservable one: ask for slower or fewer distinct poles, lower the order of the fault model, "
+            "or use decay= instead."
+        )
+    return k, float(np.linalg.cond(x))
+
+
+@dataclass(frozen=True, eq=False)
+class _Sylvester:
+    """``A X - X L = B G`` for many G, by one Schur form of A; L is quasi-triangular already."""
+
+    triangular: FloatArray
+    rotation: FloatArray
+    B: FloatArray
+    L: FloatArray
+    shift: FloatArray
+    objective: str
+    gram: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        a: FloatArray,
+        b: FloatArray,
+        target: FloatArray,
+        shift: FloatArray,
+        objective: str,
+        gram: FloatArray,
+    ) -> _Sylvester:
+        from scipy.linalg import schur
+
+        triangular, rotation = schur(a, output="real")
+        return cls(triangular, rotation, b, target, shift, objective, gram)
+
+    def states(self, g: FloatArray) -> FloatArray:
+        from obsynth.numerics.lapack import dtrsyl
+
+        right = self.rotation.T @ (self.B @ g)
+        x, scale, _ = dtrsyl(self.triangular, self.L, right, isgn=-1)
+        return np.asarray(self.rotation @ (x / scale))
+
+    def adjoint(self, weight: FloatArray) -> FloatArray:
+        """Return Y with ``A' Y - Y L' = weight``: the gradient of <weight, X> is ``B' Y``."""
+        from obsynth.numerics.lapack import dtrsyl
+
+        y, scale, _ = dtrsyl(self.triangular, self.L, self.rotation.T @ weight, trana="T", tranb="T", isgn=-1)
+        return np.asarray(self.rotation @ (y / scale))
+
+    def solution(self, g: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return X and the gain ``G X^-1``."""
+        x = self.states(g)
+        return x, np.asarray(np.linalg.solve(x.T, g.T).T)
+
+    def value_and_gradient(self, flat: FloatArray) -> tuple[float, FloatArray]:
+        g = flat.reshape(self.B.shape[1], -1)
+        x = self.states(g)
+        inverse = np.linalg.inv(x)
+        if self.objective == "gain":
+            gain = g @ inverse
+            total = gain + self.shift
+            weighted = total @ self.gram
+            value = float(np.sum(weighted * total))
+            weight = -2.0 * gain.T @ weighted @ inverse.T
+            direct = 2.0 * weighted @ inverse.T
+        else:
+            own, other = float(np.sum(x**2)), float(np.sum(inverse**2))
+            value = own * other
+            weight = 2.0 * other * x - 2.0 * own * inverse.T @ inverse @ inverse.T
+            direct = np.zeros_like(g)
+        gradient = direct + self.B.T @ self.adjoint(weight)
+        return float(np.log(value)), np.asarray(gradient / value).ravel()
+
+    def minimised(
+        self, start: FloatArray, *, steps: int = MOST_PLACEMENT_STEPS, restarts: int = RESTARTS
+    ) -> tuple[float, FloatArray] | None:
+        """Return the least value found and its G; ``None`` when the equation is singular from the start."""
+        from scipy.optimize import minimize
+
+        evaluate: Callable[[FloatArray], Any] = self.value_and_gradient
+        best: tuple[float, FloatArray] | None = None
+        g = start
+        try:
+            for _ in range(restarts):
+                g = self.normalised(g)
+                with np.errstate(all="ignore"):
+                    done = minimize(evaluate, g.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": steps})
+                if not np.isfinite(done.fun):
+                    break
+                gained = np.inf if best is None else best[0] - float(done.fun)
+                g = np.asarray(done.x).reshape(start.shape)
+                if best is None or gained > 0.0:
+                    best = (float(done.fun), g)
+                if gained < LEAST_PROGRESS:
+                    break
+        except np.linalg.LinAlgError:
+            return best
+        return best
+
+    def normalised(self, g: FloatArray) -> FloatArray:
+        """Return G with each Jordan chain scaled so that its part of X has unit size; the gain stays the same."""
+        lengths = np.linalg.norm(self.states(g), axis=0)
+        linked = (self.L != 0.0) | (self.L.T != 0.0) | np.eye(len(self.L), dtype=bool)
+        for _ in range(len(self.L).bit_length()):
+            linked = (linked.astype(float) @ linked.astype(float)) > 0.0
+        chains = np.array([np.max(lengths[row]) for row in linked])
+        return np.asarray(g / np.where(chains > 0.0, chains, 1.0))
+
+
+def checked_poles(
+    given: Any, count: int, fixed: ComplexArray, dt: float, *, of: str = "ui-pi-observer"
+) -> list[complex]:
+    """Return the wanted poles, in exact conjugate pairs; ``of``: what they are for, in messages."""
+    listed = [as_pole(pole) for pole in given]
+    problems = []
+    if len(listed) != count:
+        kept = ", ".join(f"{complex(value):.6g}" for value in fixed)
+        besides = f" (fixed, not to be listed: {kept})" if kept else ""
+        problems.append(f"{len(listed)} are given, but {count} can be placed{besides}.")
+    rates = decay_rates(listed, dt)
+    unstable = [pole for pole, rate in zip(listed, rates, strict=True) if not rate > 0.0]
+    if unstable:
+        where = "inside the unit circle" if dt > 0.0 else "in the left half plane"
+        problems.append(f"{', '.join(f'{pole:.6g}' for pole in unstable)} would not be stable: give poles {where}.")
+    upper = [pole for pole in listed if pole.imag > 0.0]
+    lower = [pole for pole in listed if pole.imag < 0.0]
+    lonely = []
+    for pole in upper:
+        partner = next((p for p in lower if abs(p - pole.conjugate()) <= PAIR_TOLERANCE * abs(pole)), None)
+        if partner is None:
+            lonely.append(pole)
+        else:
+            lower.remove(partner)
+    lonely += lower
+    if lonely:
+        problems.append(f"{', '.join(f'{pole:.6g}' for pole in lonely)} lack their conjugates.")
+    if problems:
+        raise SpecError(f"Option poles of {of}:", path=_POLES_OPTION, problems=problems)
+    real = [pole for pole in listed if pole.imag == 0.0]
+    return [*real, *(p for pole in upper for p in (pole, pole.conjugate()))]
+
+
+def as_pole(pole: Any) -> complex:
+    """Return a pole that is given as a number, or as its real and imaginary part."""
+    try:
+        value = complex(*pole) if isinstance(pole, (list, tuple, np.ndarray)) and len(pole) == 2 else complex(pole)
+    except (TypeError, ValueError):
+        raise SpecError(f"{pole!r} is no pole: give a number, or [re, im].", path=_POLES_OPTION) from None
+    if isinstance(pole, (bool, str)) or not np.isfinite(value):
+        raise SpecError(f"{pole!r} is no pole: give a finite number, or [re, im].", path=_POLES_OPTION)
+    return value

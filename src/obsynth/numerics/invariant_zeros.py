@@ -1,0 +1,228 @@
+"""Invariant zeros with their directions, whether they lie outside the stability region, and far out which are zeros."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
+from obsynth.numerics.pencil_points import FEW_COLUMNS, MOST_DIRECTIONS, ZERO_STEPS, PencilPoints, smallest_singular
+from obsynth.numerics.pencils import FiniteZeros, finite_zeros
+from obsynth.numerics.ranks import (
+    BOUNDARY_NEIGHBOURHOOD,
+    BOUNDARY_RANK_TOLERANCE,
+    BOUNDARY_TOLERANCE,
+    CLUSTER_TOLERANCE,
+    NEGLIGIBLE_INPUT,
+    RANK_TOLERANCE,
+    numerical_rank,
+)
+from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
+
+#: Where a pencil is tested between a zero and the nearest point of the stability boundary.
+_PATH_TO_BOUNDARY = (1.0, 0.75, 0.5, 0.25)
+
+
+def system_zeros(E: FloatArray, A: FloatArray, *, nx: int) -> FiniteZeros:
+    """Return the finite zeros of a system pencil ``(nx + ny, nx + nu)`` without those that are only nearly infinite.
+    Far out a pencil with zeros at infinity is nearly singular beside ``z E`` (a chain of k states shows with ``z^-k``):
+    there a candidate counts only when the pencil is singular to rounding in units that suit its size."""
+    found = finite_zeros(E, A, to_the_end=False)
+    if not found.values.size:
+        return found
+    # Both of a pair are judged by the upper one.
+    upper = [complex(z.real, abs(z.imag)) for z in found.values]
+    kept = np.array([abs(z) <= 1.0 or _is_singular(E, A, z, found.normal_rank, nx=nx) for z in upper], dtype=bool)
+    return replace(found, values=read_only(found.values[kept], np.complex128))
+
+
+def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int, *, nx: int) -> bool:
+    """Whether the rank drops at, or within the accuracy of, a computed zero."""
+    pencil = equilibrated_at(E, A, value, nx=nx)
+    point, best = value, np.inf
+    for _ in range(ZERO_STEPS):
+        matrix = pencil.A - point * pencil.E
+        if matrix.shape[0] >= matrix.shape[1] == normal_rank >= FEW_COLUMNS:
+            values, vectors, largest = smallest_singular(matrix)
+            smallest, v = float(values[0]), vectors[:, 0]
+            u = (matrix @ v).conj()
+            u = u / (float(np.linalg.norm(u)) or 1.0)
+        else:
+            left, sizes, right = np.linalg.svd(matrix)
+            largest, smallest = float(sizes[0]), float(sizes[normal_rank - 1])
+            u, v = left[:, normal_rank - 1].conj(), right[normal_rank - 1].conj()
+        if largest == 0.0:
+            return True
+        best = min(best, smallest / largest)
+        if best <= BOUNDARY_RANK_TOLERANCE:
+            return True
+        slope = u @ pencil.E @ v
+        # A zero far out is known only to the rounding of the largest: Newton's method on u' (A - z E) v finds the rest.
+        step: Any = (u @ (pencil.A - point * pencil.E) @ v) / slope if slope != 0.0 else 0.0
+        if abs(point + step - value) > CLUSTER_TOLERANCE * abs(value):
+            break
+        point = point + step
+    return False
+
+
+def size_of_point(value: complex) -> float:
+    """Return the largest power of two not above the modulus of a point, or 1."""
+    return math.ldexp(1.0, math.frexp(max(1.0, abs(value)))[1] - 1)
+
+
+def equilibrated_at(E: FloatArray, A: FloatArray, value: complex, *, nx: int) -> EquilibratedPencil:
+    """Return the pencil in units that suit a point of this modulus: states in those that ``z x`` has.
+    Beside a large ``z E`` the inputs and outputs would vanish."""
+    size = size_of_point(value)
+    columns = np.where(np.arange(E.shape[1]) < nx, 1.0 / size, 1.0)
+    # Scaled with the modulus at that point, then taken apart again, so that the factors are those of A - z E.
+    scaled = equilibrate_pencil(size * columns * E, columns * A)
+    return EquilibratedPencil(scaled.E / size, scaled.A, scaled.rows, read_only(scaled.columns * columns))
+
+
+@dataclass(frozen=True, eq=False)
+class Zero:
+    """An invariant zero, its direction of unit norm, and the input's share of that when the pencil is equilibrated."""
+
+    value: complex
+    state_direction: ComplexArray
+    input_direction: ComplexArray
+    input_share: float
+
+    @property
+    def is_unobservable_mode(self) -> bool:
+        """Whether the input takes no part: the zero is a mode that the outputs never show."""
+        return self.input_share <= NEGLIGIBLE_INPUT
+
+
+def is_outside(value: complex, dt: float) -> bool:
+    """Whether an eigenvalue or zero counts as not strictly stable, by its distance from the boundary alone."""
+    if dt > 0.0:
+        return bool(abs(value) >= 1.0 - BOUNDARY_TOLERANCE)
+    return bool(complex(value).real >= -BOUNDARY_TOLERANCE * max(1.0, abs(value)))
+
+
+def are_outside(E: FloatArray, A: FloatArray, zeros: FiniteZeros, dt: float) -> tuple[bool, ...]:
+    """Decide for each finite zero of ``A - z E`` whether it counts as not strictly stable.
+    One of multiplicity k moves by ``eps^(1/k)``: near the boundary it also counts as outside when the pencil is
+    singular to working precision all the way to the nearest boundary point."""
+    judged: PencilPoints | EquilibratedPencil | None = None
+    found: dict[complex, bool] = {}
+    for value in map(complex, zeros.values):
+        distance = abs(abs(value) - 1.0) if dt > 0.0 else abs(value.real)
+        # Of a pair both are where the one before was found to be: the pencil is real.
+        if (other := value.conjugate()) in found:
+            found[value] = found[other]
+        elif is_outside(value, dt) or distance > BOUNDARY_NEIGHBOURHOOD * max(1.0, abs(value)):
+            found[value] = is_outside(value, dt)
+        else:
+            if judged is None:
+                judged = pencil = equilibrate_pencil(E, A)
+                # A large one of full column rank is made ready for many points.
+                if min(E.shape[0], zeros.normal_rank) >= E.shape[1] >= FEW_COLUMNS:
+                    judged = PencilPoints(pencil.E, pencil.A, (1.0, 1.0))
+            found[value] = _reaches_boundary(judged, value, dt, zeros.normal_rank)
+    return tuple(found[value] for value in map(complex, zeros.values))
+
+
+def zero_at(E: FloatArray, A: FloatArray, value: complex, B: FloatArray, C: FloatArray, D: FloatArray) -> Zero:
+    """Return the zero of ``[A - z E, B; C, D]`` that is known to be at a point, with its direction there."""
+    wide_e, wide_a = system_pencil(E, A, B, C, D)
+    nx = E.shape[0]
+    pencil = equilibrated_at(wide_e, wide_a, value, nx=nx)
+    basis = smallest_part_first(_kernel(pencil, value, least=1), slice(nx, None))
+    return _zero_along(basis[:, 0], value, pencil.columns, nx=nx)
+
+
+def zeros_of_system(
+    E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None = None, *, dt: float
+) -> tuple[FiniteZeros, tuple[Zero, ...], tuple[Zero, ...]]:
+    """Return what `finite_zeros` says of ``[A - z E, B; C, D]``, the zeros, and those not strictly stable."""
+    e, a = system_pencil(E, A, B, C, D)
+    found = system_zeros(e, a, nx=E.shape[0])
+    zeros = zeros_with_directions(e, a, found, nx=E.shape[0])
+    outside = tuple(zero for zero, out in zip(zeros, are_outside(e, a, found, dt), strict=True) if out)
+    return found, zeros, outside
+
+
+def system_pencil(
+    E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``[A - z E, B; C, D]`` as its two matrices."""
+    feedthrough = np.zeros((C.shape[0], B.shape[1])) if D is None else D
+    padded = np.zeros((E.shape[0] + C.shape[0], E.shape[1] + B.shape[1]))
+    padded[: E.shape[0], : E.shape[1]] = E
+    return padded, np.block([[A, B], [C, feedthrough]])
+
+
+def _reaches_boundary(pencil: PencilPoints | EquilibratedPencil, value: complex, dt: float, normal_rank: int) -> bool:
+    point = value / abs(value) if dt > 0.0 else complex(0.0, value.imag)
+    # All the way to the boundary: another zero that lies there is no evidence about this one.
+    for fraction in _PATH_TO_BOUNDARY:
+        place = value + fraction * (point - value)
+        place = place if place.imag else place.real
+        if isinstance(pencil, PencilPoints):
+            smallest = pencil.smallest(place)
+        else:
+            singular_values = np.linalg.svd(pencil.A - place * pencil.E, compute_uv=False)
+            smallest = singular_values[normal_rank - 1] / singular_values[0] if singular_values[0] else 0.0
+        if smallest > BOUNDARY_RANK_TOLERANCE:
+            return False
+    return True
+
+
+def zeros_with_directions(
+    E: FloatArray, A: FloatArray, found: FiniteZeros, *, nx: int, wanted: Callable[[complex], bool] = lambda _: True
+) -> tuple[Zero, ...]:
+    """Return zeros of the system pencil ``A - z E`` with their directions: all, or the wanted ones; of a pair both."""
+    values = [complex(value) for value in found.values]
+    zeros: list[Zero] = []
+    for i, value in enumerate(values):
+        if not wanted(value):
+            continue
+        if value.imag < 0.0:
+            # Pairs follow each other and are exact.
+            state, driving = (
+                read_only(part.conj(), np.complex128) for part in (zeros[-1].state_direction, zeros[-1].input_direction)
+            )
+            zeros.append(Zero(value, state, driving, zeros[-1].input_share))
+            continue
+        pencil = equilibrated_at(E, A, value, nx=nx)
+        kernel = _kernel(pencil, value, least=pencil.A.shape[1] - found.normal_rank + 1)
+        basis = smallest_part_first(kernel, slice(nx, None))
+        twins = sum(abs(value - other) <= CLUSTER_TOLERANCE * max(1.0, abs(value)) for other in values[:i])
+        zeros.append(_zero_along(basis[:, min(twins, basis.shape[1] - 1)], value, pencil.columns, nx=nx))
+    return tuple(zeros)
+
+
+def _kernel(pencil: EquilibratedPencil, value: complex, *, least: int) -> NDArray[Any]:
+    """Return an orthonormal null basis of the pencil at ``value``, with ``least`` columns or more."""
+    matrix = pencil.A - (value if value.imag else value.real) * pencil.E
+    if matrix.shape[0] >= matrix.shape[1] >= FEW_COLUMNS and least <= MOST_DIRECTIONS:
+        values, vectors, largest = smallest_singular(matrix, MOST_DIRECTIONS)
+        count = max(least, int(np.sum(values <= RANK_TOLERANCE * largest)))
+        return np.asarray(vectors[:, :count])
+    _, singular_values, right = np.linalg.svd(matrix)
+    return np.asarray(right[min(numerical_rank(singular_values), matrix.shape[1] - least) :].conj().T)
+
+
+def smallest_part_first(basis: NDArray[Any], part: slice) -> NDArray[Any]:
+    """Rotate an orthonormal basis so that the columns' rows in ``part`` grow from first to last."""
+    if basis.shape[1] == 1 or basis[part].size == 0:
+        return basis
+    _, _, rotation = np.linalg.svd(basis[part])
+    return np.asarray(basis @ rotation.conj().T[:, ::-1])
+
+
+def _zero_along(direction: NDArray[Any], value: complex, scale: FloatArray, *, nx: int) -> Zero:
+    original = scale * direction
+    leading = original[np.argmax(np.abs(original))]
+    original = original * (abs(leading) / leading / np.linalg.norm(original))
+    share = float(np.linalg.norm(direction[nx:]))
+    state, driving = (read_only(part, np.complex128) for part in (original[:nx], original[nx:]))
+    return Zero(value, state, driving, share)

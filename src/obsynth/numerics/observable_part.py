@@ -1,0 +1,123 @@
+"""Splitting a pair into its observable part and the modes that no gain moves: Share Pasand et al., procedure 1, step 7.
+
+Lemma 6 (always observable) is false.  A staircase of rank decisions loses its way on large stiff pairs; the fixed modes
+are known from the zeros of the plant's pencil, so they are peeled off one eigenspace at a time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
+from obsynth.numerics.invariant_zeros import is_outside
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE
+from obsynth.numerics.scaling import LogBalance
+from obsynth.numerics.spectra import eigenvalues
+
+#: Fixed modes closer than this, relative to their size, are peeled off together, at their mean: a double one that
+#: rounding split lies at about the square root of the unit roundoff from it.
+SAME_MODE = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class ObservableSplit:
+    """``x = units * basis @ [observable; hidden]``: ``F = [F_o 0; F_ho F_h]`` and ``C = [C_o 0]``."""
+
+    basis: FloatArray  # (n, n), orthogonal
+    units: FloatArray  # (n,): the states are balanced first
+    F: FloatArray  # F_o (no, no)
+    C: FloatArray  # C_o (ny, no)
+    fixed_modes: ComplexArray  # of the hidden part
+
+    @property
+    def order(self) -> int:
+        """Number of observable states."""
+        return int(self.F.shape[0])
+
+    def lift(self, gain: FloatArray) -> FloatArray:
+        """Return the gain ``(n, ny)`` of the whole pair for one of the observable part ``(no, ny)``."""
+        return np.asarray(self.units[:, None] * (self.basis[:, : self.order] @ gain))
+
+    def lower(self, matrix: FloatArray) -> FloatArray:
+        """Return the observable rows of an input matrix ``(n, *)`` of the whole pair."""
+        return np.asarray(self.basis[:, : self.order].T @ (matrix / self.units[:, None]))
+
+    def shown(self, matrix: FloatArray) -> FloatArray:
+        """Return the observable columns of an output matrix ``(*, n)`` of the whole pair."""
+        return np.asarray((matrix * self.units) @ self.basis[:, : self.order])
+
+
+def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray, *, dt: float) -> ObservableSplit:
+    """Split the pair ``(F, C)`` at its fixed modes; ``f (n, n)``, ``c (ny, n)``.
+
+    A stable mode that is fixed by the zeros of the plant's pencil, but that the pair shows, is left where it shows: it
+    decays with or without a gain.  An unstable one cannot be left, and is refused."""
+    n = f.shape[0]
+    units = _balancing(f, c)
+    work_f, work_c, basis = f * units / units[:, None], c * units, np.eye(n)
+    size = max(largest_singular_value(work_f), largest_singular_value(work_c)) if n else 1.0
+    waiting: list[complex] = []
+    for mode in map(complex, fixed_modes):
+        if 0.0 < abs(mode.imag) <= SAME_MODE * max(1.0, abs(mode)):
+            waiting.append(complex(mode.real, 0.0))
+        elif mode.imag >= 0.0:
+            waiting.append(mode)
+    seen = n
+    while waiting:
+        value = waiting[0]
+        cluster = [other for other in waiting if abs(other - value) <= SAME_MODE * max(1.0, abs(value))]
+        kernel = _hidden_directions(work_f[:seen, :seen], work_c[:, :seen], sum(cluster) / len(cluster), size)
+        found = kernel.shape[1] // (2 if value.imag > 0.0 else 1)
+        if found == 0 and not any(is_outside(other, dt) for other in cluster):
+            waiting = [other for other in waiting if other not in cluster]
+            continue
+        if found == 0 or (found > len(cluster) and is_outside(value, dt)):
+            raise PreconditionError(
+                f"By the zeros of plant and fault model {value:.6g} is a fixed mode, but it is observable in the pair "
+                "(U A, C): double precision cannot decide. Lower the order of the fault model, or rescale the plant.",
+                condition="fixed modes",
+                mode=value,
+            )
+        turn = np.eye(n)
+        # Observable directions first, the hidden ones behind them.
+        left = np.linalg.svd(kernel)[0]
+        turn[:seen, :seen] = np.hstack([left[:, kernel.shape[1] :], left[:, : kernel.shape[1]]])
+        work_f, work_c, basis = turn.T @ work_f @ turn, work_c @ turn, basis @ turn
+        seen -= kernel.shape[1]
+        for other in cluster[:found]:
+            waiting.remove(other)
+    hidden = eigenvalues(work_f[seen:, seen:])
+    return ObservableSplit(basis, units, work_f[:seen, :seen], work_c[:, :seen], hidden)
+
+
+def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float) -> FloatArray:
+    """Return a real orthonormal basis of the states that stay invisible at the mode, and at its conjugate."""
+    shifted = f - (value if value.imag else value.real) * np.eye(f.shape[0])
+    _, values, right = np.linalg.svd(np.vstack([shifted, c]))
+    kernel = right[values <= HIDDEN_MODE_TOLERANCE * max(size, abs(value))].conj().T
+    if value.imag == 0.0:
+        return np.asarray(kernel.real)
+    both = np.hstack([kernel.real, kernel.imag])
+    if both.shape[1] == 0:
+        return both
+    left, lengths, _ = np.linalg.svd(both, full_matrices=False)
+    return np.asarray(left[:, lengths > RANK_TOLERANCE])
+
+
+def _balancing(f: FloatArray, c: FloatArray) -> FloatArray:
+    """Return state factors that make entries of F, and of C, alike; F's size is free, as it may be reducible."""
+    n = f.shape[0]
+    problem = LogBalance(n + 2)
+    states = range(n)
+    links = np.where(np.eye(n, dtype=bool), 0.0, f)
+    # All outputs together: which combinations of them are looked at must not matter.
+    shown = np.linalg.norm(c, axis=0, keepdims=True)
+    floor_f, floor_c = (CANCELLATION_TOLERANCE * float(np.max(np.abs(part), initial=0.0)) for part in (f, shown))
+    problem.add(np.where(np.abs(links) > floor_f, f, 0.0), states, states, signs=(-1, 1), common=n)
+    problem.add(np.where(shown > floor_c, shown, 0.0), range(n + 1, n + 2), states)
+    for state in states:
+        problem.wish(state, 0.0)
+    return np.asarray(np.exp2(problem.solve()[:n]))

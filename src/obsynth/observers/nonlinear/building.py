@@ -1,0 +1,236 @@
+"""An observer of a DAE from a model and plain options, and what is known of it from a run at nominal inputs.
+
+Used to design one, and to check the one that was shipped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.dae_structure import Identifiability, identifiability, index_report
+from obsynth.errors import SolverError, SpecError
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.lapack import pencil_eigenvalues
+from obsynth.observers.nonlinear.estimates import DAERow, GatheredRows
+from obsynth.observers.nonlinear.observer import DAEObserver, advanced
+from obsynth.observers.records import named_bounds, named_covariance, named_vector
+from obsynth.plants.dae import DAEModel, step_length
+from obsynth.plants.dae_functions import local_equations
+
+#: Radians that a mode may turn in one step of backward Euler: its amplitude then falls by an eighth of a per cent.
+LARGEST_TURN = 0.05
+
+#: Eigenvalues above this, per second times dt, are those at infinity, up to rounding.
+INFINITE = 1e8
+
+
+#: Deviation of an initial state that is not stated, as a share of its nominal size.
+DEFAULT_STATE_SHARE = 0.01
+
+#: Deviation of an initial parameter that is not stated, as a share of its nominal value.
+DEFAULT_PARAMETER_SHARE = 0.1
+
+#: Options that are fields of the observer as they are given.
+AS_GIVEN = (
+    "forgetting",
+    "guard",
+    "weight",
+    "largest_move",
+    "window",
+    "outliers",
+    "outlier_limit",
+    "outlier_sizes",
+    "sensors",
+    "state_bounds",
+    "reset",
+)
+
+OPTIONS = (
+    "dt",
+    "Q",
+    "R",
+    "form",
+    "integration",
+    "random_walk",
+    "initial_state",
+    "initial_covariance",
+    "initial_parameters",
+    "initial_parameter_covariance",
+    "bounds",
+    *AS_GIVEN,
+)
+
+
+#: Steps of the nominal run; where a plant leaves its nominal point for where its equations have no solution, so small a
+#: share of the steps to there, and the fewest that say anything.
+NOMINAL_STEPS, SHARE_OF_SOLVED, FEWEST_STEPS = 100, 0.5, 2
+
+
+def largest_turn(model: DAEModel, dt: float) -> float:
+    """Return by how many radians the fastest oscillation at the nominal point turns in a step."""
+    local = local_equations(
+        model, np.zeros(model.nx), model.nominal_state, model.nominal_input, model.nominal_parameters
+    )
+    if not local.is_defined:
+        return 0.0
+    above, below = pencil_eigenvalues(-local.by_state * model.state_scales, local.E * model.state_scales)
+    finite = np.abs(below) * INFINITE > np.abs(above) * dt
+    turns = np.abs((above[finite] / below[finite]).imag) * dt
+    return float(turns.max(initial=0.0))
+
+
+def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DAEObserver:
+    """Return the observer that options stand for."""
+    states, parameters = model.state_names, model.parameter_names
+    form, integration = options["form"], options["integration"]
+    if form == "auto":
+        form = "forgetting" if options["random_walk"] is None else "random-walk"
+    if integration == "auto":
+        turns_far = largest_turn(model, step_length(options["dt"])) > LARGEST_TURN
+        integration = "radau" if turns_far else "backward-euler"
+    bounds = named_bounds(options["bounds"], parameters, "bounds")
+    return DAEObserver(
+        model=model,
+        dt=options["dt"],
+        Q=named_covariance(options["Q"], model.equation_names, "Q", None),
+        R=named_covariance(options["R"], model.output_names, "R", None),
+        initial_state=named_vector(options["initial_state"], states, model.nominal_state, "initial_state"),
+        initial_covariance=named_covariance(
+            options["initial_covariance"],
+            states,
+            "initial_covariance",
+            (DEFAULT_STATE_SHARE * model.state_scales) ** 2,
+        ),
+        initial_parameters=named_vector(
+            options["initial_parameters"], parameters, model.nominal_parameters, "initial_parameters"
+        ),
+        initial_parameter_covariance=named_covariance(
+            options["initial_parameter_covariance"],
+            parameters,
+            "initial_parameter_covariance",
+            _default_parameter_variances(model, options["initial_parameter_covariance"]),
+        ),
+        random_walk=named_covariance(options["random_walk"], parameters, "random_walk", np.zeros(model.nq)),
+        lower=bounds[:, 0],
+        upper=bounds[:, 1],
+        form=form,
+        integration=integration,
+        **{name: options[name] for name in AS_GIVEN if name in options},
+    )
+
+
+def resolved_options(observer: DAEObserver) -> dict[str, Any]:
+    """Return every option as it was resolved, plain data: the observer can be built from them again."""
+    bounds = read_only(np.column_stack([observer.lower, observer.upper]))
+    return {name: bounds if name == "bounds" else getattr(observer, name) for name in OPTIONS}
+
+
+def _default_parameter_variances(model: DAEModel, given: Any) -> FloatArray:
+    sizes = np.abs(model.nominal_parameters)
+    if given is None and not sizes.all():
+        name = model.parameter_names[int(np.argmin(sizes))]
+        raise SpecError(
+            f"initial_parameter_covariance is missing, and the nominal value of {name!r} is zero: state how large it "
+            "may be.",
+            path="initial_parameter_covariance",
+        )
+    return np.asarray((DEFAULT_PARAMETER_SHARE * sizes) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class DAEFacts:
+    """Facts of a nominal run."""
+
+    index: int  # at the nominal point, 0 where (7) is always singular
+    condition: float  # largest condition number of (7) along the run
+    condition_k: int  # the sample at which it is largest
+    residual: float  # largest scaled Newton residual
+    contraction: float  # spectral radius of F (I - K H) at the end
+    deviations: FloatArray  # ``(nq,)``: standard deviations of the parameters at the end
+    # ``(nq, nq)``: of the parameters' errors at the end: how much a change of one is taken for another
+    correlations: FloatArray
+    projection: FloatArray  # ``(nx,)``: how far the initial state is moved onto its constraint
+    identifiable: Identifiability  # of states and parameters along the nominal trajectory
+    K: FloatArray  # ``(nx, ny)`` at the end
+    Upsilon: FloatArray  # ``(nx, nq)`` at the end
+    kept: FloatArray  # ``(steps, nx, nx)``: F (I - K H) of every step
+    parameter_covariance: FloatArray  # ``(nq, nq)`` at the end
+
+    @property
+    def steps(self) -> int:
+        """Steps of the run."""
+        return len(self.kept)
+
+    @property
+    def decay_time(self) -> float:
+        """Steps in which an error of the state filter falls to 1/e; infinite where it does not."""
+        if not 0.0 < self.contraction < 1.0:
+            return 0.0 if self.contraction == 0.0 else float("inf")
+        return float(-1.0 / np.log(self.contraction))
+
+
+def dae_facts(observer: DAEObserver) -> DAEFacts:
+    """Run an observer on its own model at nominal inputs and parameters."""
+    model = observer.model
+    u = np.array(model.nominal_input)
+    outputs = _nominal_outputs(observer, u)
+    gathered, kept = GatheredRows(observer), []
+
+    def add(rows: DAERow) -> None:
+        gathered.add(rows)
+        kept.append(np.array(rows.several.part("kept")))
+
+    end = advanced(observer.steps, outputs, np.tile(u, (len(outputs), 1)), add)
+    found = gathered.estimates()
+    covariance = found.parameter_covariances[-1]
+    deviations = np.sqrt(np.diag(covariance))
+    safe = np.where(deviations > 0.0, deviations, 1.0)
+    identifiable = identifiability(
+        model,
+        np.tile(u, (len(outputs), 1)),
+        dt=observer.dt,
+        R=observer.R,
+        method=observer.integration,
+        initial_state=observer.initial_state,
+        parameters=observer.initial_parameters,
+        parameter_scales=np.sqrt(np.diag(observer.initial_parameter_covariance)),
+    )
+    return DAEFacts(
+        index_report(model, observer.dt, x=found.states[-1], u=u, theta=found.parameters[-1]).index,
+        float(found.conditions.max()),
+        int(np.argmax(found.conditions)),
+        float(found.residuals.max()),
+        float(found.contraction[-1]),
+        read_only(deviations),
+        read_only(covariance / np.outer(safe, safe)),
+        found.projection,
+        identifiable,
+        read_only(observer.steps.part(end, "K")),
+        read_only(observer.steps.part(end, "Upsilon")),
+        read_only(np.concatenate(kept)[1:]),
+        read_only(covariance),
+    )
+
+
+def _nominal_outputs(observer: DAEObserver, u: FloatArray) -> FloatArray:
+    """Return the outputs of the model from the observer's initial state, without noise.
+
+    Inputs that a controller moves are constant here: an unstable plant, or a tank whose flows are not in balance, goes
+    to where its equations have no solution, and what is near to that is no nominal run.
+    """
+    step, outputs = observer.steps.implicit, list[FloatArray]()
+    x, theta = np.array(observer.initial_state), np.array(observer.initial_parameters)
+    for k in range(NOMINAL_STEPS + 1):
+        try:
+            x = step.solve(x, u, theta, k=k).x
+        except SolverError:
+            kept = int(SHARE_OF_SOLVED * len(outputs))
+            if kept <= FEWEST_STEPS:  # the first is none
+                raise
+            return np.array(outputs[:kept])
+        outputs.append(step.functions.outputs(x, theta)[0])
+    return np.array(outputs)

@@ -1,0 +1,263 @@
+"""The eleven steps of each sample as one CasADi graph, the only place where they are written.
+
+The order makes (12)-(23) explicit: prediction and its covariance with K, H and L of k - 1; the innovation before any
+update; the parameters; the state that follows them; H, L and K at the result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from obsynth.numerics import lazy_casadi as ca
+from obsynth.numerics.newton import definite_solved
+from obsynth.observers.nonlinear.settings import DAESettings, Layout, memory_layout, row_layout
+from obsynth.plants.dae_functions import DAEFunctions
+from obsynth.plants.implicit_step import StepGraph, input_effect, step_graph
+
+Arrays = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverGraph:
+    """The functions of an observer."""
+
+    settings: DAESettings
+    memory: Layout  # memory, row: of what is carried on, and of what is said besides
+    row: Layout
+    functions: DAEFunctions  # the model with its method of integration
+    step: StepGraph  # its implicit step
+    first: Any  # from memory, outputs and one for each that is seen, at k = 0, to memory and row
+    # from memory, stages of the solved step, input, outputs, what is seen, and what `unknown` says, to memory and row
+    sample: Any
+    whole: Any  # the implicit step and `sample`: from memory and ``[u; y; seen]`` to memory and row
+    _stretches: dict[int, Any] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def unknown(self) -> Any:
+        """From memory, stages, inputs and variances of these to what missing inputs add to the covariance; `None`
+        without inputs."""
+        if not self.settings.model.nu:
+            return None
+        effect = input_effect(self.functions, self.settings.dt)
+        packed, variances = ca.MX.sym("memory", self.memory.size), ca.MX.sym("variances", self.settings.model.nu)
+        X, u = effect.mx_in(0), effect.mx_in(2)
+        before = self.memory.symbols(packed)
+        moved = effect(X, before["posterior"], u, before["theta"])
+        return ca.Function("unknown", [packed, X, u, variances], [moved @ ca.diag(variances) @ moved.T])
+
+    @cached_property
+    def forecast(self) -> Any:
+        """From memory and row of a sample that nothing was seen of to mean and covariance of its outputs."""
+        packed, said = ca.MX.sym("memory", self.memory.size), ca.MX.sym("said", self.row.size)
+        found = {**self.memory.symbols(packed), **self.row.symbols(said)}
+        spread = found["spread"]
+        y, H, L = self.functions.output_function(found["posterior"], found["theta"])
+        cross = found["cross"] if self.settings.form == "augmented-kalman" else found["Upsilon"] @ spread
+        both = H @ cross @ L.T
+        whole = H @ found["covariance"] @ H.T + both + both.T + L @ spread @ L.T + ca.DM(self.settings.R)
+        return ca.Function("forecast", [packed, said], [ca.densify(y), ca.densify(whole)])
+
+    def over(self, samples: int) -> Any:
+        """Return `whole` over several samples: from memory and arriving columns to columns of memory and row."""
+        if samples not in self._stretches:
+            self._stretches[samples] = self.whole.mapaccum(samples)
+        return self._stretches[samples]
+
+
+def observer_graph(observer: DAESettings) -> ObserverGraph:
+    """Return the functions of an observer."""
+    functions = DAEFunctions(observer.model, observer.integration)
+    step = step_graph(functions, observer.dt, np.inf if observer.largest_move is None else observer.largest_move)
+    memory, row = memory_layout(observer), row_layout(observer)
+    nx, nu, ny = observer.model.nx, observer.model.nu, observer.model.ny
+    packed, X = ca.MX.sym("memory", memory.size), ca.MX.sym("stages", nx * functions.stages)
+    u, y, seen = ca.MX.sym("u", nu), ca.MX.sym("y", ny), ca.MX.sym("seen", ny)
+    missing = ca.MX.sym("missing", nx, nx)
+    nothing = {name: ca.MX(*shape) for name, shape in row.shapes.items()}
+    begun = {**nothing, **memory.symbols(packed)}
+    first = ca.Function(
+        "first", [packed, y, seen], _outcome(_Update(observer, functions, y, seen).first(begun), memory, row)
+    )
+    before = memory.symbols(packed)
+    local = step.sensitivities(X, before["posterior"], u, before["theta"])
+    predicted = _predicted(observer, before, X[-nx:], local, missing)
+    found = {**nothing, **_Update(observer, functions, y, seen).later(predicted)}
+    sample = ca.Function("sample", [packed, X, u, y, seen, missing], _outcome(found, memory, row))
+    if step.small:
+        first, sample = first.expand(), sample.expand()
+    arriving = ca.MX.sym("arriving", nu + 2 * ny)
+    u, y, seen = arriving[:nu], arriving[nu : nu + ny], arriving[nu + ny :]
+    before = memory.symbols(packed)
+    stages, residual, trusted = step.step(before["posterior"], u, before["theta"])
+    after, said = sample(packed, stages, u, y, seen, ca.DM.zeros(nx, nx))
+    # The residual and the verdict are the last two entries of a row.
+    said = ca.vertcat(said[: row.size - 2], residual, trusted)
+    whole = ca.Function("whole", [packed, arriving], [after, said])
+    return ObserverGraph(observer, memory, row, functions, step, first, sample, whole)
+
+
+def _outcome(found: Arrays, memory: Layout, row: Layout) -> list[Any]:
+    return [memory.column(found), row.column(found)]
+
+
+def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, ...], missing: Any) -> Arrays:
+    """Steps 1 to 5: the prediction and its covariance, with K, H and L of k - 1, and what missing inputs add."""
+    F, G, noise, scaled = local
+    P, K, H, L, spread = (before[name] for name in ("P", "K", "H", "L", "spread"))
+    added = noise @ ca.DM(observer.Q) @ noise.T + missing
+    kept = ca.DM.eye(observer.model.nx) - K @ H
+    after = {**before, "x": x, "F": F, "G": G, "noise": noise, "missing": missing, "kept": F @ kept,
+             "scaled": scaled}  # fmt: skip
+    carried = F @ (kept @ before["Upsilon"] - K @ L)
+    if observer.form != "forgetting":
+        # The parameters of a sample act in the step that leads there: they have walked already.
+        after["spread"] = walked = spread + ca.DM(observer.random_walk)
+    if observer.form == "augmented-kalman":
+        through = F @ before["cross"] @ G.T
+        P = F @ P @ F.T + through + through.T + G @ walked @ G.T + added
+        after["cross"] = F @ before["cross"] + G @ walked
+    else:
+        P = F @ (kept @ P @ kept.T + K @ ca.DM(observer.R) @ K.T) @ F.T + added
+    if observer.form == "random-walk" and observer.random_walk.any():
+        # What was learnt holds for the parameters before their walk: a share of it holds for those after, and what
+        # that leaves open is noise of the state alone (Hsieh and Chen 1999), so that both stay uncorrelated.
+        kept_share = definite_solved(walked, spread).T
+        left = spread - kept_share @ spread
+        P, carried = P + carried @ (0.5 * (left + left.T)) @ carried.T, carried @ kept_share
+        after["S"] = before["S"] + ca.DM(observer.random_walk)
+    after["P"] = 0.5 * (P + P.T)
+    after["Upsilon"] = carried + G
+    return after
+
+
+class _Update:
+    """The measurement of one sample; a channel that is not seen has an innovation of zero and no gain."""
+
+    def __init__(self, observer: DAESettings, functions: DAEFunctions, y: Any, seen: Any) -> None:
+        self.observer, self.functions, self.y, self.seen = observer, functions, y, seen
+        # The rows and columns of R that are not seen become those of the identity, which nothing else touches.
+        self.R = ca.DM(observer.R) * (seen @ seen.T) + ca.diag(1.0 - seen)
+
+    def first(self, found: Arrays) -> Arrays:
+        """Correct the state only: y(0) says nothing of the parameters that the start does not."""
+        innovation = self._innovation(found)
+        return self._joint(innovation, learns=False) if self._is_joint else self._corrected(innovation)
+
+    def later(self, found: Arrays) -> Arrays:
+        """Update parameters and state."""
+        innovation = self._innovation(found)
+        return self._joint(innovation, learns=True) if self._is_joint else self._corrected(self._learnt(innovation))
+
+    @property
+    def _is_joint(self) -> bool:
+        return self.observer.form == "augmented-kalman"
+
+    def _seen_outputs(self, found: Arrays) -> tuple[Any, Any, Any, Any, Any]:
+        """Return H and L as they are, and innovation, H and L with zeros where nothing is seen."""
+        predicted, H, L = self.functions.output_function(found["x"], found["theta"])
+        mask = ca.diag(self.seen)
+        return H, L, self.seen * (self.y - predicted), mask @ H, mask @ L
+
+    def _innovation(self, found: Arrays) -> Arrays:
+        """Step 6, with the square of the innovation in units of its covariance and what it says of the parameters."""
+        _, _, e, H, L = self._seen_outputs(found)
+        Sigma = H @ found["P"] @ H.T + self.R
+        Omega = H @ found["Upsilon"] + L
+        if self._is_joint:
+            through = H @ found["cross"] @ L.T
+            covariance = Sigma + through + through.T + L @ found["spread"] @ L.T
+        else:
+            covariance = Sigma + Omega @ found["spread"] @ Omega.T
+        return {
+            **found,
+            "innovation": e,
+            "expected": covariance,
+            "nis": e.T @ definite_solved(covariance, e),
+            "Sigma": Sigma,
+            "Omega": Omega,
+            "information": Omega.T @ definite_solved(Sigma, Omega),
+            "score": Omega.T @ definite_solved(Sigma, e + Omega @ found["theta"]),
+            "seen H": H,
+            "seen L": L,
+        }
+
+    def _learnt(self, found: Arrays) -> Arrays:
+        """Steps 7 to 9 and 11: (17)-(19); a sample without a measurement changes nothing."""
+        observer, Sigma, Omega = self.observer, found["Sigma"], found["Omega"]
+        prior, spread = self._remembered(found["S"]), found["spread"]
+        weight = self.R if observer.weight == "paper" else Sigma
+        gain = definite_solved(weight + Omega @ prior @ Omega.T, Omega @ prior).T
+        S = prior - gain @ Omega @ prior
+        kept = ca.DM.eye(observer.model.nq) - gain @ Omega
+        theta = self._bounded(found["theta"] + gain @ found["innovation"])
+        spread = kept @ spread @ kept.T + gain @ Sigma @ gain.T
+        after = {
+            "S": 0.5 * (S + S.T),
+            "spread": 0.5 * (spread + spread.T),
+            "theta": theta,
+            "x": found["x"] + found["Upsilon"] @ (theta - found["theta"]),
+        }
+        anything = ca.sum1(self.seen) > 0.0
+        return {**found, **{name: ca.if_else(anything, value, found[name]) for name, value in after.items()}}
+
+    def _remembered(self, S: Any) -> Any:
+        """Return S / lambda, or S that has walked, or what is left of the information beside that of S_0."""
+        observer = self.observer
+        if observer.form == "random-walk":
+            return S
+        if observer.guard == "none" or observer.forgetting == 1.0:
+            return S / observer.forgetting
+        one = ca.MX(ca.DM.eye(observer.model.nq))
+        start = np.linalg.inv(observer.initial_parameter_covariance) if observer.model.nq else np.zeros((0, 0))
+        kept = observer.forgetting * definite_solved(S, one) + (1.0 - observer.forgetting) * ca.DM(start)
+        prior = definite_solved(kept, one)
+        return 0.5 * (prior + prior.T)
+
+    def _bounded(self, theta: Any) -> Any:
+        entries = ca.vertsplit(theta) if theta.shape[0] else []
+        for i, (low, high) in enumerate(zip(self.observer.lower, self.observer.upper, strict=True)):
+            entries[i] = ca.fmax(entries[i], low) if np.isfinite(low) else entries[i]
+            entries[i] = ca.fmin(entries[i], high) if np.isfinite(high) else entries[i]
+        return ca.vertcat(*entries) if entries else theta
+
+    def _corrected(self, found: Arrays) -> Arrays:
+        """Step 10: the gain at the updated estimate, the state after the measurement, and its covariance."""
+        full_H, full_L, e, H, _ = self._seen_outputs(found)
+        P = found["P"]
+        K = definite_solved(H @ P @ H.T + self.R, H @ P).T @ ca.diag(self.seen)
+        kept = ca.DM.eye(self.observer.model.nx) - K @ full_H
+        through = kept @ found["Upsilon"] - K @ full_L
+        own = kept @ P @ kept.T + K @ ca.DM(self.observer.R) @ K.T
+        covariance = own + through @ found["spread"] @ through.T
+        return {**found, "H": full_H, "L": full_L, "K": K, "posterior": found["x"] + K @ e, "covariance": covariance}
+
+    def _joint(self, found: Arrays, *, learns: bool) -> Arrays:
+        """Update states and parameters together, in Joseph's form."""
+        nx, nq = self.observer.model.nx, self.observer.model.nq
+        P, cross, spread, H, L = (found[name] for name in ("P", "cross", "spread", "seen H", "seen L"))
+        whole = ca.vertcat(ca.horzcat(P, cross), ca.horzcat(cross.T, spread))
+        rows, mask = ca.horzcat(H, L), ca.diag(self.seen)
+        if learns:
+            gain = definite_solved(rows @ whole @ rows.T + self.R, rows @ whole).T @ mask
+        else:
+            gain = ca.vertcat(definite_solved(H @ P @ H.T + self.R, H @ P).T @ mask, ca.DM.zeros(nq, mask.shape[0]))
+        kept = ca.DM.eye(nx + nq) - gain @ rows
+        whole = kept @ whole @ kept.T + gain @ self.R @ gain.T
+        whole = 0.5 * (whole + whole.T)
+        correction = gain @ found["innovation"]
+        after = {
+            **found,
+            "P": whole[:nx, :nx],
+            "cross": whole[:nx, nx:],
+            "spread": whole[nx:, nx:],
+            "x": found["x"] + correction[:nx],
+            "theta": self._bounded(found["theta"] + correction[nx:]),
+            "K": gain[:nx, :],
+            "covariance": whole[:nx, :nx],
+        }
+        full_H, full_L, *_ = self._seen_outputs(after)
+        return {**after, "H": full_H, "L": full_L, "posterior": after["x"]}

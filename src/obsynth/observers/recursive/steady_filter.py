@@ -1,0 +1,223 @@
+"""The steady state of the descriptor Kalman filter of a time-invariant plant, from its algebraic Riccati equation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.analysis.existence.condition import Condition, require_all
+from obsynth.analysis.existence.recursive import described_mode, recursive_conditions
+from obsynth.analysis.time_varying import as_time_varying
+from obsynth.errors import SolverError, SpecError
+from obsynth.numerics.arguments import arguments_checked, require_shape
+from obsynth.numerics.arrays import FloatArray, as_matrix, read_only, require_no_overflow
+from obsynth.numerics.invariant_zeros import are_outside
+from obsynth.numerics.matrix_equations import discrete_lyapunov, discrete_riccati
+from obsynth.numerics.norms import spectral_radius
+from obsynth.numerics.pencils import finite_zeros
+from obsynth.numerics.ranks import BOUNDARY_TOLERANCE, CANCELLATION_TOLERANCE, covariance_factor, decide_rank
+from obsynth.numerics.square_root_estimation import least_squares_step, rank_revealing_step
+from obsynth.observers.recursive.gain_schedule import MOST_SETTLING_STEPS
+from obsynth.observers.recursive.step_model import stacked_noise
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.recovery import Transformation
+
+#: The solution must satisfy its equation to this share of its size: half the digits.
+RICCATI_TOLERANCE = 1e-8
+
+#: Newton steps after the recursion: each doubles the digits.
+MOST_RICCATI_STEPS = 50
+
+
+@dataclass(frozen=True, eq=False)
+class SteadyState:
+    """What the filter converges to.
+
+    Parameters
+    ----------
+    P : FloatArray
+        ``(nx, nx)``: covariance of the estimate.
+    P_predicted : FloatArray
+        ``(ne, ne)``: ``A P A' + Q``, the unknown of (16).
+    L, K : FloatArray
+        ``(nx, ne)`` and ``(nx, ny)``: the gains (11).
+    rate : float
+        Factor per step by which the distance of P to its limit shrinks: the squared spectral radius of L A.
+    """
+
+    P: FloatArray
+    P_predicted: FloatArray
+    L: FloatArray
+    K: FloatArray
+    rate: float
+
+
+@arguments_checked
+def steady_state_filter(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | Transformation, *, Q: ArrayLike, R: ArrayLike
+) -> SteadyState:
+    r"""Return the steady state of the descriptor Kalman filter.
+
+    Solves (16) for the inverse of P, where Q and R are definite:
+
+    .. math::
+        X = E^T Q^{-1} E + C^T R^{-1} C - E^T Q^{-1} A (A^T Q^{-1} A + X)^{-1} A^T Q^{-1} E, \qquad P = X^{-1}
+
+    Parameters
+    ----------
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem or Transformation
+        Time-invariant, discrete; ``E (ne, nx)``, ``C (ny, nx)``.
+    Q, R : array_like
+        ``(ne, ne)`` and ``(ny, ny)``, may be singular; a number stands for that multiple of the identity.
+
+    Returns
+    -------
+    SteadyState
+        Covariances, gains, and the rate of convergence per step (dimensionless).
+
+    Raises
+    ------
+    SpecError
+        The plant changes with k, or Q or R is no covariance.
+    PreconditionError
+        ``rank [E; C] < nx``, an undetectable mode, or a mode on the unit circle that no noise reaches: the covariance
+        then tends to zero like ``1 / k``, and no stabilising solution exists.
+    SolverError
+        No solution was found that passes its own residual; the recursion may still converge.
+
+    Notes
+    -----
+    (16) needs Q and R definite.  Where they are singular (equations or outputs that hold exactly) or ill-conditioned,
+    the fixed point of the filter's own step is found by Newton's method (Kleinman), from gains that the recursion has
+    made stable.
+
+    References
+    ----------
+    .. [MoussaAli2013] Fault diagnosis for linear time-varying descriptor systems, IFAC ALCOSP 2013, eq. (16).
+    """
+    varying = as_time_varying(plant)
+    if not varying.is_time_invariant:
+        raise SpecError("The plant changes with k: it has no steady state.", path="plant")
+    require_all(recursive_conditions(varying, parameters=False))
+    q, r = as_matrix(Q, "Q"), as_matrix(R, "R")
+    q, r = (
+        float(found[0, 0]) * np.eye(size) if np.ndim(given) == 0 else found
+        for given, found, size in ((Q, q, varying.ne), (R, r, varying.ny))
+    )
+    for name, matrix, size in (("Q", q, varying.ne), ("R", r, varying.ny)):
+        require_shape(matrix.shape, (size, size), name)
+        require_no_overflow(matrix, name, name)
+    roots = covariance_factor(q, "Q"), covariance_factor(r, "R")
+    reached_condition(varying, *roots).require()
+    E, A, C = varying.E.at(1), varying.A.at(0), varying.C.at(1)
+    noise = stacked_noise(*roots)
+    P = _from_riccati(E, A, C, q, r) if decide_rank(q).full and decide_rank(r).full else None
+    if P is None or not _is_fixed(P, _step(E, A, C, noise, _root(P))[1]):
+        P = _from_recursion(E, A, C, noise)
+    gain, found = _step(E, A, C, noise, _root(P))
+    if not _is_fixed(P, found):
+        raise SolverError("The solution of the Riccati equation (16) fails its own residual. Run the filter instead.")
+    L, K = gain[:, : varying.ne], gain[:, varying.ne :]
+    return SteadyState(
+        read_only(P), read_only(A @ P @ A.T + q), read_only(L), read_only(K), spectral_radius(L @ A) ** 2
+    )
+
+
+def reached_condition(plant: TimeVaryingDescriptorSystem, Q_root: FloatArray, R_root: FloatArray) -> Condition:
+    """Return the condition that noise reaches every mode on the unit circle, so that the gains never fall asleep."""
+    E, A, C = plant.E.at(1), plant.A.at(0), plant.C.at(1)
+    noise = stacked_noise(Q_root, R_root)
+    wide_e = np.hstack([np.vstack([E, C]), np.zeros_like(noise)])
+    wide_a = np.hstack([np.vstack([A, np.zeros_like(C)]), noise])
+    zeros = finite_zeros(wide_e, wide_a, to_the_end=False)
+    outside = are_outside(wide_e, wide_a, zeros, plant.dt)
+    on_circle = [
+        complex(z) for z, out in zip(zeros.values, outside, strict=True) if out and abs(z) <= 1.0 + BOUNDARY_TOLERANCE
+    ]
+    listed = ", ".join(described_mode(z) for z in on_circle if z.imag >= 0.0)
+    detail = (
+        "no mode lies on the unit circle unreached"
+        if not on_circle
+        else (
+            f"at z = {listed} the noise does not act: what is known there grows without end, so that the gains tend "
+            "to zero like 1 / k and later changes are not followed. Give the equations that move this "
+            "mode a variance in Q."
+        )
+    )
+    return Condition(
+        "noise on the unit circle",
+        "[A - zE, Q^(1/2), 0; -zC, 0, R^(1/2)] has its full rank for all |z| = 1",
+        not on_circle,
+        float(len(on_circle)),
+        0.0,
+        "Nikoukhah, Willsky, Levy 1992",
+        detail,
+        on_circle[0] if on_circle else None,
+    )
+
+
+def _is_fixed(P: FloatArray, following: FloatArray) -> bool:
+    return bool(np.linalg.norm(following - P) <= RICCATI_TOLERANCE * np.linalg.norm(P))
+
+
+def _from_riccati(E: FloatArray, A: FloatArray, C: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray | None:
+    """Solve (16) for the inverse of P; return ``None`` where the solver finds nothing."""
+
+    n = E.shape[1]
+    weighted = np.linalg.solve(q, np.hstack([E, A]))
+    known = E.T @ weighted[:, :n] + C.T @ np.linalg.solve(r, C)
+    cross, square = E.T @ weighted[:, n:], A.T @ weighted[:, n:]
+    try:
+        inverse = discrete_riccati(
+            np.zeros((n, n)), np.eye(n), 0.5 * (known + known.T), 0.5 * (square + square.T), e=np.eye(n), s=cross
+        )
+        P = np.linalg.inv(inverse)
+    except (np.linalg.LinAlgError, ValueError):  # SciPy raises ValueError where it cannot reorder the Schur form
+        return None
+    return np.asarray(0.5 * (P + P.T), dtype=np.float64)
+
+
+def _from_recursion(E: FloatArray, A: FloatArray, C: FloatArray, noise: FloatArray) -> FloatArray:
+    """Find the fixed point of the step by Newton's method."""
+
+    P, ne = np.eye(E.shape[1]), len(E)
+    gain, following = _step(E, A, C, noise, _root(P))
+    for _ in range(MOST_SETTLING_STEPS):
+        if spectral_radius(gain[:, :ne] @ A) < 1.0:
+            break
+        P = following
+        gain, following = _step(E, A, C, noise, _root(P))
+    else:
+        raise SolverError(
+            f"The gains of the filter are not stable after {MOST_SETTLING_STEPS} steps: its convergence is too "
+            "slow for a steady state. Run the filter instead."
+        )
+    for _ in range(MOST_RICCATI_STEPS):
+        driven = gain @ noise
+        last, P = P, discrete_lyapunov(gain[:, :ne] @ A, driven @ driven.T)
+        P = np.asarray(0.5 * (P + P.T))
+        gain, _ = _step(E, A, C, noise, _root(P))
+        if np.linalg.norm(P - last) <= CANCELLATION_TOLERANCE * np.linalg.norm(P):
+            break
+    return P
+
+
+def _step(
+    E: FloatArray, A: FloatArray, C: FloatArray, noise: FloatArray, root: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``[L K]`` and the covariance after one step from ``root root'``."""
+    H = np.vstack([E, C])
+    S = np.hstack([np.vstack([A @ root, np.zeros((len(C), root.shape[1]))]), noise])
+    S = np.hstack([S, np.zeros((len(H), max(len(H) - S.shape[1], 0)))])
+    data = np.eye(len(H))
+    found = least_squares_step(H, S, data) or rank_revealing_step(H, S, data, np.zeros((len(H), 0)), mapped=len(H))
+    return found.estimate, np.asarray(found.factor @ found.factor.T)
+
+
+def _root(P: FloatArray) -> FloatArray:
+    """Return a square root of a covariance that rounding may have left slightly indefinite."""
+    values, vectors = np.linalg.eigh(P)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -1,0 +1,1 @@
+"""Observers that are finite windows of samples."""

@@ -1,0 +1,279 @@
+"""One implicit step of a DAE: Newton, then homotopy in the input, with sensitivities and the residual that is left.
+
+As CasADi functions the iteration is the undamped one of `obsynth.numerics.newton`; where that would damp, lead the
+input along a homotopy, or give up, the step is not to be trusted, and `ImplicitStep.solve_carefully` takes it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SolverError
+from obsynth.numerics import lazy_casadi as ca
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.newton import (
+    LARGEST_RESIDUAL,
+    LAST_STEP,
+    MOST_ITERATIONS,
+    SMALL,
+    NewtonResult,
+    equilibrated,
+    newton,
+    solved,
+)
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.dae_functions import Compiled, DAEFunctions
+
+#: Iterations that every step takes, and further ones in blocks for those that need them.  From the last sample's state
+#: three or four are the rule.
+BLOCKS = (4, 4, 8, MOST_ITERATIONS - 16)
+
+
+#: First fraction of a homotopy; it grows twofold after each success and is halved after each failure.
+FIRST_FRACTION = 0.125
+
+#: A homotopy that needs smaller fractions than this, or more sub-solves, is not going anywhere.
+LEAST_FRACTION = 2.0**-20
+
+MOST_SUBSOLVES = 10_000
+
+
+#: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
+PROJECTION_SHARE = 1e-6
+
+#: Smaller moves, in sizes of the states, are the motion during that step and no projection.
+PROJECTION_NOTICE = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class StepGraph:
+    """The functions of one implicit step of fixed length."""
+
+    newton: Any  # (stages, state before, input, parameters) -> residual, row scales, step
+    sensitivities: Any  # the same -> F of (8), G of (9), that of what is added, the matrix of (7)
+    step: Any  # the same -> stages, residual, 1 if trusted
+    small: bool  # all is scalar operations
+
+
+def step_graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepGraph:
+    """Return the functions of one implicit step."""
+    graphs, key = functions.model.graphs, (functions.method, dt, largest_move)
+    if key not in graphs:
+        graphs[key] = _graph(functions, dt, largest_move)
+    found: StepGraph = graphs[key]
+    return found
+
+
+def _graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepGraph:
+    model, stages = functions.model, functions.stages
+    n = model.nx * stages
+    sizes = np.tile(model.state_scales, stages)
+    X, x = ca.MX.sym("X", n), ca.MX.sym("x", model.nx)
+    u, theta = ca.MX.sym("u", model.nu), ca.MX.sym("theta", model.nq)
+    point = [X, x, u, theta]
+    value, J = functions.residual_function(*point, dt)
+    scaled, rows = equilibrated(J, sizes)
+    newton = ca.Function("newton", point, [value, rows, sizes * solved(scaled, -rows * value)])
+    J, start, parameters = functions.derivative_function(*point, dt)
+    scaled, rows = equilibrated(J, sizes)
+    right = ca.horzcat(-start, -parameters, ca.repmat(ca.DM.eye(model.nx), stages, 1))
+    width = right.shape[1]
+    moved = ca.repmat(ca.DM(sizes), 1, width) * solved(scaled, ca.repmat(rows, 1, width) * right)
+    nx, last, noise = model.nx, slice(n - model.nx, n), slice(model.nx + model.nq, width)
+    local = ca.Function(
+        "sensitivities", point, [moved[last, :nx], moved[last, nx : noise.start], moved[last, noise], scaled]
+    )
+    if n <= SMALL:
+        newton, local = newton.expand(), local.expand()
+    return StepGraph(newton, local, _whole(newton, sizes, stages, largest_move), n <= SMALL)
+
+
+def input_effect(functions: DAEFunctions, dt: float) -> Any:
+    """Return the function from stages, state before, input and parameters to the derivative of a solved step by the
+    input ``(nx, nu)``."""
+    model, stages = functions.model, functions.stages
+    n = model.nx * stages
+    sizes = np.tile(model.state_scales, stages)
+    point = [ca.MX.sym(name, size) for name, size in (("X", n), ("x", model.nx), ("u", model.nu), ("theta", model.nq))]
+    value, J = functions.residual_function(*point, dt)
+    scaled, rows = equilibrated(J, sizes)
+    right = -ca.densify(ca.jacobian(value, point[2]))
+    moved = ca.repmat(ca.DM(sizes), 1, model.nu) * solved(scaled, ca.repmat(rows, 1, model.nu) * right)
+    found = ca.Function("input_effect", point, [moved[n - model.nx :, :]])
+    return found.expand() if n <= SMALL else found
+
+
+def _whole(newton: Any, sizes: FloatArray, stages: int, largest_move: float) -> Any:
+    """Return the step: blocks of iterations, the later ones taken only where the earlier have not ended."""
+    point = [ca.MX.sym("x", len(sizes) // stages), *(ca.MX.sym(name, newton.size1_in(i)) for i, name in ((2, "u"),
+             (3, "theta")))]  # fmt: skip
+    start = ca.repmat(point[0], stages, 1)
+    state = [start, *newton(start, *point), ca.MX(0.0), ca.MX(0.0), ca.MX(0.0)]
+    iteration = _iteration(newton, sizes)
+    for i, count in enumerate(BLOCKS):
+        block, done = _block(iteration, count), state[4]
+        if i:
+            inputs = block.mx_in()
+            kept = ca.Function("kept", inputs, inputs[: len(state)])
+            block = ca.Function.if_else("further", kept, block)
+            state = list(block(done, *state, *point))
+        else:
+            state = list(block(*state, *point))
+    X, done, converged, residual = state[0], *state[4:]
+    near = _all(ca.fabs(X - start) <= largest_move * ca.DM(sizes)) if np.isfinite(largest_move) else ca.MX(1.0)
+    trusted = ca.logic_and(ca.logic_and(done, converged), near)
+    return ca.Function("step", point, [X, residual, trusted], ["x", "u", "theta"], ["stages", "residual", "trusted"])
+
+
+def _iteration(newton: Any, sizes: FloatArray) -> Any:
+    """Return one iteration, from and to stages, residual, row scales, Newton step, and whether and how it ended."""
+    inputs = [newton.mx_in(0)] + [ca.MX.sym(name, len(sizes)) for name in ("value", "rows", "move")]
+    inputs += [ca.MX.sym(name) for name in ("done", "converged", "residual")]
+    point = [newton.mx_in(i) for i in (1, 2, 3)]
+    X, value, rows, move, done, converged, residual = inputs
+    # A comparison with what is not a number is false, so that it never converges.
+    last = _all(ca.fabs(move) <= LAST_STEP * ca.fmax(ca.fabs(X), ca.DM(sizes)))
+    after = [X + move, *newton(X + move, *point)]
+    reached = ca.fabs(rows * after[1])
+    smaller = _all(reached < ca.mmax(ca.fabs(rows * value)))
+    solved_now = ca.logic_and(last, _all(reached <= LARGEST_RESIDUAL))
+    converged = ca.if_else(done, converged, solved_now)
+    residual = ca.if_else(done, residual, ca.mmax(reached))
+    X, value, rows, move = (ca.if_else(done, old, new) for old, new in zip((X, value, rows, move), after, strict=True))
+    done = ca.logic_or(done, ca.logic_or(last, ca.logic_not(smaller)))
+    found = ca.Function("iteration", [*inputs, *point], [X, value, rows, move, done, converged, residual])
+    return found.expand() if len(sizes) <= SMALL else found
+
+
+def _block(iteration: Any, count: int) -> Any:
+    """Return so many iterations as one function."""
+    inputs = iteration.mx_in()
+    state, point = inputs[: iteration.n_out()], inputs[iteration.n_out() :]
+    for _ in range(count):
+        state = iteration(*state, *point)
+    found = ca.Function("iterations", inputs, state)
+    return found.expand() if iteration.is_a("SXFunction") else found
+
+
+def _all(conditions: Any) -> Any:
+    return ca.sum1(conditions) >= float(conditions.numel())
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The state ``x (nx,)`` after a step, its stages, the residual in sizes of the states, Newton iterations begun."""
+
+    x: FloatArray
+    stages: FloatArray
+    residual: float
+    subsolves: int
+
+
+class ImplicitStep:
+    """Steps of dt s; moves beyond ``largest_move`` in parts along a homotopy, to the root connected with the last."""
+
+    def __init__(self, functions: DAEFunctions, dt: float, *, largest_move: float | None = None) -> None:
+        self.functions, self.dt = functions, dt
+        self.largest_move = np.inf if largest_move is None else largest_move
+        self.sizes = np.tile(functions.model.state_scales, functions.stages)
+
+    @cached_property
+    def graph(self) -> StepGraph:
+        """The step as CasADi functions."""
+        return step_graph(self.functions, self.dt, self.largest_move)
+
+    @cached_property
+    def _fast(self) -> Compiled:
+        return Compiled(self.graph.step)
+
+    @cached_property
+    def _local(self) -> Compiled:
+        return Compiled(self.graph.sensitivities)
+
+    def solve(
+        self, x: FloatArray, u: FloatArray, theta: FloatArray, *, before: FloatArray | None = None, k: int = 0
+    ) -> Solution:
+        """Return the state after one step from ``x (nx,)`` with ``u (nu,)``, ``theta (nq,)``; ``before``: last u."""
+        stages, residual, trusted = self._fast(x, u, theta)
+        if trusted[0, 0] == 1.0:
+            return Solution(stages[-self.functions.model.nx :, 0], stages[:, 0], float(residual[0, 0]), 1)
+        return self.solve_carefully(x, u, theta, before=before, k=k)
+
+    def solve_carefully(
+        self, x: FloatArray, u: FloatArray, theta: FloatArray, *, before: FloatArray | None = None, k: int = 0
+    ) -> Solution:
+        """Return the state after one step, by damped Newton and by a homotopy where that is needed."""
+        start = np.tile(x, self.functions.stages)
+        found = self._newton(start, x, u, theta)
+        if found.converged and self._move(found.x, start) <= self.largest_move:
+            return self._solution(found, 1)
+        if before is None or np.array_equal(before, u):
+            if found.converged:
+                return self._solution(found, 1)
+            raise self._error(found, k, "")
+        return self._homotopy(start, x, before, u, theta, k)
+
+    def sensitivities(
+        self, solution: Solution, x: FloatArray, u: FloatArray, theta: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the derivatives of a step that was solved: F (8), G (9), and of what is added to the equations."""
+        F, G, noise, _ = self._local(solution.stages, x, u, theta)
+        if not (np.isfinite(F).all() and np.isfinite(G).all() and np.isfinite(noise).all()):
+            raise SolverError("The matrix of (7), dF/dx' / dt + dF/dx, is singular: the step has no unique solution.")
+        return F, G, noise
+
+    def _move(self, stages: FloatArray, start: FloatArray) -> float:
+        return float(np.abs((stages - start) / self.sizes).max())
+
+    def _newton(self, start: FloatArray, x: FloatArray, u: FloatArray, theta: FloatArray) -> NewtonResult:
+        dt = np.array([self.dt])
+
+        def evaluate(stages: FloatArray) -> tuple[FloatArray, FloatArray]:
+            value, jacobian = self.functions.residual(stages, x, u, theta, dt)
+            return value[:, 0], jacobian
+
+        return newton(evaluate, start, self.sizes)
+
+    def _homotopy(
+        self, start: FloatArray, x: FloatArray, before: FloatArray, u: FloatArray, theta: FloatArray, k: int
+    ) -> Solution:
+        """Lead the input from its last value to the new one, as fast as Newton follows."""
+        found = self._newton(start, x, before, theta)
+        if not found.converged:
+            raise self._error(found, k, " (with the input of the step before)")
+        reached, fraction, subsolves = 0.0, FIRST_FRACTION, 1
+        while reached < 1.0:
+            target = min(1.0, reached + fraction)
+            tried = self._newton(found.x, x, before + target * (u - before), theta)
+            subsolves += 1
+            if tried.converged and self._move(tried.x, found.x) <= self.largest_move:
+                found, reached, fraction = tried, target, 2.0 * fraction
+            else:
+                fraction *= 0.5
+            if fraction < LEAST_FRACTION or subsolves > MOST_SUBSOLVES:
+                raise self._error(tried, k, f" (homotopy: {100 * reached:.3g} % of the change of the input)")
+        return self._solution(found, subsolves)
+
+    def _solution(self, found: NewtonResult, subsolves: int) -> Solution:
+        return Solution(found.x[-self.functions.model.nx :], found.x, found.residual, subsolves)
+
+    def _error(self, found: NewtonResult, k: int, where: str) -> SolverError:
+        model = self.functions.model
+        name = model.equation_names[found.worst % model.nx]
+        defined = np.isfinite(found.residual)
+        worst = f"residual {found.residual:.3g} in sizes of the states" if defined else "which is not defined there"
+        return SolverError(
+            f"No solution at k = {k}{where}: Newton stopped after iteration {found.iterations}, and the worst equation "
+            f"is {name!r} ({worst}). Check that input and state at this k are possible, or take smaller steps.",
+            record={"k": k, "iteration": found.iterations, "equation": name, "residual": found.residual},
+        )
+
+
+def onto_constraint(model: DAEModel, x: FloatArray, u: FloatArray, theta: FloatArray, dt: float) -> FloatArray:
+    """Return a state on the algebraic equations: the given one ``x (nx,)`` where it is on them already."""
+    found = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * dt).solve_carefully(x, u, theta).x
+    return found if np.abs((found - x) / model.state_scales).max() > PROJECTION_NOTICE else x

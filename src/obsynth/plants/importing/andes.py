@@ -1,0 +1,153 @@
+"""Power networks of the simulator ANDES: a case, or the pencil that was written from one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import scipy
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import arguments_checked
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.libraries import imported
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.signal_names import checked_names
+
+#: Names of variables, or the variables of each device: ``{"GENCLS 1": ["omega"], "Bus 1": ["a", "v"]}``.
+Picked: TypeAlias = "Sequence[str] | Mapping[str, Sequence[str]]"
+
+_PENCIL = ("E.mtx", "A.mtx", "names.json")
+
+
+#: Devices that a message lists.
+_LISTED_DEVICES = 12
+
+
+@arguments_checked
+def from_andes(
+    case: Any, *, outputs: Picked, faults: Picked = (), disturbances: Picked = (), **plant: Any
+) -> DescriptorSystem:
+    """Return the plant of a power network, linearised at its power flow solution.
+
+    Parameters
+    ----------
+    case : path or andes.System
+        A case file that ANDES reads (``.json``, ``.xlsx``, ``.raw``, ...); a folder with ``E.mtx``, ``A.mtx`` and
+        ``names.json``, such as ``designs/smib``; or a system of ANDES, whose power flow is solved where it is not yet.
+    outputs : list of str, or mapping
+        Measured variables by name, ``["omega GENCLS 1", "v Bus 1"]``, or by device,
+        ``{"GENCLS 1": ["omega"], "Bus 1": ["v"]}``.
+    faults, disturbances : list of str, or mapping
+        Variables in whose equations a fault, or an unknown input, is added: ``{"GENCLS 1": ["tm"]}`` is a change of
+        mechanical torque, ``{"Bus 3": ["a"]}`` active power drawn at a bus.
+    **plant
+        Any other argument of `DescriptorSystem`, such as ``sensor_noise`` or ``fault_names``.
+
+    Returns
+    -------
+    DescriptorSystem
+        Continuous, ``T x' = f(x, y)``, ``0 = g(x, y)`` as one pencil ``(nx + ny, nx + ny)``: differential variables
+        first.  From a case, the power flow solution is the operating point.
+
+    Raises
+    ------
+    SpecError
+        ANDES is not installed (it is licensed under the GPL and no dependency of ours), it cannot read or solve the
+        case, or a name is unknown.
+    """
+    point: dict[str, float] = {}
+    if isinstance(case, (str, Path)) and Path(case).is_dir():
+        e, a, names = _written_pencil(Path(case))
+    else:
+        e, a, names, point = _solved_case(case)
+    given = {
+        kind: _names(picked, names, kind)
+        for kind, picked in (("outputs", outputs), ("faults", faults), ("disturbances", disturbances))
+    }
+    stated = {**point, **(plant.pop("operating_point", None) or {})}
+    arguments: dict[str, Any] = {
+        "dt": 0.0,
+        "state_names": checked_names(names, len(names), prefix="x", what="state_names"),
+        "Bf": given["faults"] or None,
+        "Bd": given["disturbances"] or None,
+        "C": given["outputs"],
+    }
+    # A fault and a disturbance are changes: the value of the variable they are named after is not theirs.
+    for kind, role, word in (("faults", "fault_names", "change of"), ("disturbances", "disturbance_names", "load on")):
+        if given[kind]:
+            arguments[role] = [f"{word} {name}" for name in given[kind]]
+    return DescriptorSystem(e, a, **{**arguments, "operating_point": stated, **plant})
+
+
+def _written_pencil(folder: Path) -> tuple[FloatArray, FloatArray, list[str]]:
+    missing = [name for name in _PENCIL if not (folder / name).is_file()]
+    if missing:
+        raise SpecError(f"{folder} has no {missing[0]}: a pencil of ANDES is {', '.join(_PENCIL)}.", path=str(folder))
+    try:
+        e, a = (np.asarray(_dense(scipy.io.mmread(folder / name)), dtype=np.float64) for name in _PENCIL[:2])
+        names = json.loads((folder / _PENCIL[2]).read_text(encoding="utf-8"))
+        listed = [*names["differential"], *names["algebraic"]]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise SpecError(f"{folder} holds no pencil of ANDES: {error}", path=str(folder)) from error
+    return e, a, listed
+
+
+def _solved_case(case: Any) -> tuple[FloatArray, FloatArray, list[str], dict[str, float]]:
+    """Return E, A, the names of the variables and their values at the power flow solution."""
+    andes = imported("andes", extra="andes")
+    system = case
+    if isinstance(case, (str, Path)):
+        if not Path(case).is_file():
+            raise SpecError(f"{case} does not exist.", path=str(case))
+        system = andes.load(str(case), no_output=True, default_config=True, setup=True)
+    if not hasattr(system, "PFlow") or not hasattr(system, "dae"):
+        raise SpecError(f"ANDES cannot read {case}.", path="case")
+    if not system.PFlow.converged and not system.PFlow.run():
+        raise SpecError("The power flow of the case has no solution that ANDES finds.", path="case")
+    if not system.TDS.initialized:
+        system.TDS.init()
+    dae = system.dae
+    n, m = dae.n, dae.m
+    blocks = ((dae.fx, dae.fy), (dae.gx, dae.gy))
+    a = np.block([[_dense(block) for block in row] for row in blocks])
+    e = np.zeros((n + m, n + m))
+    e[np.arange(n), np.arange(n)] = np.asarray(dae.Tf, dtype=np.float64)
+    names = [str(name) for name in (*dae.x_name, *dae.y_name)]
+    values = np.concatenate([np.asarray(dae.x), np.asarray(dae.y)])
+    return e, a, names, dict(zip(names, map(float, values), strict=True))
+
+
+def _dense(matrix: Any) -> FloatArray:
+    """Return a full array of a sparse matrix of scipy or of kvxopt."""
+    if hasattr(matrix, "toarray"):
+        return np.asarray(matrix.toarray(), dtype=np.float64)
+    if hasattr(matrix, "V"):
+        rows, columns, values = (np.array(part).ravel() for part in (matrix.I, matrix.J, matrix.V))
+        dense = np.zeros(matrix.size)
+        np.add.at(dense, (rows.astype(np.int64), columns.astype(np.int64)), values)
+        return dense
+    return np.asarray(matrix, dtype=np.float64)
+
+
+def _names(picked: Picked, known: Sequence[str], what: str) -> list[str]:
+    """Return names of variables; devices are spelled as ANDES does, ``omega GENCLS 1``."""
+    if isinstance(picked, str):
+        raise SpecError(f"{what} is {picked!r}: give a list of names.", path=what)
+    if not isinstance(picked, Mapping):
+        return list(picked)
+    listed = []
+    for device, variables in picked.items():
+        own = [name.removesuffix(f" {device}") for name in known if name.endswith(f" {device}")]
+        if not own:
+            devices = list(dict.fromkeys(name.partition(" ")[2] for name in known))
+            shown = ", ".join(devices[:_LISTED_DEVICES]) + (", ..." if len(devices) > _LISTED_DEVICES else "")
+            raise SpecError(f"{what}: the network has no device {device!r}; it has {shown}.", path=what)
+        for variable in variables:
+            if variable not in own:
+                raise SpecError(f"{what}: {device} has no variable {variable!r}; it has {', '.join(own)}.", path=what)
+            listed.append(f"{variable} {device}")
+    return listed

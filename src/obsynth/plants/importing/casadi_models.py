@@ -1,0 +1,124 @@
+"""Plants from CasADi: a Function or a dictionary of expressions, as its integrators take them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import arguments_checked, shown
+from obsynth.numerics.libraries import imported
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.importing.python_objects import INTEGRATOR_INPUTS, OUTPUTS
+
+
+@arguments_checked
+def from_casadi(
+    system: Any,
+    *,
+    states: Mapping[str, float],
+    inputs: Mapping[str, float] | None = None,
+    parameters: Mapping[str, float] | None = None,
+    output_names: Any = None,
+    units: Mapping[str, str] | None = None,
+) -> DAEModel:
+    """Return the nonlinear plant of a CasADi Function, or of a dictionary of expressions.
+
+    Parameters
+    ----------
+    system : casadi.Function or dict
+        ``x' = ode(x, z, u, p)``, ``0 = alg(x, z, u, p)``, ``y = y(x, z, p)``: a Function with inputs and outputs of
+        these names, or a dictionary of SX or MX with these keys, as ``casadi.integrator`` takes it.  ``z``, ``u``,
+        ``p`` and ``alg`` may be missing.
+    states : mapping of str to float
+        Name -> nominal value, of x first and then of z.
+    inputs : mapping of str to float, optional
+        Name -> nominal value, of u.
+    parameters : mapping of str to float, optional
+        Name -> nominal value, of p.
+    output_names : list of str, optional
+        Names of y; ``y1, ...`` by default.
+    units : mapping of str to str, optional
+        As for `DAEModel`.
+
+    Returns
+    -------
+    DAEModel
+        Linearise it by `obsynth.linearise` for a method that needs a linear plant.
+
+    Raises
+    ------
+    SpecError
+        CasADi is not installed, a name is unknown, sizes do not fit, ``ode`` or ``y`` is missing, or y depends on u.
+
+    References
+    ----------
+    .. [Andersson2019] J. Andersson et al., CasADi: a software framework for nonlinear optimization and optimal control,
+       Math. Prog. Comp. 11 (1), 2019.
+    """
+    casadi = imported("casadi", extra="nonlinear", what="A plant of CasADi")
+    function = _function(casadi, system)
+    taken = {name: function.size1_in(name) if name in function.name_in() else 0 for name in INTEGRATOR_INPUTS}
+    made = {name: function.size1_out(name) if name in function.name_out() else 0 for name in OUTPUTS}
+    nx, nz = taken["x"], taken["z"]
+    for what, count, wanted in (
+        ("states", len(states), nx + nz), ("inputs", len(inputs or {}), taken["u"]),
+        ("parameters", len(parameters or {}), taken["p"]),
+    ):  # fmt: skip
+        if count != wanted:
+            raise SpecError(f"{what} names {count} value(s), but the system has {wanted}.", path=what)
+    if made["ode"] != nx or made["alg"] != nz or not made["y"]:
+        raise SpecError(
+            f"The system has {nx} state(s) x and {nz} state(s) z, but {made['ode']} equation(s) ode, {made['alg']} alg "
+            f"and {made['y']} output(s) y: one ode for each x, one alg for each z, and at least one y are needed.",
+            path="system",
+        )
+    if "u" in function.name_in() and function.jac_sparsity(
+        function.index_out("y"), function.index_in("u")
+    ).nnz():  # fmt: skip
+        raise SpecError("y depends on u: outputs are of states and parameters alone.", path="system")
+
+    def values(x: Any, u: Any, theta: Any) -> dict[str, Any]:
+        given = {"x": x[:nx], "z": x[nx:], "u": u, "p": theta}
+        return dict(function(**{name: casadi.vertcat(*given[name]) for name in function.name_in()}))
+
+    def equations(rates: Any, x: Any, u: Any, theta: Any) -> list[Any]:
+        found = values(x, u, theta)
+        moving = [rates[i] - found["ode"][i] for i in range(nx)]
+        return moving + [found["alg"][i] for i in range(nz)]
+
+    def outputs(x: Any, theta: Any) -> list[Any]:
+        found = values(x, [0.0] * taken["u"], theta)["y"]
+        return [found[i] for i in range(made["y"])]
+
+    output_names = [f"y{i + 1}" for i in range(made["y"])] if output_names is None else output_names
+    return DAEModel(
+        equations, outputs, states=states, inputs=inputs, parameters=parameters, units=units, output_names=output_names
+    )  # fmt: skip
+
+
+def _function(casadi: Any, system: Any) -> Any:
+    """Return a Function with our names; raise `SpecError` for what is none."""
+    if isinstance(system, Mapping):
+        unknown = [key for key in system if key not in (*INTEGRATOR_INPUTS, *OUTPUTS)]
+        if unknown:
+            raise SpecError(
+                f"system has the unknown key {unknown[0]!r}; there are: {', '.join((*INTEGRATOR_INPUTS, *OUTPUTS))}.",
+                path="system",
+            )
+        names = [name for name in INTEGRATOR_INPUTS if name in system]
+        results = [name for name in OUTPUTS if name in system]
+        try:
+            made = casadi.Function("plant", [system[n] for n in names], [system[n] for n in results], names, results)
+        except (RuntimeError, NotImplementedError, TypeError) as error:
+            raise SpecError(f"CasADi makes no function of this system: {error}", path="system") from error
+        return made
+    if not isinstance(system, casadi.Function):
+        raise SpecError(f"system is {shown(system)}: give a casadi.Function, or a dictionary.", path="system")
+    unknown = [name for name in (*system.name_in(), *system.name_out()) if name not in (*INTEGRATOR_INPUTS, *OUTPUTS)]
+    if unknown:
+        raise SpecError(
+            f"The Function has an input or output {unknown[0]!r}: name them {', '.join(INTEGRATOR_INPUTS)} and "
+            f"{', '.join(OUTPUTS)}.", path="system",
+        )  # fmt: skip
+    return system

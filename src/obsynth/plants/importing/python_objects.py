@@ -1,0 +1,244 @@
+"""Plants from objects of other libraries: systems of python-control and scipy, matrices of sympy, frames of pandas."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import arguments_checked, is_finite_number, require_kind
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.libraries import imported
+from obsynth.plants.descriptor import ALL_MATRICES, SIGNAL_NAMES, DescriptorSystem
+from obsynth.plants.importing.roles import plant_of
+from obsynth.plants.signal_names import suggestion
+
+#: What goes in and what comes out, by the names that CasADi's integrators have; y is ours.
+INTEGRATOR_INPUTS, OUTPUTS = ("x", "z", "u", "p"), ("ode", "alg", "y")
+
+
+@arguments_checked
+def from_control(
+    system: Any,
+    *,
+    E: ArrayLike | None = None,
+    dt: float | None = None,
+    **plant: Any,
+) -> DescriptorSystem:
+    """Return the plant of a system of python-control, with its labels.
+
+    Parameters
+    ----------
+    system : control.StateSpace or control.TransferFunction
+        A transfer function is realised by ``control.ss``.
+    E : array_like, optional
+        ``(nx, nx)``: python-control has none; ``None`` means the identity.
+    dt : float, optional, seconds
+        Sampling time; needed where the system's own is ``True``, which only says that there is one.  A system whose
+        ``dt`` is ``None`` is continuous.
+    **plant
+        Roles, as lists of names: ``faults`` and ``disturbances`` (inputs that are faults, or unknown; the others are
+        known inputs), ``actuator_faults`` (known inputs on which a fault acts: adds ``fault of <input>``) and
+        ``sensor_faults`` (outputs with a bias: adds ``bias of <output>``).  Any other argument of `DescriptorSystem`,
+        such as ``sensor_noise``, ``Bd`` or ``operating_point``.
+
+    Returns
+    -------
+    DescriptorSystem
+        With ``state_labels``, ``input_labels`` and ``output_labels`` as names.
+
+    Raises
+    ------
+    SpecError
+        It is no linear system, python-control is not installed, a name is unknown, or the sampling time is missing.
+    """
+    control = imported("control", extra=None)
+    if isinstance(system, control.TransferFunction):
+        system = control.ss(system)
+    require_kind(system, control.StateSpace, "system", "a control.StateSpace, such as control.ss(...)")
+    labels = {
+        "state_names": system.state_labels,
+        "input_names": system.input_labels,
+        "output_names": system.output_labels,
+    }
+    return plant_of(
+        {"E": E, "A": system.A, "B": system.B, "C": system.C, "D": system.D},
+        plant,
+        labels=labels,
+        dt=_sampling_time(system.dt, dt),
+    )
+
+
+@arguments_checked
+def from_scipy(
+    system: Any,
+    *,
+    E: ArrayLike | None = None,
+    input_names: Sequence[str] | None = None,
+    output_names: Sequence[str] | None = None,
+    **plant: Any,
+) -> DescriptorSystem:
+    """Return the plant of a linear system of ``scipy.signal``.
+
+    Parameters
+    ----------
+    system : scipy.signal.lti or scipy.signal.dlti
+        A ``StateSpace``, or what ``to_ss`` makes into one.
+    E : array_like, optional
+        ``(nx, nx)``: scipy has none; ``None`` means the identity.
+    input_names, output_names : list of str, optional
+        Of all inputs and outputs of the system; ``u1, u2, ...`` and ``y1, y2, ...`` by default.
+    **plant
+        Roles, as lists of names: ``faults`` and ``disturbances`` (inputs that are faults, or unknown; the others are
+        known inputs), ``actuator_faults`` (known inputs on which a fault acts: adds ``fault of <input>``) and
+        ``sensor_faults`` (outputs with a bias: adds ``bias of <output>``).  Any other argument of `DescriptorSystem`,
+        such as ``state_names``.
+
+    Returns
+    -------
+    DescriptorSystem
+        Continuous, or with the ``dt`` of the system.
+
+    Raises
+    ------
+    SpecError
+        It is no linear system of scipy, a name is unknown, or a discrete system does not say its ``dt``.
+    """
+    signal = imported("scipy.signal", extra=None)
+    require_kind(system, (signal.lti, signal.dlti), "system", "a scipy.signal.StateSpace")
+    state_space = system.to_ss()
+    return plant_of(
+        {"E": E, **{name: np.asarray(getattr(state_space, name)) for name in "ABCD"}},
+        plant,
+        labels={"input_names": input_names, "output_names": output_names},
+        dt=_sampling_time(state_space.dt, plant.pop("dt", None)),
+    )
+
+
+def _sampling_time(own: Any, given: float | None) -> float:
+    """Return the sampling time: ``None`` is continuous, ``True`` unsaid; two that differ are refused."""
+    if own is True and given is None:
+        raise SpecError("The system is sampled, but has no sampling time: give dt in seconds.", path="dt")
+    if own is None or own is True:
+        return 0.0 if given is None else given
+    if given is not None and given != own:
+        raise SpecError(f"dt is {given}, but the system has dt = {own}: leave dt out.", path="dt")
+    return float(own)
+
+
+@arguments_checked
+def from_sympy(
+    A: Any, B: Any = None, C: Any = None, *, parameters: Mapping[Any, float] | None = None, **plant: Any
+) -> DescriptorSystem:
+    """Return the plant of matrices of sympy, whose symbols are parameters with values.
+
+    Parameters
+    ----------
+    A : sympy.Matrix
+        ``(nx, nx)``.
+    B, C : sympy.Matrix, optional
+        ``(nx, nu)``, ``(ny, nx)``.
+    parameters : mapping, optional
+        Value of each symbol, by the symbol or by its name.
+    **plant
+        Any other argument of `DescriptorSystem`: matrices (``E``, ``Bf``, ``Bd``, ``D``, ...) may be of sympy too, and
+        names may be symbols.
+
+    Returns
+    -------
+    DescriptorSystem
+        With the numbers that the parameters give: rational entries exactly, and rounded once.
+
+    Raises
+    ------
+    SpecError
+        A symbol has no value, a value has no symbol, an entry is no real number, or sympy is not installed.
+    """
+    sympy = imported("sympy", extra="sympy")
+    given = {"A": A, "B": B, "C": C, **plant}
+    symbolic = {name: sympy.Matrix(given[name]) for name in ALL_MATRICES if _is_symbolic(given.get(name), sympy)}
+    free = {str(symbol) for matrix in symbolic.values() for symbol in matrix.free_symbols}
+    values = {str(name): value for name, value in (parameters or {}).items()}
+    _require_values(free, values)
+    arguments = {name: value for name, value in given.items() if value is not None}
+    for name, matrix in symbolic.items():
+        numbers = {symbol: _exact(values[str(symbol)], sympy) for symbol in matrix.free_symbols}
+        arguments[name] = _evaluated(matrix, numbers, name)
+    for name in SIGNAL_NAMES:
+        if arguments.get(name) is not None:
+            arguments[name] = [str(entry) for entry in arguments[name]]
+    return DescriptorSystem(**{"E": None, **arguments})
+
+
+@arguments_checked
+def from_pandas(A: Any, B: Any = None, C: Any = None, **plant: Any) -> DescriptorSystem:
+    """Return the plant of labelled frames of pandas; `DescriptorSystem` takes them as well.
+
+    Parameters
+    ----------
+    A : pandas.DataFrame
+        ``(nx, nx)``; its labels are the names of the states.
+    B, C : pandas.DataFrame, optional
+        ``(nx, nu)`` and ``(ny, nx)``: columns of B name the inputs, rows of C the outputs.
+    **plant
+        Any other argument of `DescriptorSystem`: matrices may be frames, and columns of ``Bf`` name the faults, those
+        of ``Bd`` the unknown inputs.
+
+    Returns
+    -------
+    DescriptorSystem
+        Rows and columns are put in the order of the first frame with their labels, A before C.
+
+    Raises
+    ------
+    SpecError
+        Labels differ between frames, or are repeated.
+    """
+    return DescriptorSystem(**{"E": None, "A": A, "B": B, "C": C, **plant})
+
+
+def _is_symbolic(value: Any, sympy: Any) -> bool:
+    if isinstance(value, sympy.MatrixBase):
+        return True
+    rows = value if isinstance(value, Sequence) and not isinstance(value, str) else ()
+    return any(isinstance(entry, sympy.Basic) for row in rows if isinstance(row, Sequence) for entry in row)
+
+
+def _require_values(free: set[str], values: Mapping[str, float]) -> None:
+    missing = sorted(free - set(values))
+    if missing:
+        raise SpecError(
+            f"The matrices hold symbols without a value: {', '.join(missing)}. Give parameters={{...}}.",
+            path="parameters",
+        )
+    unused = sorted(set(values) - free)
+    if unused:
+        raise SpecError(
+            f"No matrix holds the symbol {unused[0]!r}.{suggestion(unused[0], sorted(free))}", path="parameters"
+        )
+    wrong = [name for name, value in values.items() if not is_finite_number(value)]
+    if wrong:
+        raise SpecError(f"The parameter {wrong[0]!r} is {values[wrong[0]]!r}: give a finite number.", path="parameters")
+
+
+def _exact(value: float, sympy: Any) -> Any:
+    return sympy.Rational(*float(value).as_integer_ratio())
+
+
+def _evaluated(matrix: Any, numbers: Mapping[Any, Any], name: str) -> FloatArray:
+    rows, columns = matrix.shape
+    dense = np.zeros((rows, columns))
+    for i in range(rows):
+        for j in range(columns):
+            entry = matrix[i, j].subs(numbers)
+            if not (entry.is_number and entry.is_real and entry.is_finite):
+                raise SpecError(
+                    f"{name}, row {i + 1}, column {j + 1}: {matrix[i, j]} is {entry} at these parameters; "
+                    "give a finite real number.",
+                    path=name,
+                )
+            dense[i, j] = int(entry.p) / int(entry.q) if entry.is_Rational else float(entry)
+    return dense

@@ -1,0 +1,135 @@
+"""What a plant says of its noise beyond white noise: words, and names of the states that stand for it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import real_number, require_mapping
+from obsynth.plants.dae_functions import BUTCHER
+from obsynth.plants.signal_names import index_of
+
+#: Stands for a number that `obsynth.calibrate` is to find.
+UNKNOWN_NUMBER = "unknown"
+
+
+#: White noise beside coloured noise whose size is not stated, as a share of its deviation: no sensor is without any.
+DEFAULT_WHITE_SHARE = 0.01
+
+#: An offset that is unknown, in deviations of its sensor; and by how many it walks in a sample, or per root of a
+#: second: so that filters with a steady state follow it within a thousand samples.
+OFFSET_SIZE, OFFSET_WALK = 10.0, 1e-3
+
+#: Units of time in s.
+SECONDS_OF_UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+
+
+def require_noise(noise_bound: float | None, *, noisy: bool) -> None:
+    """Refuse a bound of noise in deviations where no noise is stated: zero deviations, however many, stay zero."""
+    if noise_bound and not noisy:
+        raise SpecError(
+            "noise_bound is a number of standard deviations, but no noise is stated that reaches the monitored "
+            "signals, so there is nothing to multiply: state the noise of the sensors (sensor_noise of the plant, or "
+            "Bw and Dw), or leave noise_bound out.",
+            path="noise_bound",
+        )
+
+
+def noise_state(output: str) -> str:
+    """Return the name of the state of an output's coloured noise."""
+    return re.sub(r"\W", "_", f"noise_{output}")
+
+
+def offset_state(output: str) -> str:
+    """Return the name of the state of a sensor's offset."""
+    return re.sub(r"\W", "_", f"offset_{output}")
+
+
+def kept_share(correlation: float, dt: float, integration: str) -> float:
+    """Return what a sample keeps of coloured noise, as a method of integration steps it; exactly for others."""
+    if integration not in BUTCHER:
+        return float(np.exp(-dt / correlation))
+    stages = len(BUTCHER[integration])
+    # The last stage is the end of the step.
+    whole = np.eye(stages) + dt / correlation * BUTCHER[integration]
+    return float(np.linalg.solve(whole, np.ones(stages))[-1])
+
+
+def process_variance(variance: float, correlation: float, dt: float, integration: str) -> float:
+    """Return the variance per step on the equation of coloured noise, so that the noise has the stated variance."""
+    kept = kept_share(correlation, dt, integration)
+    if integration not in BUTCHER:
+        return variance * (1.0 - kept**2)
+    return variance * (1.0 + kept) / (correlation**2 * (1.0 - kept))
+
+
+def noise_variance(process: float, correlation: float, dt: float, integration: str) -> float:
+    """Return the variance of coloured noise whose equation has a variance per step: `process_variance` turned round."""
+    return process / process_variance(1.0, correlation, dt, integration)
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Noise of one sensor: deviations of what is coloured and of what is white, and the correlation in s or zero."""
+
+    deviation: float
+    correlation: float
+    white: float
+
+    @property
+    def size(self) -> float:
+        """Deviation of both together."""
+        return float(np.hypot(self.deviation, self.white))
+
+
+def seconds(value: Any, path: str) -> float:
+    """Return a time in s from a number or a text such as ``5 s``, ``200 ms`` or ``3 min``."""
+    found = re.fullmatch(r"\s*([0-9.]+(?:[eE][+-]?\d+)?)\s*([a-z]+)\s*", value) if isinstance(value, str) else None
+    if found is not None and found[2] in SECONDS_OF_UNITS:
+        try:
+            return stated_number(float(found[1]) * SECONDS_OF_UNITS[found[2]], path)
+        except ValueError:
+            pass
+    return stated_number(value, path)
+
+
+def stated_number(value: Any, path: str) -> float:
+    """Return a positive number; what is still unknown is to be found first."""
+    if value == UNKNOWN_NUMBER:
+        raise SpecError(
+            f"{path} is unknown: find it from normal rows (obsynth calibrate --write-spec), or state a number.",
+            path=path,
+        )
+    return real_number(value, path, f"a number above 0 ({', '.join(SECONDS_OF_UNITS)} for times)", above=0.0)
+
+
+def sensor_noises(given: Mapping[str, Any] | None, outputs: Sequence[str]) -> dict[str, SensorNoise]:
+    """Return the noise of each sensor of which something is stated."""
+    require_mapping(given, "sensor_noise")
+    found = {}
+    for name, item in (given or {}).items():
+        index_of(name, outputs, what="sensor_noise")
+        path = f"sensor_noise.{name}"
+        if not isinstance(item, Mapping):
+            found[name] = SensorNoise(0.0, 0.0, stated_number(item, path))
+            continue
+        wrong = [key for key in item if key not in ("deviation", "correlation", "white")]
+        if wrong or "deviation" not in item:
+            told = f"has no {wrong[0]!r}" if wrong else "needs a deviation"
+            raise SpecError(f"{path} {told}: it takes deviation, correlation and white.", path=path)
+        deviation = stated_number(item["deviation"], f"{path}.deviation")
+        if item.get("correlation") is None:
+            found[name] = SensorNoise(0.0, 0.0, deviation)
+            continue
+        white = item.get("white")
+        found[name] = SensorNoise(
+            deviation,
+            seconds(item["correlation"], f"{path}.correlation"),
+            DEFAULT_WHITE_SHARE * deviation if white is None else stated_number(white, f"{path}.white"),
+        )
+    return found

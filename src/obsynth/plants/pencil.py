@@ -1,0 +1,39 @@
+"""What a design promises for every plant in the box of its constants."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray, read_only, remembered
+from obsynth.numerics.pencil_points import Deflation, normal_rank_of
+from obsynth.numerics.pencils import PencilStructure, is_regular, reduced, structure_of_reduced
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.plant_units import PlantUnits
+
+
+@remembered
+def _reduced(plant: DescriptorSystem) -> tuple[Deflation, Deflation]:
+    return reduced(*in_own_units(plant))
+
+
+def in_own_units(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
+    """Return E and A in units of the plant's own, powers of two: no rank may hang on those of the data."""
+    units = PlantUnits.of(plant).rounded()
+    moving, whole = (units.equations[:, None] * matrix * units.states for matrix in (plant.E, plant.A))
+    return moving, units.rate * whole
+
+
+def regularity_of(plant: DescriptorSystem) -> tuple[bool, int]:
+    """Return whether a plant's pencil ``A - z E`` is regular, and its normal rank, without eigenvalues."""
+    right, left = _reduced(plant)
+    return is_regular(plant.E.shape, right), normal_rank_of(right, left)
+
+
+@remembered
+def structure_of(plant: DescriptorSystem) -> PencilStructure:
+    """Return the structure of a plant's pencil ``A - z E``, which methods and verification ask for again and again."""
+    found = structure_of_reduced(plant.E.shape, _reduced(plant))
+    values = PlantUnits.of(plant).rounded().eigenvalues(found.finite_eigenvalues)
+    return replace(found, finite_eigenvalues=read_only(values, np.complex128))

@@ -1,0 +1,178 @@
+"""What a transformation did, and the map back to the states of the plant it started from; faults as states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arrays import FloatArray, freeze, read_only
+from obsynth.numerics.sparse_factor import SolutionBounds
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.recovery_operator import RecoveryOperator
+from obsynth.plants.uncertainty import matrices_of
+
+#: Map of a recovery -> the signal that it maps.
+_RECOVERED_SIGNALS = {
+    "from_state": "state",
+    "from_input": "input",
+    "from_fault": "fault",
+    "from_disturbance": "disturbance",
+    "from_noise": "noise",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class StateRecovery:
+    """``x_source = from_state x + from_input u + from_fault f + from_disturbance d + from_noise w``, read-only maps."""
+
+    names: tuple[str, ...]
+    from_state: FloatArray
+    from_input: FloatArray
+    from_fault: FloatArray
+    from_disturbance: FloatArray
+    from_noise: FloatArray
+    noise_kept: FloatArray  # ``(nw_source, nw)``: the source's noise as far as it is left
+    operating_point: Mapping[str, float] = field(default_factory=dict)  # of the source states
+
+    def __post_init__(self) -> None:
+        freeze(self, *_RECOVERED_SIGNALS, "noise_kept")
+        object.__setattr__(self, "operating_point", dict(self.operating_point))
+
+    @classmethod
+    def from_operator(
+        cls, names: Sequence[str], operator: RecoveryOperator, noise_kept: FloatArray, point: Mapping[str, float]
+    ) -> StateRecovery:
+        """Return a recovery by sparse solutions: a dense map is formed only where one is asked for."""
+        made = object.__new__(cls)
+        parts = {"names": tuple(names), "operator": operator, "noise_kept": read_only(noise_kept)}
+        for name, value in {**parts, "operating_point": dict(point)}.items():
+            object.__setattr__(made, name, value)
+        return made
+
+    def __getattr__(self, name: str) -> FloatArray:
+        """Form a map of a recovery by sparse solutions when it is first asked for."""
+        operator = self.__dict__.get("operator")
+        if operator is None or name not in _RECOVERED_SIGNALS:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        matrix = read_only(operator.matrix(_RECOVERED_SIGNALS[name]))
+        object.__setattr__(self, name, matrix)
+        return matrix
+
+    @property
+    def by_operator(self) -> RecoveryOperator | None:
+        """The sparse operator behind the maps of a large plant, or ``None``."""
+        return self.__dict__.get("operator")
+
+    def flags(self) -> tuple[str, ...]:
+        """Return per source state what an estimate from state and input alone is; a bias wins."""
+        return tuple(
+            "biased by the disturbance" if biased.any() else "needs the fault estimate" if faulty.any() else "exact"
+            for biased, faulty in zip(self.from_disturbance, self.from_fault, strict=True)
+        )
+
+    def then(self, later: StateRecovery) -> StateRecovery:
+        """Return the recovery through two transformations, this one first."""
+        if (operator := self.by_operator) is not None:
+            through = operator.then(
+                {signal: getattr(later, name) for name, signal in _RECOVERED_SIGNALS.items()}, later.noise_kept
+            )
+            kept = self.noise_kept @ later.noise_kept
+            return StateRecovery.from_operator(self.names, through, kept, self.operating_point)
+        step = self.from_state
+        own = {
+            "from_input": self.from_input,
+            "from_fault": self.from_fault,
+            "from_disturbance": self.from_disturbance,
+            "from_noise": self.from_noise @ later.noise_kept,
+        }
+        maps = {name: step @ getattr(later, name) + direct for name, direct in own.items()}
+        return replace(self, from_state=step @ later.from_state, noise_kept=self.noise_kept @ later.noise_kept, **maps)
+
+
+@dataclass(frozen=True, eq=False)
+class Transformation:
+    """A plant made from another; ``dropped`` states are not recovered; ``bounds``: of sparse solutions."""
+
+    source: DescriptorSystem
+    plant: DescriptorSystem
+    description: str
+    recovery: StateRecovery
+    dropped: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    bounds: SolutionBounds | None = None
+
+    def with_tolerances(self, kind: str, size: float = 0.0) -> Transformation:
+        """Return the step with the tolerances of its source carried on to its plant."""
+        before = self.source.uncertainty
+        if before is None:
+            return self
+        after = before if before.lost else before.then(matrices_of(self.source), kind, size)
+        return replace(self, plant=self.plant.replace(uncertainty=after))
+
+    def then(self, later: Transformation) -> Transformation:
+        """Return both steps as one, for a ``later`` that starts from this one's plant."""
+        description = "; ".join(text for text in (self.description, later.description) if text)
+        return Transformation(
+            self.source,
+            later.plant,
+            description,
+            self.recovery.then(later.recovery),
+            self.dropped + later.dropped,
+            self.notes + later.notes,
+            self.bounds or later.bounds,
+        )
+
+
+def plant_and_recovery(given: Any, recovery: StateRecovery | None = None) -> tuple[Any, StateRecovery | None]:
+    """Return the plant of a transformation with its way back, or a plant as it is; a stated way back goes first."""
+    if not isinstance(given, Transformation):
+        return given, recovery
+    return given.plant, given.recovery if recovery is None else recovery
+
+
+def linear_plant(given: Any) -> DescriptorSystem:
+    """Return a linear plant, of a transformation the transformed one; raise `SpecError` for anything else."""
+    plant = given.plant if isinstance(given, Transformation) else given
+    if isinstance(plant, DAEModel):
+        raise SpecError(
+            "This is for linear plants; of a plant of equations give the linear one that its spec makes with "
+            "transform: {linearise: {at: equilibrium, faults: [...]}}, or obsynth.linearise.",
+            path="plant",
+        )
+    require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
+    found: DescriptorSystem = plant
+    return found
+
+
+def unchanged_states(
+    source: DescriptorSystem, new: DescriptorSystem, *, from_state: FloatArray, noise_kept: FloatArray | None = None
+) -> StateRecovery:
+    """Return the recovery of a transformation that adds no direct effect of any signal on the states."""
+    inputs, faults, disturbances, noise = (np.zeros((source.nx, n)) for n in (new.nu, new.nf, new.nd, new.nw))
+    kept = np.eye(source.nw) if noise_kept is None else noise_kept
+    point = state_point(source)
+    return StateRecovery(source.state_names, from_state, inputs, faults, disturbances, noise, kept, point)
+
+
+def state_point(plant: DescriptorSystem) -> dict[str, float]:
+    """Return the operating point of the states of a plant, as far as it is stated."""
+    return {name: value for name, value in plant.operating_point.items() if name in plant.state_names}
+
+
+def with_states(plant: DescriptorSystem, names: Sequence[str], **changes: Any) -> DescriptorSystem:
+    """Replace matrices and states, dropping operating points and units of states that are gone."""
+    others = (plant.input_names, plant.output_names, plant.fault_names, plant.disturbance_names, plant.noise_names)
+    # An output or a fault may carry the name of the state it was picked by, and outlives it.
+    gone = set(plant.state_names) - set(names) - {name for signals in others for name in signals}
+
+    labels = {
+        label: {name: value for name, value in getattr(plant, label).items() if name not in gone}
+        for label in ("operating_point", "units")
+    }
+    return plant.replace(state_names=names, **labels, **changes)

@@ -1,0 +1,152 @@
+"""Zero-order-hold sampling of continuous plants."""
+
+from __future__ import annotations
+
+import math
+
+import flint
+import numpy as np
+import scipy
+
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics.arguments import arguments_checked, real_number
+from obsynth.numerics.arrays import LARGEST, FloatArray, require_no_overflow
+from obsynth.numerics.continuous import zero_order_hold
+from obsynth.numerics.libraries import on_one_thread_if_small
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
+from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
+from obsynth.numerics.sparse import dense
+from obsynth.plants.descriptor import DescriptorSystem, note_source
+from obsynth.plants.transformations.elimination import columns_of, eliminate_algebraic_states
+from obsynth.plants.transformations.exact_elimination import MOST_STATES_EXACTLY, sampled_exact_numbers
+from obsynth.plants.transformations.recovery import Transformation, unchanged_states
+from obsynth.plants.uncertainty import SAMPLED
+from obsynth.proofs.extended_balls import arb_matrix
+from obsynth.proofs.products import as_ball
+
+#: With so many states and signals, whose exponential takes 10 ms, each entry is rounded once: another machine finds it
+#: again, and entries that are small beside those they come from have all their digits.
+MOST_ROUNDED_ONCE = 24
+
+#: Digits, in bits: a chain of integrators in large units, whose exponential is squared thirty times, takes over 300.
+SQUARING_BITS = 640
+
+
+@arguments_checked
+@on_one_thread_if_small
+def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> Transformation:
+    """Sample a continuous plant with a zero-order hold.
+
+    Exact for inputs, faults and disturbances that are constant between samples.  Algebraic states are
+    eliminated first.  A fault that changes within an interval acts there like its mean over it, weighted by how much
+    of the effect of each moment is left at the next sample: for short intervals the plain mean.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        Continuous, regular, index 0 or 1.
+    sample_time : float, seconds
+        Time between samples.
+
+    Returns
+    -------
+    Transformation
+        Process noise (``Bw``, per square root of a second) is integrated over a sample and becomes
+        ``process noise 1, 2, ...``, a factor of its covariance; ``Dw`` is per sample and stays.
+
+    Raises
+    ------
+    SpecError
+        ``plant.dt > 0``, or ``sample_time`` is not a positive number, or an unstable mode outgrows double precision
+        within it.
+    PreconditionError
+        As for `eliminate_algebraic_states`; or continuous white noise reaches an output directly.
+
+    References
+    ----------
+    .. [VanLoan1978] C. Van Loan, "Computing integrals involving the matrix exponential", IEEE TAC 23, 1978.
+    """
+    if isinstance(plant, Transformation):
+        return plant.then(discretise(plant.plant, sample_time))
+    if plant.dt > 0.0:
+        raise SpecError(f"The plant is already sampled (dt = {plant.dt:g} s): give a continuous plant.", path="dt")
+    real_number(sample_time, "sample_time", "a positive number of seconds", above=0.0)
+    require_no_overflow(sample_time, "sample_time", "sample_time")
+    first = eliminate_algebraic_states(plant)
+    smooth = first.plant
+    direct = np.flatnonzero(np.any(smooth.Dw, axis=0))
+    process = np.flatnonzero(np.any(dense(plant.Bw), axis=0) | np.any(smooth.Bw, axis=0))
+    signals = tuple(smooth.noise_names[i] for i in np.intersect1d(direct, process))
+    if signals:
+        raise PreconditionError(
+            f"Process noise {', '.join(signals)} reaches an output directly, where continuous white noise has "
+            "infinite variance: give measurement noise in Dw only, or filter the process noise by a state.",
+            condition="noise without a direct path",
+            signals=signals,
+        )
+    _require_bounded_growth(smooth.A, float(sample_time))
+    signals_in = np.hstack([smooth.B, smooth.Bf, smooth.Bd])
+    few = sum(signals_in.shape) <= MOST_ROUNDED_ONCE
+    transition, held = zero_order_hold(smooth.A, signals_in, sample_time, exponential=_rounded_once if few else None)
+    B, Bf, Bd = columns_of(held, (smooth.nu, smooth.nf, smooth.nd))
+    factor = _noise_factor(smooth.A, smooth.Bw, sample_time)
+    kept = [smooth.noise_names[i] for i in direct]
+    noise_names = [*(f"process noise {i + 1}" for i in range(factor.shape[1])), *kept]
+    Bw = np.hstack([factor, np.zeros((smooth.nx, len(kept)))])
+    Dw = np.hstack([np.zeros((smooth.ny, factor.shape[1])), smooth.Dw[:, direct]])
+    changes = {"A": transition, "B": B, "Bf": Bf, "Bd": Bd, "Bw": Bw, "Dw": Dw}
+    exact = sampled_exact_numbers(smooth, sample_time) if smooth.nx <= MOST_STATES_EXACTLY else None
+    sampled = smooth.replace(**changes, dt=float(sample_time), noise_names=noise_names, exact=exact)
+    noise_kept = np.hstack([np.zeros((smooth.nw, factor.shape[1])), np.eye(smooth.nw)[:, direct]])
+    recovery = unchanged_states(smooth, sampled, from_state=np.eye(smooth.nx), noise_kept=noise_kept)
+    description = f"sampled every {sample_time:g} s (zero-order hold)"
+    note_source(smooth, sampled, sample_time=float(sample_time))
+    step = Transformation(smooth, sampled, description, recovery)
+    return first.then(step.with_tolerances(SAMPLED, sample_time))
+
+
+def _rounded_once(block: FloatArray, step: float) -> FloatArray | None:
+    """Return ``exp(A h)`` in which every entry is rounded once; ``None`` where its balls are too wide."""
+    with flint.ctx.workprec(SQUARING_BITS):
+        found = as_ball((arb_matrix(block) * flint.arb(float(step))).exp())
+    size = np.abs(found.midpoint)
+    if not np.max(found.radius, initial=0.0) <= CANCELLATION_TOLERANCE * np.max(size, initial=0.0):
+        return None
+    return np.where(size > found.radius, found.midpoint, 0.0)
+
+
+def _require_bounded_growth(A: FloatArray, sample_time: float) -> None:
+    """Raise `SpecError` where the fastest unstable mode of ``A`` leaves the range of numbers within a sample."""
+    rate = float(np.linalg.eigvals(balanced_matrix(A)[0]).real.max(initial=0.0))
+    if rate * sample_time > math.log(LARGEST):
+        raise SpecError(
+            f"In one sample of {sample_time:g} s an unstable mode (eigenvalue {rate:.3g} 1/s) grows beyond "
+            f"{LARGEST:g}: sample more often than every {math.log(LARGEST) / rate:.2g} s, or look at the signs and "
+            "units of A.",
+            path="sample_time",
+        )
+    require_no_overflow(float(np.abs(A).max(initial=0.0)) * sample_time, "A times sample_time", "sample_time")
+
+
+def _noise_factor(A: FloatArray, noise: FloatArray, step: float) -> FloatArray:
+    """Return a factor of the covariance that unit white noise through ``noise`` gathers in ``step``."""
+    nx = A.shape[0]
+    if not noise.any():
+        return np.zeros((nx, 0))
+    balanced, scale = balanced_matrix(A)
+    scaled = noise / scale[:, None]
+    # Van Loan's block grows like exp(-A h): integrate a short step, then double it.
+    doublings = math.ceil(math.log2(max(float(np.linalg.norm(balanced, 1)) * step, 1.0)))
+    block = np.block([[-balanced, scaled @ scaled.T], [np.zeros((nx, nx)), balanced.T]])
+    result = scipy.linalg.expm(block * (step / 2.0**doublings))
+    transition = result[nx:, nx:].T
+    covariance = transition @ result[:nx, nx:]
+    for _ in range(doublings):
+        covariance = covariance + transition @ covariance @ transition.T
+        transition = transition @ transition
+    # An integrated state gathers far less noise than its derivative: compare like with like.
+    spread = power_of_two_below(np.sqrt(np.abs(np.diag(covariance))))
+    correlation = covariance / spread / spread[:, None]
+    sizes, directions = np.linalg.eigh((correlation + correlation.T) / 2.0)
+    kept = sizes > CANCELLATION_TOLERANCE * sizes[-1]
+    return np.asarray((scale * spread)[:, None] * directions[:, kept] * np.sqrt(sizes[kept]))

@@ -1,0 +1,99 @@
+"""Stationary covariances whose digits are known: where two ways in double precision disagree, in balls of more digits.
+
+With ``X = A X A' + B B'`` and ``P = A^(2^k)``, ``X = S + P X P'``, S the sum of the first 2^k terms: what is left out
+is at most ``|P|^2 |S| / (1 - |P|^2)``.  In continuous time ``(p - A)^-1 (p + A)`` takes the place of A, for any p > 0.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flint
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.norms import balanced_realisation
+from obsynth.numerics.spectra import abscissa, noise_covariance
+from obsynth.proofs.extended_balls import arb_matrix
+
+#: Relative difference of two ways of computing a variance up to which double precision is believed.
+SURE_DIFFERENCE = 1e-6
+
+#: With more states nothing is enclosed, and this much is believed.
+MOST_ENCLOSED_STATES, AGREEMENT = 40, 1e-2
+
+#: Digits in bits, tried in turn; doublings, of which each doubles the time; and the radius that is small enough.
+TRIED_BITS, MOST_COVARIANCE_DOUBLINGS, RADIUS = (160, 640), 100, 1e-9
+
+
+def certain_noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> FloatArray:
+    """Return `noise_covariance` where the trace by observability agrees, or the enclosed one; NaN where neither is had.
+    Infinite is that of a matrix with a pole on or outside the boundary, not of sums that rounding has blown up."""
+    found = noise_covariance(a, b, c, d, dt)
+    # A variance below zero is rounding as well.
+    variance, again = float(np.trace(found)), float(np.trace(noise_covariance(a.T, c.T, b.T, d.T, dt)))
+    if np.isfinite(variance) and abs(variance - again) <= SURE_DIFFERENCE * variance:
+        return found
+    exact = enclosed_noise_covariance(a, b, c, d, dt)
+    if exact is not None:
+        return exact
+    if np.isfinite(variance):
+        known = abs(variance - again) <= AGREEMENT * variance
+    else:
+        known = not np.isfinite(again) and not abscissa(a, dt) < (1.0 if dt > 0.0 else 0.0)
+    return found if known else np.full_like(found, np.nan)
+
+
+def enclosed_noise_covariance(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float
+) -> FloatArray | None:
+    """Return the covariance of the stored numbers, of which nine digits are proved; ``None`` where they are not."""
+    if not 0 < len(a) <= MOST_ENCLOSED_STATES or not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
+        return None
+    # States of like size need fewer digits; powers of two change none of the numbers.
+    a, b, c = balanced_realisation(a, b, c)
+    for bits in TRIED_BITS:
+        with flint.ctx.workprec(bits):
+            driven = arb_matrix(b) * arb_matrix(b).transpose()
+            states = enclosed_sum(arb_matrix(a), driven, largest_singular_value(a) or 1.0, discrete=dt > 0.0)
+            if states is None:
+                continue
+            shown = arb_matrix(c) * states * arb_matrix(c).transpose()
+            if dt > 0.0:
+                shown = shown + arb_matrix(d) * arb_matrix(d).transpose()
+            values = np.reshape(shown.entries(), (len(c), len(c)))
+            found = np.array([[float(value.mid()) for value in row] for row in values]).reshape(values.shape)
+            radii = np.array([[float(value.rad()) for value in row] for row in values]).reshape(values.shape)
+        sizes = np.sqrt(np.maximum(np.diag(found), 0.0))
+        if np.all(np.isfinite(found)) and np.all(radii <= RADIUS * np.outer(sizes, sizes)):
+            return found
+    return None
+
+
+def enclosed_sum(a: Any, weight: Any, size: float, *, discrete: bool) -> Any | None:
+    """Return X with ``X = a X a' + weight`` (``a X + X a' + weight = 0``) of ``flint.arb_mat`` as balls; ``None`` where
+    powers do not decay.  ``size``: of a, any positive number will do."""
+    n = a.nrows()
+    states, power = weight, a
+    if not discrete:
+        one = flint.arb_mat(n, n, [float(i == j) for i in range(n) for j in range(n)]) * flint.arb(size)
+        try:
+            inverse = (one - a).inv()
+        except ZeroDivisionError:
+            return None
+        states, power = inverse * states * inverse.transpose() * flint.arb(2.0 * size), inverse * (one + a)
+    for _ in range(MOST_COVARIANCE_DOUBLINGS):
+        states, power = states + power * states * power.transpose(), power * power
+        left = squared_norm(power)
+        if not left.is_finite():
+            return None
+        if left < flint.arb(2) ** (-flint.ctx.prec):
+            rest = (left * squared_norm(states).sqrt() / (1 - left)).upper()
+            ball = flint.arb(0, rest)
+            return states + flint.arb_mat(n, n, [ball] * (n * n))
+    return None
+
+
+def squared_norm(matrix: Any) -> Any:
+    """Return the squared Frobenius norm, as a ball."""
+    return sum((value * value for value in matrix.entries()), flint.arb(0))

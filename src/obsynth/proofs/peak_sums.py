@@ -1,0 +1,211 @@
+r"""Sums over all time of what a system makes of its inputs, from above, every rounding accounted for.
+
+``c_{j+1} = fl(c_j M)`` misses ``c_j M`` by a known defect; with a proved `Contraction` all later terms gain no more
+than ``sum |defect Q^-1| |Q b| / (1 - rate)``, and what follows the last computed one is that of ``|c_N Q^-1|``.
+``\int_0^h |g(s)| ds`` of ``g(s) = c M^j e^{A s} b`` is the trapezoidal sum over p pieces, ``p d = h``, plus
+``d^3 / 12`` times the largest second derivative of each: at most that at its left end plus d times the largest third,
+which the contraction bounds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.scaling import balanced_matrix
+from obsynth.proofs.balls import UNDERFLOW, Ball, gamma, rounded_up
+from obsynth.proofs.contraction import (
+    LEFT_OF_SUM,
+    LOOKS,
+    MOST_PIECES,
+    MOST_SUMMED_STEPS,
+    NORM_PIECE,
+    STEPS_AT_ONCE,
+    Contraction,
+)
+from obsynth.proofs.products import exponential
+
+#: More than the square root of what underflows in a square.
+LOST_SQUARES = 2.0**-510
+
+#: Length of an interval in units of one over the norm of A, and the largest order, for gains in continuous time.
+LENGTH, MOST_CONTINUOUS_STATES = 0.4, 12
+
+#: Share of such a gain that the rest may have, and most steps towards it: what it bounds is a rounding, and slow modes
+#: would take a hundred thousand.
+LEFT_OF_GAINS, MOST_STEPS_OF_GAINS = 0.05, 1_024
+
+#: Most steps for given columns, where another machine's bound is to be found again, whatever its contraction was.
+MOST_STEPS_OF_COLUMNS = 2_048
+
+
+def peak_sums(
+    matrix: Ball,
+    rows: FloatArray,
+    columns: Ball,
+    contraction: Contraction,
+    *,
+    least: int = 0,
+    left: float = LEFT_OF_SUM,
+    each: bool = False,
+    most: int = MOST_SUMMED_STEPS,
+) -> tuple[FloatArray, FloatArray]:
+    """Return bounds on the sums over j of ``|c M^j b|`` (Euclidean; ``each``: by row) of columns ``b``, ``c (p, n)``.
+
+    A column per input: on terms ``0 .. k``, ``(steps, ..., m)``, and on all of them, ``(..., m)``.
+
+    From ``least`` to ``most`` terms, in blocks of 64, until the rest is bounded by the share ``left``.
+    """
+    moving, n, growth = matrix.midpoint, len(matrix.midpoint), gamma(len(matrix.midpoint) + 2)
+    driven, sizes = columns.midpoint, contraction.sizes(columns.midpoint, columns.radius)
+    powers, idle = np.array(rows, dtype=np.float64), ~driven.any(axis=0)
+    terms, looked = list[FloatArray](), 1
+    collected = np.zeros_like(powers)
+    total: FloatArray | float = 0.0
+    while True:
+        block, powers = _block(powers, moving)
+        # Products of many rows at once: one step after the other would take most of its time in Python.
+        products = np.abs(block @ driven)
+        terms.append(products if each else _norms(products))
+        total, collected = total + np.sum(terms[-1], axis=0), collected + np.sum(np.abs(block), axis=0)
+        done = STEPS_AT_ONCE * len(terms) >= max(most, least)
+        if done or (STEPS_AT_ONCE * len(terms) >= least and len(terms) >= looked):
+            looked = len(terms) + len(terms) // LOOKS + 1
+            after = contraction.factor * _seen(contraction, powers, _missed(matrix, np.abs(block[-1]), growth), each)
+            after = np.asarray(after * sizes)
+            # A column that is nothing but its radius has no terms to compare with.
+            if done or np.all((after <= left * total) | idle):
+                break
+    every = np.concatenate(terms)
+    count = len(every) + 8
+    # Every defect of the rows, and what the columns are off by, in the norm that contracts: sums of norms are at most
+    # the sums of all entries.
+    defects = rounded_up(_missed(matrix, collected, growth), 3 * n + count)
+    added = contraction.factor * _seen(contraction, np.zeros_like(rows), defects, each, summed=True) * sizes
+    products = rounded_up(growth * (collected @ np.abs(driven)) + count * n * UNDERFLOW, 3 * n + count)
+    known = collected @ columns.radius if columns.radius.any() else np.zeros_like(products)
+    products = rounded_up(products + known, n + count)
+    added = rounded_up(added + (products if each else np.sum(products, axis=0)), len(rows) + 6)
+    partial = rounded_up(np.cumsum(every, axis=0), count + 2 * len(rows) + 10) + added
+    return rounded_up(partial, 4), rounded_up(partial[-1] + after, 6)
+
+
+def _block(rows: FloatArray, moving: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return rows ``(p, n)`` moved zero times and more, ``(steps, p, n)``, and moved once more than the last."""
+    found = np.empty((STEPS_AT_ONCE, *rows.shape))
+    found[0] = rows
+    for i in range(1, STEPS_AT_ONCE):
+        np.matmul(found[i - 1], moving, out=found[i])
+    return found, found[-1] @ moving
+
+
+def _missed(matrix: Ball, sizes: FloatArray, growth: float) -> FloatArray:
+    """Return what products of rows of these sizes with the midpoint miss of those with any member."""
+    n = len(matrix.midpoint)
+    return np.asarray(growth * (sizes @ np.abs(matrix.midpoint)) + sizes @ matrix.radius + n * UNDERFLOW)
+
+
+def _seen(
+    contraction: Contraction, rows: FloatArray, radius: FloatArray, each: bool, *, summed: bool = False
+) -> FloatArray:
+    """Return bounds on ``|c Q^-1|``: of each row as a column, or of all; with ``summed`` those of sums of rows."""
+    if each:
+        return np.array([contraction.seen(rows[i : i + 1], radius[i : i + 1], summed) for i in range(len(rows))])[
+            :, None
+        ]
+    return np.array(contraction.seen(rows, radius, summed))
+
+
+def _norms(sizes: FloatArray) -> FloatArray:
+    """Return Euclidean norms of columns, up to roundings that the caller counts; what squares lose is added."""
+    return np.asarray(np.sqrt(np.sum(sizes * sizes, axis=-2)) + sizes.shape[-2] * LOST_SQUARES)
+
+
+class Pieces(NamedTuple):
+    """Columns ``(n, k)`` whose weighted norms bound the integral over an interval of what ``inputs (k,)`` do."""
+
+    columns: Ball
+    weights: FloatArray
+    inputs: np.ndarray
+
+
+def interval_pieces(a: FloatArray, b: FloatArray, into: Ball, length: float) -> Pieces:
+    """Return the pieces of ``into e^{A s} b``, s from 0 to ``length``: ``a (n, n)``, ``b (n, m)``, ``into (k, n)``."""
+    norm = _natural_norm(a)
+    count = int(np.clip(np.ceil(length * norm / NORM_PIECE), 1, MOST_PIECES))
+    step, m = length / count, b.shape[1]
+    transition, ball_a = exponential(a, step), Ball.exact(a)
+    at = Ball.exact(b)
+    first = ball_a @ (ball_a @ Ball.exact(b))
+    growth = _growth(a, step)
+    third = growth @ (ball_a @ first).magnitude
+    parts: list[Ball] = []
+    weights: list[float] = []
+    largest = np.zeros_like(b)
+    for i in range(count + 1):
+        parts.append(into @ at)
+        weights.append(step * (0.5 if i in (0, count) else 1.0))
+        if i < count:
+            parts.append(into @ first)
+            weights.append(step**3 / 12.0)
+            largest = np.maximum(largest, third)
+            at, first = transition @ at, transition @ first
+            third = growth @ (ball_a @ first).magnitude
+    # What is left, of any sign, in every coordinate at once: as many columns as coordinates.
+    rest = Ball(np.zeros((into.shape[0], m)), rounded_up(into.magnitude @ largest, 2 * len(a) + 6))
+    parts.append(rest)
+    weights.append(count * step**4 / 12.0)
+    joined = Ball(np.hstack([part.midpoint for part in parts]), np.hstack([part.radius for part in parts]))
+    scale = rounded_up(np.repeat(np.array(weights), m), 6)
+    return Pieces(joined, scale, np.tile(np.arange(m), len(parts)))
+
+
+def _natural_norm(a: FloatArray) -> float:
+    """Return the norm of a matrix in units that balance it: how fast its motions are, whatever their units."""
+    return largest_singular_value(balanced_matrix(a)[0]) if a.size else 0.0
+
+
+def _growth(a: FloatArray, step: float) -> FloatArray:
+    """Return an upper bound on ``|e^{A s}|``, entry by entry, for s up to ``step``."""
+    return exponential(np.abs(a), step).magnitude
+
+
+def gathered(pieces: Pieces, sums: FloatArray, inputs: int) -> FloatArray:
+    """Return the bound of each input, ``(..., inputs)``, from the sums ``(..., k)`` of all pieces."""
+    weighted = sums * pieces.weights
+    found = np.stack([np.sum(weighted[..., pieces.inputs == i], axis=-1) for i in range(inputs)], axis=-1)
+    return np.asarray(rounded_up(found, len(pieces.weights) + 4))
+
+
+def absolute_gains(
+    a: FloatArray, rows: FloatArray, contraction: Contraction, columns: Ball | None = None
+) -> FloatArray:
+    """Return upper bounds on ``sum_j |c A^j b|`` (the integral of ``|c e^{A t} b|``), for ``c (p, n)``: ``(p, m)``.
+
+    ``b`` are the unit vectors, or ``columns (n, m)``.  Bounds hang on the contraction by what is left of the sum alone:
+    where it settles, by `LEFT_OF_GAINS` at most, of given columns by `LEFT_OF_SUM`."""
+    n, given = len(a), columns is not None
+    into = Ball.exact(np.eye(n)) if columns is None else columns
+    loose = contraction.gain(rows, into.midpoint, into.radius)
+    if not loose.size or not n or (not contraction.discrete and n > MOST_CONTINUOUS_STATES):
+        return loose
+    left, most = (LEFT_OF_SUM, MOST_STEPS_OF_COLUMNS) if given else (LEFT_OF_GAINS, MOST_STEPS_OF_GAINS)
+    if contraction.discrete:
+        return np.asarray(
+            np.minimum(loose, peak_sums(Ball.exact(a), rows, into, contraction, left=left, each=True, most=most)[1])
+        )
+    length = LENGTH / _natural_norm(a)
+    gather = interval_pieces(a, into.midpoint, Ball.exact(np.eye(n)), length)
+    # The contraction in continuous time is one of its samples as well.
+    rate = float(rounded_up(np.exp(-contraction.rate * length), 4))
+    if not rate < 1.0:
+        return loose
+    held = replace(contraction, rate=rate, discrete=True)
+    sums = peak_sums(exponential(a, length), rows, gather.columns, held, left=left, each=True, most=most)[1]
+    whole = gathered(gather, sums, loose.shape[1])
+    if given and into.radius.any():
+        whole = rounded_up(whole + contraction.gain(rows, np.zeros_like(into.radius), into.radius), 2)
+    return np.asarray(np.minimum(loose, whole))

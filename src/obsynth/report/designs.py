@@ -1,0 +1,322 @@
+"""A finished design for people: what its plant is, what it promises, and what it may still not do."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from obsynth.analysis.diagnosis.exact_fault_columns import question
+from obsynth.analysis.diagnosis.fault_columns import dc_point, others
+from obsynth.errors import ObsynthError, PreconditionError
+from obsynth.methods.automatic import SETTLING_SAMPLES
+from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock
+from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, settling_time
+from obsynth.methods.registry import REGISTRY, method_class
+from obsynth.observers.linear.derived import sample_observer
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.window.observer import WindowObserver
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.recovery import StateRecovery
+from obsynth.report.plots.frequency import FaultGains, fault_gains
+from obsynth.results.checks import FITS
+from obsynth.results.design import ObserverDesign
+from obsynth.results.layout import facts_table, headed_table, name_list, number, print_checks, print_section
+
+#: Signals of any kind of plant, as they are called here.
+_NAMES_OF_SIGNALS = {
+    "states": "state_names",
+    "known inputs": "input_names",
+    "outputs": "output_names",
+    "faults": "fault_names",
+    "disturbances": "disturbance_names",
+    "noise": "noise_names",
+    "parameters": "parameter_names",
+}
+
+
+#: Curves of at most so many faults; plants with more states have none, and no steps are followed there.
+MOST_CURVES, MOST_STATES_OF_CURVES = 3, 80
+
+
+#: What the meaning of a claim says of its proof, which is left out where checks fail.
+_PROOF_WORDS = re.compile(r"[,:;]? ?\bproved( where a row says so)?\b")
+
+
+#: Without a scenario steps are followed for so many settling times of the plant, at most so many samples.
+STEP_SETTLING_TIMES, MOST_STEP_SAMPLES = 30, 6000
+
+#: How often the time to 90 % is looked at on a finer clock, each time 200 times as fine at most.
+MOST_CLOSER_LOOKS = 2
+
+#: An estimate of a unit step beyond this is no estimate, and its size is that of rounding that has grown.
+FAR_FROM_ONE = 10.0
+
+
+def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
+    """Return what holds for every plant within its tolerances, as label and text; none for other designs."""
+    from obsynth.studies.robustness import robustness
+    from obsynth.verification.over_tolerances.plants_of_the_box import EXACT_MODEL
+
+    if not isinstance(design.plant, DescriptorSystem) or not isinstance(design.observer, LinearObserver):
+        return []
+    uncertain = design.plant.uncertainty
+    if uncertain is None or not uncertain.box.names:
+        return [("model", f"{EXACT_MODEL} (no constant has a tolerance).")]
+    if design.report.checks and not design.report.passed:
+        return [("bounds", "none: the design fails its verification")]
+    try:
+        return list(robustness(design).facts())
+    except PreconditionError as error:
+        # The design is one for the nominal plant whatever the box may be.
+        return [("bounds", f"none: {error}")]
+
+
+def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> Iterator[tuple[str, str]]:
+    """Yield label and value of what is known about a plant."""
+    if isinstance(plant, DAEModel):
+        yield "equations", f"{plant.nx}: {name_list(plant.equation_names)}"
+    elif isinstance(plant, TimeVaryingDescriptorSystem):
+        steps = "without end" if plant.horizon is None else f"{plant.horizon} steps"
+        yield "time", f"discrete, {plant.dt:g} s between samples, {steps}"
+        varying = [name for name, matrix in plant.matrices.items() if not matrix.is_constant]
+        yield "change with k", name_list(varying) if varying else "nothing"
+        yield "equations", str(plant.ne)
+    else:
+        yield "time", f"discrete, {plant.dt:g} s between samples" if plant.is_discrete else "continuous"
+    for label, attribute in _NAMES_OF_SIGNALS.items():
+        if (names := getattr(plant, attribute, None)) is not None:
+            yield label, f"{len(names)}: {name_list(names)}" if names else "none"
+
+
+def design_report(design: ObserverDesign, *, console: Console) -> None:
+    """Print a design with its report."""
+    print_section(console, f"Design '{design.name}' by {design.method}", facts_table(plant_facts(design.plant)))
+    print_section(console, "Claims", facts_table(promises(design)))
+    if design.observer.fault_names:
+        headings, rows = fault_estimates(design, gains_if_linear(design))
+        table = headed_table(*headings)
+        for row in rows:
+            table.add_row(*map(Text, row))
+        print_section(console, f"{headings[0].capitalize()} estimates", table)
+    for curve in delay_curves(design):
+        print_section(console, f"Deviation of {curve.fault} against delay", delay_table(curve))
+        console.print(Text(curve.sentence))
+        console.print()
+    if design.recovery is not None:
+        print_section(console, "States of the plant as written", facts_table(recovered_states(design.recovery)))
+    print_checks(design.report.checks, console=console)
+    facts = tolerance_facts(design)
+    if len(facts) == 1 and facts[0][0] == "model":
+        console.print(Text(f"Model: {facts[0][1]}"))
+    elif facts:
+        print_section(console, "Within the tolerances of the plant", facts_table(facts))
+    for note in design.notes:
+        console.print(Text(f"Note: {note}"))
+
+
+def delay_curves(design: ObserverDesign) -> list[DelayCurve]:
+    """Return the deviation against the delay on the plant of a design, for each fault that it estimates, where noise is
+    stated."""
+    plant, observer = design.plant, design.observer
+    if (
+        not isinstance(plant, DescriptorSystem)
+        or not isinstance(observer, LinearObserver)
+        or plant.nx > MOST_STATES_OF_CURVES
+    ):
+        return []
+    names = [name for name in observer.fault_names if name in plant.fault_names][:MOST_CURVES]
+    rates = design.options.get("fault_rate")
+    found = []
+    for name in names:
+        rate = rates.get(name) if isinstance(rates, Mapping) else rates
+        found.append(delay_curve(plant, plant.fault_names.index(name), rate))
+    return [curve for curve in found if curve is not None]
+
+
+def delay_table(curve: DelayCurve) -> Table:
+    """Return deviations by walk (rows) and lag in samples (columns)."""
+    table = headed_table("walk per sample", *(f"lag {lag}" for lag in curve.lags))
+    for rate, row in zip(curve.rates, curve.deviations, strict=True):
+        table.add_row(Text(f"{rate:.3g}"), *(Text(number(float(value), digits=3)) for value in row))
+    return table
+
+
+def recovered_states(recovery: StateRecovery) -> Iterator[tuple[str, str]]:
+    """Yield how good an estimate of each original state is, with the names, best first."""
+    names_by_flag: dict[str, list[str]] = {}
+    for name, flag in zip(recovery.names, recovery.flags(), strict=True):
+        names_by_flag.setdefault(flag, []).append(name)
+    for flag in sorted(names_by_flag, key=lambda flag: flag != "exact"):
+        yield flag, f"{len(names_by_flag[flag])}: {name_list(names_by_flag[flag])}"
+
+
+def unproved(meaning: str) -> str:
+    """Return the meaning of a claim without the word that it is proved."""
+    return _PROOF_WORDS.sub("", meaning).strip()
+
+
+def promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
+    """Yield name, value and meaning of what a design claims."""
+    known = method_class(design.method).claims if design.method in REGISTRY else {}
+    for name, value in design.certificate.claims.items():
+        claim = known.get(name.partition("[")[0])
+        unit, meaning = (claim.unit, claim.meaning) if claim else ("", "unknown to this version")
+        if not design.report.passed:
+            meaning = f"{unproved(meaning)} (claimed only: checks fail)"
+        yield name, f"{number(value, digits=7)} {unit}".strip(), meaning
+    for check in design.report.checks:
+        if check.name == "H-infinity norm":
+            yield "norm", number(check.value, digits=7), "the same gain recomputed by a second route"
+    yield "observer order", str(design.observer.order), "states of the shipped realisation"
+
+
+def gains_if_linear(design: ObserverDesign) -> FaultGains | None:
+    """Return the gains of a linear design that estimates faults of its plant; a broken one has none."""
+    if not isinstance(design.plant, DescriptorSystem) or not design.observer.fault_names:
+        return None
+    if any(check.name == FITS for check in design.report.failures):
+        return None
+    # Numbers of a corrupted design may overflow; the table shows infinity then, beside the checks that fail.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return fault_gains(design)
+
+
+def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return headings and one row for each fault, or parameter: delay, deviation, and what else reaches it."""
+    observer, plant, units = design.observer, design.plant, design.plant.units
+    deviations = {check.name: check.value for check in design.report.checks}
+
+    def deviation(name: str, missing: str) -> str:
+        value = deviations.get(f"noise in fhat[{name}]")
+        unit = units.get(name, "")
+        return missing if value is None else f"{number(value)} {'' if unit == '1' else unit}".strip()
+
+    if isinstance(observer, WindowObserver):
+        delayed = zip(observer.fault_names, observer.fault_delays, strict=True)
+        return ("fault", "delay", "delay in s"), [(name, str(k), number(k * observer.dt)) for name, k in delayed]
+    if gains is None or not isinstance(plant, DescriptorSystem):
+        when = "after the nominal run" if isinstance(plant, DAEModel) else "at the end of the horizon"
+        return ("parameter", f"deviation {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]
+    linear = design.linear[1]
+    none, noise = "by sampling" if plant.nw else "none stated", "deviation" if plant.is_discrete else "deviation, 1 s"
+    delays = ("delay", "delay in s") if plant.is_discrete else ()
+    rows: list[tuple[str, ...]] = []
+    for name, lag, disturbance_gains in zip(
+        linear.fault_names, linear.fault_delays, gains.disturbance_gains, strict=True
+    ):
+        delay = (str(lag), number(lag * plant.dt)) if plant.is_discrete else ()
+        row = (name, *delay, deviation(name, none))
+        if plant.nd:
+            gain = float(disturbance_gains.max())
+            row += (
+                f"{number(gain)} from {plant.disturbance_names[int(disturbance_gains.argmax())]}" if gain else "none",
+            )
+        rows.append(row)
+    return ("fault", *delays, noise, *(("largest gain",) if plant.nd else ())), rows
+
+
+def _estimating(design: ObserverDesign) -> tuple[DescriptorSystem, LinearObserver] | None:
+    """Return plant and observer of a linear design that estimates faults of a plant that is not too large."""
+    plant, observer = design.plant, design.observer
+    if (
+        not isinstance(plant, DescriptorSystem)
+        or not isinstance(observer, LinearObserver)
+        or plant.nx > MOST_STATES_OF_CURVES
+    ):
+        return None
+    return (plant, observer) if observer.fault_names and set(observer.fault_names) <= set(plant.fault_names) else None
+
+
+def followed_steps(design: ObserverDesign) -> Mapping[str, FaultFigures]:
+    """Return what becomes of a unit step of each fault of a linear design, by fault, none where they could not be
+    followed."""
+    pair = _estimating(design)
+    if pair is None:
+        return {}
+    plant, observer = pair
+    if (observer.Bu.shape[1], observer.By.shape[1]) != (plant.nu, plant.ny):
+        return {}
+    step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SETTLING_SAMPLES
+    length = STEP_SETTLING_TIMES * settling_time(plant)
+    steps = int(min(max(length / step, 20), MOST_STEP_SAMPLES))
+    try:
+        sampled = on_the_clock(plant, step)
+        clocked = observer if observer.dt > 0.0 else sample_observer(observer, step)
+    except ObsynthError:
+        return {}
+    figures = fault_figures(sampled, clocked, steps)
+    if plant.dt == 0.0:
+        figures = _closely_timed(plant, observer, figures, step)
+    return {found.fault: found for found in figures}
+
+
+def _closely_timed(
+    plant: DescriptorSystem, observer: LinearObserver, figures: tuple[FaultFigures, ...], step: float
+) -> tuple[FaultFigures, ...]:
+    """Return figures whose times to 90 % are known to one in `SETTLING_SAMPLES`: the plant's settling time, by which
+    they were sampled, may be long beside these."""
+    for _ in range(MOST_CLOSER_LOOKS):
+        coarse = [found.most for found in figures if found.reaches and 0.0 < found.most < SETTLING_SAMPLES * step]
+        if not coarse:
+            break
+        # The straight lines between samples may show a step by up to two of these too soon.
+        length, step = max(coarse) + 2.0 * step, min(coarse) / SETTLING_SAMPLES
+        steps = int(min(length / step, MOST_STEP_SAMPLES))
+        try:
+            closer = fault_figures(on_the_clock(plant, step), sample_observer(observer, step), steps)
+        except ObsynthError:
+            break
+        figures = tuple(
+            replace(found, most=fine.most) if math.isfinite(fine.most) else found
+            for found, fine in zip(figures, closer, strict=True)
+        )
+    return figures
+
+
+def design_warnings(
+    design: ObserverDesign, steps: Mapping[str, FaultFigures], *, told: Collection[str] = ()
+) -> tuple[str, ...]:
+    """Return what to know before trusting the fault estimates; ``steps`` from `followed_steps`."""
+    pair = _estimating(design)
+    if pair is None:
+        return ()
+    missed = (
+        f"A unit step of {name} gives an estimate of {_of_one(figures.at_horizon)} after {figures.horizon:.2g} s: it "
+        "has not reached the fault by then."
+        for name, figures in steps.items()
+        if not figures.reaches and name not in told
+    )
+    return (*_undetectable(*pair), *missed)
+
+
+def _of_one(value: float) -> str:
+    """Return the estimate of a unit step to the digits that are not rounding, whatever the design."""
+    return f"{round(value, 2) + 0.0:g}" if abs(value) <= FAR_FROM_ONE else f"more than {FAR_FROM_ONE:g} times as much"
+
+
+def _undetectable(plant: DescriptorSystem, observer: LinearObserver) -> Iterator[str]:
+    rest = dc_point(plant.dt)
+    unknown = ", ".join(plant.disturbance_names)
+    for name in observer.fault_names if plant.nd else ():
+        number = plant.fault_names.index(name)
+        beside = others(plant, number)
+        asked, among, either = question(plant, (), number), unknown, "either"
+        if asked.shows_at(rest):
+            if not beside or question(plant, beside, number).shows_at(rest):
+                continue
+            among = f"{unknown} and {', '.join(plant.fault_names[i] for i in beside)} together"
+            either = "any of them"
+        what = f"A constant {name}" if asked.visible else name
+        yield (
+            f"{what} cannot be distinguished from {among}: the estimate may be an effect of {either}. See obsynth "
+            "check for the sensors that would distinguish them."
+        )

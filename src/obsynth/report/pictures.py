@@ -1,0 +1,191 @@
+"""Pictures of a design for a page: drawn without a window, held as text."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from html import escape
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from obsynth.errors import ObsynthError, SpecError
+from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
+from obsynth.methods.guaranteed_test.result import GuaranteedTest
+from obsynth.monitoring.thresholds.monitor import Detection
+from obsynth.monitoring.thresholds.residual_monitor import monitor
+from obsynth.observers.decisions import decide
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.parameter_alarms import Decision
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.report.demonstration import EDGE, HALF_WIDTH, PANEL, WIDE, demonstration_scenario
+from obsynth.report.plots.estimates import plot_states
+from obsynth.report.plots.frequency import plot_gains
+from obsynth.report.plots.guaranteed import plot_hidden_course
+from obsynth.report.plots.panels import data_url, image_of
+from obsynth.report.plots.simulation import plot_simulation
+from obsynth.report.plots.spectra import plot_poles
+from obsynth.results.design import ObserverDesign
+from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.simulate import Simulation, simulate
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+#: More states than this are not drawn.
+MOST_DRAWN_STATES = 6
+
+
+class Picture(NamedTuple):
+    """A picture in a page: what it shows, in words for who cannot see it and as a caption, and a data URL."""
+
+    title: str
+    text: str
+    source: str
+    wide: bool = False
+
+    def html(self) -> str:
+        """Return the picture as a figure; a wide one takes a row of its own."""
+        title = f"<h3>{escape(self.title)}</h3>" if self.title else ""
+        return (
+            f'<figure class="{"wide" if self.wide else "half"}">{title}<img alt="{escape(self.text)}" '
+            f'src="{self.source}"><figcaption>{escape(self.text)}</figcaption></figure>'
+        )
+
+
+def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> Iterator[Picture]:
+    """Yield the pictures of a design."""
+    yield from _at_work(design, scenario)
+    if design.method == GuaranteedTestMethod.id:
+        yield from _hidden(GuaranteedTest.of(design))
+    if not isinstance(design.observer, LinearObserver):
+        return
+    sampled = design.observer.dt > 0.0
+    if design.observer.order:
+        region = "inside the circle" if sampled else "left of the dashed line"
+        yield Picture(
+            "Spectrum",
+            f"Eigenvalues of the observer: its initial-condition response decays where all are {region}.",
+            drawn((HALF_WIDTH, 5.4 if sampled else 4.2), 1, lambda axes: plot_poles(design, axes=axes[0])),
+        )
+    if design.observer.fault_names:
+        yield _gains_picture(
+            design,
+            "faults",
+            "Gains to the fault estimates",
+            "Singular values over the frequency: from the faults, where 1 is ideal, and from disturbances and noise, "
+            "where small values are better.",
+        )
+    if design.observer.state_names:
+        yield _gains_picture(
+            design,
+            "states",
+            "Gains to the errors of the state estimates",
+            "Largest singular values over the frequency, to the errors of the states: small values are better.",
+        )
+
+
+def _hidden(test: GuaranteedTest) -> Iterator[Picture]:
+    """Yield how small a fault so many samples tell, and the courses that hide a fault from every test."""
+    if len(test.tests) == 1:
+        if len(test.trade_off) > 1:
+            text = "The least threshold of all tests against the duration of their samples; the marked one is proved."
+            yield Picture("Least threshold", text, drawn((HALF_WIDTH, 4.2), 1, lambda axes: test.plot(axes=axes[0])))
+        if test.least > 0.0:
+            yield Picture(
+                "Why there is no smaller one",
+                f"This time course of {test.fault} with these disturbances, and the opposite of all of them, give the "
+                "same samples: every equation and all bounds hold.",
+                drawn((HALF_WIDTH, 4.2), 1, lambda axes: plot_hidden_course(test, axes=axes[0])),
+            )
+        return
+    for own, group in zip(test.tests, test.groups, strict=True):
+        if len(group) > 1:
+            yield Picture(
+                f"Why {own.fault} is not isolated",
+                "Together these time courses change no output: every equation holds, without disturbance and noise.",
+                drawn((HALF_WIDTH, 4.2), 1, partial(_draw_hidden, test, own.fault)),
+            )
+
+
+def _draw_hidden(test: GuaranteedTest, fault: str, axes: Sequence[Axes]) -> None:
+    plot_hidden_course(test, fault=fault, axes=axes[0])
+
+
+def _gains_picture(design: ObserverDesign, to: str, title: str, text: str) -> Picture:
+    return Picture(title, text, drawn((HALF_WIDTH, 4.2), 1, lambda axes: plot_gains(design, to=to, axes=axes[0])))
+
+
+def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Picture]:
+    """Yield faults and states beside their estimates; nothing where the plant has no demonstration."""
+    shown, given = scenario, scenario is not None
+    try:
+        shown = scenario if given else demonstration_scenario(design)
+        simulation = None if shown is None else simulate(design, shown)
+    except ObsynthError:
+        # Without a scenario of its own, a page is whole without this picture.
+        if given:
+            raise
+        return
+    if simulation is None or shown is None:
+        return
+    linear = isinstance(design.observer, LinearObserver)
+    what = "On the scenario" if given else "Each fault in turn" if linear else "Each parameter in turn"
+    text = f"{what}: {_story(shown, given=given, linear=linear)}"
+    faults, states = len(design.observer.fault_names), simulation.estimates.state_names
+    units, dt = design.plant.units, float(simulation.time[1]) if len(simulation.time) > 1 else 1.0
+    seen = [*_watched(design, shown, simulation)] if given else []
+    if faults or seen:
+        yield stacked(
+            "The design at work",
+            text,
+            faults + len(seen),
+            lambda axes: plot_simulation(simulation, detections=seen, units=units, axes=axes),
+        )
+    if 0 < len(states) <= MOST_DRAWN_STATES:
+        run = "in the same run" if faults or seen else "in a run with the stated noise"
+        bands = "" if linear else ", with 95 % bands"
+        yield stacked(
+            "States",
+            f"States {run}, and their estimates{bands}.",
+            len(states),
+            lambda axes: plot_states(simulation.estimates, states=simulation.states, dt=dt, units=units, axes=axes),
+        )
+
+
+def _watched(design: ObserverDesign, scenario: Scenario, simulation: Simulation) -> Iterator[Detection | Decision]:
+    """Yield what the first monitor sees that this design and this scenario have; nothing where they have none."""
+    if isinstance(design.observer, LinearObserver):
+        for kind in ("pointwise", "chi-square"):
+            try:
+                yield monitor(design, scenario, kind).watch(simulation.estimates)
+            except SpecError:
+                # A signal without a bound, or without a covariance; a continuous design has neither threshold.
+                continue
+            return
+    elif isinstance(design.observer, RecursiveObserver) and design.observer.fault_names:
+        yield decide(design.observer, simulation.estimates)
+
+
+def _story(scenario: Scenario, *, given: bool, linear: bool) -> str:
+    if given:
+        return f"{scenario.horizon:g} s, seed {scenario.seed}."
+    if not linear:
+        return (
+            "a step of one initial standard deviation, with the stated noise. The 95 % bands hold while the "
+            "parameters are constant."
+        )
+    closed = " A stabilising state feedback was added, as the plant is unstable." if scenario.stabilise else ""
+    return (
+        "a unit step, from zero and without noise. It shows how fast each estimate follows its fault, and its gain "
+        f"from the other faults.{closed}"
+    )
+
+
+def stacked(title: str, text: str, panels: int, draw: Callable[[Sequence[Axes]], Any]) -> Picture:
+    """Return a wide picture of so many panels."""
+    return Picture(title, text, drawn((WIDE, PANEL * panels + EDGE), panels, draw), wide=True)
+
+
+def drawn(size: tuple[float, float], panels: int, draw: Callable[[Sequence[Axes]], Any]) -> str:
+    """Return what ``draw`` puts on panels one above the other, as a data URL."""
+    return data_url(image_of(panels, draw, size=size))

@@ -1,0 +1,256 @@
+"""A plant for people: its structure, what can be diagnosed on it, which methods can serve it, its matrices as text."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from obsynth.analysis.structure import Structure
+from obsynth.files.outputs import yaml_text
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.report.designs import plant_facts
+from obsynth.results.checks import Check
+from obsynth.results.layout import checks_table, complex_numbers, facts_table, headed_table, name_list, print_section
+from obsynth.results.verification_report import VerificationReport
+from obsynth.verification.plant import PLANT_MATRICES
+
+if TYPE_CHECKING:
+    from obsynth.analysis.diagnosis.verdicts import Diagnosis
+
+
+#: Of a bank of residuals so many rows are shown.
+MOST_BANK_ROWS = 12
+
+#: What the columns of numbers mean.
+_COLUMN_MEANINGS = (
+    "detectable: some residual responds to the fault; steady state: also to a constant one. as a step, any signal: the "
+    "fault can be estimated if it is a step, or whatever its time course. delay: samples, or derivatives of the "
+    "outputs in continuous time. residual, filter: order of the smallest residual generator, and of a filter that "
+    "estimates the fault."
+)
+
+
+#: Conditions that ask for another time than the plant's, and what to do about each.
+_TIME_CONDITIONS = {
+    "exists: continuous time": "continuous only: design for the plant in continuous time (dt: 0, without sample_time), "
+    "and sample the observer afterwards (obsynth.sample_observer)",
+    "exists: discrete time": "discrete only: sample the plant first (transform: {sample_time: ...})",
+}
+
+#: Conditions on what a spec says, which the plant cannot fail.
+_ASKED = {"exists: bounds stated", "exists: fault named", "exists: region stated", "exists: stated"}
+
+_PLANT_KIND, _OF_THIS_KIND = "exists: kind of plant", "exists: plant of this kind"
+
+
+_PLANT_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names")
+
+
+def plain_table(headings: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> Iterator[tuple[str, str]]:
+    """Yield the lines of a table; long names are cut, and the last column takes what is left."""
+    widths = [max(len(row[i]) for row in (headings, *rows)) for i in range(len(headings))]
+    excess = sum(widths) + 2 * (len(widths) - 1) - width
+    for column in (0, len(widths) - 1):
+        cut = min(max(excess, 0), max(widths[column] - 16, 0))
+        widths[column] -= cut
+        excess -= cut
+
+    def line(row: Sequence[str]) -> str:
+        cells = (text if len(text) <= size else f"{text[: size - 1]}…" for text, size in zip(row, widths, strict=True))
+        return "  ".join(f"{text:<{size}}" for text, size in zip(cells, widths, strict=True)).rstrip()
+
+    yield line(headings), "bold"
+    for row in rows:
+        yield line(row), ""
+
+
+def check_report(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel,
+    structures: Mapping[str, Structure],
+    methods: Mapping[str, VerificationReport],
+    *,
+    console: Console,
+    transformation: str = "",
+) -> None:
+    """Print the structure of a plant, and for each method whether it can serve this plant."""
+    facts = list(plant_facts(plant))
+    if transformation:
+        facts.insert(0, ("transformed", transformation))
+    print_section(console, "Plant", facts_table(facts))
+    columns = [structure_facts(structure) for structure in structures.values()]
+    if columns:
+        rows = [(label, *(column[label] for column in columns)) for label in columns[0]]
+        headings = ["", *structures] if len(columns) > 1 else []
+        print_section(console, "Structure (information, no verdict)", facts_table(rows, headings=headings))
+    for method, report in methods.items():
+        title = f"Existence conditions of {method}"
+        print_section(console, title, checks_table(report.checks, width=console.width))
+        console.print(_existence_line(method, report))
+
+
+def _existence_line(method: str, report: VerificationReport) -> Text:
+    if report.passed:
+        return Text(f"{method}: all conditions hold, so a design exists.", style="green")
+    failed = ", ".join(check.name for check in report.failures) or "no condition was checked"
+    if {check.name for check in report.failures} & _ASKED:
+        return Text(f"{method}: needs more options: {failed}.", style="yellow")
+    return Text(f"{method}: {_verdict(report.failures)} for this plant: {failed}.", style="bold red")
+
+
+def is_unclear(failed: Sequence[Check]) -> bool:
+    """Whether all conditions that do not hold are undecided."""
+    return bool(failed) and all(check.unclear for check in failed)
+
+
+def _verdict(failed: Sequence[Check]) -> str:
+    return "UNCLEAR" if is_unclear(failed) else "IMPOSSIBLE"
+
+
+def structure_facts(structure: Structure) -> dict[str, str]:
+    """Return the facts about a plant's structure."""
+    blocks = [f"{size}" for size in structure.infinite_block_sizes]
+    return {
+        "pencil A - zE": "regular" if structure.regular else "NOT regular",
+        "index": "-" if structure.index is None else str(structure.index),
+        "rank of E": structure.rank_of_E.describe(),
+        "finite eigenvalues": complex_numbers(structure.finite_eigenvalues),
+        "infinite blocks": f"{len(blocks)}, of size {name_list(sorted(set(blocks)))}" if blocks else "none",
+        "impulse-free": _yes(structure.impulse_free),
+        "stable": _yes(structure.stable),
+        "admissible": _yes(structure.admissible),
+        "finitely observable": _yes(structure.finitely_observable),
+        "unobservable modes": complex_numbers(structure.unobservable_modes),
+        "detectable": _yes(structure.detectable),
+        "undetectable modes": complex_numbers(structure.undetectable_modes),
+        "impulse observable": _yes(structure.impulse_observable),
+        "rank [E; C] = nx": _yes(structure.causally_observable),
+        "unclear ranks": name_list(structure.unclear),
+    }
+
+
+def _yes(value: bool) -> str:
+    return "yes" if value else "no"
+
+
+def diagnosis_report(diagnosis: Diagnosis, *, console: Console, everything: bool = True) -> None:
+    """Print what can be diagnosed: verdicts and sentences; isolability and banks with ``everything``."""
+    if not diagnosis.faults:
+        return
+    print_section(console, diagnosis.heading, _rich_table(diagnosis.verdict_rows()))
+    console.print(Text(_COLUMN_MEANINGS, style="dim"))
+    if everything and len(diagnosis.faults) > 1:
+        rows = diagnosis.bank_rows()
+        print_section(
+            console,
+            "Isolability: which fault (row) can be distinguished from which (column)",
+            _rich_table(diagnosis.isolability_rows()),
+        )
+        more = len(rows) - 1 - MOST_BANK_ROWS
+        title = "Structured residuals" + (f" ({more} more are not shown; --json has them)" if more > 0 else "")
+        if len(rows) > 1:
+            print_section(console, title, _rich_table(rows[: MOST_BANK_ROWS + 1]))
+    for sentence in diagnosis.sentences:
+        console.print(Text(sentence))
+    for warning in diagnosis.warnings:
+        console.print(Text(f"Warning: {warning}", style="yellow"))
+    if diagnosis.sentences or diagnosis.warnings:
+        console.print()
+
+
+def _rich_table(rows: Sequence[Sequence[str]]) -> Table:
+    table = headed_table(*rows[0])
+    for column, (heading, *cells) in zip(table.columns, zip(*rows, strict=True), strict=True):
+        column.overflow = "fold"
+        # A column that cannot fold must not be narrowed: the last columns would be cut off.
+        column.no_wrap = " " not in heading and all(len(cell) <= len(heading) for cell in cells)
+    for row in rows[1:]:
+        table.add_row(*(Text(text) for text in row))
+    return table
+
+
+def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") -> Iterator[tuple[str, str, str]]:
+    """Yield method, verdict in words and style; methods for other kinds of plants come last, in one line."""
+    others = []
+    for method, report in methods.items():
+        failed = report.failures
+        names = {check.name for check in failed}
+        asked = " (the spec's method)" if method == own else ""
+        if report.passed:
+            yield method, f"all conditions hold, so a design exists{asked}", "green"
+        elif _PLANT_KIND in names and method != own:
+            others.append(method)
+        elif names & set(_TIME_CONDITIONS):
+            yield method, next(text for name, text in _TIME_CONDITIONS.items() if name in names) + asked, "yellow"
+        elif _OF_THIS_KIND in names:
+            reason = next(check.detail for check in failed if check.name == _OF_THIS_KIND)
+            yield method, f"not for this plant{asked}: {reason}".rstrip("."), "yellow"
+        elif names & _ASKED:
+            reason = " ".join(check.detail for check in failed if check.name in _ASKED)
+            yield method, f"needs more options{asked}: {reason}".rstrip("."), "yellow"
+        else:
+            yield method, f"{_verdict(failed)} for this plant{asked}: {_reason(failed)}", "bold red"
+    if others:
+        yield "for other kinds of plants", ", ".join(others), "dim"
+
+
+def print_methods(methods: Mapping[str, VerificationReport], *, own: str, console: Console) -> None:
+    """Print the lines of all methods."""
+    for method, text, style in method_lines(methods, own=own):
+        lines = textwrap.wrap(
+            f"{method}: {text}", min(console.width, 120), subsequent_indent="  ", break_on_hyphens=False
+        )
+        for line in lines:
+            console.print(Text(line, style=style), soft_wrap=True)
+
+
+def _reason(failed: Sequence[Check]) -> str:
+    if not failed:
+        return "no condition was checked"
+    first, *more = failed
+    told = f"the condition '{first.name.removeprefix('exists: ')}' FAILS. Needed: {first.claim}".rstrip(".")
+    told += f". Found: {first.detail}".rstrip(".") if first.detail else ""
+    return f"{told}." + (f" {len(more)} more condition{' fails' if len(more) == 1 else 's fail'} (-v)." if more else "")
+
+
+def linear_plant_text(plant: DescriptorSystem) -> str:
+    """Return operating point and matrices, each with its signals."""
+    lines = ["Operating point:"]
+    for name, value in plant.operating_point.items():
+        unit = plant.units.get(name, "1")
+        lines.append(f"  {name} = {value:.8g}{'' if unit == '1' else ' ' + unit}")
+    for name, signals in (
+        ("E", plant.state_names),
+        ("A", plant.state_names),
+        ("B", plant.input_names),
+        ("C", plant.state_names),
+        ("Bf", plant.fault_names),
+        ("Df", plant.fault_names),
+        ("Bd", plant.disturbance_names),
+    ):
+        matrix = getattr(plant, name)
+        if matrix.size and (np.any(matrix) or name in "EABC"):
+            lines += [f"{name}, columns {', '.join(signals)}:"]
+            lines += ["  " + "  ".join(f"{value + 0.0:>11.5g}" for value in row) for row in matrix]
+    return "\n".join(lines)
+
+
+def plant_document(plant: DescriptorSystem, source: str) -> str:
+    """Return the plant as YAML that a spec can name; every number as exact as it is."""
+    data: dict[str, Any] = {"schema_version": 1, "dt": float(plant.dt)}
+    for name in PLANT_MATRICES:
+        matrix = getattr(plant, name)
+        if matrix.size and (np.any(matrix) or name in "EAC"):
+            data[name] = [[float(value) + 0.0 for value in row] for row in matrix]
+    data |= {name: list(getattr(plant, name)) for name in _PLANT_NAMES if getattr(plant, name)}
+    data["operating_point"] = {name: float(value) for name, value in plant.operating_point.items()}
+    data["units"] = dict(plant.units)
+    where = "at the operating point below and at nominal values of all constants"
+    return f"# Linearised by obsynth from {source}, {where}.\n{yaml_text(data)}"

@@ -1,0 +1,1 @@
+"""Pictures of designs and simulations, readable without colour; public as ``obsynth.plotting``."""

@@ -1,0 +1,254 @@
+"""What reaches the estimates of faults and states, and the residual, at each frequency."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.analysis.existence.augmented_pencils import equilibrated
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import arguments_checked, chosen
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.modal_response import resolved
+from obsynth.numerics.norms import response
+from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.spectra import boundary_points
+from obsynth.observers.linear.derived import GRID_REACH, frequency_grid
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.pencil import regularity_of
+from obsynth.report.plots.panels import WIDTH, one_panel, plain_decades, tidy
+from obsynth.results.design import ObserverDesign
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+#: A gain below this share of what is subtracted from one another in it is rounding: zero gain.
+GAIN_ROUNDING_SHARE = 1e-9
+
+#: Frequencies between the neighbours of a largest gain: a peak that was missed by 1 % is missed by 1e-5 then.
+POINTS_OF_A_PEAK = 33
+
+#: The least singular value is drawn where it is below this share of the largest one somewhere.
+VISIBLE_SHARE = 0.99
+
+TARGETS = {"faults": "fault estimates", "states": "errors of the states", "residuals": "residual"}
+
+_STYLES: dict[str, dict[str, Any]] = {
+    "faults": {"color": "black", "linewidth": 1.8, "linestyle": "-"},
+    "disturbances": {"color": "tab:red", "linewidth": 1.6, "linestyle": "--"},
+    "noise": {"color": "tab:blue", "linewidth": 1.6, "linestyle": ":"},
+}
+
+_LEAST_LINE: dict[str, Any] = {"color": "black", "linewidth": 0.8, "linestyle": "-"}
+
+_BOUND: dict[str, Any] = {"color": "tab:green", "linewidth": 1.2, "linestyle": "-."}
+
+
+@dataclass(frozen=True, eq=False)
+class EstimateGains:
+    """Singular values from what acts on a plant to what an observer says.
+
+    Fields: frequencies: ``(k,)``, rad/s; gains: Largest ones from ``faults``, ``disturbances``, ``noise`` as far as the
+    plant has them: ``(k,)``, zero where only rounding is left; least: ``(k,)``: the least ones from the faults.
+    """
+
+    frequencies: FloatArray
+    gains: dict[str, FloatArray]
+    least: FloatArray
+
+
+@arguments_checked
+def estimate_gains(design: ObserverDesign, *, to: str = "faults") -> EstimateGains:
+    """Return the singular values of the transfer functions that matter, from the plant and the shipped realisation.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Linear.
+    to : {"faults", "states", "residuals"}, optional
+        The fault estimates, the errors of the state estimates (aligned with their delays), or the residual.
+
+    Returns
+    -------
+    EstimateGains
+        Around the poles of the observer.
+
+    Raises
+    ------
+    SpecError
+        The design is recursive, or has no such output.
+    """
+    plant, observer = design.linear
+    chosen(to, "to", tuple(TARGETS))
+    rows = {"faults": observer.fault_rows, "states": observer.state_rows, "residuals": observer.residual_rows}[to]
+    if rows.start == rows.stop:
+        what = "estimates no faults" if to == "faults" else f"has no {to}"
+        raise SpecError(f"The design {what}.", path="observer")
+    frequencies, points, to_estimate = _over_frequencies(observer, rows)
+    inputs = {"faults": (plant.Bf, plant.Df), "disturbances": (plant.Bd, plant.Dd), "noise": (plant.Bw, plant.Dw)}
+    gains: dict[str, FloatArray] = {}
+    least: FloatArray = np.zeros(len(points))
+    for name, (b, d) in inputs.items():
+        if not b.shape[1]:
+            continue
+        states, seen, terms = _seen(plant, b, d, points, to_estimate)
+        if to == "states":
+            truth = _delayed(observer, points) * states
+            seen, terms = seen - truth, terms + _sizes(truth)
+        values = _above_rounding(np.linalg.svd(seen, compute_uv=False), terms[:, None])
+        gains[name] = values[:, 0]
+        if name == "faults":
+            least = values[:, -1]
+    return EstimateGains(frequencies, gains, least)
+
+
+@dataclass(frozen=True, eq=False)
+class FaultGains:
+    """Largest gain from unknown inputs to fault estimates ``(nf, nd)``; share of a step shown in the end ``(nf,)``."""
+
+    disturbance_gains: FloatArray
+    steady: FloatArray
+
+
+def fault_gains(design: ObserverDesign) -> FaultGains:
+    """Return what reaches each fault estimate of a linear design that estimates faults."""
+    plant, observer = design.linear
+    frequencies, points, to_estimate = _over_frequencies(observer, observer.fault_rows)
+    disturbance_gains = np.zeros((len(observer.fault_names), plant.nd))
+    if plant.nd:
+        found = _disturbance_gains(plant, points, to_estimate)
+        # A peak lies between the frequencies of the grid: beside the largest gains they are looked at closely.
+        top = frequencies[-1] * (GRID_REACH if observer.dt == 0.0 else 1.0)
+        sides = np.concatenate([frequencies[:1] / GRID_REACH, frequencies, [top]])
+        peaks = np.unique(found.argmax(axis=0))
+        near = np.concatenate([np.geomspace(sides[k], sides[k + 2], POINTS_OF_A_PEAK) for k in peaks])
+        closely = _disturbance_gains(plant, *_at_frequencies(observer, observer.fault_rows, near))
+        disturbance_gains = np.maximum(found.max(axis=0), closely.max(axis=0))
+    own = [plant.fault_names.index(name) for name in observer.fault_names]
+    _, slowest, _ = _seen(plant, plant.Bf, plant.Df, points, to_estimate)
+    steady = slowest[0].real[np.arange(len(own)), own]
+    return FaultGains(disturbance_gains, np.asarray(steady))
+
+
+def _disturbance_gains(plant: DescriptorSystem, points: ComplexArray, to_estimate: ComplexArray) -> FloatArray:
+    """Return gains from each unknown input to each fault estimate ``(k, nf, nd)``."""
+    _, found, terms = _seen(plant, plant.Bd, plant.Dd, points, to_estimate)
+    return _above_rounding(np.abs(found), terms[:, None, None])
+
+
+def _over_frequencies(observer: LinearObserver, rows: slice) -> tuple[FloatArray, ComplexArray, ComplexArray]:
+    """Return frequencies (rad/s), their points on the boundary, and what some outputs make of y there."""
+    frequencies = frequency_grid(observer)[1:]
+    return frequencies, *_at_frequencies(observer, rows, frequencies)
+
+
+def _at_frequencies(
+    observer: LinearObserver, rows: slice, frequencies: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return the points on the boundary of some frequencies (rad/s), and what some outputs make of y there."""
+    points = boundary_points(frequencies, observer.dt)
+    return points, response(observer.Az, observer.By, observer.Cz[rows], observer.Dy[rows], points)
+
+
+def _seen(
+    plant: DescriptorSystem, b: FloatArray, d: FloatArray, points: ComplexArray, to_estimate: ComplexArray
+) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    """Return the states that an input drives, what the outputs show of it, and the size of the terms of that."""
+    states = _state_response(plant, b, points)
+    outputs = plant.C @ states + d
+    return states, np.asarray(to_estimate @ outputs), _sizes(to_estimate) * _sizes(outputs)
+
+
+def _above_rounding(sizes: Any, terms: FloatArray) -> FloatArray:
+    """Return sizes, and zero where only the rounding of terms is left."""
+    return np.asarray(np.where(sizes > GAIN_ROUNDING_SHARE * terms, sizes, 0.0), dtype=np.float64)
+
+
+def _sizes(matrices: ComplexArray) -> FloatArray:
+    return np.asarray(np.linalg.norm(matrices, axis=(1, 2)))
+
+
+def _delayed(observer: LinearObserver, points: ComplexArray) -> ComplexArray:
+    """Return what a known delay makes of each state, ``(k, nx, 1)``."""
+    delays = np.array(observer.state_delays, dtype=float)
+    return np.asarray(points[:, None, None] ** -delays[None, :, None])
+
+
+def _state_response(plant: DescriptorSystem, b: FloatArray, points: ComplexArray) -> ComplexArray:
+    """Return a state for each input: of a plant that is not regular one of many, which its estimates cannot tell."""
+    if regularity_of(plant)[0]:
+        try:
+            return np.concatenate([*resolved(plant.E, plant.A, b, points)])
+        except np.linalg.LinAlgError:
+            pass  # beside an integrator a low frequency is lost in rounding
+    return np.stack([_least_state(point * plant.E - plant.A, b) for point in points])
+
+
+def _least_state(pencil: ComplexArray, b: FloatArray) -> ComplexArray:
+    """Return the least ``x`` with ``pencil x = b``, where each row and column has a size near one."""
+    nx = pencil.shape[1]
+    scaled, columns = equilibrated(np.hstack([pencil, b]))
+    found = np.linalg.pinv(scaled[:, :nx], rcond=RANK_TOLERANCE) @ scaled[:, nx:]
+    return np.asarray(columns[:nx, None] * found / columns[nx:])
+
+
+@arguments_checked
+def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None = None) -> Axes:
+    """Plot what reaches the fault estimates (or the state errors, or the residual), from whatever acts on the plant.
+
+    A faithful fault estimate has singular values of 1 from the faults and small ones from disturbances and noise.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Linear.
+    to : {"faults", "states", "residuals"}, optional
+        As for `estimate_gains`.
+    axes : Axes, optional
+        New ones by default.
+
+    Returns
+    -------
+    Axes
+        Largest singular values over the frequency, both logarithmic; the least one from the faults too where it
+        differs, and the gain that was proved where there is one.
+
+    Raises
+    ------
+    SpecError
+        The design is recursive, or has no such output.
+    """
+    found, target = estimate_gains(design, to=to), TARGETS.get(to, "")
+    panel = one_panel(axes, size=(WIDTH, 4.0))
+    if to == "faults":
+        panel.axhline(1.0, color="0.7", linewidth=0.8, zorder=0)
+    for name, gain in found.gains.items():
+        if np.any(gain > 0.0):
+            ending = "" if np.all(gain > 0.0) else " (elsewhere only rounding)"
+            panel.plot(found.frequencies, _positive(gain), label=f"{name} to {target}{ending}", **_STYLES[name])
+        else:
+            panel.plot([], [], label=f"{name}: zero gain", **_STYLES[name])
+    largest = found.gains.get("faults", found.least)
+    if to != "states" and np.any(found.least < VISIBLE_SHARE * largest):
+        panel.plot(found.frequencies, _positive(found.least), label="faults, least singular value", **_LEAST_LINE)
+    gamma = design.certificate.claims.get("gamma")
+    if to == "faults" and gamma is not None and "disturbances" in found.gains:
+        panel.plot(found.frequencies[[0, -1]], [gamma, gamma], label=f"proved for disturbances: {gamma:.4g}", **_BOUND)
+    plain_decades(panel)
+    plain_decades(panel, across=True)
+    panel.set_xlabel("frequency (rad/s)")
+    panel.set_ylabel("singular value")
+    if found.gains:
+        panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    else:
+        panel.set_title("The plant states no faults, disturbances or noise.")
+    tidy(panel)
+    return panel
+
+
+def _positive(gain: FloatArray) -> FloatArray:
+    return np.where(gain > 0.0, gain, np.nan)

@@ -1,0 +1,177 @@
+"""The spectrum of an observer with the limit of stability, and the region that was asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.analysis.zeros import fault_zeros
+from obsynth.methods.registry import REGISTRY, method_class
+from obsynth.numerics.arguments import arguments_checked
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.spectra import eigenvalues
+from obsynth.report.plots.panels import WIDTH, one_panel
+from obsynth.results.design import ObserverDesign
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+#: From this ratio of the fastest to the slowest part on, axes are logarithmic away from zero.
+WIDE_RATES = 30.0
+
+#: Points of the grid on which a region is found, each way.
+REGION_GRID = 400
+
+_LIMIT: dict[str, Any] = {"color": "0.45", "linewidth": 1.0, "linestyle": "--"}
+
+_REGION_EDGE: dict[str, Any] = {"color": "tab:green", "linewidth": 1.4, "linestyle": "-."}
+
+_REGION_SHADE = "0.93"
+
+_POLE_MARKS: dict[str, Any] = {
+    "marker": "x",
+    "markersize": 9,
+    "markeredgewidth": 1.6,
+    "linestyle": "none",
+    "color": "black",
+    "zorder": 3,
+}
+
+_ZEROS: dict[str, Any] = {
+    "marker": "o",
+    "markersize": 9,
+    "markeredgewidth": 1.6,
+    "linestyle": "none",
+    "color": "tab:red",
+    "markerfacecolor": "none",
+    "zorder": 3,
+}
+
+#: How far a complex number is outside of a part of the region: negative inside.
+Excess = Callable[[ComplexArray], FloatArray]
+
+
+@arguments_checked
+def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
+    """Plot the observer's eigenvalues and the plant's fault zeros, the limit of stability, and the region asked for.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Of a linear method, either time.
+    axes : Axes, optional
+        New ones by default.
+
+    Returns
+    -------
+    Axes
+        The complex plane: with the unit circle in discrete time; in 1/s with the imaginary axis in continuous time,
+        logarithmic away from zero where the eigenvalues spread widely.
+
+    Raises
+    ------
+    SpecError
+        The design is recursive.
+    """
+    plant, observer = design.linear
+    sampled = observer.dt > 0.0
+    axes = one_panel(axes, size=(5.0, 5.4) if sampled else (WIDTH, 4.4))
+    poles = np.asarray(eigenvalues(observer.Az), dtype=complex)
+    zeros = np.array([zero.value for zero in fault_zeros(plant)[0]], dtype=complex)
+    axes.axhline(0.0, color="0.85", linewidth=0.8, zorder=0)
+    if sampled:
+        _discrete_plane(axes, poles, zeros)
+    else:
+        _continuous_plane(axes, poles, zeros)
+    _draw_region(axes, region_asked_for(design))
+    axes.plot(poles.real, poles.imag, label=f"observer eigenvalues ({len(poles)})", **_POLE_MARKS)
+    axes.plot(zeros.real, zeros.imag, label=f"fault zeros ({len(zeros)})", **_ZEROS)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    return axes
+
+
+def _discrete_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> None:
+    circle = np.exp(2j * np.pi * np.linspace(0.0, 1.0, 361))
+    axes.plot(circle.real, circle.imag, label="unit circle", **_LIMIT)
+    axes.axvline(0.0, color="0.85", linewidth=0.8, zorder=0)
+    axes.set_aspect("equal")
+    reach = 1.1 * max(1.05, float(np.max(np.abs(np.concatenate([poles, zeros])), initial=0.0)))
+    axes.set_xlim(-reach, reach)
+    axes.set_ylim(-reach, reach)
+    axes.set_xlabel("real part")
+    axes.set_ylabel("imaginary part")
+
+
+def _continuous_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> None:
+    axes.axvline(0.0, label="limit of stability", **_LIMIT)
+    shown = np.concatenate([poles, zeros])
+    for values, scale, limits in (
+        (shown.real, axes.set_xscale, axes.set_xlim),
+        (shown.imag, axes.set_yscale, axes.set_ylim),
+    ):
+        sizes = np.abs(values)
+        alive = sizes[sizes > np.finfo(np.float64).eps * np.max(np.abs(shown), initial=0.0)]
+        if not alive.size:
+            limits(-1.0, 1.0)
+        elif alive.max() > WIDE_RATES * alive.min():
+            scale("symlog", linthresh=float(alive.min()))
+            limits(*(side * 3.0 * float(max(np.max(side * values), alive.min())) for side in (-1.0, 1.0)))
+        else:
+            reach = 0.15 * float(alive.max())
+            limits(float(min(np.min(values), 0.0)) - reach, float(max(np.max(values), 0.0)) + reach)
+    axes.set_xlabel("real part (1/s)")
+    axes.set_ylabel("imaginary part (1/s)")
+
+
+def region_asked_for(design: ObserverDesign) -> list[Excess]:
+    """Return the parts of the region that was asked for (or imposed and proved); none where none was."""
+    claims, options, dt = design.certificate.claims, design.options, design.linear[1].dt
+    asked = options.get("region") or {}
+    asked = dict(asked) if isinstance(asked, Mapping) else {}
+    decay = asked.get("decay") or options.get("decay") or 0.0
+    if design.method in REGISTRY and "decay" in method_class(design.method).imposed:
+        decay = claims.get("decay", 0.0)
+    parts: list[Excess] = []
+    if decay and dt > 0.0:
+        parts.append(lambda z: np.abs(z) - np.exp(-decay * dt))
+    elif decay:
+        parts.append(lambda s: s.real + decay)
+    if asked.get("radius"):
+        parts.append(lambda s: np.abs(s) - asked["radius"])
+    if asked.get("damping"):
+        parts.append(lambda s: asked["damping"] * np.abs(s) + s.real)
+    if "disk_radius" in claims:
+        parts.append(lambda s: np.abs(s + claims["disk_centre"]) - claims["disk_radius"])
+    return parts
+
+
+def _draw_region(axes: Axes, parts: list[Excess]) -> None:
+    """Shade where all parts hold, within the limits of the axes, on whatever scale they have."""
+    if not parts:
+        return
+    scales = axes.xaxis.get_transform(), axes.yaxis.get_transform()
+    x, y = (_grid(scale, limits) for scale, limits in zip(scales, (axes.get_xlim(), axes.get_ylim()), strict=True))
+    plane = x[None, :] + 1j * y[:, None]
+    excess = np.max([part(plane) for part in parts], axis=0)
+    axes.contourf(x, y, excess, levels=[-np.inf, 0.0], colors=[_REGION_SHADE], zorder=-1)
+    if excess.min() < 0.0 < excess.max():
+        axes.contour(
+            x,
+            y,
+            excess,
+            levels=[0.0],
+            colors=[_REGION_EDGE["color"]],
+            linestyles=[_REGION_EDGE["linestyle"]],
+            linewidths=[_REGION_EDGE["linewidth"]],
+            zorder=1,
+        )
+    axes.plot([], [], label="region asked for", **_REGION_EDGE)
+
+
+def _grid(scale: Any, limits: tuple[float, float]) -> FloatArray:
+    """Return points that are evenly spaced on a scale."""
+    low, high = scale.transform(np.array(limits))
+    return np.asarray(scale.inverted().transform(np.linspace(float(low), float(high), REGION_GRID)))

@@ -1,0 +1,176 @@
+"""Designs against one another: what one promise costs in another, scans of delta, studies of tolerances, sweeps."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import arguments_checked, is_number
+from obsynth.report.plots.panels import PANEL_HEIGHT, WIDE_AXIS, WIDTH, new_panels, plain_decades, tidy
+from obsynth.results.design import ObserverDesign
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+#: Inches: height of the picture of a sweep.
+SWEEP_HEIGHT = 4.2
+
+#: A ratio of the largest to the smallest value above which an axis is logarithmic.
+LOGARITHMIC = 100.0
+
+#: Markers of lines, in turn, and of cases without a design, by what they came to.
+MARKERS = "osD^vP*Xh"
+
+FAILED = {"impossible": "x", "infeasible": "+", "unknown": "1", "unverified": "2", "malformed": "|"}
+
+#: At most so many lines get an entry of their own in the legend.
+MOST_LINES = 8
+
+
+@arguments_checked
+def plot_trade_off(
+    designs: Sequence[ObserverDesign], along: str, against: str | Sequence[str], *, axes: Iterable[Axes] | None = None
+) -> list[Axes]:
+    """Plot what several designs claim (or what was found in their reports) against one of their claims.
+
+    Parameters
+    ----------
+    designs : sequence of ObserverDesign
+        Such as designs of one plant with several values of an option.
+    along : str
+        Claim, check or numeric option on the horizontal axis, such as ``"decay"``.
+    against : str or sequence of str
+        Claims, checks or numeric options, one panel each, such as ``"noise_amplification"`` or
+        ``"noise in fhat[valve]"``.
+    axes : iterable of Axes, optional
+        One for each of ``against``; new ones, one above the other, by default.
+
+    Returns
+    -------
+    list of Axes
+        One for each of ``against``; logarithmic where the values spread over more than a decade.
+
+    Raises
+    ------
+    SpecError
+        No design, or one that has no such number (the names that it has are listed).
+    """
+    if len(designs) == 0:
+        raise SpecError("A trade-off needs designs: give at least one.", path="designs")
+    names = [against] if isinstance(against, str) else list(against)
+    panels = new_panels(axes, len(names), size=(WIDTH, PANEL_HEIGHT * len(names) + 1.2))
+    x = np.array([_number(design, along) for design in designs])
+    order = np.argsort(x, kind="stable")
+    for panel, name in zip(panels, names, strict=True):
+        y = np.array([_number(design, name) for design in designs])
+        panel.plot(x[order], y[order], color="black", linewidth=1.2, marker="o", markersize=5)
+        for values in (x, y):
+            if values.min() > 0.0 and values.max() > WIDE_AXIS * values.min():
+                plain_decades(panel, across=values is x)
+        panel.set_ylabel(name)
+        tidy(panel)
+        panel.margins(x=0.03)
+    if panels:
+        panels[-1].set_xlabel(along)
+    return panels
+
+
+def _number(design: ObserverDesign, name: str) -> float:
+    claims, checks = design.certificate.claims, {check.name: check.value for check in design.report.checks}
+    options = {key: float(value) for key, value in design.options.items() if is_number(value)}
+    for source in (claims, checks, options):
+        if name in source:
+            return float(source[name])
+    raise SpecError(
+        f"Design {design.name!r} has no {name!r}: its claims are {', '.join(claims) or 'none'}; names of checks and "
+        f"numeric options ({', '.join(options) or 'none'}) go too.",
+        path=name,
+    )
+
+
+def plot_sweep(results: Sequence[Any], claim: str | None = None, *, parameter: str | None = None) -> Figure:
+    """Draw a claim of every case over a parameter, one line for each combination of the others."""
+    import matplotlib.pyplot as plt
+
+    claim = _claim(results, claim)
+    along = _parameter(results, parameter)
+    figure, panel = plt.subplots(figsize=(WIDTH, SWEEP_HEIGHT), layout="constrained")
+    lines: dict[str, list[tuple[float, Any]]] = {}
+    for number, result in enumerate(results, 1):
+        place = float(number) if along is None else float(result.parameters[along])
+        lines.setdefault("" if along is None else _others(result, along), []).append((place, result))
+    for number, (label, points) in enumerate(lines.items()):
+        points.sort(key=lambda point: point[0])
+        panel.plot(
+            [place for place, _ in points],
+            [result.claims.get(claim, np.nan) for _, result in points],
+            linewidth=1.0,
+            marker=MARKERS[number % len(MARKERS)],
+            markersize=4,
+            label=label if label and number < MOST_LINES else None,
+        )
+    # Cases without a design are marked at the lower edge, by what they came to.
+    for status, marker in FAILED.items():
+        places = [place for points in lines.values() for place, result in points if result.status == status]
+        if places:
+            panel.plot(
+                places,
+                [0.03] * len(places),
+                marker,
+                color="tab:red",
+                markersize=8,
+                clip_on=False,
+                transform=panel.get_xaxis_transform(),
+                label=f"{status}: {len(places)}",
+            )
+    values = [result.claims[claim] for result in results if claim in result.claims]
+    if _spread(values):
+        panel.set_yscale("log")
+    if along is not None and _spread([place for points in lines.values() for place, _ in points]):
+        panel.set_xscale("log")
+    panel.set_xlabel("case" if along is None else along)
+    panel.set_ylabel(claim)
+    tidy(panel)
+    if panel.get_legend_handles_labels()[1]:
+        panel.legend(frameon=False, fontsize="small")
+    return figure
+
+
+def _claim(results: Sequence[Any], claim: str | None) -> str:
+    counts: Counter[str] = Counter(name for result in results for name in result.claims)
+    if claim is None and counts:
+        return max(counts, key=lambda name: counts[name])
+    if claim is None or claim not in counts:
+        known = ", ".join(counts) or "none"
+        raise SpecError(f"No design of the sweep claims {claim!r}; there are: {known}.", path="claim")
+    return claim
+
+
+def _parameter(results: Sequence[Any], parameter: str | None) -> str | None:
+    numbers = {}
+    for name in {name for result in results for name in result.parameters}:
+        values = [result.parameters.get(name) for result in results]
+        if all(is_number(value) for value in values):
+            numbers[name] = len(set(values))
+    if parameter is not None and parameter not in numbers:
+        known = ", ".join(numbers) or "none"
+        raise SpecError(f"{parameter!r} is no number that was varied; there are: {known}.", path="parameter")
+    varied = {name: count for name, count in numbers.items() if count > 1}
+    return parameter or max(sorted(varied), key=lambda name: varied[name], default=None)
+
+
+def _others(result: Any, along: str) -> str:
+    stem = result.name.partition(",")[0]
+    said = [f"{name.rpartition('.')[2]} = {value}" for name, value in result.parameters.items() if name != along]
+    return ", ".join([stem, *said])
+
+
+def _spread(values: list[float]) -> bool:
+    positive = [value for value in values if value > 0.0]
+    return len(positive) == len(values) > 1 and max(positive) >= LOGARITHMIC * min(positive)

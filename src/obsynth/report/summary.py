@@ -1,0 +1,273 @@
+"""A finished design in about twelve lines: what it is, what each fault estimate is worth, what it rests on."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+from obsynth.analysis.structure import questions
+from obsynth.files.tables import html_table
+from obsynth.methods.fault_figures import FaultFigures
+from obsynth.methods.guaranteed_test.method import is_guaranteed
+from obsynth.methods.registry import REGISTRY, method_class
+from obsynth.observers.linear.derived import SETTLED_TO, transient
+from obsynth.observers.window.observer import WindowObserver
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.signal_names import listed
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.report.designs import (
+    FAR_FROM_ONE,
+    design_warnings,
+    fault_estimates,
+    followed_steps,
+    gains_if_linear,
+    unproved,
+)
+from obsynth.report.plants import plain_table
+from obsynth.report.plots.frequency import FaultGains
+from obsynth.results.design import ObserverDesign
+from obsynth.results.layout import number, verdict_line
+
+#: Faults, warnings and notes that are listed; the others are counted.
+_MOST_IN_SUMMARY, _MOST_NOTES = 5, 1
+
+#: An unknown input that reaches a fault estimate in the fault's own unit with this gain or more is not separated from
+#: the fault.
+UNSEPARATED_GAIN = 0.5
+
+#: An estimate follows a step if in the end it misses it by no more than this share.
+FOLLOWS = 0.1
+
+_LABEL = 10
+
+#: Claims that say what a design is worth; the others are for -v.
+_PROMISES = ("gamma", "decay")
+
+#: Errors that shrink to less of them in a step are gone within a few, and how much is left is rounding.
+LEAST_CONTRACTION = 1e-6
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The lines of a summary: a verdict, facts by label, a table of the fault estimates, warnings and notes."""
+
+    verdict: str
+    passed: bool
+    facts: tuple[tuple[str, str], ...]
+    headings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    more: str
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+    file: str = ""
+
+    def lines(self, width: int = 80) -> Iterator[tuple[str, str]]:
+        """Yield text and style of each line, none wider than ``width`` but the file's."""
+        yield self.verdict, "green" if self.passed else "bold red"
+        for label, text in self.facts:
+            yield from ((line, "") for line in _wrapped(label, text, width))
+        if self.rows:
+            yield from plain_table(self.headings, self.rows, width)
+        if self.more:
+            yield self.more, "dim"
+        for text in self.warnings:
+            yield from ((line, "yellow") for line in _wrapped("warning", text, width))
+        for text in self.notes:
+            yield from ((line, "") for line in _wrapped("note", text, width))
+        if self.file:
+            yield f"Gain set: {self.file}", ""
+
+    def __repr__(self) -> str:
+        """Return the lines as plain text."""
+        return "\n".join(text for text, _ in self.lines())
+
+    def html(self) -> str:
+        """Return the summary as a piece of HTML."""
+        colour = "#1a7f37" if self.passed else "#b42318"
+        parts = [f'<p style="color:{colour};font-weight:600">{escape(self.verdict)}</p>', "<table>"]
+        parts += [
+            f'<tr><th style="text-align:left">{escape(label)}</th><td style="text-align:left">{escape(text)}</td></tr>'
+            for label, text in self.facts
+        ]
+        parts += ["</table>", *([html_table([self.headings, *self.rows])] if self.rows else [])]
+        parts += [f"<p>{escape(self.more)}</p>"] if self.more else []
+        parts += [f'<p style="color:#9a6700">Warning: {escape(text)}</p>' for text in self.warnings]
+        parts += [f"<p>Note: {escape(text)}</p>" for text in self.notes]
+        return f'<div class="obsynth-design">{"".join(parts)}</div>'
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the summary as plain data."""
+        return {
+            "verdict": self.verdict,
+            "passed": self.passed,
+            "facts": dict(self.facts),
+            "estimates": [dict(zip(self.headings, row, strict=True)) for row in self.rows],
+            "warnings": list(self.warnings),
+            "notes": list(self.notes),
+        }
+
+
+def summary(design: ObserverDesign, *, file: Path | None = None, everything: bool = False) -> Summary:
+    """Return the summary of a design; with ``everything`` no fault and no note is left out."""
+    gains = gains_if_linear(design)
+    steps = followed_steps(design)
+    headings, rows = fault_estimates(design, gains)
+    warnings = tuple(_warnings(design, gains, steps))
+    shown = len(rows) if everything else _MOST_IN_SUMMARY
+    notes = design.notes if everything else design.notes[:_MOST_NOTES]
+    hidden = ((len(rows) - shown, "more estimate"), (len(design.notes) - len(notes), "more note"))
+    more = _counted([(count, what) for count, what in hidden if count > 0])
+    verdict = f"{design.name}: {verdict_line(design.report.checks).plain}"
+    return Summary(
+        verdict,
+        design.report.passed,
+        tuple(_facts(design, steps)),
+        headings,
+        tuple(rows[:shown]),
+        f"{more} with -v" if more else "",
+        warnings,
+        notes,
+        "" if file is None else str(file),
+    )
+
+
+def print_summary(found: Summary, *, console: Console) -> None:
+    """Print a summary; a file's name stays in one piece, so that it can be copied."""
+    for text, style in found.lines(min(console.width, 120)):
+        console.print(Text(text, style=style), soft_wrap=True)
+
+
+def _facts(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterator[tuple[str, str]]:
+    known = method_class(design.method) if design.method in REGISTRY else None
+    yield "method", design.method + (f": {known.summary}" if known else "")
+    yield "plant", _plant(design.plant)
+    yield from _promise(design)
+    yield "dynamics", _dynamics(design)
+    yield from _speed(design, steps)
+    yield "assumes", "; ".join(_assumptions(design))
+
+
+def _plant(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> str:
+    counts = [(len(plant.state_names), "state"), (len(plant.output_names), "output")]
+    if isinstance(plant, DescriptorSystem):
+        time = f"{plant.dt:g} s between samples" if plant.is_discrete else "continuous in time"
+        return f"{time}; {_counted([*counts, (plant.nf, 'fault'), (plant.nd, 'unknown input')])}"
+    counts.append((len(plant.parameter_names), "parameter"))
+    if isinstance(plant, DAEModel):
+        return f"nonlinear; {_counted(counts)}"
+    varying = [name for name, matrix in plant.matrices.items() if not matrix.is_constant]
+    change = (
+        f"{', '.join(varying)} {'change' if len(varying) > 1 else 'changes'} with k" if varying else "constant matrices"
+    )
+    return f"{plant.dt:g} s between samples; {change}; {_counted(counts)}"
+
+
+def _counted(counts: Sequence[tuple[int, str]]) -> str:
+    return ", ".join(f"{count or 'no'} {word}{'' if count == 1 else 's'}" for count, word in counts)
+
+
+def _promise(design: ObserverDesign) -> Iterator[tuple[str, str]]:
+    """Yield the claim that says what is shipped."""
+    known = method_class(design.method).claims if design.method in REGISTRY else {}
+    claims = design.certificate.claims
+    for name in (name for name in _PROMISES if name in claims and name in known):
+        unit = f" {known[name].unit}" if known[name].unit else ""
+        label, meaning = (
+            ("claim", known[name].meaning)
+            if design.report.passed
+            else ("claimed", f"{unproved(known[name].meaning)} (NOT proved: checks fail)")
+        )
+        yield label, f"{name} = {number(claims[name])}{unit}, {meaning}"
+
+
+def _dynamics(design: ObserverDesign) -> str:
+    """Return how fast the initial-condition response settles, and the order of the observer."""
+    if isinstance(design.observer, WindowObserver):
+        return f"the last {design.observer.samples} samples are used, and none before them"
+    if isinstance(design.plant, DescriptorSystem):
+        seconds = transient(design.linear[1])
+        if not math.isfinite(seconds):
+            return f"the initial-condition response does not decay; observer of order {design.observer.order}"
+        settling = f"{100.0 * SETTLED_TO:g} % settling time {number(float(f'{seconds:.2g}'))} s"
+        return f"{settling}; observer of order {design.observer.order}"
+    factor = design.certificate.claims.get("contraction", math.nan)
+    share = f"less than {100.0 * LEAST_CONTRACTION:g}" if factor < LEAST_CONTRACTION else number(100.0 * factor)
+    return f"errors shrink to {share} % per step on average; observer of order {design.observer.order}"
+
+
+def _speed(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterator[tuple[str, str]]:
+    """Yield how soon the estimates show a step, where that is later than their delays say."""
+    if not steps:
+        return
+    observer = design.linear[1]
+    late = dict(zip(observer.fault_names, observer.fault_delays, strict=True))
+    reached = [(name, found.most) for name, found in steps.items() if found.reaches]
+    digits = 4 if observer.dt > 0.0 else 3
+    told = [
+        f"{name} {number(most, digits=digits)} s" for name, most in reached if most > (late[name] + 0.5) * observer.dt
+    ]
+    if told:
+        yield "step", f"the estimate reaches 90 % after: {listed(told, most=_MOST_IN_SUMMARY)}"
+
+
+def _assumptions(design: ObserverDesign) -> Iterator[str]:
+    if isinstance(design.plant, DescriptorSystem):
+        uncertain = design.plant.uncertainty
+        some = uncertain is not None and bool(uncertain.box.names)
+        yield "an exact model, except in thresholds over its tolerances" if some else "an exact model"
+    else:
+        bounded = isinstance(design.observer, WindowObserver)
+        yield f"a model with the stated {'bounds' if bounded else 'noise'}"
+    model = design.options.get("fault_model")
+    if isinstance(model, str):
+        yield f"faults that follow the model '{model}'"
+    if is_guaranteed(design) and isinstance(design.plant, DescriptorSystem) and design.options.get("noise_bound"):
+        yield "noise within its stated bounds"
+    elif isinstance(design.plant, DescriptorSystem):
+        noisy = sum(bool(row.any()) for row in design.plant.Dw)
+        yield f"white noise on {noisy} of {design.plant.ny} sensors" if noisy else "no sensor noise stated"
+
+
+def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[str, FaultFigures]) -> Iterator[str]:
+    """Yield what a user should not overlook: disturbances that look like faults, steps that are not followed."""
+    if isinstance(design.plant, DescriptorSystem):
+        yield from questions(design.plant)
+    if gains is None:
+        return
+    plant, observer = design.linear
+    units = plant.units
+    told = []
+    for i, fault in enumerate(observer.fault_names):
+        for j, name in enumerate(plant.disturbance_names):
+            gain = float(gains.disturbance_gains[i, j])
+            if gain >= UNSEPARATED_GAIN and units.get(fault) == units.get(name):
+                yield (
+                    f"{name} reaches the estimate of {fault} with a gain of up to {number(gain)}: the estimate cannot "
+                    "separate it from the fault."
+                )
+        followed = float(gains.steady[i])
+        if abs(followed - 1.0) > FOLLOWS:
+            share = f"{round(100.0 * followed)} %" if abs(followed) <= FAR_FROM_ONE else "many times the size"
+            told.append(fault)
+            yield f"the estimate of {fault} does not follow a step: its steady state is {share} of it."
+    yield from design_warnings(design, steps, told=told)
+    for check in design.report.checks:
+        if check.name.startswith("limit at "):
+            place = check.name.removeprefix("limit at ")
+            limit = check.claim.rpartition(": ")[0].replace("at this zero", f"At the zero {place}")
+            yield f"{limit.replace('cannot follow', 'cannot follow a fault of that mode')}."
+
+
+def _wrapped(label: str, text: str, width: int) -> list[str]:
+    return textwrap.wrap(
+        text, width, initial_indent=f"{label:<{_LABEL}}", subsequent_indent=" " * _LABEL, break_on_hyphens=False
+    )

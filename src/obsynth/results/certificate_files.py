@@ -1,0 +1,125 @@
+"""Certificates on disk: a kind, a version, a digest and what is certified, as one JSON document."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.files.inputs import read_json
+from obsynth.files.outputs import FileKind
+from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_set_writing import design_as_dict, digest_of, plain, restored
+from obsynth.results.gain_sets import COMPARISON, ROBUSTNESS, STUDY
+
+RESULTS = (ROBUSTNESS, STUDY, COMPARISON)
+
+RESULT_FILE = FileKind(
+    "a certificate of a result",
+    rb'\A\s*\{\s*"kind":\s*"obsynth (robustness|tolerance study|comparison)"',
+    suffix=".json",
+)
+
+RESULT_VERSION = 1
+
+#: Digits of a digest that a sentence shows.
+SHOWN_DIGITS = 12
+
+
+#: Figures that are found again agree to this share of themselves, or of the largest beside them for rounding.
+SAME_FIGURE, FIGURE_ROUNDING_SHARE = 1e-6, 1e-9
+
+
+def sealed(kind: str, version: int, body: Any, *, under: str = "certificate") -> str:
+    """Return the text of a file that holds a body, plain data, with its digest."""
+    document = {"kind": kind, "schema_version": version, "sha256": digest_of(body), under: body}
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def opened(
+    path: Path,
+    kinds: tuple[str, ...],
+    version: int,
+    what: str,
+    again: str,
+    *,
+    under: str = "certificate",
+    is_protected: bool = True,
+) -> tuple[str, dict[str, Any], bool]:
+    """Return kind and body of what `sealed` wrote, and whether its digest is right; ``again`` says how to make one."""
+    document = read_json(path, is_protected=is_protected)
+    if not isinstance(document, dict) or document.get("kind") not in kinds:
+        raise SpecError(f"{path} is no {what}.", path=str(path))
+    body = document.get(under)
+    if document.get("schema_version") != version or not isinstance(body, dict):
+        raise SpecError(
+            f"{path} has the schema version {document.get('schema_version')!r}, and this obsynth reads {version}: "
+            f"{again}.",
+            path=str(path),
+        )
+    try:
+        return document["kind"], body, document.get("sha256") == digest_of(body)
+    except RecursionError as error:
+        raise SpecError(f"{path} is nested too deeply to be a {what}: {again}.", path=str(path)) from error
+
+
+def result_text(
+    kind: str,
+    designs: Mapping[str, ObserverDesign],
+    asked: Mapping[str, Any],
+    result: Mapping[str, Any],
+    statement: str,
+    log: Mapping[str, Any] | None = None,
+) -> str:
+    """Return the certificate of a result: what was asked, the figures, the sentence, and every gain set inside."""
+    told = plain({"statement": statement, "asked": asked, "result": result, "log": log})
+    inside = {name: design_as_dict(design) for name, design in designs.items()}
+    return sealed(kind, RESULT_VERSION, {**told, "gain_sets": inside})
+
+
+def differences(stored: Any, found: Any, where: str = "") -> list[str]:
+    """Return the places at which two results differ, numbers by more than rounding."""
+    if isinstance(found, Mapping):
+        if not isinstance(stored, Mapping) or stored.keys() != found.keys():
+            return [where or "names"]
+        items = [(str(name), stored[name], found[name]) for name in found]
+    elif isinstance(found, (list, tuple)):
+        if not isinstance(stored, (list, tuple)) or len(stored) != len(found):
+            return [where]
+        items = [(str(i + 1), one, other) for i, (one, other) in enumerate(zip(stored, found, strict=True))]
+    else:
+        return [] if _same_figure(stored, found, 0.0) else [where]
+    numbers = [abs(float(other)) for _, _, other in items if _is_figure(other)]
+    rounding = FIGURE_ROUNDING_SHARE * max((size for size in numbers if size < float("inf")), default=0.0)
+    wrong = []
+    for name, one, other in items:
+        place = f"{where}, {name}" if where else name
+        if not _is_figure(other):
+            wrong += differences(one, other, place)
+        elif not _same_figure(one, other, rounding):
+            wrong.append(place)
+    return wrong
+
+
+def _is_figure(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _same_figure(one: Any, other: Any, rounding: float) -> bool:
+    if not (_is_figure(one) and _is_figure(other)):
+        return bool(type(one) is type(other) and one == other)
+    if one == other or (one != one and other != other):
+        return True
+    if not (np.isfinite(one) and np.isfinite(other)):
+        return False
+    return bool(abs(one - other) <= max(SAME_FIGURE * abs(other), rounding))
+
+
+def body_of(body: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a certificate of a result holds beside its gain sets, as it was before it was written."""
+    found: dict[str, Any] = restored({name: value for name, value in body.items() if name != "gain_sets"})
+    return found

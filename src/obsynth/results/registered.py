@@ -1,0 +1,18 @@
+"""Functions of upper rooms that methods of results call: registered by `obsynth`, which stands above every room."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+_FUNCTIONS: dict[str, Callable[..., Any]] = {}
+
+
+def register(**functions: Callable[..., Any]) -> None:
+    """Register functions by the names under which lower rooms call them."""
+    _FUNCTIONS.update(functions)
+
+
+def registered(name: str) -> Callable[..., Any]:
+    """Return the function that was registered by this name."""
+    return _FUNCTIONS[name]

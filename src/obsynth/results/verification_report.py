@@ -1,0 +1,88 @@
+"""A verification report: its rows, and whether all of them hold."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from obsynth.numerics.arguments import require_kind
+from obsynth.results.checks import Check, all_hold
+
+#: Checks by the names that they had once; asked for by these, they answer with a DeprecationWarning.
+FORMER_NAMES = {"state part": "state error alone", "P part alone": "proportional part alone"}
+
+
+@dataclass(frozen=True)
+class VerificationReport:
+    """All checks of one design; an empty report fails.
+
+    Parameters
+    ----------
+    checks : tuple of Check
+        The rows, in the order of the argument they make.
+    """
+
+    checks: tuple[Check, ...] = field(default_factory=tuple)
+
+    @classmethod
+    def of(cls, checks: Iterable[Check]) -> VerificationReport:
+        """Return a report.
+
+        Parameters
+        ----------
+        checks : iterable of Check
+            Its rows.
+        """
+        return cls(tuple(checks))
+
+    @property
+    def passed(self) -> bool:
+        """Whether there is at least one real check and all of them hold."""
+        return all_hold(self.checks)
+
+    @property
+    def failures(self) -> tuple[Check, ...]:
+        """The checks that do not hold."""
+        return tuple(check for check in self.checks if not check.passed)
+
+    def __getitem__(self, name: str) -> Check:
+        for check in self.checks:
+            if check.name == name:
+                return check
+        if name in FORMER_NAMES:
+            warnings.warn(f"The check {name!r} is now {FORMER_NAMES[name]!r}.", DeprecationWarning, stacklevel=2)
+            return self[FORMER_NAMES[name]]
+        raise KeyError(f"no check named {name!r}; there are: {', '.join(c.name for c in self.checks)}")
+
+    def __repr__(self) -> str:
+        """Return the table of the checks."""
+        from obsynth.results.layout import report_text
+
+        return report_text(self.checks)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as plain data."""
+        rows = [asdict(check) for check in self.checks]
+        for row in rows:
+            if not row["unclear"]:
+                del row["unclear"]
+        return {"passed": self.passed, "checks": rows}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> VerificationReport:
+        """Return the report that `as_dict` wrote.
+
+        Parameters
+        ----------
+        data : dict
+            With the key ``checks``.
+        """
+        require_kind(data, dict, "data", "what as_dict() returns")
+        return cls.of(Check(**row) for row in data["checks"])
+
+
+def failed_rows(report: VerificationReport) -> str:
+    """Return the rows that fail as a text."""
+    return "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)

@@ -1,0 +1,316 @@
+"""Designs and scenarios side by side, ready to run: plant, signals and observer, once for each of many seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.continuous import driven, first_order_hold
+from obsynth.numerics.ranks import covariance_factor
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.derived import sample_observer
+from obsynth.observers.linear.observer import LinearObserver, split_rows
+from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.recursive.gain_schedule import run_batch
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.window.observer import WindowObserver
+from obsynth.plants.sequences import MatrixSequence
+from obsynth.plants.signal_names import index_of
+from obsynth.results.design import ObserverDesign
+from obsynth.simulation.dae import simulate_dae
+from obsynth.simulation.linear import PlantRuns, scenario_runs, scenario_stepper, varying_runs
+from obsynth.simulation.scenario import Scenario, observer_start
+from obsynth.simulation.signals import ScenarioSignals, resolve_parameters
+from obsynth.verification.over_tolerances.plants_of_the_box import drawn_points, plant_at
+
+#: Warm-up ends when the effect of an error at the start has shrunk to this share of its largest, for good.
+WARM_UP_SHARE = 0.01
+
+#: Notes on simulations.
+INPUTS_BETWEEN_SAMPLES = (
+    "Between samples the plant is exact for signals that are constant or linear there; its observer is sampled by a "
+    "first-order hold."
+)
+
+STABILISED = (
+    "A stabilising state feedback (linear-quadratic, unit weights) was added for this simulation; the inputs include "
+    "it."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """What happened in several runs, ``(steps, runs, signals)`` each."""
+
+    states: FloatArray
+    outputs: FloatArray  # as measured
+    inputs: FloatArray
+    faults: FloatArray  # the parameters of a plant that has some
+    disturbances: FloatArray
+    rows: FloatArray  # the observer's states, faults, residuals
+    observer: LinearObserver | RecursiveObserver | DAEObserver
+    kept: tuple[Estimates, ...] = ()  # estimates that say more than rows
+
+    @property
+    def estimates(self) -> tuple[Estimates, ...]:
+        """What the observer says, one per run."""
+        if not isinstance(self.observer, LinearObserver):
+            return self.kept
+        return tuple(split_rows(self.observer, self.rows[:, run]) for run in range(self.rows.shape[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """A design and a scenario, ready to run; it can be sent to another process, with a model that is data."""
+
+    signals: ScenarioSignals
+    observer: LinearObserver | RecursiveObserver | DAEObserver  # in discrete time
+    initial_state: FloatArray
+    fault_signals: slice
+    estimated: tuple[int, ...]  # which of the true faults are estimated
+    notes: tuple[str, ...]
+    #: The plant alone, once for each seed.
+    simulated: Callable[[Sequence[int]], PlantRuns]
+    #: Rows of the observer from outputs and inputs of several runs, and its estimates where they say more than rows.
+    observed: Callable[[FloatArray, FloatArray], tuple[FloatArray, tuple[Estimates, ...]]]
+
+    def run(self, seeds: Sequence[int]) -> Runs:
+        """Run the plant and the observer, once for each seed."""
+        states, outputs, inputs, faults, disturbances = self.simulated(seeds)
+        rows, kept = self.observed(outputs, inputs)
+        return Runs(states, outputs, inputs, faults, disturbances, rows, self.observer, kept)
+
+    @property
+    def onset(self) -> int | None:
+        """First sample at which a fault acts, or a faulty sensor; `None` if there is none."""
+        return self.signals.first_fault(self.fault_signals)
+
+    def warm_ups(self) -> tuple[int | None, int | None]:
+        """Return from when the start no longer shows in the estimates of states, and of faults; 0 with deviations."""
+        observer, steps = self.observer, self.signals.steps
+        if not isinstance(observer, LinearObserver):
+            return 0, 0
+
+        def end(rows: slice, delays: tuple[int, ...]) -> int | None:
+            shown, sizes = observer.Cz[rows], np.zeros(steps)
+            for k in range(steps):
+                sizes[k] = np.linalg.norm(shown)
+                shown = shown @ observer.Az
+            late = np.flatnonzero(sizes > WARM_UP_SHARE * np.max(sizes))
+            found = max(int(late[-1]) + 1 if late.size else 0, *delays, 0)
+            return found if found < steps else None
+
+        return end(observer.state_rows, observer.state_delays), end(observer.fault_rows, observer.fault_delays)
+
+
+def make_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
+    """Return the bench of a linear design and a scenario."""
+    plant, observer = design.linear
+    start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])
+    drive, stepper = scenario_stepper(plant, scenario, start)
+    begin = observer_start(scenario, observer.order)
+    ramp = np.zeros((observer.order, len(observer.input_names) + len(observer.output_names)))
+    if observer.dt <= 0.0:
+        ramp = first_order_hold(observer.Az, np.hstack([observer.Bu, observer.By]), drive.dt)[2]
+        observer = sample_observer(observer, drive.dt)
+    said = ((not plant.is_discrete, INPUTS_BETWEEN_SAMPLES), (stepper.feedback is not None, STABILISED))
+    return Bench(
+        drive,
+        observer,
+        start,
+        slice(plant.nu, plant.nu + plant.nf),
+        tuple(index_of(name, plant.fault_names, what="The plant") for name in observer.fault_names),
+        tuple(text for holds, text in said if holds),
+        partial(scenario_runs, drive, stepper, (plant.nu, plant.nu + plant.nf)),
+        partial(_linear_rows, observer, begin, ramp),
+    )
+
+
+def _linear_rows(
+    observer: LinearObserver, begin: FloatArray, ramp: FloatArray, outputs: FloatArray, inputs: FloatArray
+) -> tuple[FloatArray, tuple[Estimates, ...]]:
+    """Return what a linear observer says to ``outputs (steps, runs, ny)``, ``inputs (steps, runs, nu)``: its rows.
+    ``ramp (nz, nu + ny)``: what a first sample adds to the state at the start."""
+    start = begin - np.concatenate([inputs[0], outputs[0]], axis=1) @ ramp.T
+    z = driven(observer.Az, start, inputs @ observer.Bu.T + outputs @ observer.By.T)
+    rows = z @ observer.Cz.T + inputs @ observer.Du.T + outputs @ observer.Dy.T + observer.added
+    return np.asarray(rows), ()
+
+
+def drawn_designs(design: ObserverDesign, count: int, seed: int) -> list[ObserverDesign]:
+    """Return a linear design for so many plants, drawn from the box of its plant's constants."""
+    plant, _ = design.linear
+    uncertain = plant.uncertainty
+    if uncertain is None:
+        return [design] * count
+    points = drawn_points(len(uncertain.box.names), count, seed)
+    return [design.replace(plant=plant_at(plant, uncertain.box.values(q))) for q in points]
+
+
+def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
+    """Return a design and a scenario, ready to run."""
+    if isinstance(design.observer, LinearObserver):
+        return make_bench(design, scenario)
+    if isinstance(design.observer, WindowObserver):
+        raise SpecError(
+            f"Design {design.name!r} is a test whose weights change with k: it cannot be simulated. Simulate the "
+            "plant (obsynth.simulate(plant, scenario)) and run the test on the outputs (design.observer.run).",
+            path="observer",
+        )
+    observer: RecursiveObserver | DAEObserver
+    simulated: Callable[..., PlantRuns]
+    if isinstance(design.observer, DAEObserver):
+        observer = design.observer
+        model = observer.model
+        drive = resolve_parameters(model, scenario, dt=observer.dt)
+        start, inputs, theta = model.nominal_state, model.nominal_input, model.nominal_parameters
+        note = "The plant was integrated by Radau IIA, with inputs constant during each step."
+        simulated = partial(_dae_plant, observer)
+    else:
+        observer = design.recursive[1]
+        adaptation = observer.adaptation
+        drive = resolve_parameters(observer.plant, scenario, dt=observer.dt)
+        start, inputs = observer.initial_state, np.zeros(observer.plant.nu)
+        note = "The model begins with y(1): the first row of the outputs is empty."
+        theta = np.zeros(observer.plant.nq) if adaptation is None else adaptation.initial_parameters
+        simulated = partial(_varying_plant, observer)
+    names = observer.state_names
+    begin = np.array([scenario.initial_state.get(name, value) for name, value in zip(names, start, strict=True)])
+    nu, estimated = len(inputs), tuple(range(len(observer.fault_names)))
+    true = inputs + drive.left[:, :nu], theta + drive.left[:, nu:]
+    return Bench(
+        drive,
+        observer,
+        begin,
+        slice(nu, None),
+        estimated,
+        (note,),
+        partial(simulated, drive, begin, *true),
+        partial(_rows_of, observer),
+    )
+
+
+def _varying_plant(
+    observer: RecursiveObserver,
+    drive: ScenarioSignals,
+    begin: FloatArray,
+    inputs: FloatArray,
+    parameters: FloatArray,
+    seeds: Sequence[int],
+) -> PlantRuns:
+    steps = drive.steps
+    mu, nu = np.zeros((steps, len(seeds), observer.plant.ne)), np.zeros((steps - 1, len(seeds), observer.plant.ny))
+    process, sensing = _factors(observer.Q, steps), _factors(observer.R, steps - 1)
+    for run, seed in enumerate(seeds):
+        rng = np.random.default_rng(seed)
+        if drive.noise:
+            mu[:, run] = drive.noise * _drawn(process, rng)
+            nu[:, run] = drive.noise * _drawn(sensing, rng)
+        if drive.deviations.any():
+            nu[:, run] += drive.deviations * rng.standard_normal(nu[:, run].shape)
+    states, clean = varying_runs(
+        observer.plant,
+        parameters=parameters,
+        inputs=inputs,
+        initial_state=begin,
+        equation_noise=mu,
+        output_noise=nu,
+    )
+    return _with_parameters(observer, drive, states, clean, inputs, parameters)
+
+
+def _dae_plant(
+    observer: DAEObserver,
+    drive: ScenarioSignals,
+    begin: FloatArray,
+    inputs: FloatArray,
+    parameters: FloatArray,
+    seeds: Sequence[int],
+) -> PlantRuns:
+    share = drive.noise**2
+    runs = [
+        simulate_dae(
+            observer.model,
+            inputs,
+            dt=observer.dt,
+            parameters=parameters,
+            initial_state=begin,
+            Q=share * observer.Q if share else None,
+            R=share * observer.R + np.diag(drive.deviations**2),
+            seed=seed,
+        )
+        for seed in seeds
+    ]
+    states, clean = (np.stack([getattr(run, name) for run in runs], axis=1) for name in ("states", "outputs"))
+    return _with_parameters(observer, drive, states, clean, inputs, parameters)
+
+
+def _with_parameters(
+    observer: RecursiveObserver | DAEObserver,
+    drive: ScenarioSignals,
+    states: FloatArray,
+    clean: FloatArray,
+    inputs: FloatArray,
+    parameters: FloatArray,
+) -> PlantRuns:
+    """Return runs of a plant with parameters, with outputs as its sensors give them (``clean (steps, runs, ny)``)."""
+    outputs = np.moveaxis(observer.timing.arriving(np.moveaxis(drive.measured(clean), 1, 0)), 0, 1)
+    steps, runs = outputs.shape[:2]
+    shared = (np.broadcast_to(signal[:, None], (steps, runs, signal.shape[1])) for signal in (inputs, parameters))
+    return states, outputs, *shared, np.zeros((steps, runs, 0))  # type: ignore[return-value]
+
+
+def _rows_of(
+    observer: RecursiveObserver | DAEObserver, outputs: FloatArray, inputs: FloatArray
+) -> tuple[FloatArray, tuple[Estimates, ...]]:
+    """Return the rows and the estimates of an observer with parameters; all runs have the same inputs."""
+    if isinstance(observer, RecursiveObserver):
+        estimates = _recursive_estimates(observer, outputs, inputs[:, 0])
+    else:
+        estimates = tuple(observer.run(outputs[:, run], inputs[:, 0]) for run in range(outputs.shape[1]))
+    rows = np.stack([np.hstack([found.states, found.faults, found.residuals]) for found in estimates], axis=1)
+    return rows, estimates
+
+
+def _recursive_estimates(observer: RecursiveObserver, outputs: FloatArray, inputs: FloatArray) -> tuple[Estimates, ...]:
+    """Return the estimates of every run; gains and covariances depend on no data, unless the observer resets."""
+    runs = outputs.shape[1]
+    resets = observer.adaptation is not None and bool(observer.adaptation.reset)
+    if runs == 1 or resets or not observer.is_plain:
+        return tuple(observer.run(outputs[:, run], inputs, compiled=False) for run in range(runs))
+    first = observer.run(outputs[:, 0], inputs, compiled=False)
+    others = run_batch(observer, np.swapaxes(outputs[:, 1:], 0, 1), inputs)
+    width = first.innovations.shape[1]
+    found = [first]
+    for states, parameters, innovations in zip(others.states, others.faults, others.innovations, strict=True):
+        seen = read_only(innovations[:, :width])
+        nis = read_only(_squares(seen, first.regressors, parameters))
+        found.append(replace(first, states=states, faults=parameters, innovations=seen, nis=nis))
+    return tuple(found)
+
+
+def _factors(covariances: MatrixSequence, steps: int) -> FloatArray:
+    """Return square roots ``(steps, n, n)`` of covariances."""
+    if covariances.is_constant:
+        root = covariance_factor(covariances.at(0), covariances.name)
+        return np.broadcast_to(root, (steps, *root.shape))
+    roots = [covariance_factor(covariances.at(k), f"{covariances.name}({k})") for k in range(steps)]
+    return np.stack(roots) if roots else np.zeros((0, *covariances.shape))
+
+
+def _drawn(factors: FloatArray, rng: np.random.Generator) -> FloatArray:
+    return np.asarray(np.einsum("kij,kj->ki", factors, rng.standard_normal(factors.shape[:2])))
+
+
+def _squares(innovations: FloatArray, regressors: FloatArray, parameters: FloatArray) -> FloatArray:
+    """Return squared innovations at the parameters estimated one sample before."""
+    before = np.concatenate([parameters[:1], parameters[:-1]])
+    gaps = innovations
+    if regressors.shape[1:] == (innovations.shape[1], parameters.shape[1]) and regressors.size:
+        gaps = innovations - np.einsum("kmq,kq->km", np.nan_to_num(regressors), before)
+    return np.asarray(np.nansum(gaps**2, axis=1))

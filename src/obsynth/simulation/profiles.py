@@ -1,0 +1,268 @@
+"""How one signal of a scenario goes with time; between samples it is held or linear, so that simulations are exact.
+
+A profile acts from the first sample at or after ``start`` until the last one before ``end``.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
+from typing import Annotated, ClassVar
+
+import numpy as np
+from annotated_types import Gt, Le
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import OpenUnitInterval, Positive, check_fields, is_finite_number, is_number, shown
+from obsynth.numerics.arrays import FloatArray, require_no_overflow
+
+#: Share of a sample by which rounding may move a start or an end.
+SAMPLE_SLACK = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Profile:
+    """What all profiles have: ``start`` and ``end``, seconds, between which they act; without end by default."""
+
+    #: Whether the signal is held between samples; else it is linear there.
+    held: ClassVar[bool] = True
+    start: float = 0.0
+    end: float = math.inf
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if value is None and item.name == "value":
+                continue
+            if not is_finite_number(value) and not (item.name == "end" and is_number(value) and value == math.inf):
+                raise SpecError(f"{item.name} is {shown(value)}: give a finite number.", path=item.name)
+            if item.name != "end":
+                require_no_overflow(value, item.name, item.name)
+        check_fields(self, type(self))
+        if not self.end > self.start:
+            raise SpecError(f"end ({self.end:g} s) is not after start ({self.start:g} s).", path="end")
+
+    def active(self, steps: int, dt: float) -> np.ndarray:
+        """Return which of the samples 0 to ``steps - 1`` it acts on."""
+        place = np.arange(steps) + SAMPLE_SLACK
+        return np.asarray((place >= self.start / dt) & (place < self.end / dt))
+
+
+class Additive(Profile, ABC):
+    """A function of time, which is added to its signal."""
+
+    @abstractmethod
+    def _at(self, time: FloatArray) -> FloatArray:
+        """Return its values at ``time``, seconds."""
+
+    def sampled(self, steps: int, dt: float) -> tuple[FloatArray, FloatArray]:
+        """Return its values at the left and right end of each interval between samples, ``(steps,)`` each."""
+        acts, values = self.active(steps, dt), self._at(dt * np.arange(steps + 1, dtype=np.float64))
+        left = np.where(acts, values[:-1], 0.0)
+        return left, left.copy() if self.held else np.where(acts, values[1:], 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step(Additive):
+    """A constant; on a sensor, its bias.
+
+    Parameters
+    ----------
+    size : float
+        In the signal's unit.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    size: float
+
+    def _at(self, time: FloatArray) -> FloatArray:
+        return np.full(time.shape, float(self.size))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ramp(Additive):
+    """A straight line from zero at ``start``; linear between samples.
+
+    Parameters
+    ----------
+    rate : float
+        Per second.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    held: ClassVar[bool] = False
+    rate: float
+
+    def _at(self, time: FloatArray) -> FloatArray:
+        return np.asarray(self.rate * (time - self.start))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sine(Additive):
+    """``amplitude sin(frequency t + phase)``, t the scenario's time; linear between samples.
+
+    Parameters
+    ----------
+    amplitude : float
+        In the signal's unit.
+    frequency : float, rad/s
+        Angular frequency.
+    phase : float, optional, rad
+        At t = 0.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    held: ClassVar[bool] = False
+    amplitude: float
+    frequency: float
+    phase: float = 0.0
+
+    def _at(self, time: FloatArray) -> FloatArray:
+        return np.asarray(self.amplitude * np.sin(self.frequency * time + self.phase))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drift(Additive):
+    """A slow approach to ``size``, with a time constant; linear between samples.
+
+    Parameters
+    ----------
+    size : float
+        Where it ends.
+    time_constant : float, seconds
+        After which 63 % are reached.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    held: ClassVar[bool] = False
+    size: float
+    time_constant: Positive
+
+    def _at(self, time: FloatArray) -> FloatArray:
+        # Before the start it is masked; there the exponential must not overflow.
+        return np.asarray(-self.size * np.expm1(-np.maximum(time - self.start, 0.0) / self.time_constant))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intermittent(Additive):
+    """A constant that comes and goes.
+
+    Parameters
+    ----------
+    size : float
+        While it is there.
+    period : float, seconds
+        From one coming to the next.
+    duty : float, optional
+        Share of the period during which it is there, between 0 and 1.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    size: float
+    period: Positive
+    duty: OpenUnitInterval = 0.5
+
+    def _at(self, time: FloatArray) -> FloatArray:
+        turn = (time - self.start) / self.period + SAMPLE_SLACK
+        return np.where(turn - np.floor(turn) < self.duty, float(self.size), 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stuck(Profile):
+    """An actuator or a sensor that stays where it is.
+
+    Parameters
+    ----------
+    value : float, optional
+        Where; by default where it is when this begins.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    value: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LostEffectiveness(Profile):
+    """An actuator or a sensor that gives only a share of its signal.
+
+    Parameters
+    ----------
+    share : float
+        What is lost, between 0 (nothing) and 1 (all).
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    share: Annotated[float, Gt(0.0), Le(1.0)]
+
+
+class Random(Profile, ABC):
+    """Independent samples, held between samples."""
+
+    @abstractmethod
+    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
+        """Return ``steps`` samples, drawn with ``rng``."""
+
+    @abstractmethod
+    def moments(self) -> tuple[float, float, float]:
+        """Return the largest absolute value (infinite if there is none), the mean and the variance."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Uniform(Random):
+    """Independent samples, uniform between two limits (a bias is their mean), held between samples.
+
+    Parameters
+    ----------
+    low, high : float
+        The limits.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.high > self.low:
+            raise SpecError("high must be greater than low.", path="high")
+
+    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
+        return np.asarray(rng.uniform(self.low, self.high, steps))
+
+    def moments(self) -> tuple[float, float, float]:
+        """Return the same as `Random.moments`."""
+        return max(abs(self.low), abs(self.high)), (self.low + self.high) / 2, (self.high - self.low) ** 2 / 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gaussian(Random):
+    """Independent normal samples, held between samples.
+
+    Parameters
+    ----------
+    deviation : float
+        Standard deviation.
+    mean : float, optional
+        Their mean.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    deviation: Positive
+    mean: float = 0.0
+
+    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
+        return np.asarray(rng.normal(self.mean, self.deviation, steps))
+
+    def moments(self) -> tuple[float, float, float]:
+        """Return the same as `Random.moments`."""
+        return math.inf, self.mean, self.deviation**2

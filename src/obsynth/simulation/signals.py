@@ -1,0 +1,244 @@
+"""Signals over a record: those of a scenario for one plant and one sampling, given ones, and what a plant did."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, as_given, as_matrix, freeze
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.signal_names import index_of
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.simulation.profiles import SAMPLE_SLACK, Additive, LostEffectiveness, Profile, Random, Stuck
+from obsynth.simulation.scenario import FAILURES, Scenario, profiles_of
+
+#: A simulation holds every sample in memory: a typing error in a horizon must not fill it.
+MAXIMUM_SAMPLES = 5_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioSignals:
+    """A scenario for one plant, in arrays, apart from its random numbers: column and profile of each of those."""
+
+    dt: float
+    left: FloatArray  # (steps, nu + nf + nd): [u, f, d] where each interval begins
+    right: FloatArray  # where it ends
+    random: tuple[tuple[int, Random], ...]
+    sensors: tuple[tuple[int, Profile], ...]
+    noise: float
+    deviations: FloatArray  # (ny,) of more noise
+
+    @property
+    def steps(self) -> int:
+        """Number of samples."""
+        return len(self.left)
+
+    def drawn(self, seeds: Sequence[int], nw: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return what the seeds add: signals, plant noise, sensor noise, ``(steps, runs, *)`` each."""
+        steps, ny = self.steps, len(self.deviations)
+        signals = np.zeros((steps, len(seeds), self.left.shape[1]))
+        noise, sensors = np.zeros((steps, len(seeds), nw)), np.zeros((steps, len(seeds), ny))
+        for run, seed in enumerate(seeds):
+            rng = np.random.default_rng(seed)
+            for column, profile in self.random:
+                signals[:, run, column] += np.where(profile.active(steps, self.dt), profile._draw(rng, steps), 0.0)
+            if self.noise and nw:
+                noise[:, run] = self.noise * rng.standard_normal((steps, nw))
+            if self.deviations.any():
+                sensors[:, run] = self.deviations * rng.standard_normal((steps, ny))
+        return signals, noise, sensors
+
+    def measured(self, outputs: FloatArray) -> FloatArray:
+        """Return outputs ``(steps, runs, ny)`` as the faulty sensors show them."""
+        shown = outputs.copy()
+        for column, profile in self.sensors:
+            acts = profile.active(self.steps, self.dt)
+            if isinstance(profile, LostEffectiveness):
+                shown[acts, :, column] *= 1.0 - profile.share
+            elif isinstance(profile, Stuck) and acts.any():
+                first = shown[int(np.argmax(acts)), :, column] if profile.value is None else profile.value
+                shown[acts, :, column] = first
+            elif isinstance(profile, Additive):
+                shown[:, :, column] += profile.sampled(self.steps, self.dt)[0][:, None]
+        return shown
+
+    def first_fault(self, faults: slice) -> int | None:
+        """Return the first sample at which a fault or a faulty sensor acts; `None` if there is none."""
+        wrong = np.any(self.left[:, faults] != 0.0, axis=1)
+        for _, profile in self.sensors:
+            wrong |= profile.active(self.steps, self.dt)
+        return int(np.argmax(wrong)) if wrong.any() else None
+
+
+def resolve(plant: DescriptorSystem, scenario: Scenario) -> ScenarioSignals:
+    """Return the signals of ``scenario`` for ``plant``."""
+    scenario.check_names(plant)
+    return _resolved(plant, scenario, scenario.step_of(plant), plant.fault_names, plant.disturbance_names)
+
+
+def resolve_parameters(
+    plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Scenario, *, dt: float
+) -> ScenarioSignals:
+    """Return the signals of ``scenario`` for a plant with parameters: ``[u, theta]``, less their nominal values."""
+    check_parameters(plant, scenario)
+    if scenario.sample_time is not None and scenario.sample_time != dt:
+        raise SpecError(
+            f"sample_time is {scenario.sample_time:g} s, but the observer has {dt:g} s: leave it out.",
+            path="sample_time",
+        )
+    drive = _resolved(plant, scenario, dt, plant.parameter_names, ())
+    if isinstance(plant, TimeVaryingDescriptorSystem) and plant.horizon is not None and drive.steps > plant.horizon:
+        raise SpecError(
+            f"The scenario has {drive.steps} samples, but the plant is known for {plant.horizon} steps: its horizon "
+            f"must be below {plant.horizon * dt:g} s.",
+            path="horizon",
+        )
+    return drive
+
+
+def check_parameters(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Scenario) -> None:
+    """Raise where a scenario says what a plant with parameters does not have."""
+    scenario.check_names(plant)
+    for name, profile in profiles_of(scenario, "faults"):
+        if isinstance(profile, FAILURES):
+            raise SpecError(
+                "A parameter neither sticks nor loses effectiveness: give a step or another profile, which is added to "
+                "it.",
+                path=f"faults.{name}",
+            )
+    for group, why in {
+        "disturbances": "Such a plant has no disturbances: give noise, or make one of them a parameter.",
+        "observer_state": "A recursive observer starts where its design says: leave observer_state out.",
+        "stabilise": "No feedback is designed for such a plant: give inputs that keep it near its operating point.",
+    }.items():
+        if getattr(scenario, group):
+            raise SpecError(why, path=group)
+
+
+def _resolved(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel,
+    scenario: Scenario,
+    dt: float,
+    faults: tuple[str, ...],
+    disturbances: tuple[str, ...],
+) -> ScenarioSignals:
+    if scenario.horizon / dt > MAXIMUM_SAMPLES:
+        raise SpecError(
+            f"{scenario.horizon:g} s are {scenario.horizon / dt:.3g} samples of {dt:g} s, more than "
+            f"{MAXIMUM_SAMPLES:,}: shorten the horizon.",
+            path="horizon",
+        )
+    steps, before = int(scenario.horizon / dt + SAMPLE_SLACK) + 1, 0
+    groups = {"inputs": plant.input_names, "faults": faults, "disturbances": disturbances}
+    left, right = np.zeros((2, steps, sum(map(len, groups.values()))))
+    random: list[tuple[int, Random]] = []
+    for group, names in groups.items():
+        for name, profile in profiles_of(scenario, group):
+            column = before + index_of(name, names, what=group)
+            if isinstance(profile, Random):
+                random.append((column, profile))
+            elif isinstance(profile, Additive):
+                for ends, values in zip((left, right), profile.sampled(steps, dt), strict=True):
+                    ends[:, column] += values
+            elif isinstance(plant, DescriptorSystem):
+                actuator, acts = _actuator(plant, name, scenario), profile.active(steps, dt)
+                for ends in (left, right):
+                    added = _missing(profile, ends[:, actuator], acts, left[:, actuator])
+                    ends[:, column] += np.where(acts, added, 0.0)
+        before += len(names)
+    random.sort(key=lambda item: item[0])
+    uncertain = plant.uncertainty if isinstance(plant, DescriptorSystem) else None
+    if uncertain is not None and uncertain.shift and uncertain.shift not in scenario.inputs:
+        # What the equilibrium's motion enters through is one, always.
+        left[:, plant.input_names.index(uncertain.shift)] = right[:, plant.input_names.index(uncertain.shift)] = 1.0
+    sensors = [
+        (index_of(name, plant.output_names, what="sensors"), profile)
+        for name, profile in profiles_of(scenario, "sensors")
+    ]
+    deviations = np.array([scenario.sensor_noise.get(name, 0.0) for name in plant.output_names])
+    return ScenarioSignals(dt, left, right, tuple(random), tuple(sensors), scenario.noise, deviations)
+
+
+def _missing(profile: Profile, commanded: FloatArray, acts: np.ndarray, before: FloatArray) -> FloatArray:
+    """Return what a failing actuator adds to the command."""
+    if isinstance(profile, LostEffectiveness):
+        return np.asarray(-profile.share * commanded)
+    value = profile.value if isinstance(profile, Stuck) else None
+    return np.asarray((before[int(np.argmax(acts))] if value is None else value) - commanded)
+
+
+def _actuator(plant: DescriptorSystem, fault: str, scenario: Scenario) -> int:
+    """Return the input whose columns of B and D are those of the fault."""
+    where = f"faults.{fault}"
+    if scenario.stabilise:
+        raise SpecError(
+            "With a stabilising feedback the commands depend on the fault, and such a failure is no function of time: "
+            "give a step or another profile.",
+            path=where,
+        )
+    column = plant.fault_names.index(fault)
+    of_fault = np.concatenate([plant.Bf[:, column], plant.Df[:, column]])
+    of_inputs = np.vstack([plant.B, plant.D])
+    found = [i for i in range(plant.nu) if np.array_equal(of_inputs[:, i], of_fault)]
+    if len(found) != 1:
+        raise SpecError(
+            f"Fault {fault!r} must enter exactly where one input does to be a failing actuator, but "
+            f"{len(found)} inputs have its columns.",
+            path=where,
+        )
+    return found[0]
+
+
+def _none() -> FloatArray:
+    return np.zeros((0, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A simulated record, one row per sample; arrays are read-only, and empty where such a plant has none.
+
+    Parameters
+    ----------
+    states, outputs : FloatArray
+        ``(samples, nx)`` and ``(samples, ny)``, with noise; the outputs of a time-varying plant begin with y(1): their
+        first row is NaN.
+    inputs, faults, disturbances, noise : FloatArray
+        ``(samples, nu)``, ``(samples, nf)``, ``(samples, nd)``, ``(samples, nw)``: what drove a plant; the faults of a
+        plant with parameters are these, ``(samples, nq)``.
+    time : FloatArray
+        ``(samples,)``, seconds; starts at zero.
+    residuals : FloatArray
+        ``(samples,)``, nonlinear plants: scaled Newton residual of each step.
+    inconsistency : float
+        Linear plants: norm of the change that the given initial state needed to satisfy the algebraic equations at
+        k = 0; only rounding for a consistent one.
+    """
+
+    states: FloatArray
+    outputs: FloatArray
+    inputs: FloatArray
+    faults: FloatArray
+    disturbances: FloatArray = field(default_factory=_none)
+    noise: FloatArray = field(default_factory=_none)
+    time: FloatArray = field(default_factory=_none)
+    inconsistency: float = 0.0
+    residuals: FloatArray = field(default_factory=_none)
+
+    def __post_init__(self) -> None:
+        freeze(self, *(name for name, value in vars(self).items() if isinstance(value, np.ndarray)))
+
+
+def signal_of(value: ArrayLike | None, name: str, shape: tuple[int, int]) -> FloatArray:
+    """Return a signal over a record, zero where none is given; a list of numbers is a single one."""
+    if value is None or (0 in shape and not np.size(value)):
+        return np.zeros(shape)
+    array = as_given(value, name, f"{name} has rows of different lengths: give a full matrix.")
+    matrix = as_matrix(array.reshape(-1, 1) if array.ndim == 1 and shape[1] == 1 else array, name)
+    if matrix.shape != shape:
+        raise SpecError(f"{name} has shape {matrix.shape}, but {shape} is needed (samples by signals).", path=name)
+    return matrix

@@ -1,0 +1,396 @@
+"""Documents (YAML, JSON) read into plain data and checked: every problem at once, each with its path."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from obsynth.errors import SpecError, a_kind
+from obsynth.files.inputs import read_json, read_text
+from obsynth.methods.registry import AUTO, REGISTRY, method_class
+from obsynth.numerics.arguments import is_whole
+from obsynth.plants.signal_names import suggestion
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from obsynth.specs.schema import SpecDocument
+    from obsynth.specs.schema_plants import PlantSection
+    from obsynth.specs.schema_sections import DAESection, TimeVaryingSection
+
+    Model = TypeVar("Model", bound=BaseModel)
+
+
+#: Values that the aliases of a document may repeat it to.
+MOST_ALIASED_VALUES = 1_000_000
+
+
+#: Whole numbers from here on are not printed.
+LONGEST_NUMBER = 1e15
+
+
+#: A document with more problems than this is not read to its end by anybody.
+MAXIMUM_PROBLEMS = 25
+
+
+#: What the checks call a kind of value, in a path to a problem.
+_KIND = re.compile(r"<\w+>")
+
+#: Problems of a value that is of another kind, beside those whose names end with `_type`.
+_OTHER_KIND = ("missing", "extra_forbidden", "literal_error")
+
+
+def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
+    """Return the mapping in a YAML 1.2 document; duplicate keys, tags, anchors set twice, and aliases that
+    stand for more than a document can hold, are refused."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError, YAMLWarning
+
+    place = where or str(path)
+    text = read_text(path, where=place)
+    if re.search(r"^%YAML\s+(?!1\.2\s*$)", text, flags=re.MULTILINE):
+        raise SpecError(f"{path} asks for another YAML than 1.2: remove the %YAML line.", path=place)
+    try:
+        with warnings.catch_warnings(action="error", category=YAMLWarning):
+            document = YAML(typ="safe", pure=True).load(text)
+        count = _values_in(document, {})
+    except (YAMLError, YAMLWarning) as error:
+        raise SpecError(f"{path} is no valid YAML: {_one_line(error)}", path=place) from error
+    except RecursionError as error:
+        raise SpecError(f"{path} is no valid spec: it is nested too deeply.", path=place) from error
+    except (ValueError, TypeError, OverflowError, AttributeError) as error:
+        raise SpecError(f"{path} has a value that YAML cannot read: {error}.", path=place) from error
+    if count > max(len(text), MOST_ALIASED_VALUES):
+        raise SpecError(
+            f"{path} expands to {count:.3g} values: its aliases (*name) repeat their contents too often. Put such "
+            "matrices into files beside it.",
+            path=place,
+        )
+    if document is None:
+        raise SpecError(f"{path} is empty.", path=place)
+    if not isinstance(document, dict):
+        raise SpecError(
+            f"{path} holds {described(document)}: the top level must be a mapping (key: value).", path=place
+        )
+    return document
+
+
+def _values_in(value: Any, known: dict[int, float]) -> float:
+    """Return how many values a document stands for, each as often as an alias repeats it; infinite in a circle."""
+    if not isinstance(value, (dict, list)):
+        return 1.0
+    if id(value) not in known:
+        known[id(value)] = float("inf")
+        parts = value.values() if isinstance(value, dict) else value
+        known[id(value)] = 1.0 + sum(_values_in(part, known) for part in parts)
+    return known[id(value)]
+
+
+def read_names(path: Path, *, where: str) -> list[str]:
+    """Return the names in a JSON file: a list, or a mapping of lists that are concatenated in order."""
+    if path.suffix.lower() != ".json":
+        raise SpecError(f"{path.name} has an unknown suffix: names are read from .json files.", path=where)
+    document = read_json(path, where=where)
+    lists = list(document.values()) if isinstance(document, dict) else [document]
+    if not lists or not all(isinstance(part, list) for part in lists):
+        raise SpecError(f"{path} must hold a list of names, or a mapping of such lists.", path=where)
+    names = [name for part in lists for name in part]
+    if not all(isinstance(name, str) for name in names):
+        raise SpecError(f"{path} holds something that is no text: names must be texts.", path=where)
+    return names
+
+
+def described(value: Any) -> str:
+    """Return a short description of ``value`` for a message, such as ``the text '1.0'``."""
+    if value is None:
+        return "nothing (null)"
+    if isinstance(value, bool):
+        return f"the truth value {str(value).lower()}"
+    if isinstance(value, str):
+        return f"the text {value!r}" if len(value) <= 40 else f"the text {value[:37]!r}..."
+    if isinstance(value, (int, float)):
+        # A long integer cannot even be printed.
+        return (
+            f"the number {value}" if abs(value) < LONGEST_NUMBER or isinstance(value, float) else "a huge whole number"
+        )
+    if isinstance(value, dict):
+        return "a mapping"
+    return "a list" if isinstance(value, list) else a_kind(value)
+
+
+def _one_line(error: Exception) -> str:
+    """Return what the YAML reader says about the place and the problem, without the quoted source."""
+    problem = getattr(error, "problem", None) or str(error).strip().splitlines()[0]
+    # The reader adds what it has of the values, which is empty where they are mappings.
+    problem = re.sub(r"^(found duplicate key .*?) with value .*", r"\1", str(problem), flags=re.DOTALL)
+    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+    place = f" (line {mark.line + 1}, column {mark.column + 1})" if mark is not None else ""
+    return f"{str(problem).strip()}{place}."
+
+
+@dataclass(frozen=True)
+class DocumentProblems:
+    """Collects path and text of each problem of one document, which is to be a ``what``, to raise them together."""
+
+    source: Path
+    what: str
+    found: list[tuple[str, str]] = field(default_factory=list)
+
+    def add(self, path: str, text: str) -> None:
+        """Note that ``text`` is wrong at ``path``."""
+        if (path, text) not in self.found:
+            self.found.append((path, text))
+
+    def raise_if_any(self) -> None:
+        """Raise one `SpecError` with everything noted, if anything was."""
+        if not self.found:
+            return
+        lines = [f"{path}: {text}" if path else text for path, text in self.found]
+        if len(lines) > MAXIMUM_PROBLEMS:
+            lines = [*lines[:MAXIMUM_PROBLEMS], f"and {len(lines) - MAXIMUM_PROBLEMS} more"]
+        head = f"{self.source} is no valid {self.what}:"
+        raise SpecError(head, path=self.found[0][0] or str(self.source), problems=lines)
+
+
+def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocument, dict[str, Any]]:
+    """Check a whole spec, and the options of its method."""
+    from obsynth.specs.schema_values import options_schema
+
+    problems = DocumentProblems(source, what="spec")
+    _check_version(document, problems)
+    checked = _checked_sections(document, problems)
+    method = document.get("method", {"id": AUTO})
+    raw_options: Any = {}
+    identifier = None
+    if isinstance(method, dict):
+        identifier, raw_options = method.get("id", AUTO), method.get("options", {})
+    options = None
+    if identifier == AUTO and isinstance(raw_options, dict) and checked is not None:
+        problems.raise_if_any()
+        return checked, _options_of_any(raw_options, source)
+    if isinstance(identifier, str) and identifier != AUTO and identifier not in REGISTRY:
+        close = suggestion(identifier, list(REGISTRY))
+        known = ", ".join(sorted([*REGISTRY, AUTO]))
+        problems.add("method.id", f"unknown method {identifier!r}; the known methods are: {known}.{close}")
+    elif isinstance(identifier, str) and identifier != AUTO and isinstance(raw_options, dict):
+        gone = method_class(identifier).gone
+        for name in (name for name in raw_options if name in gone):
+            problems.add(f"method.options.{name}", f"there is no such option any more: {gone[name]}")
+        kept = {name: value for name, value in raw_options.items() if name not in gone}
+        options = _validated(options_schema(identifier), kept, problems, prefix="method.options")
+    problems.raise_if_any()
+    if checked is None or options is None:
+        raise SpecError(f"{source} is no valid spec.", path=str(source))
+    return checked, {name: getattr(options, name) for name in options.model_fields_set}
+
+
+def _checked_sections(document: Mapping[str, Any], problems: DocumentProblems) -> SpecDocument | None:
+    """Return a whole spec but for the options of its method; ``None`` where it has problems, which are noted."""
+    from obsynth.specs.schema import CHECKED_APART, SpecDocument, section_of
+
+    checked = _validated(SpecDocument, document, problems)
+    sections: dict[str, BaseModel | None] = {}
+    for name in CHECKED_APART:
+        value = document.get(name)
+        if value is not None or (name == "plant" and name in document):
+            sections[name] = _validated(section_of(name, value), value, problems, prefix=name)
+    # As if all had been checked at once: in the order of the keys of a spec, unknown ones last.
+    order = list(SpecDocument.model_fields)
+    problems.found.sort(key=lambda problem: (*order, key := problem[0].partition(".")[0]).index(key))
+    if checked is None or None in sections.values():
+        return None
+    return checked.model_copy(update=sections)
+
+
+def _options_of_any(given: dict[str, Any], source: Path) -> dict[str, Any]:
+    """Return options as the first method reads them that has them all; `auto` decides between those that do."""
+    from obsynth.specs.schema_values import options_schema
+
+    if not given:
+        return {}
+    for method in REGISTRY:
+        problems = DocumentProblems(source, what="spec")
+        found = _validated(options_schema(method), given, problems, prefix="method.options")
+        if not problems.found and found is not None:
+            return {name: getattr(found, name) for name in found.model_fields_set}
+    raise SpecError(
+        f"{source}: no single method has the options {', '.join(sorted(given))} with these values: name the method "
+        "that they are for.",
+        path="method.options",
+    )
+
+
+def checked_plant(document: Mapping[str, Any], source: Path) -> PlantSection | TimeVaryingSection | DAESection:
+    """Check a plant in a file of its own."""
+    from obsynth.specs.schema import RARE_KINDS, plant_document
+
+    problems = DocumentProblems(source, what="plant")
+    _check_version(document, problems)
+    kind = document.get("kind")
+    known = plant_document(kind if kind in RARE_KINDS else None)
+    checked: Any = _validated(known, document, problems)
+    problems.raise_if_any()
+    found: PlantSection | TimeVaryingSection | DAESection = checked
+    return found
+
+
+def _check_version(document: Mapping[str, Any], problems: DocumentProblems) -> None:
+    """Raise at once for another version: the other keys would then mean something else."""
+    from obsynth.specs.schema import SPEC_VERSION
+
+    version = document.get("schema_version")
+    if is_whole(version) and version != SPEC_VERSION:
+        other = " This is a gain set: give the spec that it was made from." if "design" in document else ""
+        told = f"version {version} is unknown; this obsynth reads version {SPEC_VERSION}.{other}"
+        problems.add("schema_version", told)
+        problems.raise_if_any()
+
+
+def _validated(model: type[Model], document: Any, problems: DocumentProblems, *, prefix: str = "") -> Model | None:
+    from pydantic import ValidationError
+
+    try:
+        return model.model_validate(document)
+    except ValidationError as error:
+        for item in _of_likely_kinds(error.errors(include_url=False), document):
+            problems.add(*_explained(item, model, prefix))
+        return None
+
+
+def _of_likely_kinds(items: Sequence[Any], document: Any) -> list[Any]:
+    """Return pydantic's errors without those of kinds that a value was not meant to be: of a value that may be of
+    several, a number or a mapping, each kind adds its own errors, below a name of this kind that no document has."""
+    kept, groups = [], dict[tuple[Any, ...], dict[str, list[Any]]]()
+    for item in items:
+        loc = item["loc"]
+        place = _kind_in(loc, document, item["type"])
+        if place is None:
+            kept.append(item)
+        else:
+            inner = {**item, "loc": (*loc[:place], *loc[place + 1 :])}
+            groups.setdefault(loc[:place], {}).setdefault(str(loc[place]), []).append(inner)
+    for path, kinds in groups.items():
+        whole = [_of_likely_kinds(found, document) for found in kinds.values()]
+        least = min(_strange(found, path) for found in whole)
+        likely = [found for found in whole if _strange(found, path) == least]
+        if len(likely) > 1 and all(len(found) == 1 for found in likely):
+            wanted = list(dict.fromkeys(_kind_wanted(found[0]) for found in likely))
+            kept.append({**likely[0][0], "loc": path, "type": "kinds", "ctx": {"wanted": ", or ".join(wanted)}})
+        else:
+            kept.extend(likely[0])
+    return kept
+
+
+def _kind_in(loc: Sequence[Any], document: Any, problem: str) -> int | None:
+    """Return the place in a path of the first name that is a kind of value, and no key of the document."""
+    value = document
+    for i, part in enumerate(loc):
+        if isinstance(part, str) and (_KIND.fullmatch(part) or part == "[key]"):
+            continue
+        known = part in value if isinstance(value, dict) else isinstance(part, int) and isinstance(value, list)
+        if not known:
+            return None if isinstance(part, int) or (problem == "missing" and i == len(loc) - 1) else i
+        value = value[part]
+    return None
+
+
+def _strange(items: Sequence[Any], path: Sequence[Any]) -> tuple[int, int]:
+    """Return how many errors say that a value at a path is of another kind, and how many there are."""
+    at_once = 0
+    for item in items:
+        below = [part for part in item["loc"][len(path) :] if not (isinstance(part, str) and _KIND.fullmatch(part))]
+        other = item["type"] in (*_OTHER_KIND, "kinds") or item["type"].endswith("_type")
+        at_once += other and len(below) <= (item["type"] in _OTHER_KIND)
+    return at_once, len(items)
+
+
+def _kind_wanted(item: Any) -> str:
+    """Return what a value should have been, by an error that says that it is of another kind."""
+    if "<rows>" in item["loc"]:
+        return "a list of rows, such as [[1, 0], [0, 1]]"
+    return _wanted(item["type"], item.get("ctx", {})).removeprefix("one of ")
+
+
+def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str]:
+    """Return the path and the message of one of pydantic's errors."""
+    location = [part for part in item["loc"] if not (isinstance(part, str) and re.fullmatch(r"<\w+>", part))]
+    names = [str(part) for part in location if isinstance(part, str) and part != "[key]"]
+    numbers = [part + 1 for part in location if isinstance(part, int)]
+    kind, value, context = item["type"], item["input"], item.get("ctx", {})
+    in_stack = "<stack>" in item["loc"]
+    in_rows = in_stack or "<rows>" in item["loc"]
+    key = names[-1] if names else ""
+    if kind == "invalid_key" or "[key]" in location:
+        text, numbers = f"a key must be a non-empty text, not {described(value)}.", []
+    elif kind == "extra_forbidden":
+        known = _known_keys((prefix, *item["loc"])) if len(names) > 1 else list(model.model_fields)
+        text = f"unknown key.{suggestion(key, known)}"
+    elif kind == "missing":
+        needed = ": give the seconds between samples, or 0 for a plant in continuous time"
+        text = f"this key is missing{needed if key == 'dt' else ''}."
+    elif kind in ("ragged_rows", "stack_shapes"):
+        text = f"{item['msg']}."
+    elif kind == "finite_number":
+        text = f"must be a finite number, not {value}."
+    elif kind == "entry_of_k":
+        text = f"{item['msg']}, not {described(value)}."
+    elif kind == "string_pattern_mismatch":
+        text = f"use letters, digits, '.', '_' and '-' only (at most 100), not {described(value)}."
+    else:
+        wanted = "a list of numbers" if in_rows and kind in ("list_type", "too_short") else _wanted(kind, context)
+        wanted = "a list of rows, such as [[1, 0], [0, 1]]" if in_rows and not numbers else wanted
+        found = "an empty one" if kind in ("too_short", "string_too_short") else described(value)
+        text = f"must be {wanted}, not {found}."
+    words = ("matrix", "row", "column") if in_stack else ("row", "column") if in_rows else ("entry",)
+    place = ", ".join(f"{word} {number}" for word, number in zip(words, numbers, strict=False))
+    return ".".join([*([prefix] if prefix else []), *names]), f"{place} {text}" if place else text
+
+
+def _wanted(kind: str, context: Mapping[str, Any]) -> str:
+    if kind == "kinds":
+        return str(context["wanted"])
+    if kind == "literal_error":
+        return f"one of {context['expected']}"
+    limits = {
+        "greater_than": "greater than",
+        "greater_than_equal": "at least",
+        "less_than": "less than",
+        "less_than_equal": "at most",
+    }
+    if kind in limits:
+        limit = next(iter(context.values()))
+        return f"{limits[kind]} {limit:g}"
+    plain = {
+        "float_type": "a number",
+        "int_type": "a whole number",
+        "string_type": "a text",
+        "bool_type": "true or false",
+        "string_too_short": "a non-empty text",
+        "list_type": "a list",
+        "dict_type": "a mapping (key: value)",
+        "model_type": "a mapping (key: value)",
+        "too_short": "a list with at least one entry",
+    }
+    return plain.get(kind, f"valid ({kind.replace('_', ' ')})")
+
+
+def _known_keys(location: Sequence[str | int]) -> list[str]:
+    """Return the keys that the section around the last part of ``location`` may have."""
+    from obsynth.specs import schema, schema_plants, schema_values
+
+    sections: dict[str, type[BaseModel]] = {
+        "<file>": schema_values.MatrixFile,
+        "<one>": schema.ProfileSection,
+        "method": schema.MethodSection,
+        "transform": schema_plants.TransformSection,
+    }
+    if "<pick>" in location:
+        return ["outputs" if {"C", "Df", "Dd"} & set(location) else "states", "file"]
+    if "<list>" in location and location[0] == "scenario":
+        return list(schema.ProfileSection.model_fields)
+    section = sections.get(str(location[-2]))
+    return list(section.model_fields) if section is not None else []

@@ -1,0 +1,169 @@
+"""What a spec says of a plant: its matrices, its noise, the tolerances of its constants, and how it is transformed.
+
+This module imports pydantic, so it is imported only when a spec is read.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from obsynth.numerics.arguments import Positive
+from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, expressions_in
+from obsynth.specs.schema_values import (
+    FILE_TAG,
+    ONE_TAG,
+    PICKED,
+    Matrix,
+    MatrixFile,
+    Names,
+    OutputMatrix,
+    Range,
+    Rows,
+    Section,
+    StatePick,
+    Text,
+    kind_of_matrix,
+)
+
+#: A fault, or an unknown input, on each sensor that is named.
+SensorMatrix = OutputMatrix
+
+EquationMatrix = Annotated[
+    Rows | Annotated[MatrixFile, Tag(FILE_TAG)] | Annotated[StatePick, Tag(PICKED)], Discriminator(kind_of_matrix)
+]
+
+
+_COLOURED = "<coloured>"
+
+#: Offsets and walks: a number, or what a calibration is to find.
+Sizes = dict[Text, Literal["unknown"] | Positive]
+
+
+class LineariseSection(Section):
+    """Where a nonlinear plant is linearised: arguments of `obsynth.linearise`."""
+
+    at: Literal["equilibrium", "point"] | None = None
+    given: dict[Text, float] | None = None
+    free: list[Text] | dict[Text, Range] | None = None
+    faults: list[Text] | None = None
+    disturbances: list[Text] | None = None
+    start: dict[Text, float] | None = None
+    drift: bool | None = None
+    constants: dict[Text, Any] | None = None
+
+
+class TransformSection(Section):
+    """What is done to the plant before a method sees it, in this order."""
+
+    linearise: LineariseSection | None = None
+    eliminate_algebraic_states: bool = False
+    sample_time: Positive | None = None
+
+
+class EntrySection(Section):
+    """One entry of a matrix as an expression in the constants: row and column by name, or by number from 1."""
+
+    row: Text | int
+    column: Text | int
+    value: Text | float
+
+
+class BoxSection(Section):
+    """Where the tolerances come from: a source, or a file that ``obsynth calibrate --out`` has written."""
+
+    source: Literal["stated", "set-membership", "calibrated"] | None = None
+    level: float | None = None
+    digest: Text | None = None
+    file: Text | None = None
+
+
+class ColouredNoise(Section):
+    """Noise of a sensor that is not white; see `obsynth.with_noise`."""
+
+    deviation: Positive | Literal["unknown"]
+    correlation: Positive | Text | None = None
+    white: Positive | Literal["unknown"] | None = None
+
+
+SensorNoises = dict[
+    Text,
+    Annotated[
+        Annotated[Positive, Tag(ONE_TAG)] | Annotated[ColouredNoise, Tag(_COLOURED)],
+        Discriminator(lambda value: _COLOURED if isinstance(value, dict) else ONE_TAG),
+    ],
+]
+
+
+class PlantSection(Section):
+    """A plant, matrix by matrix."""
+
+    dt: Annotated[float, Field(ge=0.0)]
+    E: Matrix | None = None
+    A: Matrix
+    B: EquationMatrix | None = None
+    C: OutputMatrix
+    D: Matrix | None = None
+    Bf: EquationMatrix | None = None
+    Df: SensorMatrix | None = None
+    Bd: EquationMatrix | None = None
+    Dd: SensorMatrix | None = None
+    Bw: EquationMatrix | None = None
+    Dw: Matrix | None = None
+    state_names: Names | None = None
+    input_names: Names | None = None
+    output_names: Names | None = None
+    fault_names: Names | None = None
+    disturbance_names: Names | None = None
+    noise_names: Names | None = None
+    operating_point: dict[Text, float] | None = None
+    scales: dict[Text, float] | None = None
+    units: dict[Text, str] | None = None
+    sensor_noise: SensorNoises | None = None
+    offset: Sizes | None = None
+    walks: Sizes | None = None
+    constants: dict[Text, Any] | None = None
+    entries: dict[Text, list[EntrySection]] | None = None
+    tolerance: dict[Text, Text | float] | None = None
+    variation: Literal["constant", "varying"] | None = None
+    box: BoxSection | None = None
+    transform: TransformSection | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expressions(cls, data: Any) -> Any:
+        """Return a raw plant section with expressions in rows moved to ``entries``; only where there are constants."""
+        if not isinstance(data, dict) or not isinstance(data.get("constants"), dict):
+            return data
+        found, entries = dict(data), data.get("entries")
+        entries = dict(entries) if isinstance(entries, dict) else entries
+        for name in UNCERTAIN_MATRICES:
+            rows, texts = expressions_in(found.get(name))
+            if texts and (entries is None or isinstance(entries, dict)):
+                found[name] = rows
+                more = [{"row": i + 1, "column": j + 1, "value": text} for i, j, text in texts]
+                entries = {**(entries or {}), name: [*(entries or {}).get(name, []), *more]}
+        if entries is not None:
+            found["entries"] = entries
+        return found
+
+
+class PlantReference(Section):
+    """A plant in another file: ``{file: plant.yaml}``, whose transform may be replaced, or ``{file: plant.mat}``.
+
+    All but the first two entries are for ``.mat`` files, and are arguments of `obsynth.from_matlab`.
+    """
+
+    file: Text
+    transform: TransformSection | None = None
+    variable: Text | None = None
+    dt: Annotated[float, Field(ge=0.0)] | None = None
+    faults: list[Text] | None = None
+    disturbances: list[Text] | None = None
+    actuator_faults: list[Text] | None = None
+    sensor_faults: list[Text] | None = None
+    sensor_noise: dict[Text, Positive] | None = None
+    operating_point: dict[Text, float] | None = None
+    scales: dict[Text, float] | None = None
+    units: dict[Text, str] | None = None

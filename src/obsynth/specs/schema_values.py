@@ -1,0 +1,265 @@
+"""What a spec takes for values: numbers, names and matrices, written out or in a file; and the options of every method.
+
+This module imports pydantic, so it is imported only when a spec is read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import fields
+from functools import cache
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    create_model,
+)
+from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic_core.core_schema import ErrorType
+
+from obsynth.methods.registry import method_class
+from obsynth.numerics.arguments import Count, NonNegative, OpenUnitInterval, Positive, WrittenAs, field_types, is_number
+
+# Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
+_ROWS, FILE_TAG, PICKED, LIST_TAG, _STACK_TAG, _NUMBER_TAG, ONE_TAG = (
+    "<rows>",
+    "<file>",
+    "<pick>",
+    "<list>",
+    "<stack>",
+    "<number>",
+    "<one>",
+)
+
+
+Text = Annotated[str, Field(min_length=1)]
+
+Range = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER_TAG)]
+
+
+def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
+    """Check that rows have one length, besides their entries, so that both kinds of problem are reported."""
+    listed = [(i, len(row)) for i, row in enumerate(rows, 1) if isinstance(row, list)] if isinstance(rows, list) else []
+    ragged = next(((i, length) for i, length in listed if length != listed[0][1]), None)
+    if ragged is None:
+        return check_entries(rows)
+    problem = PydanticCustomError(
+        "ragged_rows",
+        "row {row} has {found} entries, but row {first} has {expected}",
+        {"row": ragged[0], "found": ragged[1], "first": listed[0][0], "expected": listed[0][1]},
+    )
+    others: list[InitErrorDetails] = []
+    own: Any = get_args(ErrorType)
+    try:
+        check_entries(rows)
+    except ValidationError as error:
+        others = [
+            InitErrorDetails(
+                # Kinds of our own are unknown to pydantic by name.
+                type=item["type"] if item["type"] in own else PydanticCustomError(item["type"], item["msg"]),
+                loc=item["loc"],
+                input=item["input"],
+                ctx=item.get("ctx", {}),
+            )
+            for item in error.errors()
+        ]
+    raise ValidationError.from_exception_data("matrix", [*others, InitErrorDetails(type=problem, input=None)])
+
+
+def kind_of_matrix(value: Any) -> str:
+    """Return which form of a matrix a value of a spec has."""
+    if isinstance(value, dict):
+        return FILE_TAG if "file" in value or not value else PICKED
+    return _ROWS
+
+
+def _file_or(other: str) -> Discriminator:
+    return Discriminator(lambda value: FILE_TAG if isinstance(value, dict) else other)
+
+
+class Section(BaseModel):
+    """A part of a document: strict types, no unknown keys, finite numbers."""
+
+    # Options may be called model_...: older releases of pydantic keep that for themselves.
+    # Validators are made at the first use: most sections are only ever parts of another one.
+    model_config = ConfigDict(
+        strict=True, extra="forbid", allow_inf_nan=False, frozen=True, protected_namespaces=(), defer_build=True
+    )
+
+
+Rows = Annotated[
+    list[Annotated[list[float], Field(min_length=1)]], Field(min_length=1), WrapValidator(_rectangular), Tag(_ROWS)
+]
+
+
+class MatrixFile(Section):
+    """A matrix in a file: ``{file: A.mtx}``, or ``{file: plant.mat, variable: A}``."""
+
+    file: Text
+    variable: Text | None = None
+
+
+class NamesFile(Section):
+    """Names in a JSON file: ``{file: names.json}``."""
+
+    file: Text
+
+
+class OutputPick(Section):
+    """Outputs by state name: ``{outputs: [omega 1, v 3]}``."""
+
+    outputs: Annotated[list[Text], Field(min_length=1)]
+
+
+class StatePick(Section):
+    """Equations by state name: ``{states: [tm 1]}``."""
+
+    states: Annotated[list[Text], Field(min_length=1)]
+
+
+Matrix = Annotated[Rows | Annotated[MatrixFile, Tag(FILE_TAG)], _file_or(_ROWS)]
+
+OutputMatrix = Annotated[
+    Rows | Annotated[MatrixFile, Tag(FILE_TAG)] | Annotated[OutputPick, Tag(PICKED)], Discriminator(kind_of_matrix)
+]
+
+Names = Annotated[Annotated[list[Text], Tag(LIST_TAG)] | Annotated[NamesFile, Tag(FILE_TAG)], _file_or(LIST_TAG)]
+
+
+def _number_or_expression(value: Any) -> Any:
+    """Check one entry of a matrix that may change with k; expressions are parsed later, with the plant's constants."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        raise PydanticCustomError("entry_of_k", "must be a number or an expression in k")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise PydanticCustomError("finite_number", "must be finite")
+    return value
+
+
+VaryingRows = Annotated[
+    list[Annotated[list[Annotated[Any, BeforeValidator(_number_or_expression)]], Field(min_length=1)]],
+    Field(min_length=1),
+    WrapValidator(_rectangular),
+    Tag(_ROWS),
+]
+
+
+def _same_shapes(stack: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
+    """Check that the matrices of a stack have as many rows and columns as the first one."""
+    checked = check_entries(stack)
+    shapes = [(len(matrix), len(matrix[0])) for matrix in checked]
+    k = next((k for k, shape in enumerate(shapes) if shape != shapes[0]), None)
+    if k is None:
+        return checked
+    raise PydanticCustomError(
+        "stack_shapes",
+        "matrix {number} of the stack is {rows} by {columns}, but the first is {wanted}",
+        {"number": k + 1, "rows": shapes[k][0], "columns": shapes[k][1], "wanted": "{} by {}".format(*shapes[0])},
+    )
+
+
+Stack = Annotated[list[Rows], Field(min_length=1), WrapValidator(_same_shapes), Tag(_STACK_TAG)]
+
+
+class VaryingFile(MatrixFile):
+    """A matrix, or a stack of them, in a file; ``stack: 60`` tells that 60 matrices stand one below the other."""
+
+    stack: Annotated[int, Field(ge=1)] | None = None
+
+
+def kind_of_varying_matrix(value: Any) -> str:
+    """Return which form of a time-varying matrix a value of a spec has."""
+    if isinstance(value, dict):
+        return FILE_TAG
+    first = value[0] if isinstance(value, list) and value else None
+    return _STACK_TAG if isinstance(first, list) and first and isinstance(first[0], list) else _ROWS
+
+
+#: One variance stands for that multiple of the identity, as from Python.
+Covariance = Annotated[
+    Variance | Rows | Annotated[MatrixFile, Tag(FILE_TAG)],
+    Discriminator(lambda value: _NUMBER_TAG if is_number(value) else FILE_TAG if isinstance(value, dict) else _ROWS),
+]
+
+VaryingCovariance = Annotated[
+    Variance | VaryingRows | Stack | Annotated[VaryingFile, Tag(FILE_TAG)],
+    Discriminator(lambda value: _NUMBER_TAG if is_number(value) else kind_of_varying_matrix(value)),
+]
+
+
+class PoleRegion(Section):
+    """Where all movable poles must lie."""
+
+    decay: NonNegative | None = None
+    radius: Positive | None = None
+    damping: OpenUnitInterval | None = None
+
+
+class NoiseSection(Section):
+    """What the Kalman filter believes."""
+
+    measurement: Positive | list[Positive] | dict[Text, Positive] | None = None
+    process: Positive = 1.0
+    fault: Positive = 1.0
+
+
+class SensorTimes(Section):
+    """When a sensor is sampled, and by how much its values are delayed, in rows."""
+
+    every: Count = 1
+    delay: Annotated[int, Field(ge=0)] = 0
+
+
+#: What a document may write for an option that is no plain number, text or truth.
+OPTION_KINDS: Mapping[str, Any] = {
+    "matrix": Matrix | None,
+    "covariance": Covariance | None,
+    "varying covariance": VaryingCovariance | None,
+    "vector": list[float] | None,
+    "pair": Range | None,
+    "positive numbers": Annotated[list[Positive], Field(min_length=1)] | None,
+    "text": Text | None,
+    "texts": Annotated[list[Text], Field(min_length=1)] | None,
+    "fault model": Text | dict[Text, Any],
+    "fault sets": Text | list[Text | list[Text]] | None,
+    "poles": list[float | Range] | None,
+    "pole sets": list[float | Range] | list[list[float | Range]] | None,
+    "pole region": PoleRegion | None,
+    "noise weights": NoiseSection | None,
+    "named covariance": Positive | Matrix | dict[Text, NonNegative] | None,
+    "named bounds": NonNegative | dict[Text, NonNegative | Range] | None,
+    "samples": Literal["auto"] | Count,
+    "free faults": Text | list[Text] | None,
+    "named numbers": Positive | dict[Text, Positive] | None,
+    "named vector": list[float] | dict[Text, float] | None,
+    "named pairs": dict[Text, Range] | None,
+    "solver": Text,
+    "function": type(None),
+    "objective": Literal["h2"] | None,
+    "placement objective": Literal["conditioning", "gain"],
+    "region": dict[Text, float | Range] | list[dict[Text, float | Range]] | None,
+    "solver options": dict[Text, Any] | None,
+    "sensor times": dict[Text, SensorTimes] | None,
+}
+
+
+@cache
+def options_schema(method: str) -> type[Section]:
+    """Return the schema of the options of a method, made from its typed options."""
+    options: Any = method_class(method)
+    defaults, entries = {field.name: field.default for field in fields(options)}, dict[str, Any]()
+    for name, kind in field_types(options).items():
+        written = [OPTION_KINDS[mark.kind] for mark in get_args(kind)[1:] if isinstance(mark, WrittenAs)]
+        entries[name] = ((written or [kind])[0], defaults[name])
+    return create_model(options.__name__, __base__=Section, __doc__=options.__doc__, **entries)

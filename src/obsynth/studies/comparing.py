@@ -1,0 +1,571 @@
+"""Every method that exists for a plant, designed, on one clock and on the same draws.
+
+The stated scenario, many times: disturbances, noise and tolerances drawn; the same draws for every method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.methods.automatic import DECOUPLED, SETTLING_TIMES, Candidate, Maker, candidate, linear_methods
+from obsynth.methods.designing import agree, design
+from obsynth.methods.fault_figures import held, on_the_clock, step_responses
+from obsynth.methods.functional_filter.rates import settling_time
+from obsynth.methods.registry import method_class
+from obsynth.monitoring.logs.log_run import faults_on_rows
+from obsynth.monitoring.logs.log_tables import log_table
+from obsynth.monitoring.logs.signals import TIME_HEADER
+from obsynth.monitoring.logs.stuck_sensors import stuck_rows, stuck_texts
+from obsynth.monitoring.thresholds.residual_model import largest_disturbances
+from obsynth.numerics.arguments import (
+    Count,
+    NonNegative,
+    Positive,
+    Probability,
+    arguments_checked,
+    is_finite_number,
+    require_kind,
+)
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.continuous import driven
+from obsynth.numerics.libraries import on_one_thread_if_small
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.recovery import Transformation, linear_plant
+from obsynth.results.design import ObserverDesign
+from obsynth.simulation.profiles import Sine, Step
+from obsynth.simulation.scenario import Scenario, scenario_from
+from obsynth.simulation.signals import resolve
+from obsynth.studies.comparison import (
+    ComparedMethod,
+    Comparison,
+    FaultComparison,
+    comparison_statement,
+    relative_error,
+    rms,
+)
+from obsynth.studies.least_thresholds import thresholds_beside_least
+from obsynth.verification.assumptions import Log
+from obsynth.verification.over_tolerances.plants_of_the_box import plant_at
+
+#: Entries of A, B, Bf, Bd that tolerances do not touch: they are kinematics, not parameters.
+EXACT_ENTRIES = (0.0, 1.0, -1.0)
+
+
+#: Runs of the scenario, and samples and settling times where nothing is stated.
+RUNS, SCENARIO_SAMPLES, MOST_SCENARIO_SAMPLES = 20, 40, 6000
+
+COMPARISON_SEED = 7
+
+#: Unknown inputs of the scenario that is made up are sines with so many periods in a settling time.
+PERIOD_SHARE = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What observers are run on, ``(.., steps, ..)``: many runs of drawn plants, or a log."""
+
+    times: FloatArray  # ``(steps,)``, seconds
+    u: FloatArray
+    y: FloatArray
+    truth: FloatArray  # ``(steps, nf)``: the faults, zero where a log has no column of one
+    known: tuple[str, ...] = ()  # the faults of which a log has a column
+    notes: tuple[str, ...] = ()  # what is to be said of a log
+
+
+def drawn_runs(
+    source: DescriptorSystem,
+    sampled: DescriptorSystem,
+    scenario: Scenario,
+    *,
+    runs: int,
+    tolerance: float,
+    seed: int,
+    feedback: FloatArray,
+) -> tuple[Record, Record]:
+    """Return runs ``(runs, steps, ..)`` with the scenario's faults, and without any; plants are drawn before they are
+    sampled, and disturbances by a factor between -1 and 1."""
+    drive = resolve(sampled, scenario)
+    nu, nf = sampled.nu, sampled.nf
+    rng = np.random.default_rng(seed)
+    seeds = [int(value) for value in rng.integers(0, 2**31, size=runs)]
+    random, noise, sensors = drive.drawn(seeds, sampled.nw)
+    scales = rng.uniform(-1.0, 1.0, size=(runs, sampled.nd))
+    faults = drive.left[:, nu : nu + nf]
+    found: list[tuple[list[FloatArray], list[FloatArray]]] = [([], []), ([], [])]
+    off = tolerance > 0.0 or source.uncertainty is not None
+    for run in range(runs):
+        plant = on_the_clock(_drawn(source, tolerance, rng), sampled.dt) if off else sampled
+        signals = drive.left + random[:, run]
+        d = signals[:, nu + nf :] * scales[run]
+        shaken = noise[:, run] if noise.shape[2] == plant.nw else np.zeros((drive.steps, plant.nw))
+        for (inputs, outputs), f in zip(found, (signals[:, nu : nu + nf], np.zeros((drive.steps, nf))), strict=True):
+            measured, known = _outputs(plant, signals[:, :nu], d, f, shaken, feedback)
+            inputs.append(known)
+            outputs.append(measured + sensors[:, run])
+    times = _clock(drive.steps, drive.dt)
+    (u, y), (healthy_u, healthy_y) = ((np.array(inputs), np.array(outputs)) for inputs, outputs in found)
+    return Record(times, u, y, faults), Record(times, healthy_u, healthy_y, np.zeros_like(faults))
+
+
+def estimates(observer: LinearObserver, runs: Record) -> FloatArray:
+    """Return fault estimates ``(runs, steps, faults)`` of an observer at rest."""
+    rows, y, known = observer.fault_rows, runs.y.swapaxes(0, 1), runs.u.swapaxes(0, 1)
+    z = driven(observer.Az, np.zeros(observer.order), y @ observer.By.T + known @ observer.Bu.T)
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = z @ observer.Cz[rows].T + y @ observer.Dy[rows].T + known @ observer.Du[rows].T + observer.added[rows]
+    return np.ascontiguousarray(found.swapaxes(0, 1))
+
+
+def _outputs(
+    plant: DescriptorSystem, u: FloatArray, d: FloatArray, f: FloatArray, w: FloatArray, feedback: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return outputs and known inputs ``(steps, ..)`` of a plant at rest, with ``u - feedback x`` as its input."""
+    into = u @ plant.B.T + d @ plant.Bd.T + f @ plant.Bf.T + w @ plant.Bw.T
+    direct = u @ plant.D.T + d @ plant.Dd.T + f @ plant.Df.T + w @ plant.Dw.T
+    closed, seen = plant.A - plant.B @ feedback, plant.C - plant.D @ feedback
+    states = driven(closed, np.zeros(plant.nx), into)
+    return np.asarray(states @ seen.T + direct), np.asarray(u - states @ feedback.T)
+
+
+def _drawn(plant: DescriptorSystem, tolerance: float, rng: np.random.Generator) -> DescriptorSystem:
+    """Return a plant with its constants within their tolerances, and parameters off by up to one; equal stay equal."""
+    if plant.uncertainty is not None:
+        box = plant.uncertainty.box
+        plant = plant_at(plant, box.values(rng.uniform(-1.0, 1.0, size=len(box.names))))
+        if not tolerance:
+            return plant
+    factors: dict[float, float] = {}
+
+    def off(matrix: FloatArray) -> FloatArray:
+        changed = matrix.copy()
+        for index, value in np.ndenumerate(matrix):
+            if value not in EXACT_ENTRIES:
+                factor = factors.setdefault(abs(float(value)), 1.0 + tolerance * rng.uniform(-1.0, 1.0))
+                changed[index] = value * factor
+        return changed
+
+    return plant.replace(E=off(plant.E), A=off(plant.A), B=off(plant.B), Bf=off(plant.Bf), Bd=off(plant.Bd))
+
+
+def alarms(
+    found: FloatArray, quiet: FloatArray, fault: FloatArray, response: FloatArray, false_alarms: float, dt: float
+) -> tuple[float, float, float]:
+    """Return threshold (passed in a share of the fault-free runs), median detection delay (s) and smallest fault found.
+    ``found, quiet (runs, steps)``: estimates with and without the fault; ``response (steps,)``: to a unit step."""
+    level = float(np.quantile(np.max(np.abs(quiet), axis=1), 1.0 - false_alarms))
+    acts = np.flatnonzero(fault)
+    if not acts.size:
+        return level, float("nan"), float("nan")
+    first = int(acts[0])
+    above = np.abs(found[:, first:]) > level
+    delays = np.where(above.any(axis=1), np.argmax(above, axis=1) * dt, np.inf)
+    # The response is computed as far as a step is followed, which may be less than the record.
+    length = min(len(fault) - first, len(response))
+    shown = np.maximum(response[:length], 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        needed = np.where(shown > 0.0, (level - quiet[:, first : first + length]) / shown, np.inf)
+    smallest = np.maximum(np.min(needed, axis=1), 0.0)
+    return level, float(np.median(delays)), float(np.median(smallest))
+
+
+@arguments_checked
+@on_one_thread_if_small
+def compare(
+    plant: DescriptorSystem | Transformation,
+    *,
+    scenario: Scenario | None = None,
+    options: Mapping[str, Mapping[str, Any]] | None = None,
+    methods: Sequence[str] | None = None,
+    sample_time: Positive | None = None,
+    within: Positive | None = None,
+    tolerance: NonNegative = 0.0,
+    disturbance: NonNegative = 1.0,
+    runs: Count = RUNS,
+    false_alarms: Probability = 0.05,
+    data: Any = None,
+    columns: Mapping[str, str] | None = None,
+    scales: Mapping[str, float] | None = None,
+    input_delay: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> Comparison:
+    """Design every method that exists for a plant and put them side by side, on one clock and the same draws.
+
+    Methods are ranked by the root mean square error over the scenario, with disturbances, noise and tolerances drawn,
+    as a share of the size of each fault there, so that units do not matter, among those whose estimate reaches 90 % of
+    a step within the time asked for.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem or Transformation
+        Either time, with faults.  A continuous one is sampled: methods are designed for the samples where they can be.
+        Options such as poles are for the plant: such a method of either time is designed for it, and sampled
+        afterwards.  Of a transformation they are for the plant that it makes; compared is the one it starts from.
+    scenario : Scenario, optional
+        What happens; by default each fault in turn is a step, while every unknown input is a sinusoid.
+    options : mapping of str to mapping, optional
+        Options by method id.
+    methods : sequence of str, optional
+        Ids; by default all for linear plants.
+    sample_time : float, optional, seconds
+        The clock of a continuous plant; by default that of the scenario, or a fortieth of the plant's settling time.
+    within : float, optional, seconds
+        Time within which 90 % of a step must be shown; by default the plant's settling time.
+    tolerance : float, optional
+        Relative: each parameter of a drawn plant is off by up to this.
+    disturbance : float, optional
+        Amplitude of unknown inputs where no scenario is given.
+    runs : int, optional
+        Drawn runs, with and without faults each.
+    false_alarms : float, optional
+        Share of fault-free runs that pass the threshold of an alarm.
+    data : str, Path or DataFrame, optional
+        A log with the outputs and inputs by name, replayed through every method; columns named as faults are the truth.
+    input_delay : int, optional
+        Rows of ``data`` by which inputs act later than during the step that begins with them.
+    columns, scales : mapping, optional
+        Columns of signals where their names differ, and factors of their values, as for `obsynth.run_on_data`.
+    progress : callable, optional
+        Called with a text at the start of each stage.
+
+    Returns
+    -------
+    Comparison
+        ``times (steps,)``, ``truth (steps, nf)``; refused methods with the reason in one line.
+
+    Raises
+    ------
+    SpecError
+        The plant has no faults, an argument is out of range, a method is unknown, or the log lacks a column.
+
+    References
+    ----------
+    Ours: see `Comparison` for what each number means.
+    """
+    made = linear_plant(plant)
+    # Some methods are continuous, and so are tolerances; faults and unknown inputs are those of the plant as written.
+    plant, clock = (plant.source, made.dt or None) if isinstance(plant, Transformation) else (made, None)
+    sample_time = clock if sample_time is None else sample_time
+    if plant.nf == 0:
+        raise SpecError("The plant has no faults, so there are no fault estimates to compare.", path="plant")
+    unused = sorted(name for name, given in (("columns", columns), ("scales", scales)) if given and data is None)
+    if unused:
+        raise SpecError(f"{unused[0]} is for a log: give data.", path=unused[0])
+    if scenario is not None and disturbance != 1.0:
+        raise SpecError("disturbance is for the default scenario: the scenario that is given states its own.",
+                        path="disturbance")  # fmt: skip
+    if plant.dt and sample_time not in (None, plant.dt):
+        raise SpecError(f"sample_time is for continuous plants: this one has {plant.dt:g} s.", path="sample_time")
+    known = [spec.id for spec in linear_methods()]
+    unknown = [name for name in methods or () if name not in known]
+    if unknown:
+        raise SpecError(f"{', '.join(map(repr, unknown))}: use some of {', '.join(known)}.", path="methods")
+    ids = known if methods is None else list(methods)
+    for method in options or {}:
+        if method not in ids:
+            raise SpecError(f"options has {method!r}, which is not compared: {', '.join(ids)} are.", path="options")
+    return side_by_side(
+        plant,
+        scenario,
+        ids,
+        lambda given, method, own: design(given, method, **own),
+        sample_time=sample_time,
+        within=within,
+        tolerance=float(tolerance),
+        disturbance=float(disturbance),
+        runs=int(runs),
+        false_alarms=float(false_alarms),
+        input_delay=int(input_delay),
+        options=options or {},
+        of_samples=made.dt > 0.0,
+        data=data,
+        columns=columns,
+        scales=scales,
+        progress=progress,
+    )
+
+
+def side_by_side(
+    plant: DescriptorSystem,
+    scenario: Scenario | None,
+    methods: Sequence[str],
+    maker: Maker,
+    *,
+    sample_time: float | None,
+    within: float | None,
+    tolerance: float,
+    disturbance: float,
+    runs: int,
+    false_alarms: float,
+    input_delay: int = 0,
+    options: Mapping[str, Mapping[str, Any]] | None = None,
+    of_samples: bool = True,
+    data: Any = None,
+    columns: Mapping[str, str] | None = None,
+    scales: Mapping[str, float] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Comparison:
+    """Return the designs that ``maker(plant, method, options)`` gives side by side; arguments as for `compare`.
+
+    ``of_samples``: options are for the sampled plant.
+    """
+    report_stage = progress or (lambda _: None)
+    asked = {"plant": plant.as_dict(), "scenario": None if scenario is None else scenario.as_dict(),
+             "sample_time": sample_time, "within": within, "tolerance": tolerance, "disturbance": disturbance,
+             "runs": runs, "false_alarms": false_alarms,
+             **({"input_delay": input_delay} if input_delay else {})}  # fmt: skip
+    plant = plant.dense() if plant.is_sparse else plant
+    stated = None if scenario is None else scenario.sample_time
+    dt = plant.dt or sample_time or stated or settling_time(plant) / SCENARIO_SAMPLES
+    sampled = on_the_clock(plant, dt)
+    happening = _scenario(plant, scenario, dt, disturbance)
+    steps = int(min(happening.horizon / dt, MOST_SCENARIO_SAMPLES)) + 1
+    followed, feedback = held(sampled, steps)
+    if followed < steps:
+        steps, happening = followed, happening.replace(horizon=followed * dt)
+    found = []
+    for method in methods:
+        report_stage(f"designing by {method}")
+        own = (options or {}).get(method, {})
+        in_own_time = bool(own) and not of_samples and method_class(method).time == "both"
+        found.append(candidate(method, plant, sampled, steps, maker, own, continuous=in_own_time))
+    report_stage("running the scenario")
+    faulty, healthy = drawn_runs(
+        plant, sampled, happening, runs=runs, tolerance=tolerance, seed=COMPARISON_SEED, feedback=feedback
+    )
+    log = None if data is None else _log(data, sampled, columns, scales, input_delay)
+    limit = within if within is not None else settling_time(plant)
+    bounds = largest_disturbances(happening, sampled.disturbance_names, followed, dt)
+    kept = followed, feedback
+    compared = _sized(
+        [_compared(entry, sampled, faulty, healthy, log, kept, limit, false_alarms, bounds) for entry in found]
+    )
+    compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.relative_error))
+    setting = (
+        f"{runs} runs of {happening.horizon:g} s, sampled every {dt:g} s, disturbances and noise drawn"
+        + (", constants within their tolerances" if plant.uncertainty is not None else "")
+        + (f", parameters off by up to {tolerance:.0%}" if tolerance else "")
+        + (", a state feedback stabilises the plant" if feedback.any() else "")
+        + f"; 90 % of a step to be reached within {limit:.3g} s"
+    )
+    shown = faulty if log is None else log
+    best = next((entry for entry in compared if not entry.refused), None)
+    settling = settling_time(plant)
+    among = [entry for entry in found if entry.figures and "faults" in method_class(entry.method).purposes]
+    usual = min(among, key=lambda entry: entry.rank(sampled.nd > 0, settling), default=None)
+    from_file = isinstance(data, (str, Path))
+    return Comparison(
+        tuple(compared),
+        "" if best is None else best.method,
+        _reason(best, compared, sampled, "" if usual is None else usual.method),
+        dt,
+        read_only(shown.times),
+        read_only(shown.truth),
+        plant.fault_names,
+        setting,
+        asked if data is None or from_file else {},
+        Log.of(Path(data), columns, scales).as_dict() if from_file else None,
+        () if log is None else log.notes,
+    )
+
+
+def compared_again(
+    body: Mapping[str, Any], designs: Mapping[str, ObserverDesign], log: Path | None
+) -> tuple[dict[str, Any], str, list[str]]:
+    """Return figures and sentence of a certificate made again from its plant and gain sets, and designs of others."""
+    asked = dict(body["asked"])
+    plant = DescriptorSystem(**asked.pop("plant"))
+    scenario = asked.pop("scenario")
+    read = {} if log is None else {"data": log, "columns": body["log"]["columns"], "scales": body["log"]["scales"]}
+    found = side_by_side(
+        plant,
+        None if scenario is None else scenario_from(scenario),
+        sorted(designs),
+        lambda _, method, __: designs[method],
+        **asked,
+        **read,
+    )
+    result = found.claims()
+    if log is None and body["log"] is not None:
+        # The errors on a log that is not given are assumed.
+        for name, entry in result["methods"].items():
+            for fault, stored in zip(entry["faults"], body["result"]["methods"][name]["faults"], strict=True):
+                fault |= {name: float(stored[name]) for name in ("rms", "size")}
+            entry["relative_error"] = relative_error(entry["faults"])
+    sampled = on_the_clock(plant, found.sample_time)
+    others = [f"plant of {name}" for name, one in designs.items() if not _is_of(one, (plant, sampled))]
+    digests = {name: inside["sha256"] for name, inside in body["gain_sets"].items()}
+    return result, comparison_statement(body["result"], digests, body["log"]), others
+
+
+def _is_of(made: ObserverDesign, plants: Sequence[DescriptorSystem]) -> bool:
+    """Whether a design is for one of some plants, as it was written or transformed."""
+    own = [made.plant] if made.source is None else [made.source.plant, made.plant]
+    return any(isinstance(one, DescriptorSystem) and agree(one.dense(), other) for one in own for other in plants)
+
+
+def _scenario(plant: DescriptorSystem, given: Scenario | None, dt: float, disturbance: float) -> Scenario:
+    """Return what happens: the scenario given, with at least the sensors' own noise, or each fault in turn."""
+    if given is not None:
+        clocked = given if plant.dt or given.sample_time == dt else given.replace(sample_time=dt)
+        # All runs begin at rest; a state that is given may be one that the sampled plant does not have any more.
+        return clocked.replace(observer_state=None, initial_state={}, stabilise=False)
+    settle = max(settling_time(plant), 4.0 * dt)
+    length = SETTLING_TIMES * settle
+    faults = {
+        name: Step(size=1.0, start=(1.0 + 2.0 * i) * length / 2.0, end=(2.0 + 2.0 * i) * length / 2.0)
+        for i, name in enumerate(plant.fault_names)
+    }
+    frequency = PERIOD_SHARE / settle
+    return Scenario(
+        horizon=min(plant.nf * length, MOST_SCENARIO_SAMPLES * dt),
+        sample_time=None if plant.dt else dt,
+        faults=faults,
+        noise=1.0,
+        disturbances={name: Sine(amplitude=disturbance, frequency=frequency) for name in plant.disturbance_names}
+        if disturbance
+        else {},
+    )
+
+
+def _log(
+    data: Any,
+    plant: DescriptorSystem,
+    columns: Mapping[str, str] | None,
+    scales: Mapping[str, float] | None,
+    input_delay: int = 0,
+) -> Record:
+    """Return a log on the clock."""
+    import pandas as pd
+
+    if not isinstance(data, (str, Path)):
+        require_kind(data, pd.DataFrame, "data", "a file name or a pandas.DataFrame")
+    wanted = {
+        name: (columns or {}).get(name, name) for name in (*plant.input_names, *plant.output_names, *plant.fault_names)
+    }
+    table, _, said = log_table(data, list(wanted.values()), (columns or {}).get(TIME_HEADER, TIME_HEADER))
+    frame = {name: table[column] for name, column in wanted.items() if column in table}
+    shift = None if plant.uncertainty is None else plant.uncertainty.shift
+    if shift and frame:
+        # The input of a linearised plant that is one in every row has no column.
+        frame[shift] = np.ones(max(map(len, frame.values())))
+    missing = [wanted[name] for name in (*plant.input_names, *plant.output_names) if name not in frame]
+    if missing:
+        raise SpecError(f"The log has no column {', '.join(map(repr, missing))}.", path="data")
+    count = max(map(len, frame.values()), default=0)
+    if not count:
+        raise SpecError("The log has no rows.", path="data")
+    for name in (*plant.input_names, *plant.output_names):
+        if not np.isfinite(frame[name]).any():
+            raise SpecError(f"The column {wanted[name]!r} holds no number: {name!r} is never measured.", path="data")
+
+    def signals(names: Sequence[str]) -> FloatArray:
+        offsets = np.array([plant.operating_point.get(name, 0.0) for name in names])
+        factors = np.array([(scales or {}).get(name, plant.scales.get(name, 1.0)) for name in names])
+        values = np.column_stack([frame[name] for name in names]) if names else np.zeros((count, 0))
+        return np.asarray(values * factors - offsets)
+
+    there = [name for name in plant.fault_names if name in frame]
+    truth = np.zeros((count, plant.nf))
+    for name in there:
+        truth[:, plant.fault_names.index(name)] = frame[name]
+    u, y = signals(plant.input_names), signals(plant.output_names)
+    u = u[np.clip(np.arange(count) - input_delay, 0, count - 1)]
+    stamps = table.get((columns or {}).get(TIME_HEADER, TIME_HEADER))
+    stuck = {name: stuck_rows(values) for name, values in zip(plant.output_names, y.T, strict=True)}
+    times = _clock(count, plant.dt) if stamps is None else stamps
+    return Record(times, u, y, truth, tuple(there), (*said, *stuck_texts(stuck)))
+
+
+def _clock(samples: int, dt: float) -> FloatArray:
+    return np.asarray(np.arange(samples) * float(dt), dtype=np.float64)
+
+
+def _compared(
+    entry: Candidate,
+    plant: DescriptorSystem,
+    faulty: Record,
+    healthy: Record,
+    log: Record | None,
+    kept: tuple[int, FloatArray],
+    limit: float,
+    false_alarms: float,
+    bounds: FloatArray,
+) -> ComparedMethod:
+    nothing = np.zeros((0, 0))
+    if entry.observer is None:
+        return ComparedMethod(entry.method, entry.refused, None, 0, entry.milliseconds, (), False, nothing, nothing)
+    observer = entry.observer
+    impulses, responses = step_responses(plant, observer, *kept)
+    names = [figures.fault for figures in entry.figures]
+    beside = thresholds_beside_least(plant, impulses, names, bounds)
+    found, quiet = estimates(observer, faulty), estimates(observer, healthy)
+    replayed = None if log is None or entry.design is None else faults_on_rows(entry.design, log.times, log.u, log.y)
+    rows = []
+    for row, figures in enumerate(entry.figures):
+        column = plant.fault_names.index(figures.fault)
+        fault = faulty.truth[:, column]
+        response = responses[:, row, column]
+        level, delay, smallest = alarms(found[:, :, row], quiet[:, :, row], fault, response, false_alarms, plant.dt)
+        error, truth = found[:, :, row] - fault, fault
+        if replayed is not None and log is not None and figures.fault in log.known:
+            truth = log.truth[:, column]
+            error = replayed[:, row] - truth
+        bias = float(np.max(np.abs(np.mean(quiet[:, :, row], axis=1)), initial=0.0))
+        rows.append(FaultComparison(figures, rms(error), rms(truth), bias, level, delay, smallest, *beside[row]))
+    shown = found[0] if replayed is None else replayed
+    fast = all(fault.figures.reaches and fault.figures.most <= limit for fault in rows)
+    own = np.column_stack([responses[:, i, plant.fault_names.index(f.fault)] for i, f in enumerate(entry.figures)])
+    return ComparedMethod(
+        entry.method,
+        "",
+        entry.design,
+        observer.order,
+        entry.milliseconds,
+        tuple(rows),
+        fast,
+        read_only(own),
+        read_only(shown),
+    )
+
+
+def _sized(compared: Sequence[ComparedMethod]) -> list[ComparedMethod]:
+    """Return the methods with a size for each fault that does not happen: the largest error of any method."""
+    largest: dict[str, float] = {}
+    for fault in (fault for entry in compared for fault in entry.faults):
+        largest[fault.figures.fault] = max(largest.get(fault.figures.fault, 0.0), fault.size or fault.rms)
+    return [
+        replace(entry, faults=tuple(replace(fault, size=largest[fault.figures.fault]) for fault in entry.faults))
+        for entry in compared
+    ]
+
+
+def _reason(
+    best: ComparedMethod | None, compared: Sequence[ComparedMethod], plant: DescriptorSystem, by_default: str
+) -> str:
+    if best is None:
+        return compared[0].refused if compared else "no method was asked for"
+    others = [entry for entry in compared if not entry.refused and entry is not best]
+    words = [f"rms error {best.relative_error:.3g} of the size of the faults"]
+    if others and is_finite_number(others[0].relative_error):
+        words[0] += f" against {others[0].relative_error:.3g} by {others[0].method}"
+    gain = max(fault.figures.unknown_input_gain for fault in best.faults)
+    if plant.nd:
+        words.append("decoupled from unknown inputs" if gain <= DECOUPLED else f"gain from unknown inputs {gain:.2g}")
+    if not best.fast_enough:
+        words.append("though none reaches 90 % of a step within the time asked for")
+    slow = [entry.method for entry in others if not entry.fast_enough] if best.fast_enough else []
+    if slow:
+        words.append(f"90 % of a step is reached too late or never: {', '.join(slow)}")
+    if by_default not in ("", best.method):
+        words.append(
+            f"auto, which knows no scenario, takes {by_default}, by whether a step is reached, by the gain from "
+            "unknown inputs, and by noise against delay"
+        )
+    return "; ".join(words)

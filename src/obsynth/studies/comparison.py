@@ -1,0 +1,457 @@
+"""What `obsynth.compare` returns: one row per method, one recommendation, one picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.tables import html_table, standing_page, text_table
+from obsynth.methods.fault_figures import FaultFigures
+from obsynth.numerics.arrays import FloatArray
+from obsynth.report.plots.panels import (
+    LINE_COLOURS,
+    TRUE_STYLE,
+    data_url,
+    label_time,
+    legend_above,
+    tidy,
+    with_unit,
+    written,
+)
+from obsynth.results.certificate_files import SHOWN_DIGITS, result_text
+from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_set_writing import design_as_dict
+from obsynth.results.gain_sets import COMPARISON
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+#: Samples of the window on which the least threshold is looked for, at most.
+LONGEST_WINDOW = 32
+
+#: A picture of estimates reaches as far as this share of their samples.
+SHOWN_SAMPLES = 0.98
+
+#: Room below and above a fault in its panel, as a share of its range.
+ROOM_AROUND_FAULT = 0.75
+
+#: Opacity of an estimate that reaches beyond its panel.
+FAINT = 0.25
+
+#: What the page of a comparison begins with.
+COMPARISON_PAGE = FileKind("a comparison of obsynth", rb'name="generator" content="obsynth compare"', suffix=".html")
+
+_HEADER = (
+    "method",
+    "fault",
+    "order",
+    "s to 50 %",
+    "s to 90 %",
+    "at horizon",
+    "peak",
+    "deviation",
+    "gain from d",
+    "bias",
+    "s to alarm",
+    "smallest",
+    "bound",
+    "/ least",
+    "rms",
+    "ms",
+)
+
+#: What the columns of numbers mean.
+_FIGURE_MEANINGS = {
+    "order": "states of the observer",
+    "s to 50 %": "time until the estimate of a unit step reaches 50 %",
+    "s to 90 %": "time until the estimate of a unit step reaches 90 %",
+    "at horizon": "the estimate of a unit step at the end",
+    "peak": "its largest absolute value",
+    "deviation": "standard deviation of the estimate",
+    "gain from d": "largest gain from an unknown input to the estimate",
+    "bias": "largest mean of the estimate without a fault",
+    "s to alarm": "median detection delay",
+    "smallest": "step that half of the runs detect",
+    "bound": "what the estimate never exceeds without a fault",
+    "/ least": f"the bound, divided by the least of all tests with this delay on at most {LONGEST_WINDOW} samples",
+    "rms": "root mean square error in the runs, or on the log where it has a column of the fault",
+    "ms": "milliseconds to design and verify",
+}
+
+
+@dataclass(frozen=True)
+class FaultComparison:
+    """How one method estimates one fault.
+
+    Parameters
+    ----------
+    figures : FaultFigures
+        In closed form, on the nominal plant.
+    rms : float
+        Root mean square of ``fhat - f`` over the drawn runs of the scenario, not shifted by any delay.
+    size : float
+        Root mean square of the fault itself in these runs; where it does not happen, the largest `rms` of any method.
+    bias : float
+        Largest absolute mean over the runs of the estimate without a fault: what tolerances and disturbances make.
+    threshold : float
+        Level of an alarm, calibrated on the fault-free runs.
+    detection_delay : float, seconds
+        Median over the runs, from the start of the fault.
+    smallest_found : float
+        Size of a step that half of the runs find.
+    bound : float
+        What the estimate never passes without a fault, with disturbances as large as in the scenario and three
+        deviations of noise: sums of absolute values.
+    least : float
+        The least such bound that any test with the same delay on at most `LONGEST_WINDOW` samples can have, linear or
+        not: of a fault of any time course where the estimate is one sample of it, else of a constant one.  An observer
+        uses all samples before, and its bound may be smaller.
+    """
+
+    figures: FaultFigures
+    rms: float
+    size: float
+    bias: float
+    threshold: float
+    detection_delay: float
+    smallest_found: float
+    bound: float = float("nan")
+    least: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedMethod:
+    """One method, or why there is none.
+
+    Parameters
+    ----------
+    method : str
+        Its id.
+    refused : str
+        Why it does not exist, in one line; empty where it does.
+    design : ObserverDesign or None
+        The design, verified.
+    order : int
+        States of the observer on the common clock.
+    milliseconds : float
+        To design and verify.
+    faults : tuple of FaultComparison
+        One for each fault.
+    fast_enough : bool
+        Whether 90 % of every step is shown within the time asked for.
+    responses : FloatArray
+        ``(steps, faults)``: estimates of a unit step of each fault.
+    estimates : FloatArray
+        ``(steps, faults)``: on the first drawn run, or on the log.
+    """
+
+    method: str
+    refused: str
+    design: ObserverDesign | None
+    order: int
+    milliseconds: float
+    faults: tuple[FaultComparison, ...]
+    fast_enough: bool
+    responses: FloatArray
+    estimates: FloatArray
+
+    @property
+    def relative_error(self) -> float:
+        """Root mean square over all faults of each one's error, as a share of its size: the same in all units."""
+        return relative_error([vars(found) for found in self.faults])
+
+
+def relative_error(faults: Sequence[Mapping[str, Any]]) -> float:
+    """Return the root mean square of ``rms / size`` over faults; infinite where there are none."""
+    shares = [fault["rms"] / fault["size"] if fault["rms"] else 0.0 for fault in faults]
+    return rms(shares) if shares else float("inf")
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """All methods side by side on one clock; made by `compare`.
+
+    Parameters
+    ----------
+    methods : tuple of ComparedMethod
+        The best first; refused ones last.
+    recommended : str
+        Method id, empty where none exists.
+    reason : str
+        Why, in one sentence.
+    sample_time : float, seconds
+        The clock.
+    times : FloatArray
+        ``(steps,)``, seconds.
+    truth : FloatArray
+        ``(steps, nf)``: faults of the scenario (zeros for a log without them).
+    fault_names : tuple of str
+        Columns of `truth`.
+    setting : str
+        What was drawn, in words.
+    asked : mapping, optional
+        Plant, scenario and options, as plain data; empty where a log is in no file.
+    log : mapping, optional
+        The log by its name and digest, and how its columns were read.
+    notes : tuple of str, optional
+        What is to be said of the log: cells without numbers, rows that are left out, outputs that are stuck.
+    """
+
+    methods: tuple[ComparedMethod, ...]
+    recommended: str
+    reason: str
+    sample_time: float
+    times: FloatArray
+    truth: FloatArray
+    fault_names: tuple[str, ...]
+    setting: str
+    asked: Mapping[str, Any] = field(default_factory=dict)
+    log: Mapping[str, Any] | None = None
+    notes: tuple[str, ...] = ()
+
+    def __getitem__(self, method: str) -> ComparedMethod:
+        for found in self.methods:
+            if found.method == method:
+                return found
+        raise KeyError(f"no method {method!r}; there are: {', '.join(found.method for found in self.methods)}")
+
+    def rows(self) -> tuple[tuple[str, ...], ...]:
+        """Return the table as texts: the header, then a row for each method and fault."""
+        rows = []
+        for entry in self.methods:
+            for k, fault in enumerate(entry.faults):
+                figures = fault.figures
+                numbers = (
+                    figures.half,
+                    figures.most,
+                    figures.at_horizon,
+                    figures.peak,
+                    figures.deviation,
+                    figures.unknown_input_gain,
+                    fault.bias,
+                    fault.detection_delay,
+                    fault.smallest_found,
+                    fault.bound,
+                    fault.bound / fault.least if fault.least > 0.0 else np.nan,
+                    fault.rms,
+                )
+                rows.append(
+                    (
+                        entry.method if k == 0 else "",
+                        figures.fault,
+                        str(entry.order) if k == 0 else "",
+                        *(_number(value) for value in numbers),
+                        f"{entry.milliseconds:.0f}" if k == 0 else "",
+                    )
+                )
+        return (_HEADER, *rows)
+
+    @property
+    def _units(self) -> dict[str, str]:
+        return next((dict(entry.design.plant.units) for entry in self.methods if entry.design is not None), {})
+
+    def meanings(self, columns: Sequence[str] = _HEADER) -> str:
+        """Return what columns of numbers of the table mean, in one sentence.
+
+        Parameters
+        ----------
+        columns : sequence of str, optional
+            Headers of the columns: all by default.
+
+        Returns
+        -------
+        str
+            Each header with its meaning.
+        """
+        return "; ".join(f"{name}: {_FIGURE_MEANINGS[name]}" for name in columns if name in _FIGURE_MEANINGS) + "."
+
+    @property
+    def refusals(self) -> tuple[str, ...]:
+        """Methods that do not exist, each with the reason in one line."""
+        return tuple(f"{entry.method}: {entry.refused}" for entry in self.methods if entry.refused)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the comparison as plain data."""
+        header, *rows = self.rows()
+        return {
+            "recommended": self.recommended,
+            "reason": self.reason,
+            "sample_time": self.sample_time,
+            "setting": self.setting,
+            "notes": list(self.notes),
+            "refusals": list(self.refusals),
+            "rows": [dict(zip(header, row, strict=True)) for row in rows],
+            "methods": [{"method": name, **entry} for name, entry in self.claims()["methods"].items()],
+        }
+
+    def claims(self) -> dict[str, Any]:
+        """Return what a certificate claims: the figures of every design on the same draws."""
+        figures = {
+            entry.method: {
+                "order": entry.order,
+                "fast_enough": entry.fast_enough,
+                "relative_error": entry.relative_error,
+                "faults": [
+                    {**vars(fault.figures), **{k: v for k, v in vars(fault).items() if k != "figures"}}
+                    for fault in entry.faults
+                ],
+            }
+            for entry in self.methods
+            if not entry.refused
+        }
+        return {"setting": self.setting, "methods": figures}
+
+    @property
+    def statement(self) -> str:
+        """Which method is best on what, in one sentence, with everything that it rests on."""
+        if not self.recommended:
+            return f"None exists: {self.reason}."
+        digests = {name: design_as_dict(design)["sha256"] for name, design in self._designs().items()}
+        return comparison_statement(self.claims(), digests, self.log)
+
+    def _designs(self) -> dict[str, ObserverDesign]:
+        return {entry.method: entry.design for entry in self.methods if entry.design is not None}
+
+    def save(self, path: str | Path) -> Path:
+        """Write a certificate that `obsynth verify` recomputes, with every gain set inside.
+
+        Parameters
+        ----------
+        path : str or Path
+            Where to write (.json).
+
+        Raises
+        ------
+        SpecError
+            No method exists, or the log is in no file: there is nothing to certify.
+        """
+        if not self.recommended or not self.asked:
+            why = "no method exists" if not self.recommended else "the log is in no file"
+            raise SpecError(f"There is nothing to certify: {why}.", path="methods")
+        text = result_text(COMPARISON, self._designs(), self.asked, self.claims(), self.statement, self.log)
+        return write_atomically(path, text)
+
+    def plot(self) -> Figure:
+        """Return a figure: for each fault, each method's estimate of a unit step, and its estimate on the scenario.
+
+        An estimate that is too noisy for the range of its panel lies faintly behind the others.
+        """
+        import matplotlib.pyplot as plt
+
+        return self._drawn(plt.figure)
+
+    def _drawn(self, new_figure: Callable[..., Figure]) -> Figure:
+        shown = [entry for entry in self.methods if entry.faults]
+        count = len(self.fault_names)
+        figure = new_figure(figsize=(11.0, 2.8 * count), layout="constrained")
+        axes = figure.subplots(count, 2, squeeze=False)
+        for row, name in enumerate(self.fault_names):
+            left, right = axes[row]
+            right.plot(self.times, self.truth[:, row], label="fault", **TRUE_STYLE)
+            left.axhline(1.0, color="0.8", linewidth=0.8)
+            low, high = self._range(shown, row)
+            for rank, entry in enumerate(shown):
+                names = [fault.figures.fault for fault in entry.faults]
+                if name not in names:
+                    continue
+                column, colour = names.index(name), LINE_COLOURS[rank % len(LINE_COLOURS)]
+                # The best lies on top.
+                style: dict[str, Any] = {"color": colour, "zorder": 3.0 + len(shown) - rank}
+                response, estimate = np.clip(entry.responses[:, column], -1.0, 3.0), entry.estimates[:, column]
+                left.plot(np.arange(len(response)) * self.sample_time, response, label=entry.method, **style)
+                noisy = float(np.nanquantile(np.abs(estimate), SHOWN_SAMPLES)) > max(-low, high)
+                faint = {"alpha": FAINT, "linewidth": 0.4, "zorder": 1.0} if noisy else {"linewidth": 0.8}
+                right.plot(self.times, estimate, **{**style, **faint})
+            times = [f.figures.most for entry in shown for f in entry.faults if np.isfinite(f.figures.most)]
+            length = max((len(entry.responses) for entry in shown), default=2) * self.sample_time
+            left.set_xlim(0.0, min(max([3.0 * max(times, default=length), 10.0 * self.sample_time]), length))
+            left.set_ylabel(f"estimate of a unit step\nof {name}")
+            right.set_ylabel(with_unit(name, self._units))
+            right.set_ylim(low, high)
+            for panel in (left, right):
+                label_time(panel)
+                tidy(panel)
+        legend_above(axes[0, 0])
+        legend_above(axes[0, 1])
+        return figure
+
+    def _range(self, shown: Sequence[ComparedMethod], row: int) -> tuple[float, float]:
+        """Return the ends of the panel of a fault: room about the fault, and for the best estimate of the first one."""
+        known = self.truth[np.isfinite(self.truth[:, row]), row]
+        low, high = float(np.min(known, initial=0.0)), float(np.max(known, initial=0.0))
+        room = ROOM_AROUND_FAULT * (high - low or 1.0)
+        if row or not shown:
+            return low - room, high + room
+        best = np.nanquantile(shown[0].estimates[:, 0], (1.0 - SHOWN_SAMPLES, SHOWN_SAMPLES))
+        return min(low - room, 1.5 * float(best[0])), max(high + room, 1.5 * float(best[1]))
+
+    def __repr__(self) -> str:
+        table = text_table(self.rows(), left=2)
+        return "\n".join([self.setting, *self.notes, *table, self.meanings(), *self.refusals, self.advice])
+
+    @property
+    def advice(self) -> str:
+        """The recommendation with its reason."""
+        return f"Take {self.recommended}: {self.reason}." if self.recommended else f"None exists: {self.reason}."
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(self.setting)}</p>{html_table(self.rows())}" + "".join(
+            f"<p>{escape(text)}</p>" for text in (*self.notes, self.meanings(), *self.refusals, self.advice)
+        )
+
+    def page(self) -> str:
+        """Return a page of HTML that stands alone, with table, picture, refusals and recommendation."""
+        from matplotlib.figure import Figure
+
+        picture = data_url(written(self._drawn(Figure)))
+        meanings = "".join(f"<li>{escape(f'{name}: {text}')}</li>" for name, text in _FIGURE_MEANINGS.items())
+        refused = "".join(f"<li>{escape(text)}</li>" for text in self.refusals)
+        head, *rows = self.rows()
+        # With the unit of each fault, in which its figures are.
+        table = (head, *((method, with_unit(fault, self._units), *others) for method, fault, *others in rows))
+        body = [
+            f'<p class="verdict {"holds" if self.recommended else "fails"}">{escape(self.advice)}</p>',
+            f"<p>{escape(self.setting)}</p>",
+            *(f"<p>{escape(text)}</p>" for text in self.notes),
+            f'<div class="scroll figures">{html_table(table)}</div>',
+            f'<div class="scroll"><figure><img alt="Estimates of each method" src="{picture}"></figure></div>',
+            "<h2>What the columns mean</h2>",
+            f'<ul class="soft">{meanings}</ul>',
+            *(["<h2>Methods without a design</h2>", f"<ul>{refused}</ul>"] if refused else []),
+        ]
+        return standing_page("Comparison of methods", body, generator="obsynth compare")
+
+
+def comparison_statement(claims: Mapping[str, Any], digests: Mapping[str, str], log: Mapping[str, Any] | None) -> str:
+    """Return what the figures of a comparison come to; ``digests`` are those of the gain sets."""
+    methods = claims["methods"]
+    errors = {name: relative_error(entry["faults"]) for name, entry in methods.items()}
+    best = min(methods, key=lambda name: (not methods[name]["fast_enough"], errors[name]))
+    others = ", ".join(f"{errors[name]:.4g} of {name}" for name in methods if name != best)
+    fast = "" if methods[best]["fast_enough"] else ", though none reaches 90 % of a step within the time asked for"
+    where = "" if log is None else f", errors on {log['name']} (sha256 {log['sha256'][:SHOWN_DIGITS]})"
+    kept = ", ".join(f"{name} {digest[:SHOWN_DIGITS]}" for name, digest in digests.items())
+    against = f" against {others}" if others else ""
+    return (
+        f"Of the methods that exist, {best} has the least rms error of the fault estimates, as a share of each fault's "
+        f"size ({errors[best]:.4g}{against}){fast}: {claims['setting']}{where}. Gain sets: {kept}."
+    )
+
+
+def _number(value: float) -> str:
+    return "-" if np.isnan(value) else "never" if np.isinf(value) else f"{value:.3g}"
+
+
+def rms(errors: Sequence[float] | FloatArray) -> float:
+    """Return the root of the mean square; where a sample is missing (NaN) there is no error."""
+    values = np.asarray(errors, dtype=np.float64)
+    values = values[~np.isnan(values)]
+    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")

@@ -1,0 +1,208 @@
+"""What a design promises for every plant in the box of its constants."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import PreconditionError
+from obsynth.methods.tracking import structure_of, tracking_of
+from obsynth.numerics.arguments import arguments_checked
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.constants import ConstantsBox
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.elimination import eliminate_algebraic_states
+from obsynth.plants.transformations.uncertain_plant import (
+    ROW_ROUNDING_SHARE,
+    AffinePlant,
+    affine_plant,
+    moving_basis,
+    moving_family,
+    untouched_states,
+)
+from obsynth.plants.uncertainty import SAMPLED, as_written
+from obsynth.proofs.affine import AffineMatrix
+from obsynth.results.design import ObserverDesign
+from obsynth.studies.robustness_result import Robustness
+from obsynth.verification.over_tolerances.plants_of_the_box import (
+    EXACT_MODEL,
+    acting_like_faults,
+    plant_as_written_at,
+    vertex_gains,
+    with_tolerances,
+)
+from obsynth.verification.over_tolerances.responses import (
+    Responses,
+    blame,
+    blamed_rows,
+    largest_factor,
+    loop_radius,
+    responses_of,
+    same_sample_inverse,
+)
+from obsynth.verification.over_tolerances.subdivision import (
+    MOST_BOXES,
+    BoxVerdict,
+    index_one_on_box,
+    proved_stable,
+    values_at,
+)
+
+#: Boxes for stability after which it is left open where most states are algebraic: each elimination takes long.
+FEW_BOXES = 40
+
+
+@arguments_checked
+def robustness(
+    design: ObserverDesign, *, constants: Any = None, progress: Callable[[str], None] | None = None
+) -> Robustness:
+    """Return what a linear discrete-time design guarantees for every plant in the box of its constants.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Linear; of a plant with tolerances (`obsynth.uncertain_system`, or ``constants`` in a spec).
+    constants : mapping, ConstantsBox or DescriptorSystem, optional
+        Tolerances instead of the plant's own, as `obsynth.uncertain_system` takes them.
+    progress : callable, optional
+        Called with a text before each step.
+
+    Returns
+    -------
+    Robustness
+        Print it for a dozen lines.
+
+    Raises
+    ------
+    SpecError
+        The design is not linear, or a tolerance is malformed.
+
+    Notes
+    -----
+    The loop's radius is that of ``H = D0 + sum_j D_j``, what the error adds to itself through what is uncertain, with
+    the tail of the sum proved.  Below 1 all bounds stay finite for ever (sufficient for constant and varying
+    constants).  The largest tolerance is found by bisection, all matrices built anew.  Stability and regularity are
+    proved by cutting the box; a point that refutes them is named.  Theory: M. Khammash and J. Pearson,
+    "Performance robustness of discrete-time systems with structured uncertainty", IEEE TAC 36, 1991.
+    """
+    design, plant = with_tolerances(design, constants)
+    told = progress or (lambda text: None)
+    uncertain = plant.uncertainty
+    if uncertain is None or not uncertain.box.names:
+        empty = ConstantsBox({}) if uncertain is None else uncertain.box
+        return Robustness(empty, True, "open", {}, None, None, {}, {}, {}, {}, "open", 0, EXACT_MODEL)
+    told("regularity over the box")
+    regular = index_one_on_box(plant)
+    reason = ""
+    try:
+        affine = affine_plant(plant)
+        told("stability over the box")
+        stable, untouched = _stability(plant, affine)
+    except PreconditionError as error:
+        affine, stable, untouched, reason = None, BoxVerdict("open", 0), (), str(error)
+    broken = regular if regular.verdict == "refuted" else stable
+    breaking = {} if broken.at is None or broken.verdict != "refuted" else values_at(uncertain.box, broken.at)
+    radius = factor = None
+    shares, rows, gains, errors = dict[str, float](), dict[str, float](), dict[str, float](), dict[str, Any]()
+    if affine is not None:
+        try:
+            told("loop over the box")
+            tracking = tracking_of(design, affine)
+            responses = responses_of(structure_of(design, affine, tracking))
+            radius = loop_radius(responses)
+            try:
+                same_sample_inverse(responses)
+            except PreconditionError as error:
+                # No bound holds at a sample, and all else is told.
+                reason = str(error)
+            told("largest tolerances")
+            factor = largest_factor(
+                lambda t: structure_of(design, affine_plant(plant, uncertain.box.scaled(t)), tracking), radius
+            )
+            shares = _named((*uncertain.box.names, "remainders"), blame(responses))
+            parts = (affine.E.parts, affine.A.parts)
+            rows = _named(plant.state_names, blamed_rows(responses, tracking.T, parts))
+            errors = _error_per_unit(design, responses, affine)
+            told("gains at the vertices")
+            gains = vertex_gains(design, plant, affine, tracking)
+        except PreconditionError as error:
+            reason = str(error)
+    return Robustness(
+        uncertain.box,
+        False,
+        regular.verdict,
+        breaking,
+        radius,
+        factor,
+        shares,
+        rows,
+        errors,
+        gains,
+        stable.verdict,
+        stable.boxes,
+        reason,
+        acting_like_faults(plant),
+        untouched,
+        uncertain.not_covered,
+        design,
+    )
+
+
+def _named(names: tuple[str, ...], shares: FloatArray) -> dict[str, float]:
+    return {name: float(share) for name, share in zip(names, shares, strict=True)}
+
+
+def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict, tuple[complex, ...]]:
+    """Return whether the plant is stable on the box, but for modes that no constant touches, and these."""
+    box, uncertain = affine.box, plant.uncertainty
+    sampled = uncertain is not None and any(kind == SAMPLED for kind, _ in uncertain.steps)
+    discrete = plant.is_discrete and not sampled
+    basis = moving_basis(plant, box)
+    whole = moving_family(plant, box, basis)
+    least = np.vstack([np.abs(whole.center), whole.spread + whole.radius])
+    size = whole.magnitude.sum(axis=1)
+    apart = untouched_states(least, np.concatenate([size, size]))
+    values = np.linalg.eigvals(whole.center[np.ix_(apart, apart)])
+    outside = (
+        np.abs(values) >= 1.0 - ROW_ROUNDING_SHARE if discrete else values.real >= -ROW_ROUNDING_SHARE * size.max()
+    )
+    lasting = tuple(complex(value) for value in values[outside])
+    # Stable modes that no constant touches are stable everywhere.
+    rest = [i for i in range(len(whole.center)) if i not in apart]
+    if not rest:
+        return BoxVerdict("proved", 0), lasting
+    back = 2.0 * np.eye(len(basis)) - basis
+
+    def exactly(q: FloatArray) -> FloatArray:
+        bare = plant if plant.uncertainty is None else plant_as_written_at(plant, plant.uncertainty, box.values(q))
+        # Of the signals nothing is asked: without them the elimination has a tenth of the columns.
+        moving = DescriptorSystem(E=bare.E, A=bare.A, C=np.zeros((1, bare.nx)), dt=bare.dt)
+        found = eliminate_algebraic_states(moving).plant.A
+        return np.asarray((back @ found @ basis)[np.ix_(rest, rest)])
+
+    def build(lower: FloatArray, upper: FloatArray) -> AffineMatrix:
+        return moving_family(plant, box.part(lower, upper), basis)[rest, rest]
+
+    most = MOST_BOXES if uncertain is None or len(basis) * 4 > len(as_written(plant, uncertain)["A"]) else FEW_BOXES
+    return proved_stable(build, affine.count, exactly, discrete=discrete, most=most), lasting
+
+
+def _error_per_unit(design: ObserverDesign, responses: Responses, affine: AffinePlant) -> dict[str, dict[str, float]]:
+    """Return by output: what one unit of each state and input adds, first order and remainders, for ever."""
+    plant, observer = design.linear
+    structure = responses.structure
+    inner, _, outputs = structure.rows
+    back = 2.0 * np.eye(plant.nx) - affine.coordinates
+    total = np.zeros((len(structure.Co), plant.nx + plant.nu))
+    for i in range(affine.count):
+        both = np.hstack([structure.state.parts[i] @ back, structure.inputs.parts[i]])
+        total += (1.0 + abs(structure.offsets[i])) * responses.gain(structure.Co, both[inner], both[outputs])
+    rest = np.hstack([structure.state.radius @ np.abs(back), structure.inputs.radius])
+    total += responses.absolute_gain(structure.Co, rest[inner]) + rest[outputs]
+    names = (*plant.state_names, *plant.input_names)
+    return {
+        label: _named(names, row)
+        for label, row in zip(observer.row_names[len(observer.state_names) :], total, strict=True)
+    }

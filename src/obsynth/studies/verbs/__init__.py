@@ -1,0 +1,1 @@
+"""The commands that run scenarios and sweeps: their arguments and what they do."""

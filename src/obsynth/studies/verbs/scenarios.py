@@ -1,0 +1,204 @@
+"""The verbs that run a scenario: ``simulate``, ``evaluate``, and ``compare``, which does so for every method."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import obsynth
+from obsynth.cli.arguments import MONITOR_NAMES, columns_of, flag_of, numbers_of, refuse_given, stated_settings
+from obsynth.cli.commands import designed_or_loaded, spec_output
+from obsynth.cli.output import answer, output_file, progress, stdout_console
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.files.inputs import protect
+from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.monitoring.thresholds.options import CHANGE, FALSE_ALARMS, PARAMETER_OPTIONS, refuse_idle
+from obsynth.monitoring.verbs.data_arguments import monitor_settings, required_scenario, stated_delay
+from obsynth.monitoring.verbs.logs import picture_kind, written_picture
+from obsynth.plants.transformations.recovery import linear_plant
+from obsynth.results.certificate_files import RESULT_FILE
+from obsynth.studies.verbs.sweeps import chosen_executor
+
+
+def _prepared(
+    options: argparse.Namespace, report_stage: Callable[[str], None], kind: FileKind | None = None
+) -> tuple[obsynth.Spec, obsynth.Scenario, Path | None, obsynth.ObserverDesign]:
+    """Return spec, scenario, where to write a file of some kind, and the design, made or loaded."""
+    report_stage(f"reading {options.system}")
+    spec = obsynth.load_spec(options.system)
+    scenario = required_scenario(spec)
+    if options.gains is not None:
+        protect(options.gains)
+    else:
+        refuse_given(options, ("unverified",), "a gain set: give --gains, as what is designed here is verified")
+    target = None if options.out is None else spec_output(options.out, kind, spec, options, option="--out")
+    return spec, scenario, target, designed_or_loaded(spec, options.gains, report_stage, unverified=options.unverified)
+
+
+def run_simulate(options: argparse.Namespace) -> int:
+    """Run ``simulate``: spec in, table of errors out, and every signal in a file if asked."""
+    with progress(quiet=options.quiet) as report_stage:
+        from obsynth.simulation.simulate import SIMULATED_SIGNALS, simulate
+
+        spec, scenario, target, design = _prepared(options, report_stage, SIMULATED_SIGNALS)
+        report_stage("simulating")
+        found = simulate(design, scenario)
+        # A log as run reads it; a bias of a sensor is a deviation of its own.
+        point = {**getattr(design.plant, "operating_point", {})}
+        point = {name: value for name, value in point.items() if name not in getattr(design.plant, "sensor_faults", ())}
+        written = None if target is None else str(found.write_csv(target, operating_point=point))
+    from obsynth.report.scenarios import simulation_report
+
+    answer(
+        options,
+        {"spec": spec.path, "file": written, **found.summary()},
+        lambda: simulation_report(design.name, found, console=stdout_console(), units=design.plant.units, file=written),
+    )
+    return 0
+
+
+def _run_tolerances(options: argparse.Namespace) -> int:
+    """Run ``evaluate --tolerances``: spec in, a table and a picture out."""
+    if options.monitor not in (None, "pointwise"):
+        raise SpecError("--tolerances compares two pointwise monitors: leave out --monitor.", path="--tolerances")
+    unused = ("plants", "confidence", "jobs", "initial_error", "initial", "false_alarms", "window", "change")
+    refuse_given(options, unused, "one monitor on many runs, and --tolerances compares two on plants that it draws")
+    with progress(quiet=options.quiet) as report_stage:
+        kind = None if options.out is None else RESULT_FILE if _is_json(options.out) else picture_kind(options.out)
+        spec, scenario, target, design = _prepared(options, report_stage, kind)
+
+        found = obsynth.tolerance_study(
+            design,
+            scenario,
+            tolerances=[_tolerance(item) for item in options.tolerances.split(",")],
+            runs=options.runs,
+            disturbance_bounds=numbers_of(options.disturbance) or None,
+            noise_bound=options.noise_bound,
+            progress=report_stage,
+        )
+    if target is not None and _is_json(target):
+        found.save(target)
+    elif target is not None:
+        from obsynth.studies.plots.tolerances import plot_tolerances
+
+        written_picture(target, 2, lambda axes: plot_tolerances(found, axes=axes))
+    answer(
+        options,
+        {"spec": spec.path, "file": target, "statement": found.statement, **found.as_dict()},
+        f"{found}\n{found.statement}",
+    )
+    return 0
+
+
+def _is_json(path: Path) -> bool:
+    return path.suffix.lower() == ".json"
+
+
+def _tolerance(text: str) -> float | str:
+    """Return a tolerance as a share, or as a text with its per cent."""
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip()
+
+
+def run_evaluate(options: argparse.Namespace) -> int:
+    """Run ``evaluate``: spec in, table of rates and errors out."""
+    if options.tolerances is not None:
+        return _run_tolerances(options)
+    refuse_given(options, ("out", "force"), "the picture or certificate of --tolerances")
+    if options.monitor is None:
+        refuse_given(options, MONITOR_NAMES, "a monitor: name it with --monitor")
+    with progress(quiet=options.quiet) as report_stage:
+        spec, scenario, _, design = _prepared(options, report_stage)
+        report_stage("running")
+
+        watched: obsynth.types.Monitor | obsynth.ParameterMonitor | None = None
+        if options.monitor is not None and isinstance(design.observer, obsynth.LinearObserver):
+            watched = obsynth.monitor(design, scenario, options.monitor, **monitor_settings(design, options))
+        elif options.monitor is not None:
+            table = {**PARAMETER_OPTIONS, "glr": ("false_alarms",)}
+            refuse_idle(table, options.monitor, stated_settings(options), called=flag_of)
+            watched = obsynth.ParameterMonitor(
+                options.monitor,
+                false_alarms=options.false_alarms or FALSE_ALARMS,
+                change=(options.change or CHANGE) if options.monitor == "cusum" else None,
+            )
+        with chosen_executor(options.jobs, None) as executor:
+            found = obsynth.evaluate(
+                design,
+                scenario,
+                runs=options.runs,
+                monitor=watched,
+                executor=executor,
+                progress=lambda done, total: report_stage(f"{done} of {total} runs"),
+                plants=options.plants,
+                **({} if options.confidence is None else {"confidence": options.confidence}),
+            )
+    from obsynth.report.scenarios import described, evaluation_report, final_threshold
+    from obsynth.studies.least_thresholds import design_beside_least, in_words
+
+    least = design_beside_least(design, scenario)
+    sentences = [in_words(name, *pair, design.plant.units.get(name, "")) for name, pair in least.items()]
+    told: dict[str, Any] | None = None
+    if watched is not None:
+        kind, statement = described(watched)
+        told = {"kind": kind, "statement": statement, "final_threshold": final_threshold(watched)}
+    answer(
+        options,
+        {
+            "spec": spec.path,
+            "monitor": told,
+            "least_thresholds": {name: {"bound": pair[0], "least": pair[1]} for name, pair in least.items()},
+            **found.as_dict(),
+        },
+        lambda: evaluation_report(
+            design.name, found, monitor=watched, console=stdout_console(), units=design.plant.units, beside=sentences
+        ),
+    )
+    return 0
+
+
+def run_compare(options: argparse.Namespace) -> int:
+    """Run ``compare``: spec in, table and recommendation out; 3 where no method exists."""
+    from obsynth.studies.comparison import COMPARISON_PAGE
+
+    with progress(quiet=options.quiet) as report_stage:
+        report_stage(f"reading {options.system}")
+        spec = obsynth.load_spec(options.system)
+        if options.data is None:
+            refuse_given(options, ("map", "scale", "time_column", "input_delay"), "a log: give --data")
+        if options.out is not None:
+            output_file(options.out, RESULT_FILE if _is_json(options.out) else COMPARISON_PAGE, options)
+        given = {} if spec.method == "auto" else {spec.method: spec.options}
+        rows = stated_delay(options)
+        found = obsynth.compare(
+            spec.transformation or linear_plant(spec.plant),
+            scenario=spec.scenario,
+            options=given,
+            sample_time=options.sample_time,
+            within=options.within,
+            tolerance=options.tolerance,
+            runs=options.runs,
+            data=options.data,
+            columns=columns_of(options),
+            scales=numbers_of(options.scale),
+            input_delay=(spec.input_delay(spec.plant) if rows is None else rows) or 0,
+            progress=report_stage,
+        )
+        if options.out is not None:
+            report_stage(f"writing {options.out}")
+            if _is_json(options.out):
+                found.save(options.out)
+            else:
+                write_atomically(options.out, found.page())
+    from obsynth.report.scenarios import comparison_report
+
+    answer(
+        options,
+        {"spec": spec.path, "statement": found.statement, **found.to_dict()},
+        lambda: comparison_report(found, console=stdout_console(), file=options.out),
+    )
+    return 0 if found.recommended else PreconditionError.exit_code

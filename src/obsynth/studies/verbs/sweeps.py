@@ -1,0 +1,268 @@
+"""The verb ``sweep``, and ``run`` for many gain sets: many cases in, one table and one picture out."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import obsynth
+from obsynth.cli.arguments import MONITOR_NAMES, STREAM, numbers_of, refuse_given
+from obsynth.cli.output import output_file, print_json, progress, stdout_console
+from obsynth.errors import SpecError
+from obsynth.files.inputs import input_file
+from obsynth.files.outputs import FileKind, made_folder, write_together
+from obsynth.methods.registry import REGISTRY, method_class
+from obsynth.specs.documents import read_yaml
+
+PICTURE = FileKind("a picture", rb"\A\x89PNG")
+
+
+#: Blanks between columns.
+_BLANKS_BETWEEN = 2
+
+
+def run_sweep(options: argparse.Namespace) -> int:
+    """Run ``sweep``; the exit code is 0 when every case was decided, whatever it came to."""
+    if options.out.exists() and not options.out.is_dir():
+        raise SpecError(f"{options.out} is no folder: give --out the name of one.", path="--out")
+    listed = [_value_list(text) for text in options.set]
+    parameters = dict(listed)
+    if len(parameters) < len(listed):
+        raise SpecError("Two lists of values (--set) are of the same entry: put them into one.", path="--set")
+    for spec in options.system:
+        input_file(Path(spec))  # what is designed for hours is not refused in the end
+    _require_claim(options, parameters)
+
+    def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:
+        return obsynth.sweep(options.system, parameters, executor=executor, folder=options.out, progress=done)
+
+    def draw(found: Any) -> Any:
+        claims = {name for result in found.results for name in result.claims}
+        if options.claim is not None and options.claim not in claims:
+            known = ", ".join(sorted(claims)) or "none"
+            print(
+                f"Warning: no picture is written, as no design claims {options.claim!r}; there are: {known}.",
+                file=sys.stderr,
+            )
+            return None
+        return found.plot(options.claim) if claims else None
+
+    table = FileKind("the table of a sweep", rb"\Acase,")
+    found, files = _carried_out(options, options.out, ("designs", table, "sweep.png"), work, draw)
+    _tell(options, found, files, "cases")
+    return 0
+
+
+def _require_claim(options: argparse.Namespace, parameters: dict[str, list[Any]]) -> None:
+    """Refuse a claim that no method of a sweep can make before anything is designed."""
+    if options.claim is None:
+        return
+    methods = list(parameters.get("method.id", ()))
+    for section in parameters.get("method", [read_yaml(Path(spec)).get("method") for spec in options.system]):
+        methods.append(section.get("id") if isinstance(section, dict) else None)
+    # What chooses its method may come to any.
+    known = REGISTRY if any(method not in REGISTRY for method in methods) else methods
+    claims = sorted({claim for method in known for claim in method_class(method).claims})
+    if options.claim not in claims:
+        raise SpecError(
+            f"No method of this sweep claims {options.claim!r}: give --claim one of {', '.join(claims)}.",
+            path="--claim",
+        )
+
+
+def run_many(options: argparse.Namespace) -> int:
+    """Run ``run`` for a folder of gain sets: a table, a picture, and the estimates of each design on each log."""
+    alone = ("system", "state", "prove", "monitor", "smooth", "lag")
+    given = [name for name in alone if getattr(options, name)]
+    if given:
+        names = ", ".join(f"--{name}" for name in given)
+        raise SpecError(f"{names}: for one gain set; --gains is a folder of many.", path=f"--{given[0]}")
+    refuse_given(options, ("state_every", "sample_time", *MONITOR_NAMES), "one gain set: --gains is a folder of many")
+    folder = Path(options.out)
+    if options.out == STREAM or (folder.exists() and not folder.is_dir()):
+        raise SpecError("Many designs need a folder for their estimates: give one to --out.", path="--out")
+
+    for path in (Path(options.gains), Path(options.data)):
+        if path.is_file():
+            input_file(path)  # what is read is never written, by force or not
+    asked = {
+        "columns": dict(options.map) or None,
+        "time_column": options.time_column,
+        "outliers": options.outliers,
+        "scales": numbers_of(options.scale) or None,
+        "thresholds": numbers_of(options.threshold) or None,
+        "gap": options.gap,
+        "warm_up": options.warm_up,
+        "recovered": options.recovered,
+        "unverified": options.unverified or None,
+    }
+
+    def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:
+        stated = {name: value for name, value in asked.items() if value is not None}
+        return obsynth.run_fleet(options.gains, options.data, folder, executor=executor, progress=done, **stated)
+
+    table = FileKind("the table of many runs", rb"\Arun,status,")
+    found, files = _carried_out(
+        options,
+        folder,
+        ("runs", table, "fleet.png"),
+        work,
+        lambda found: found.plot() if "run" in found.counts else None,
+    )
+    if options.json or not options.quiet:
+        _tell(options, found, files, "runs")
+    return 0
+
+
+def _carried_out(
+    options: argparse.Namespace,
+    folder: Path,
+    named: tuple[str, FileKind, str],
+    work: Callable[[Executor | None, Callable[[int, int], None]], Any],
+    draw: Callable[[Any], Any],
+) -> tuple[Any, tuple[Path, ...]]:
+    """Return what ``work`` comes to, and the files of its table and picture; nothing is left of a folder in vain."""
+    what, kind, picture_name = named
+    with made_folder(folder):
+        table = output_file(folder / "table.csv", kind, options)
+        picture = output_file(folder / picture_name, PICTURE, options)
+        with progress(quiet=options.quiet) as report_stage, chosen_executor(options.jobs, options.cluster) as executor:
+            found = work(executor, lambda done, total: report_stage(f"{done} of {total} {what}"))
+            contents: dict[Path, str | bytes] = {table: found.csv()}
+            image = _png_of(lambda: draw(found))
+            if image is not None:
+                contents[picture] = image
+            return found, write_together(contents)
+
+
+def _tell(options: argparse.Namespace, found: Any, files: tuple[Path, ...], what: str) -> None:
+    """Print the table of a sweep or of many runs, and the files."""
+    header, rows = found.rows()
+    if options.json:
+        cases = [dict(zip(header, row, strict=True)) for row in rows]
+        print_json({"command": options.verb, "counts": found.counts, what: cases, "files": [str(f) for f in files]})
+        return
+    console = stdout_console()
+    shown = _shown_cases if what == "cases" else _shown_runs
+    console.print(shown(found, console.width))
+    console.print(f"Written: {', '.join(map(str, files))}", soft_wrap=True)
+
+
+@contextmanager
+def chosen_executor(jobs: int | None, cluster: str | None) -> Iterator[Executor | None]:
+    """Yield where work goes: nowhere else, processes, or a Dask cluster."""
+    if jobs is not None and cluster is not None:
+        raise SpecError("--jobs and --cluster are two places for the work: give one of them.", path="--jobs")
+    if cluster is not None:
+        from dask import distributed
+
+        connect: Any = distributed.Client
+        try:
+            client = connect(cluster, timeout="10s")
+        except OSError as error:
+            raise SpecError(f"There is no Dask scheduler at {cluster}: {error}.", path="--cluster") from error
+        with client:
+            yield client.get_executor()
+        return
+    if jobs in (None, 1):
+        yield None
+        return
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as executor:
+        try:
+            yield executor
+        except BaseException:
+            executor.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _value_list(text: str) -> tuple[str, list[Any]]:
+    """Return the path and the values of ``PATH=LIST``."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    name, sign, listed = text.partition("=")
+    try:
+        values = YAML(typ="safe", pure=True).load(listed) if sign else None
+    except (YAMLError, ValueError) as error:
+        raise SpecError(f"--set {text}: {listed!r} is no YAML list.", path="--set") from error
+    if not name or not isinstance(values, list):
+        raise SpecError(f"--set {text!r}: give PATH=[value, value, ...].", path="--set")
+    return name.strip(), values
+
+
+def _png_of(plot: Callable[[], Any]) -> bytes | None:
+    import matplotlib
+
+    from obsynth.report.plots.panels import written
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure = plot()
+    if figure is None:
+        return None
+    picture = written(figure)
+    plt.close(figure)
+    return picture
+
+
+def _shown(found: Any, header: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> Any:
+    """Return a table for people, below what became of the cases, what is the same in all, and what has no room."""
+    from rich.console import Group
+    from rich.text import Text
+
+    from obsynth.results.layout import headed_table
+
+    listed = [tuple("" if cell == "nan" else cell for cell in row) for row in rows]
+    columns = dict(zip(header, zip(*listed, strict=True), strict=True)) if listed else {}
+    filled = {name: column for name, column in columns.items() if any(column)}
+    same = {name: column[0] for name, column in filled.items() if len(listed) > 1 and len(set(column)) == 1}
+    shown, widths, missing, room = dict[str, tuple[str, ...]](), dict[str, int](), list[str](), width + _BLANKS_BETWEEN
+    for name, column in filled.items():
+        if name not in same:
+            # Texts fold at blanks; a number that is cut is another number.
+            words = [word for text in (name.replace(".", ". "), *column) for word in text.split()]
+            wide = max(map(len, words)) + _BLANKS_BETWEEN
+            if wide <= room:
+                shown[name], widths[name], room = column, wide - _BLANKS_BETWEEN, room - wide
+            else:
+                missing.append(name)
+    lines = [", ".join(f"{count} {status}" for status, count in found.counts.items())]
+    if same:
+        lines.append(f"In all of them: {', '.join(f'{name} {value}' for name, value in same.items())}.")
+    if missing:
+        lines.append(f"In table.csv alone: {', '.join(missing)}.")
+    table = headed_table(*(name.replace(".", ". ") for name in shown))
+    for place, (name, cells) in zip(table.columns, shown.items(), strict=True):
+        # What room is left goes to the first texts that could use it.
+        more = min(max(map(len, cells)) - widths[name], room)
+        place.width, room = widths[name] + max(more, 0), room - max(more, 0)
+    for row in zip(*shown.values(), strict=True):
+        table.add_row(*(Text(cell or "-") for cell in row))
+    return Group(*map(Text, lines), Text(), table)
+
+
+def _shown_cases(found: Any, width: int) -> Any:
+    """Return the table of a sweep for people: without message and file."""
+    header, rows = found.rows()
+    kept = [i for i, name in enumerate(header) if name not in ("message", "file")]
+    told = ([f"{row[i]:.4g}" if isinstance(row[i], float) else str(row[i]) for i in kept] for row in rows)
+    return _shown(found, [header[i] for i in kept], told, width)
+
+
+def _shown_runs(found: Any, width: int) -> Any:
+    """Return the table of runs for people: the first alarm of each, and why one was not made."""
+    rows = []
+    for run in found.runs:
+        first = min(run.alarms, key=lambda name: run.alarms[name], default="")
+        alarm = f"{first} at {run.alarms[first]:g} s" if first else "-"
+        rows.append((run.name, run.status, str(run.rows), str(run.statuses.get("ok", 0)), alarm, run.message))
+    return _shown(found, ("run", "status", "rows", "ok", "first alarm", "why not"), rows, width)

@@ -1,1 +1,0 @@
-"""What holds for every plant in the box of its constants."""

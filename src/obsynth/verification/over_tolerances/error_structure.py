@@ -1,0 +1,282 @@
+"""How an uncertain plant drives the error of a fixed observer.
+
+    eps+ = Az eps + (Az T E + By C - T A) x + (Bu + By D - T B) u + (By Dd - T Bd) d,   eps = z - T E(q) x
+    xhat - x = Cx eps + (Cx T E + Dyx C + T0x A - I) x + ...      (fault estimates, residuals: without I)
+
+The brackets vanish at the nominal plant; over the box ``x = xhat - e`` drives them: what is known, and the error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import EFFECT_RANK_SHARE, ROUNDED_BESIDE
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.transformations.uncertain_plant import AffinePlant
+from obsynth.proofs.affine import AffineMatrix, affine_block
+from obsynth.proofs.balls import gamma, rounded_up
+from obsynth.verification.error_system import IDENTITY_SHARE
+
+#: Remainders below this share of their row's terms are rounding: one common channel is enough for them.
+REMAINDER_SHARE = 1e-9
+
+
+class Tracking(NamedTuple):
+    """``z`` follows ``T E x``, ``T (nz, nx)``; outputs use ``T0 (nx + nf + nr, nx)``: ``T0 (A x + B u + Bd d) = 0``."""
+
+    T: FloatArray
+    T0: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorStructure:
+    """The error system over a box: rows ``[eps; e; outputs]`` (nz, n, no), columns of the state and the inputs."""
+
+    Az: FloatArray
+    Cx: FloatArray
+    Co: FloatArray
+    state: AffineMatrix
+    inputs: AffineMatrix
+    disturbances: AffineMatrix
+    bounds: FloatArray
+    channel_rows: FloatArray  # |c e| of a row c each: of constants, then of states with a remainder
+    single: int  # rows after these share one channel, the largest of them
+    effects: FloatArray  # (nz + n + no, m): what a channel does
+    owner: tuple[int, ...]  # the constant of each channel
+    offsets: FloatArray
+    reading: FloatArray  # xhat (and fhat) from the rows of the observer
+    watching: FloatArray
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """``nz, n, no``."""
+        return len(self.Az), len(self.Cx), len(self.Co)
+
+    @property
+    def rows(self) -> tuple[slice, slice, slice]:
+        """Rows of eps, e and the outputs."""
+        nz, n, no = self.sizes
+        return slice(0, nz), slice(nz, nz + n), slice(nz + n, nz + n + no)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return int(self.effects.shape[1])
+
+    def seen(self, values: FloatArray) -> FloatArray:
+        """Return the size of each channel from ``channel_rows`` times something, rows in the first axis."""
+        sizes = np.abs(values)
+        if self.single == len(sizes):
+            return sizes
+        return np.concatenate([sizes[: self.single], sizes[self.single :].max(axis=0, keepdims=True)])
+
+
+def error_structure(
+    observer: LinearObserver,
+    affine: AffinePlant,
+    tracking: Tracking,
+    bounds: FloatArray,
+    noise_bound: float,
+    *,
+    faults: bool = False,
+    states: bool = False,
+    reading: FloatArray | None = None,
+    varying: bool = False,
+) -> ErrorStructure:
+    """Return the error system of an observer over a box; ``bounds (nd,)``, ``noise_bound`` in standard deviations.
+
+    With ``faults`` these are estimated like states; else outputs are fault estimates and residuals, or (``states``)
+    errors of states.  ``reading (n, states of the observer)`` is that of a continuous design on samples: what its
+    identities miss counts as one more constant, the last.  ``varying``: those of the sample of a late fault count too.
+    """
+    plant, count = affine.plant, affine.count
+    t, t0 = tracking
+    nz, n, nf = observer.order, plant.nx, plant.nf if faults else 0
+    shown = observer.fault_rows
+    back = 2.0 * np.eye(n) - affine.coordinates
+    watched = list(range(n) if states else range(shown.start, shown.stop if faults else len(observer.Cz)))
+    picked = np.zeros((n + nf + len(watched), len(observer.Cz)))
+    picked[:n, observer.state_rows] = back if reading is None else reading
+    if faults:
+        picked[n : n + nf, shown] = np.eye(nf)
+    picked[n + nf :, watched] = back if states else np.eye(len(watched))
+    c, dy, du, algebraic = picked @ observer.Cz, picked @ observer.Dy, picked @ observer.Du, picked @ t0
+
+    def stacked(inner: AffineMatrix, output: AffineMatrix) -> AffineMatrix:
+        """Return rows of eps and of what is read, for one kind of signal."""
+        top, low = output.after(observer.By) - inner.after(t), output.after(dy) + inner.after(algebraic)
+        return affine_block([[top], [low]])
+
+    rest = np.eye(n) if states else np.zeros((len(picked) - n, n))
+    target = np.vstack([np.zeros((nz, n)), np.eye(n), rest])
+    followed = affine.E.after(t)
+    state = stacked(affine.A, affine.C) + affine_block([[followed.after(observer.Az)], [followed.after(c)]]) + (-target)
+    known = stacked(affine.B, affine.D) + np.vstack([observer.Bu, du])
+    sizes = _sizes(observer, affine, t, c, dy)
+    offsets = affine.offsets
+    if reading is None:
+        _require_identities(state, known, sizes, offsets)
+    noise = AffineMatrix.exact(plant.Bw, count), AffineMatrix.exact(plant.Dw, count)
+    disturbances = affine_block([[stacked(affine.Bd, affine.Dd), stacked(*noise)]])
+    if faults:
+        direct = stacked(affine.Bf, affine.Df)
+        columns = _fault_columns(direct, observer, c, n, affine.offsets)
+        earlier = np.array(observer.fault_delays, dtype=np.int64) > 0 if varying else np.zeros(nf, dtype=bool)
+        if earlier.any():
+            state, known, disturbances = (_with_more(item, count) for item in (state, known, disturbances))
+            columns = _with_more(columns, count)
+            columns.parts[count:, :, earlier] = columns.parts[:count, :, earlier]
+            columns.parts[:count, :, earlier] = 0.0
+            offsets = np.concatenate([offsets, offsets])
+        state = affine_block([[state, columns]])
+    if reading is not None:
+        state, known = _with_missed(state, offsets), _with_missed(known, offsets)
+        disturbances = _with_more(disturbances, 1)
+        offsets = np.append(offsets, 0.0)
+    parts, rest = _about_nominal(state, offsets)
+    rows, effects, owner, left = _channels(parts, offsets)
+    rest = rounded_up(rest + left, 3)
+    more, single, remainders = _remainder_channels(rest, sizes)
+    input_parts, input_rest = _about_nominal(known, offsets)
+    return ErrorStructure(
+        observer.Az,
+        c[: n + nf],
+        c[n + nf :],
+        AffineMatrix(np.zeros_like(rest), parts, rest),
+        AffineMatrix(np.zeros_like(input_rest), input_parts, input_rest),
+        disturbances,
+        np.concatenate([bounds, np.full(plant.nw, noise_bound)]),
+        np.vstack([rows, more]),
+        len(rows) + single,
+        np.hstack([effects, remainders]),
+        tuple(owner),
+        offsets,
+        picked[: n + nf],
+        picked[n + nf :],
+    )
+
+
+def _sizes(observer: LinearObserver, affine: AffinePlant, t: FloatArray, c: FloatArray, dy: FloatArray) -> FloatArray:
+    """Return the size of the terms of each row, ``(rows, 1)``."""
+    absolute = np.abs
+    own = absolute(observer.By) @ affine.C.magnitude + absolute(t) @ affine.A.magnitude
+    # A state z that reads algebraic equations alone follows no state, but for the rounding of its own terms.
+    te = absolute(t) @ affine.E.magnitude + ROUNDED_BESIDE * own
+    top = absolute(observer.Az) @ te + own
+    low = absolute(c) @ te + absolute(dy) @ affine.C.magnitude
+    return np.asarray(np.vstack([top, low]).max(axis=1, initial=np.finfo(np.float64).tiny)[:, None])
+
+
+def _require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatArray, offsets: FloatArray) -> None:
+    """Raise `PreconditionError` where the observer is none of the nominal plant."""
+    missed = float(np.max(_missed(state, offsets) / sizes, initial=0.0))
+    missed = max(missed, float(np.max(_missed(known, offsets) / (sizes + known.magnitude), initial=0.0)))
+    if not missed <= IDENTITY_SHARE:
+        raise PreconditionError(
+            f"The observer's identities do not hold on the nominal plant (by {missed:.1e} of their terms): a bound "
+            "over tolerances needs z to follow T E x. Run obsynth.verify on the design.",
+            condition="identities",
+        )
+
+
+def _missed(matrix: AffineMatrix, offsets: FloatArray) -> FloatArray:
+    """Return what a matrix that should vanish at the nominal plant is there, at least; its remainder may explain it."""
+    return np.maximum(np.abs(matrix.at(offsets)) - matrix.radius, 0.0) if offsets.any() else np.abs(matrix.center)
+
+
+def _fault_columns(
+    direct: AffineMatrix, observer: LinearObserver, c: FloatArray, n: int, offsets: FloatArray
+) -> AffineMatrix:
+    """Return the columns of faults as signals that are estimated, each at its delay."""
+    nz, nf = observer.order, direct.shape[1]
+    target = np.zeros((nz + len(c), nf))
+    target[nz + n : nz + n + nf] = np.eye(nf)
+    target[nz + n + nf :] = np.eye(nf)
+    late = np.array(observer.fault_delays, dtype=np.int64)
+    if len(late) != nf:
+        raise PreconditionError(
+            "Not every fault is estimated, so none has a guaranteed interval.", condition="fault interval"
+        )
+    if (late > 1).any():
+        raise PreconditionError(
+            "A fault estimate that lags by more than one sample has no guaranteed interval.", condition="fault interval"
+        )
+    into = direct[:nz, :]
+    moved = affine_block([[into.after(observer.Az)], [into.after(c)]])
+    reached = direct.magnitude[nz:, late == 1]
+    if reached.size and reached.max() > EFFECT_RANK_SHARE:
+        raise PreconditionError(
+            "A fault that is estimated with a delay of one sample reaches the estimates at once: its estimate has no "
+            "guaranteed interval.",
+            condition="fault interval",
+        )
+    chosen = [moved[:, [j]] if late[j] else direct[:, [j]] for j in range(nf)]
+    found = affine_block([chosen]) + (-target)
+    if float(np.max(_missed(found, offsets), initial=0.0)) > IDENTITY_SHARE:
+        raise PreconditionError(
+            "The estimate of a fault, or of the state, depends on how the fault came about: it has no guaranteed "
+            "interval (a filter that estimates each sample of a fault on its own has one).",
+            condition="fault interval",
+        )
+    return found
+
+
+def _with_more(matrix: AffineMatrix, count: int) -> AffineMatrix:
+    """Return a matrix as a function of more constants, which it does not depend on."""
+    return AffineMatrix(matrix.center, np.concatenate([matrix.parts, np.zeros((count, *matrix.shape))]), matrix.radius)
+
+
+def _with_missed(matrix: AffineMatrix, offsets: FloatArray) -> AffineMatrix:
+    """Return a matrix with what is left at the nominal plant as the part of one more constant."""
+    missed = matrix.at(offsets)
+    rounding = gamma(matrix.count + 3) * matrix.magnitude
+    return AffineMatrix(
+        matrix.center - missed, np.concatenate([matrix.parts, missed[None]]), rounded_up(matrix.radius + rounding, 3)
+    )
+
+
+def _about_nominal(matrix: AffineMatrix, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the affine parts, which multiply ``q - offsets``, and what remains at the nominal plant."""
+    rounding = gamma(matrix.count + 2) * matrix.magnitude if offsets.any() else 0.0
+    return matrix.parts, rounded_up(np.abs(matrix.at(offsets)) + matrix.radius + rounding, 3)
+
+
+def _channels(parts: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray, list[int], FloatArray]:
+    """Return rows c, effects b (times how far a constant is from nominal) and owners; and what was left out."""
+    rows_count, n = parts.shape[1:]
+    rows, effects, owner, left = [np.zeros((0, n))], [np.zeros((rows_count, 0))], [], np.zeros((rows_count, n))
+    for i, part in enumerate(parts):
+        columns = np.flatnonzero(np.abs(part).sum(axis=0) > 0.0)
+        if not len(columns):
+            continue
+        u, values, v = np.linalg.svd(part, full_matrices=False)
+        rank = int(np.sum(values > EFFECT_RANK_SHARE * values[0]))
+        if len(columns) <= rank:
+            b, c = part[:, columns], np.eye(n)[columns]
+        else:
+            b, c = u[:, :rank] * values[:rank], v[:rank]
+            c = np.where(np.abs(c) < EFFECT_RANK_SHARE, 0.0, c)
+            missed = np.abs(part - b @ c) + gamma(2 * rank + 4) * (np.abs(b) @ np.abs(c))
+            left += (1.0 + abs(offsets[i])) * missed
+        rows.append(c)
+        effects.append((1.0 + abs(offsets[i])) * b)
+        owner += [i] * len(c)
+    return np.vstack(rows), np.hstack(effects), owner, rounded_up(left, len(parts) + 4)
+
+
+def _remainder_channels(rest: FloatArray, sizes: FloatArray) -> tuple[FloatArray, int, FloatArray]:
+    """Return rows, how many of them are channels of their own, and effects: small remainders share one channel."""
+    n = rest.shape[1]
+    share = (rest / sizes).max(axis=0, initial=0.0)
+    large = np.flatnonzero(share > REMAINDER_SHARE)
+    small = np.flatnonzero((share > 0.0) & (share <= REMAINDER_SHARE))
+    rows, effects = [np.eye(n)[large]], [rest[:, large]]
+    if len(small):
+        rows.append(np.eye(n)[small] * share[small][:, None])
+        effects.append(rounded_up((rest[:, small] / share[small]).sum(axis=1, keepdims=True), len(small) + 2))
+    return np.vstack(rows), len(large), np.hstack(effects)

@@ -1,0 +1,102 @@
+"""The method by default: existence first, then closed-form figures, and the design names what was taken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import obsynth
+from obsynth.cli.main import main
+from obsynth.methods.fault_figures import fault_figures, on_the_clock
+from obsynth.specs.loader import load_spec
+
+DESIGNS = Path(__file__).parents[2] / "designs"
+
+
+def test_the_design_names_the_method_and_why(tmp_path: Path) -> None:
+    plant = load_spec(DESIGNS / "motor" / "sampled.yaml").plant
+    found = obsynth.design(plant)
+    assert found.method == "functional-filter"
+    assert found.notes[0].startswith("Method chosen by auto: functional-filter (its estimates reach every step")
+    assert obsynth.load(found.save(tmp_path / "gains.json")).method == "functional-filter"
+
+
+def test_an_estimate_as_slow_as_the_plant_comes_after_faster_ones() -> None:
+    # A heater with three masses: averaging for as long as the plant settles has the least noise, but nobody waits.
+    e, a = np.diag([900.0, 400, 2500, 0]), [[-6, 0, 0, 6], [0, -9, 1, 8], [0, 1, -3, 0], [6, 8, 0, -14]]
+    plant = obsynth.DescriptorSystem(
+        e, a, [[0.0], [1], [0], [0]], np.eye(3, 4), Bf=[[0], [-1], [0], [0]], Bd=[[0], [0], [2], [0]],
+        Dw=0.1 * np.eye(3),
+    )  # fmt: skip
+    assert obsynth.design(obsynth.discretise(plant, 5.0)).method == "ui-pi-observer"
+
+
+def test_unstable_plants_have_true_figures() -> None:
+    plant = obsynth.DescriptorSystem(
+        None, [[1.2, 1.0], [0.0, 0.5]], [[0.0], [1.0]], [[1.0, 0.0]], Bf=[[1.0], [0.0]], Dw=[[0.01]], dt=1.0
+    )
+    design = obsynth.functional_filter(plant)
+    (found,) = fault_figures(plant, design.observer, 400)
+    assert found.at_horizon == pytest.approx(1.0, abs=1e-6)
+    assert found.peak < 2.0
+
+
+def test_options_choose_among_the_methods_that_have_them() -> None:
+    plant = load_spec(DESIGNS / "smib" / "spec.yaml").plant
+    assert obsynth.design(plant, gamma=0.5).method == "fault-estimation-filter"
+    with pytest.raises(obsynth.SpecError, match="No single method has the options delay, gamma"):
+        obsynth.design(plant, gamma=0.5, delay=3)
+
+
+def test_without_faults_the_state_is_observed() -> None:
+    plant = obsynth.DescriptorSystem(None, [[0.5, 1], [0, 0.8]], None, [[1, 0]], dt=1.0)
+    assert obsynth.design(plant).method == "ui-pi-observer"
+
+
+def test_where_nothing_exists_the_reason_and_the_sensor_are_given() -> None:
+    plant = obsynth.DescriptorSystem(None, [[0.5, 0], [0, 0.8]], None, ["x1"], Bf=["x2"], Dw=[[0.1]], dt=1.0)
+    with pytest.raises(obsynth.PreconditionError, match=r"Measure one of: x2\.$"):
+        obsynth.design(plant)
+
+
+def test_spec_without_a_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (DESIGNS / "motor" / "one_encoder.yaml").read_text(encoding="utf-8").split("method:")[0]
+    text = text.replace("[theta m, i]", "[theta m, theta l, i]").replace(
+        "theta m: 1.0e-3, ", "theta m: 1.0e-3, theta l: 1.0e-3, "
+    )
+    spec = tmp_path / "spec.yaml"
+    spec.write_text(text, encoding="utf-8")
+    assert load_spec(spec).method == "auto"
+    assert main(["check", "--system", str(spec)]) == 0
+    assert capsys.readouterr().out.startswith("What can be diagnosed")
+    target = tmp_path / "gains.json"
+    assert main(["design", "--system", str(spec), "--output", str(target), "--quiet"]) == 0
+    assert obsynth.load(target).method != "auto"
+
+
+def test_figures_are_what_a_simulation_gives() -> None:
+    spec = load_spec(DESIGNS / "smib" / "functional.yaml")
+    design = obsynth.functional_filter(spec.plant, fault_rate=0.01)
+    (found,) = fault_figures(on_the_clock(spec.plant, spec.plant.dt), design.observer, 400)
+    scenario = obsynth.Scenario(horizon=8.0 - 0.02, faults={"tm GENCLS 1": obsynth.Step(size=1.0)})
+    run = obsynth.simulate(design, scenario)
+    estimate = run.estimates.faults[:, 0]
+    assert found.at_horizon == pytest.approx(estimate[399], rel=1e-9)
+    assert found.most == pytest.approx(0.02 * np.argmax(estimate >= 0.9))
+    assert found.deviation == pytest.approx(design.certificate.matrices["deviations"][0, 0], rel=0.02)
+    assert found.unknown_input_gain < 1e-9
+
+
+def test_auto_and_compare_say_why_they_differ() -> None:
+    plant = obsynth.DescriptorSystem(
+        None, [[0.5, 0.25, 0.0], [0.0, 0.75, -0.25], [0.25, 0.0, 0.25]], C=[[1, 0, 0], [0, 1, 1]],
+        Bf=[[1], [0], [1]], Bw=np.eye(3, 5), Dw=np.eye(2, 5, 3), dt=0.5,
+    )  # fmt: skip
+    chosen, compared = obsynth.design(plant), obsynth.compare(plant, runs=5)
+    assert compared.recommended != chosen.method
+    assert f"auto, which knows no scenario, takes {chosen.method}" in compared.advice
+    assert "obsynth compare ranks by errors over a scenario instead" in chosen.notes[0]
+    alone = obsynth.compare(plant, methods=[chosen.method], runs=5)
+    assert "auto" not in alone.advice

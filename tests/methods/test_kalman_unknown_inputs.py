@@ -1,0 +1,118 @@
+"""The descriptor Kalman filter of plants with unknown inputs: against a filter that is told them, and least squares."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import obsynth
+from obsynth.analysis.existence.kalman import without_unknown_inputs
+
+
+def plant(rng, *, direct, nx=4, ny=3, nd=2, **changes):
+    """Return a sampled plant; of its unknown inputs ``direct`` show in the outputs at once."""
+    a = rng.normal(size=(nx, nx)) / nx
+    dd = np.zeros((ny, nd))
+    dd[:, :direct] = rng.normal(size=(ny, direct))
+    given = {
+        "C": rng.normal(size=(ny, nx)), "Bd": rng.normal(size=(nx, nd)), "Dd": dd, "B": rng.normal(size=(nx, 1)),
+        "Bw": np.hstack([0.1 * np.eye(nx), np.zeros((nx, ny))]), "dt": 1.0,
+        "Dw": np.hstack([np.zeros((ny, nx)), 0.2 * np.eye(ny)]),
+    }  # fmt: skip
+    return obsynth.DescriptorSystem(None, a, **(given | changes))
+
+
+def simulated(plant, rng, d, steps=12):
+    """Return x, u, y with the given unknown inputs; noise if ``rng``."""
+    x, u = np.zeros((steps, plant.nx)), rng.normal(size=(steps, plant.nu))
+    w = rng.normal(size=(steps, plant.nw))
+    y = np.zeros((steps, plant.ny))
+    for k in range(steps):
+        y[k] = plant.C @ x[k] + plant.Dd @ d[k] + plant.Dw @ w[k]
+        if k + 1 < steps:
+            x[k + 1] = plant.A @ x[k] + plant.B @ u[k] + plant.Bd @ d[k] + plant.Bw @ w[k]
+    return x, u, y
+
+
+def least_squares(plant, u, y):
+    """Return the last state that fits equations and outputs best, all unknown inputs free; x(0) has unit covariance."""
+    steps, nx, nd = len(y), plant.nx, plant.nd
+    width = steps * (nx + nd)
+    rows, right = [], []
+    first = np.zeros((nx, width))
+    first[:, :nx] = np.eye(nx)
+    rows.append(first)
+    right.append(np.zeros(nx))
+    for k in range(steps):
+        x, d = slice(k * (nx + nd), k * (nx + nd) + nx), slice(k * (nx + nd) + nx, (k + 1) * (nx + nd))
+        if k:
+            shown = np.zeros((plant.ny, width))
+            shown[:, x], shown[:, d] = plant.C / 0.2, plant.Dd / 0.2
+            rows.append(shown)
+            right.append(y[k] / 0.2)
+        if k + 1 < steps:
+            moved = np.zeros((nx, width))
+            moved[:, x], moved[:, d] = -plant.A / 0.1, -plant.Bd / 0.1
+            moved[:, (k + 1) * (nx + nd) : (k + 1) * (nx + nd) + nx] = np.eye(nx) / 0.1
+            rows.append(moved)
+            right.append(plant.B @ u[k] / 0.1)
+    found = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0]
+    return found[-(nx + nd) : -nd]
+
+
+@pytest.mark.parametrize("direct", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_as_least_squares_over_the_whole_record(direct, seed):
+    rng = np.random.default_rng(seed)
+    given = plant(rng, direct=direct)
+    design = obsynth.descriptor_kalman(given)
+    assert design.report.passed
+    x, u, y = simulated(given, rng, 100.0 * rng.normal(size=(12, 2)))
+    estimates = design.observer.run(y, u).states
+    expected = least_squares(given, u, y)
+    np.testing.assert_allclose(estimates[-1][: given.nx], expected, rtol=1e-6, atol=1e-6)
+    assert np.max(np.abs(estimates[-1][: given.nx] - x[-1])) < 5.0
+
+
+def test_unknown_inputs_that_show_are_estimated_by_name():
+    rng = np.random.default_rng(3)
+    given = plant(rng, direct=2, disturbance_names=["load", "wind"])
+    design = obsynth.descriptor_kalman(given)
+    assert design.plant.state_names[-2:] == ("load", "wind")
+    assert "'load', 'wind' are estimated" in design.notes[0]
+    d = 50.0 * rng.normal(size=(12, 2))
+    _, u, y = simulated(given, rng, d)
+    assert np.max(np.abs(design.observer.run(y, u).states[-1][-2:] - d[-1])) < 10.0
+
+
+def test_the_condition_names_what_is_missing():
+    rng = np.random.default_rng(4)
+    given = plant(rng, direct=0, ny=1)
+    with pytest.raises(obsynth.PreconditionError) as caught:
+        obsynth.descriptor_kalman(given)
+    assert caught.value.condition == "rank [E; C]"
+
+
+def test_a_given_covariance_is_that_of_all_equations():
+    rng = np.random.default_rng(5)
+    given = plant(rng, direct=0)
+    stated, told = (obsynth.descriptor_kalman(given, **options) for options in ({}, {"Q": 0.01 * np.eye(4)}))
+    np.testing.assert_allclose(stated.gains["L"], told.gains["L"], rtol=1e-12)
+    with pytest.raises(obsynth.SpecError, match="4 by 4"):
+        obsynth.descriptor_kalman(given, Q=np.eye(3))
+
+
+@pytest.mark.parametrize("direct", [0, 1, 2])
+@pytest.mark.parametrize(("equations", "outputs"), [(2.0**20, 2.0**-18), (2.0**-20, 2.0**18)])
+def test_units_do_not_decide_which_unknown_inputs_are_estimated(direct, equations, outputs):
+    # With states in thousandths and outputs in thousands, what shows at once was taken for rounding, and removed.
+    rng = np.random.default_rng(3)
+    given = plant(rng, direct=direct)
+    other = given.replace(
+        B=equations * given.B, Bd=equations * given.Bd, Bw=equations * given.Bw,
+        C=outputs / equations * given.C, Dd=outputs * given.Dd, Dw=outputs * given.Dw,
+    )  # fmt: skip
+    first, second = without_unknown_inputs(given), without_unknown_inputs(other)
+    assert first.names == second.names
+    assert len(first.equations) == len(second.equations)
+    assert first.note == second.note

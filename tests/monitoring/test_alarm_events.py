@@ -1,0 +1,57 @@
+"""Alarms as events: the fault of an alarm is named where its estimate is not zero as well."""
+
+from __future__ import annotations
+
+from obsynth.monitoring.alarms.events import NOT_VALID, AlarmLog, alarm_notes, alarm_rows
+
+COLUMNS = ("fhat[leak]", "fhat[clog]", "sd fhat[leak]", "sd fhat[clog]")
+
+
+def events(leak: float, clog: float):
+    log = AlarmLog(COLUMNS)
+    log.take("nis", "leak", 1.1, 10.0, 11, (leak, clog, 0.1, 0.1))
+    log.take("nis", "clog", 1.6, 12.0, 13, (leak, clog, 0.1, 0.1))
+    return log.events()
+
+
+def test_a_fault_whose_interval_holds_zero_is_told_as_unclear() -> None:
+    for clog, told in ((0.5, "clog"), (-0.5, "clog"), (0.1, "clog (unclear)")):
+        (found,) = events(0.0, clog)
+        assert found.clear == (told == "clog")
+        heading, row = alarm_rows([found], str)[0]
+        assert dict(zip(heading, row, strict=True))["fault"] == told
+
+
+def test_without_a_fault_or_an_interval_nothing_is_unclear() -> None:
+    log = AlarmLog(())
+    log.take("nis", "", 1.1, 10.0, 11, ())
+    log.take("chi-square", "leak", 1.1, 10.0, 11, ())
+    nameless, unknown = log.events() if log.events()[0].by == "nis" else log.events()[::-1]
+    assert not nameless.clear
+    assert unknown.clear
+    rows = alarm_rows([nameless, unknown], str)[0]
+    assert [row[rows[0].index("fault")] for row in rows[1:]] == ["", "leak"]
+
+
+def test_an_interval_that_its_own_alarm_contradicts_is_told_as_not_valid() -> None:
+    # Innovations above their threshold contradict the covariances that the deviations come from; levels do not, and
+    # guaranteed intervals rest on bounds.
+    log = AlarmLog((*COLUMNS, "lowest clog", "highest clog"))
+    row = (0.5, 0.5, 0.1, 0.1, 0.3, 0.7)
+    for by, fault in (
+        ("nis", "leak"),
+        ("learned", "leak"),
+        ("fhat[leak]", "leak"),
+        ("pointwise", "clog"),
+        ("cusum", ""),
+    ):
+        log.take(by, fault, 2.0, 10.0, 11, row)
+    events = {event.by: event for event in log.events()}
+    valid = {"nis": False, "learned": False, "fhat[leak]": True, "pointwise": True, "cusum": False}
+    assert {by: event.valid for by, event in events.items()} == valid
+    assert all(event.as_dict()["interval_valid"] == valid[by] for by, event in events.items())
+    heading, *told = alarm_rows(list(events.values()), str)[0]
+    marked = {row[0] for row in told if row[heading.index("interval")].endswith(" (not valid)")}
+    assert marked == {"nis", "learned"}
+    assert alarm_notes([events["nis"]]) == [NOT_VALID]
+    assert alarm_notes([events["fhat[leak]"], events["pointwise"], events["cusum"]]) == []

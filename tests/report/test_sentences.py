@@ -1,0 +1,143 @@
+"""What thresholds promise, in sentences that list what they rest on with its numbers, and are the same everywhere."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import obsynth
+from obsynth.plants.constants import constants_box, shown
+from obsynth.verification.assumptions import Assumptions
+
+#: An auditor signs no more words than this.
+MOST_WORDS = 75
+
+
+@pytest.fixture(scope="module")
+def design() -> obsynth.ObserverDesign:
+    plant = obsynth.uncertain_system(
+        {
+            "E": None, "A": [["0.8 * p", 0.1], [0.0, 0.5]], "B": [[1.0], [0.5]], "C": [[1.0, 0.0], [0.0, 1.0]],
+            "Bf": [[1.0], [0.0]], "Bd": [[0.0], [1.0]], "Dw": [[0.01, 0.0], [0.0, 0.02]],
+            "dt": 0.1, "units": {"d1": "N m", "y1": "rad"},
+        },
+        {"p": {"nominal": 1.0, "tolerance": "2 %"}},
+    )  # fmt: skip
+    return obsynth.fault_estimation_filter(plant)
+
+
+BOUNDS: dict[str, Any] = {"disturbance_bounds": {"d1": 0.25}, "noise_bound": 3.5}
+
+
+def test_bounds_of_an_exact_model(design: obsynth.ObserverDesign) -> None:
+    told = obsynth.online_monitor(design, initial_error=0.125, **BOUNDS).statement
+    for words in ("d1 within 0.25 N m", "3.5 standard deviations (0.035 rad at y1, 0.07 at y2)", "start within 0.125",
+                  "never passed without a fault", "assumes an exact model"):  # fmt: skip
+        assert words in told
+    assert len(told.split()) <= MOST_WORDS
+    other = obsynth.online_monitor(design, initial_error=0.125, **{**BOUNDS, "disturbance_bounds": {"d1": 0.001}})
+    assert "d1 within 0.001 N m" in other.statement
+    window = obsynth.online_monitor(design, "window", window=7, **BOUNDS).statement
+    assert "l2 norm of 7 samples" in window
+    assert "d1 within 0.25 N m" in window
+
+
+def test_box_and_start_of_a_threshold_over_tolerances(design: obsynth.ObserverDesign) -> None:
+    told = obsynth.online_monitor(design, initial_set={"x1": 0.5, "x2": [0.25, 0.75]}, **BOUNDS).statement
+    for words in ("d1 within 0.25 N m", "3.5 standard deviations", "a start with x1 within 0.5, x2 in 0.25 .. 0.75",
+                  "constants (p within 2 % of nominal; the same at all times)", "from the first row on"):  # fmt: skip
+        assert words in told
+    assert len(told.split()) <= MOST_WORDS
+    wider = obsynth.online_monitor(design, constants={"p": "3 %"}, **BOUNDS).statement
+    assert "p within 3 % of nominal" in wider
+    assert "once the initial-condition response has settled" in wider
+
+
+def test_probabilities_window_and_change_are_told(design: obsynth.ObserverDesign) -> None:
+    scenario = obsynth.Scenario(horizon=8.0, noise=1.0)
+    square = obsynth.monitor(design, scenario, "chi-square", window=9, false_alarms=0.003).statement
+    assert "9 samples" in square
+    assert "probability of 0.003 at most" in square
+    total = obsynth.monitor(design, scenario, "cusum", false_alarms=0.02, change=1.5).statement
+    assert "change of 1.5 deviations" in total
+    assert "probability of 0.02 at most" in total
+
+
+def test_a_record_tells_its_start_and_its_bounds(design: obsynth.ObserverDesign) -> None:
+    scenario = obsynth.Scenario(
+        horizon=4.0, noise=1.0, disturbances={"d1": obsynth.Step(size=0.4)}, initial_state={"x1": 0.3}
+    )
+    told = obsynth.monitor(design, scenario, noise_bound=4.0, constants=design.plant.uncertainty).statement
+    assert "d1 within 0.4 N m" in told
+    assert "x1 at 0.3, x2 at 0" in told
+    exact = obsynth.monitor(design, scenario, noise_bound=4.0, initial_error=0.0).statement
+    assert "start of zero" in exact
+
+
+def test_run_and_picture_say_the_same(design: obsynth.ObserverDesign) -> None:
+    watched = obsynth.online_monitor(design, initial_error=0.0, **BOUNDS)
+    names = [*design.plant.input_names, *design.plant.output_names]
+    data = pd.DataFrame(np.zeros((30, len(names))), columns=names).assign(time=0.1 * np.arange(30))
+    run = obsynth.run_on_data(design, data, monitor=watched)
+    assert run.statement == watched.statement
+    axes = obsynth.plotting.plot_data(run, design=design)
+    drawn = " ".join(axes[-1].texts[-1].get_text().split())
+    assert drawn == f"The threshold: {watched.statement}."
+    assert obsynth.run_on_data(design, data).statement == ""
+
+
+def test_a_box_is_told_in_per_cent_or_by_its_ends() -> None:
+    assert constants_box({"a": {"nominal": 2.0, "tolerance": "5 %"}}).phrase == (
+        "constants (a within 5 % of nominal; the same at all times)"
+    )
+    mixed = constants_box({"a": {"nominal": 2.0, "tolerance": "5 %"}, "b": {"range": [-0.5, 0.5], "unit": "m"}})
+    assert mixed.phrase == "constants (a in 1.9 .. 2.1, b in -0.5 .. 0.5 m; the same at all times)"
+    around_zero = constants_box({"b": {"range": [-0.5, 0.5]}}, variation="varying")
+    assert around_zero.phrase == "constants (b in -0.5 .. 0.5; they may change from sample to sample)"
+    off = constants_box({"a": {"nominal": 2.0, "range": [1.9, 2.2]}})
+    assert off.phrase == "constants (a in 1.9 .. 2.2; the same at all times)"
+    # Six digits, rounded into the range: what holds for the box holds for what the text says.
+    calibrated = constants_box({"a": {"nominal": 2.1, "range": [2.087847870048583, 2.1118556243976663]}})
+    assert calibrated.phrase == "constants (a in 2.08785 .. 2.11185; the same at all times)"
+    narrow = constants_box({"a": {"nominal": 2.00000001, "range": [2.00000001, 2.00000003]}})
+    assert narrow.phrase == "constants (a in 2.00000001 .. 2.00000003; the same at all times)"
+    many = constants_box({f"c{i}": {"nominal": 1.0, "range": [0.5, 1.0 + i]} for i in range(9)})
+    assert many.phrase.startswith("constants (9 constants within their ranges;")
+    assert constants_box({"a": 1.0}).phrase == "an exact model"
+
+
+def test_every_assumption_has_its_part_in_the_digest_and_in_the_words() -> None:
+    plant = obsynth.DescriptorSystem(
+        None, np.diag([0.5, 0.2]), C=np.eye(2), Bd=np.eye(2), Bw=np.zeros((2, 1)), Dw=np.array([[0.5], [0.0]]), dt=1.0
+    )
+    asked: dict[str, Any] = {
+        "bounds": np.array([0.1, np.inf]),
+        "noise_bound": 3.0,
+        "initial_set": {"x1": 1.0, "x2": 2.0},
+    }
+    one = Assumptions(plant, **asked)
+    assert one.parts() == [
+        "d1 within 0.1",
+        "sensor noise within 3 standard deviations (1.5 at y1)",
+        "a start with x1 within 1, x2 within 2",
+    ]
+    assert one.phrase().endswith(", and an exact model")
+    others = [
+        Assumptions(plant, **{**asked, "bounds": np.array([0.2, np.inf])}),
+        Assumptions(plant, **{**asked, "noise_bound": 3.5}),
+        Assumptions(plant, **{**asked, "initial_set": {"x1": 1.0, "x2": [2.0, 3.0]}}),
+        Assumptions(plant, **{**asked, "initial_set": None, "state_bounds": {"x1": 1.0, "x2": 2.0}}),
+    ]
+    assert len({one.digest, *(other.digest for other in others)}) == 5
+    assert len({one.phrase(), *(other.phrase() for other in others)}) == 5
+    driven = plant.replace(Bw=np.ones((2, 1)))
+    assert "noise within 3 standard deviations" in Assumptions(driven, **asked).parts()
+    root = Assumptions(driven, **asked | {"noise_bound": 2.0 / 3.0 + 1.0}).parts()
+    assert "noise within 1.66666 standard deviations" in root
+    assert "at y1" not in Assumptions(driven, **asked).phrase()
+    assert shown(5.0) == "5"
+    assert shown(0.25, "m") == "0.25 m"
+    assert shown(1e15) == "1000000000000000.0"

@@ -1,0 +1,63 @@
+"""Beside the threshold of every method stands the least that any test can have."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+import obsynth
+from obsynth.cli.main import main
+from obsynth.report.scenarios import comparison_report
+from obsynth.studies.least_thresholds import design_beside_least, in_words
+
+DRIVE = Path(__file__).parents[2] / "designs/drive/spec.yaml"
+
+
+def test_the_drive_s_filter_beside_the_least() -> None:
+    spec = obsynth.load_spec(DRIVE)
+    scenario = spec.scenario.replace(noise=1.0, disturbances={"load torque": obsynth.Uniform(low=-1.0, high=1.0)})
+    design = obsynth.design(spec.plant, spec.method)
+    bound, least = design_beside_least(design, scenario)["loss of torque"]
+    # The residual of this filter is the estimate itself, and its monitor has a proved bound, with the start in it.
+    watched = obsynth.monitor(design, scenario, noise_bound=3.0)
+    assert bound == pytest.approx(watched.threshold[-1], rel=1e-3)
+    # Measured with the same bounds: a fault of any time course, told one sample later.
+    assert least == pytest.approx(1.1996048, rel=2e-4)
+    assert "1.18 times the least" in in_words("loss of torque", bound, least)
+
+
+def test_compare_and_evaluate_say_how_far_from_the_least_each_method_is(capsys: pytest.CaptureFixture[str]) -> None:
+    spec = obsynth.load_spec(DRIVE)
+    found = obsynth.compare(spec.plant, scenario=spec.scenario, runs=2, methods=["fault-estimation-filter"])
+    fault = found["fault-estimation-filter"].faults[0]
+    assert 1.0 <= fault.bound / fault.least < 2.0
+    header, row = found.rows()
+    assert row[header.index("/ least")] == f"{fault.bound / fault.least:.3g}"
+    # No number is cut on a terminal of eighty columns.
+    printed = io.StringIO()
+    comparison_report(found, console=Console(file=printed, width=80))
+    for name in ("deviation", "gain from d", "bound", "/ least", "rms"):
+        assert f"  {name.removesuffix(' from d')}" in printed.getvalue()
+        assert f" {row[header.index(name)]}" in printed.getvalue()
+    assert "…" not in printed.getvalue()
+    assert main(["evaluate", "--system", str(DRIVE), "--runs", "2", "--quiet"]) == 0
+    assert "times the least of all tests with its delay on at most 32 samples" in " ".join(
+        capsys.readouterr().out.split()
+    )
+
+
+def test_the_command_line_says_which_sensor_finds_a_fault(capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ["sensors", "--system", str(DRIVE.with_name("guaranteed_test.yaml")), "--set", "noise=0.0005", "--quiet"]
+    assert main([*asked, "--goal", "threshold", "--below", "0.04", "--json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["sets"]
+    assert found["sensors"] == ["twist"]
+    assert found["threshold"] <= 0.04
+    assert found["samples"] == 30
+    assert main([*asked, "--goal", "threshold", "--below", "0.0001"]) == 3
+    assert "the least is 0.037" in " ".join(capsys.readouterr().err.split())
+    assert main([*asked, "--below", "0.04"]) == 2
+    assert "--below is for --goal threshold" in capsys.readouterr().err
