@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import obsynth
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE))
+sys.path[:0] = [str(HERE), str(HERE / "_ext")]
 from site_sources import write_sources  # noqa: E402
 
 project = "obsynth"
@@ -18,13 +20,35 @@ release = version = obsynth.__version__
 
 extensions = [
     "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.mathjax", "numpydoc", "myst_nb", "sphinx_design",
-    "sphinx_copybutton", "matplotlib.sphinxext.plot_directive",
+    "sphinx_copybutton", "matplotlib.sphinxext.plot_directive", "sphinx_gallery.gen_gallery", "shown",
 ]  # fmt: skip
-exclude_patterns = ["_build", "**.ipynb_checkpoints", "site_sources.py", "make_picture.py"]
+#: Where the code is: the one place that names it.
+REPOSITORY = "https://example.org/obsynth"
+exclude_patterns = ["_build", "_ext", "gallery", "made/gallery/*.ipynb", "**.ipynb_checkpoints", "site_sources.py", "make_picture.py"]
 myst_enable_extensions = ["colon_fence", "dollarmath", "deflist"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"
-suppress_warnings = ["myst.header"]
+# The order of the gallery is a function, which Sphinx cannot keep between builds.
+suppress_warnings = ["myst.header", "config.cache"]
+#: From what everybody draws first to what few need.
+PICTURES = (
+    "simulation", "data", "faults", "states", "parameters", "residuals", "detection", "decision", "compare", "trade_off",
+    "gains", "poles", "least_thresholds", "intervals", "hidden_course", "tolerances",
+)  # fmt: skip
+sphinx_gallery_conf = {
+    "examples_dirs": "gallery",
+    "gallery_dirs": "made/gallery",
+    "within_subsection_order": lambda name: PICTURES.index(name.removeprefix("plot_").removesuffix(".py")),
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "show_memory": False,
+    "write_computation_times": False,
+    "min_reported_time": 5,
+    "show_signature": False,
+    "image_scrapers": ("matplotlib",),
+    "reset_modules": (),
+    "capture_repr": (),
+}
 
 templates_path = ["_templates"]
 autosummary_generate = True
@@ -40,12 +64,21 @@ plot_working_directory = str(HERE.parent)
 linkcheck_ignore = [r"https?://localhost.*"]
 
 html_theme = "pydata_sphinx_theme"
-html_title = "obsynth"
+html_title = f"obsynth {version}"
 html_theme_options = {"show_toc_level": 2, "navigation_with_keys": False, "secondary_sidebar_items": ["page-toc"]}
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 # These pages have nothing beside or below them that a left column could list.
-html_sidebars: dict[str, list[str]] = {"*": [], "gallery/*": []}
+html_sidebars: dict[str, list[str]] = {"*": [], "made/gallery/*": [], "made/spec": [], "made/commands": [], "made/changelog": []}
 html_show_sourcelink = False
 
 write_sources(HERE)
+# Formulas are drawn by a copy of MathJax in the site, so that they appear without a network.
+mathjax = find_spec("sphinx-mathjax-offline")
+if mathjax is None or mathjax.origin is None:
+    raise ImportError("sphinx-mathjax-offline is missing: pip install '.[docs]'")
+(HERE / "made/static").mkdir()
+shutil.copy(Path(mathjax.origin).parent / "static/mathjax/tex-svg.js", HERE / "made/static/mathjax.js")
+html_static_path.append("made/static")
+mathjax_path = "mathjax.js"
+myst_update_mathjax = False

@@ -7,6 +7,8 @@ import re
 import shutil
 from pathlib import Path
 
+from references import command_reference, spec_reference
+
 import obsynth
 
 MADE = "made"
@@ -43,6 +45,8 @@ def write_sources(folder: Path) -> None:
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir()
     (target / "reference.rst").write_text(_reference(), encoding="utf-8")
+    (target / "spec.md").write_text(spec_reference(), encoding="utf-8")
+    (target / "commands.md").write_text(command_reference(), encoding="utf-8")
     _designs(folder.parent, target)
     _notebooks(folder.parent, target)
     shutil.copy(folder.parent / "CHANGELOG.md", target / "changelog.md")
