@@ -65,7 +65,15 @@ linkcheck_ignore = [r"https?://localhost.*"]
 
 html_theme = "pydata_sphinx_theme"
 html_title = f"obsynth {version}"
-html_theme_options = {"show_toc_level": 2, "navigation_with_keys": False, "secondary_sidebar_items": ["page-toc"]}
+html_favicon = "_static/logo.svg"
+html_theme_options = {
+    "show_toc_level": 2,
+    "navigation_with_keys": False,
+    "secondary_sidebar_items": ["page-toc"],
+    "logo": {"text": html_title, "image_light": "_static/logo.svg", "image_dark": "_static/logo.svg"},
+    "icon_links": [{"name": "Repository", "url": REPOSITORY, "icon": "fa-solid fa-code-branch"}],
+    "navbar_end": ["theme-switcher", "navbar-icon-links"],
+}
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 # These pages have nothing beside or below them that a left column could list.
