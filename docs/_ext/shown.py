@@ -2,7 +2,7 @@
 
 ``{shown}`` runs commands, one a line, and ``{shown-python}`` code, both in a folder that a page has for itself, so that what
 one writes the next one reads.  ``:files:`` copies files of the documentation into that folder first, and
-``{shown-file}`` writes one that stands on the page.
+``{shown-file}`` writes one that stands on the page.  With ``:root:`` code runs in the folder of the repository, which it only reads.
 """
 
 from __future__ import annotations
@@ -93,11 +93,15 @@ class ShownPython(SphinxDirective):
     """Run code, with the names of the page's earlier code, and show what it prints."""
 
     has_content = True
-    option_spec: ClassVar[dict[str, Any]] = {"files": directives.unchanged, "silent": directives.flag}
+    option_spec: ClassVar[dict[str, Any]] = {
+        "files": directives.unchanged,
+        "silent": directives.flag,
+        "root": directives.flag,
+    }
 
     def run(self) -> list[nodes.Node]:
         """Return the code and a block for what it has printed."""
-        folder = _folder(self)
+        folder = Path(self.env.srcdir).parent if "root" in self.options else _folder(self)
         code = "\n".join(self.content)
         began = time.monotonic()
         output = io.StringIO()

@@ -1,0 +1,41 @@
+"""The examples in the docstrings of everything public: each function has one, and each prints what it says."""
+
+from __future__ import annotations
+
+import doctest
+import inspect
+from pathlib import Path
+
+import pytest
+
+import obsynth
+
+ROOT = Path(__file__).parents[2]
+PUBLIC = {f"obsynth.{name}": getattr(obsynth, name) for name in obsynth.__all__}
+PUBLIC |= {f"obsynth.conditions.{name}": getattr(obsynth.conditions, name) for name in obsynth.conditions.__all__}
+PUBLIC |= {f"obsynth.plotting.{name}": getattr(obsynth.plotting, name) for name in obsynth.plotting.__all__}
+FUNCTIONS = {name: item for name, item in PUBLIC.items() if inspect.isfunction(item)}
+WITH_EXAMPLES = {name: item for name, item in PUBLIC.items() if ">>>" in (inspect.getdoc(item) or "")}
+
+
+def test_every_public_function_has_an_example() -> None:
+    assert sorted(set(FUNCTIONS) - set(WITH_EXAMPLES)) == []
+
+
+@pytest.mark.parametrize("name", sorted(WITH_EXAMPLES))
+def test_the_example_prints_what_it_says(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    import matplotlib as mpl
+    import matplotlib.pyplot as plt
+
+    # Where paths of examples begin: a clone.
+    monkeypatch.chdir(ROOT)
+    with mpl.rc_context({"backend": "Agg"}):
+        item = WITH_EXAMPLES[name]
+        names = dict(vars(inspect.getmodule(inspect.unwrap(item)) or obsynth))
+        (example,) = doctest.DocTestFinder(recurse=False).find(item, name, globs=names, module=False)
+        assert example.examples
+        told: list[str] = []
+        runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
+        runner.run(example, out=told.append)
+        plt.close("all")
+    assert "".join(told) == ""
