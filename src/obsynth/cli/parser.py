@@ -1,0 +1,45 @@
+"""Command-line parsing: an `argparse` parser whose refusals say what may be meant."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Sequence
+from difflib import get_close_matches
+from typing import Any, NoReturn
+
+#: How alike a word must be to what may be meant, as `difflib` measures it.
+ALIKE = 0.6
+#: How many words are suggested.
+MOST_SUGGESTIONS = 3
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that names the command or option that a misspelt one may mean."""
+
+    _words: Sequence[str] = ()
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse as `argparse` does, and keep the words for what is said about them."""
+        self._words = list(args) if args is not None else []
+        return super().parse_known_args(args, namespace)
+
+    def error(self, message: str) -> NoReturn:
+        """End the program with its usage, the message, and what may be meant."""
+        choice = re.match(r"argument (\S+): invalid choice: '([^']*)'", message)
+        if choice is not None and choice.group(1) == "COMMAND":
+            commands = next(item.choices for item in self._actions if isinstance(item, argparse._SubParsersAction))
+            word = choice.group(2)
+            message = f"there is no command {word!r}.{meant(word, list(commands))} {self.prog} --help lists all of them."
+        elif message.startswith("the following arguments are required"):
+            known = list(self._option_string_actions)
+            wrong = [word.partition("=")[0] for word in self._words if word.startswith("--")]
+            close = [(word, meant(word, known)) for word in wrong if word not in known]
+            message += "".join(f". There is no option {word}.{told}" for word, told in close if told).rstrip(".")
+        super().error(message)
+
+
+def meant(word: str, known: Sequence[str]) -> str:
+    """Return a question that begins with a blank, "Did you mean ...?", or nothing."""
+    close = get_close_matches(word, known, n=MOST_SUGGESTIONS, cutoff=ALIKE)
+    return f" Did you mean {' or '.join(close)}?" if close else ""
