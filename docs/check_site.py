@@ -15,7 +15,11 @@ import tempfile
 from pathlib import Path
 
 #: Pages that a browser opens: a paper's derivation, a nonlinear plant, a docstring with formulas.
-OPENED = ("made/01_fault_estimation_filter.html", "made/05_nonlinear_dae.html", "made/api/obsynth.DescriptorSystem.html")
+OPENED = (
+    "made/01_fault_estimation_filter.html",
+    "made/05_nonlinear_dae.html",
+    "made/api/obsynth.DescriptorSystem.html",
+)
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
 #: Milliseconds that a page has to draw its formulas.
 PATIENCE = 20_000

@@ -24,7 +24,15 @@ extensions = [
 ]  # fmt: skip
 #: Where the code is: the one place that names it.
 REPOSITORY = "https://example.org/obsynth"
-exclude_patterns = ["_build", "_ext", "gallery", "made/gallery/*.ipynb", "**.ipynb_checkpoints", "site_sources.py", "make_picture.py"]
+exclude_patterns = [
+    "_build",
+    "_ext",
+    "gallery",
+    "made/gallery/*.ipynb",
+    "**.ipynb_checkpoints",
+    "site_sources.py",
+    "make_picture.py",
+]
 myst_enable_extensions = ["colon_fence", "dollarmath", "deflist"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"
@@ -77,7 +85,13 @@ html_theme_options = {
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 # These pages have nothing beside or below them that a left column could list.
-html_sidebars: dict[str, list[str]] = {"*": [], "made/gallery/*": [], "made/spec": [], "made/commands": [], "made/changelog": []}
+html_sidebars: dict[str, list[str]] = {
+    "*": [],
+    "made/gallery/*": [],
+    "made/spec": [],
+    "made/commands": [],
+    "made/changelog": [],
+}
 html_show_sourcelink = False
 
 write_sources(HERE)

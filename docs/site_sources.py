@@ -15,27 +15,27 @@ MADE = "made"
 #: Module prefix -> section of the reference, in order; the first that fits.
 SECTIONS = (
     ("obsynth.errors", "Errors"),
-    ("obsynth.importing", "Plants from other tools"),
+    ("obsynth.plants.importing", "Plants from other tools"),
     ("obsynth.specs", "Specs"),
     ("obsynth.plants", "Plants"),
     ("obsynth.analysis", "What is possible"),
     ("obsynth.methods", "Designs"),
+    ("obsynth.verification", "Verification"),
     ("obsynth.results", "Results"),
-    ("obsynth.comparison", "Comparing designs"),
-    ("obsynth.sweeps", "Comparing designs"),
+    ("obsynth.studies", "Studies"),
     ("obsynth.observers", "Observers"),
-    ("obsynth.data", "Measured data"),
-    ("obsynth.experiments", "Simulation and monitors"),
-    ("obsynth.simulation", "Simulation and monitors"),
-    ("obsynth.calibration", "Calibration"),
-    ("obsynth.tolerances", "Tolerances"),
-    ("obsynth.exporting", "Handing on"),
-    ("obsynth.report", "Handing on"),
+    ("obsynth.simulation", "Simulation"),
+    ("obsynth.monitoring.calibration", "Calibration"),
+    ("obsynth.monitoring.alarms", "Alarms and their proofs"),
+    ("obsynth.monitoring.thresholds", "Thresholds"),
+    ("obsynth.monitoring", "Measured data"),
+    ("obsynth.exporting", "Export and reports"),
+    ("obsynth.report", "Export and reports"),
 )
 ORDER = (
-    "Plants", "Plants from other tools", "Specs", "What is possible", "Designs", "Comparing designs", "Results",
-    "Observers", "Measured data", "Simulation and monitors", "Calibration", "Tolerances", "Handing on", "Other",
-    "Conditions", "Pictures", "Errors",
+    "Plants", "Plants from other tools", "Specs", "What is possible", "Designs", "Conditions", "Verification", "Results",
+    "Studies", "Observers", "Simulation", "Measured data", "Thresholds", "Alarms and their proofs", "Calibration",
+    "Export and reports", "Other", "Pictures", "Errors",
 )  # fmt: skip
 
 
@@ -70,7 +70,13 @@ def _reference() -> str:
         found.setdefault(_section(getattr(obsynth.types, name)), []).append(f"obsynth.types.{name}")
     found["Conditions"] = [f"obsynth.conditions.{name}" for name in obsynth.conditions.__all__]
     found["Pictures"] = [f"obsynth.plotting.{name}" for name in obsynth.plotting.__all__]
-    lines = ["API reference", "=============", "", "Every public name, from its docstring.", ""]
+    lines = [
+        "API reference",
+        "=============",
+        "",
+        "All public functions and classes; each function has an example.",
+        "",
+    ]
     for title in (title for title in ORDER if title in found):
         names = sorted(found[title], key=lambda name: (not _is_function(name), name.lower()))
         lines += [title, "-" * len(title), "", ".. autosummary::", "   :toctree: api", "   :nosignatures:", ""]
@@ -93,8 +99,8 @@ def _designs(root: Path, target: Path) -> None:
         text = notes.read_text(encoding="utf-8")
         (target / f"design_{name}.md").write_text(_without_files(text), encoding="utf-8")
         entries.append(f"design_{name}")
-    head = ["# Papers and deviations", "", "What was printed, what is right, and how we differ: one page for each",
-            "published example and each real plant.", ""]  # fmt: skip
+    head = ["# Published examples and real plants", "", "One page for each: the source, what is misprinted in it, and what we",
+            "do otherwise.", ""]  # fmt: skip
     lines = [*head, "```{toctree}", ":maxdepth: 1", "", *entries, "```", ""]
     (target / "designs.md").write_text("\n".join(lines), encoding="utf-8")
 

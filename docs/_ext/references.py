@@ -14,26 +14,35 @@ from pydantic.fields import FieldInfo
 from spec_keys import KEYS, OPTION_SECTIONS, SECTIONS
 
 from obsynth.cli import main as command_line
-from obsynth.cli.output import settings_of
+from obsynth.cli.arguments import settings_of
+from obsynth.cli.examples import EXAMPLES
 from obsynth.methods.installed import REGISTRY
 from obsynth.methods.registry import method_class
 from obsynth.numerics.arguments import WrittenAs, field_types
-from obsynth.spec import schema
+from obsynth.specs import schema, schema_plants, schema_sections, schema_values
+
+_SCHEMA = (schema_values, schema_plants, schema_sections, schema)
+
+
+def _of(name: str) -> Any:
+    """Return a type of the schema by its name."""
+    return getattr(next(part for part in _SCHEMA if hasattr(part, name)), name)
+
 
 #: What types of the schema are called.
 _CALLED: tuple[tuple[Any, str], ...] = (
-    (schema.Matrix, "matrix"),
-    (schema.EquationMatrix, "matrix, or `{states: [...]}`"),
-    (schema.OutputMatrix, "matrix, or `{outputs: [...]}`"),
-    (schema.VaryingMatrix, "matrix of numbers and expressions, list of matrices, or file"),
-    (schema.Covariance, "number, or matrix"),
-    (schema.VaryingCovariance, "number, or matrix of numbers and expressions"),
-    (schema.Names, "list of names, or `{file: names.json}`"),
-    (schema.SensorNoises, "mapping of names to numbers or coloured noise"),
-    (schema.Profiles, "profile, or list of profiles"),
-    (schema.Range, "`[low, high]`"),
-    (schema.PoleRegion, "pole region"),
-    (schema.NoiseSection, "noise weights"),
+    (_of("Matrix"), "matrix"),
+    (_of("EquationMatrix"), "matrix, or `{states: [...]}`"),
+    (_of("OutputMatrix"), "matrix, or `{outputs: [...]}`"),
+    (_of("VaryingMatrix"), "matrix of numbers and expressions, list of matrices, or file"),
+    (_of("Covariance"), "number, or matrix"),
+    (_of("VaryingCovariance"), "number, or matrix of numbers and expressions"),
+    (_of("Names"), "list of names, or `{file: names.json}`"),
+    (_of("SensorNoises"), "mapping of names to numbers or coloured noise"),
+    (_of("Profiles"), "profile, or list of profiles"),
+    (_of("Range"), "`[low, high]`"),
+    (_of("PoleRegion"), "pole region"),
+    (_of("NoiseSection"), "noise weights"),
 )
 _CONSTANTS = {"nominal": "number", "tolerance": "text or number", "range": "`[low, high]`", "unit": "text"}
 _PLAIN = {float: "number", int: "integer", str: "text", bool: "`true` or `false`", Any: "any", type(None): "null"}
@@ -61,7 +70,7 @@ A key in **bold** must be given. An entry that is left out has its default.
 
 def _section(title: str, name: str, words: str) -> list[str]:
     rows = []
-    known = getattr(schema, name).model_fields if hasattr(schema, name) else dict.fromkeys(KEYS[name])
+    known = _of(name).model_fields if name != "Constant" else dict.fromkeys(KEYS[name])
     for key, field in known.items():
         unit, meaning, example = KEYS[name][key]
         if field is None:
@@ -88,7 +97,7 @@ def _options(method: str) -> list[str]:
             continue
         kind, text = told.get(field.name, ("", ""))
         marks = get_args(kinds[field.name])[1:]
-        written = [schema.OPTION_KINDS[mark.kind] for mark in marks if isinstance(mark, WrittenAs)]
+        written = [_of("OPTION_KINDS")[mark.kind] for mark in marks if isinstance(mark, WrittenAs)]
         if written == [type(None)]:
             continue  # a function of Python: a document cannot hold it
         default = "" if field.default is MISSING else _default(field.default)
@@ -132,7 +141,7 @@ def type_text(kind: Any) -> str:
         return "mapping" if values == "any" else f"mapping of names to {_plural(values)}"
     if origin is list:
         return f"list of {_plural(type_text(parts[0]))}"
-    if isinstance(kind, type) and issubclass(kind, schema.Section):
+    if isinstance(kind, type) and issubclass(kind, _of("Section")):
         return f"{kind.__name__.removesuffix('Section').lower()} section"
     return "any"
 
@@ -146,13 +155,19 @@ def _limit(mark: Any) -> float:
 
 
 def _plural(text: str) -> str:
-    for one, many in (("number", "numbers"), ("text", "texts"), ("integer", "integers"), ("profile,", "profiles,"), ("entry section", "entry sections")):
+    for one, many in (
+        ("number", "numbers"),
+        ("text", "texts"),
+        ("integer", "integers"),
+        ("profile,", "profiles,"),
+        ("entry section", "entry sections"),
+    ):
         text = re.sub(rf"^{one}(?=[ ,]|$)", many, text)
     return text
 
 
 def _default(value: Any) -> str:
-    if value is None or isinstance(value, dict) and not value or isinstance(value, schema.Section):
+    if value is None or (isinstance(value, dict) and not value) or isinstance(value, _of("Section")):
         return ""
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"
@@ -203,8 +218,7 @@ def _exit_codes() -> list[str]:
 def _command(name: str, verb: Any) -> list[str]:
     parser = command_line._fill(name, argparse.ArgumentParser(prog=f"obsynth {name}"))
     lines = [f"## obsynth {name}", "", _text(verb.told), ""]
-    if example := getattr(verb, "example", ""):
-        lines += ["```sh", example, "```", ""]
+    lines += ["```sh", EXAMPLES[name], "```", ""]
     rows = []
     for action in parser._actions:
         if isinstance(action, argparse._HelpAction) or action.help == argparse.SUPPRESS or action.dest == "set":

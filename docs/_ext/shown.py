@@ -108,7 +108,7 @@ class ShownPython(SphinxDirective):
         try:
             with _within(folder), contextlib.redirect_stdout(output):
                 exec(compile(code, self.env.docname, "exec"), _NAMES.setdefault(self.env.docname, {}))
-        except Exception:
+        except Exception:  # noqa: BLE001 - whatever ends a page's code ends the build
             text = f"{self.env.docname}, line {self.lineno}\n{traceback.format_exc()}"
             raise ExtensionError(text) from None
         _tell(self, began)
@@ -190,7 +190,7 @@ def _command(line: str, folder: Path, code: int, *, errors: bool) -> str:
                 raise _Failed(f"{words[0]} is no command that a page may run")
         except SystemExit as left:
             ended = int(left.code or 0)
-        except Exception:
+        except Exception:  # noqa: BLE001 - whatever ends a page's code ends the build
             raise _Failed(traceback.format_exc()) from None
     if ended != code:
         raise _Failed(f"exit code {ended} instead of {code}\n{output.getvalue()}{problems.getvalue()}")

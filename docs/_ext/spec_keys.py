@@ -87,8 +87,16 @@ KEYS: Keys = {
         "B": ("", "Known inputs, nx by nu.", "[[1], [0]]"),
         "C": ("", "Outputs, ny by nx; or the states that are measured.", "{outputs: [cell, plate]}"),
         "D": ("", "Direct effect of known inputs on outputs, ny by nu.", "[[0], [0.1]]"),
-        "Bf": ("", "Faults in the equations, nx by nf; or the equations, by the names of their states.", "{states: [v1]}"),
-        "Df": ("", "Faults of sensors, ny by nf; or the outputs, each of which gets a fault of its own.", "{outputs: [v3]}"),
+        "Bf": (
+            "",
+            "Faults in the equations, nx by nf; or the equations, by the names of their states.",
+            "{states: [v1]}",
+        ),
+        "Df": (
+            "",
+            "Faults of sensors, ny by nf; or the outputs, each of which gets a fault of its own.",
+            "{outputs: [v3]}",
+        ),
         "Bd": ("", "Unknown inputs in the equations, nx by nd; or by name, as Bf.", "[[0], [1]]"),
         "Dd": ("", "Unknown inputs on the outputs, ny by nd; or by name, as Df.", "{outputs: [v3]}"),
         "Bw": (
@@ -115,7 +123,11 @@ KEYS: Keys = {
         "tolerance": ("%", "The same relative tolerance for every entry of a matrix that is not zero.", "{A: 2 %}"),
     },
     "PlantReference": {
-        "file": ("", "A plant in a file: YAML as here, or `.mat`. The other keys but `transform` are for `.mat`.", "plant.mat"),
+        "file": (
+            "",
+            "A plant in a file: YAML as here, or `.mat`. The other keys but `transform` are for `.mat`.",
+            "plant.mat",
+        ),
         "transform": ("", "Replaces the transform in the file.", "{sample_time: 0.02}"),
         "variable": ("", "Struct in the file.", "sys"),
         "dt": ("s", "Sampling time, where the file does not state it.", "0.1"),
@@ -129,9 +141,17 @@ KEYS: Keys = {
     "TimeVaryingSection": {
         "kind": ("", "Says that matrices change with k.", "time-varying"),
         "dt": ("s", "Sampling time.", "1"),
-        "horizon": ("samples", "Number of steps for which the matrices are given. Left out: expressions hold for ever.", "500"),
+        "horizon": (
+            "samples",
+            "Number of steps for which the matrices are given. Left out: expressions hold for ever.",
+            "500",
+        ),
         "constants": ("", "Names and values that expressions may use besides `k`.", "{w: 0.2}"),
-        "E": ("", "ne by nx, needed at k = 1, ..., N; may be singular or rectangular. Left out: the identity.", "[[1, 0], [0, 0]]"),
+        "E": (
+            "",
+            "ne by nx, needed at k = 1, ..., N; may be singular or rectangular. Left out: the identity.",
+            "[[1, 0], [0, 0]]",
+        ),
         "A": ("", "ne by nx, needed at k = 0, ..., N - 1, as B, Phi and Psi.", '[[0.9, "0.1*sin(w*k)"], [0.5, -1]]'),
         "B": ("", "Known inputs, ne by nu.", "[[1], [0]]"),
         "C": ("", "Outputs, ny by nx, needed at k = 1, ..., N.", "[[1, 0]]"),
@@ -150,7 +170,11 @@ KEYS: Keys = {
         "outputs": ("", "By name, what each sensor measures.", "{gauge: level}"),
         "states": ("of the state", "Nominal values: start, and size, of each state.", "{level: 1.0}"),
         "inputs": ("of the input", "Known inputs with their usual values: columns of the log.", "{inflow: 0.1}"),
-        "parameters": ("of the parameter", "What is estimated, with nominal values: a fault is a change of one.", "{c: 0.1}"),
+        "parameters": (
+            "of the parameter",
+            "What is estimated, with nominal values: a fault is a change of one.",
+            "{c: 0.1}",
+        ),
         "definitions": (
             "",
             "Names for expressions that equations, outputs and later definitions may use.",
@@ -173,12 +197,20 @@ KEYS: Keys = {
     "LineariseSection": {
         "at": ("", "Linearise where nothing moves, or at the point that `given` states.", "equilibrium"),
         "given": ("of the signal", "Known values of states, inputs, parameters and outputs there.", "{level: 4.0}"),
-        "free": ("", "Inputs and parameters that are solved for, with bounds where they have some.", "{inflow: [0, 2]}"),
+        "free": (
+            "",
+            "Inputs and parameters that are solved for, with bounds where they have some.",
+            "{inflow: [0, 2]}",
+        ),
         "faults": ("", "Parameters that are faults. Left out: all.", "[c]"),
         "disturbances": ("", "Inputs that are not known.", "[rain]"),
         "start": ("of the state", "Where the search for the equilibrium begins.", "{level: 1.0}"),
         "drift": ("", "Accept a point that moves: its motion becomes an input `drift`, which is 1.", "true"),
-        "constants": ("", "Tolerances of constants and parameters, as `constants` of a plant.", "{area: {tolerance: 2 %}}"),
+        "constants": (
+            "",
+            "Tolerances of constants and parameters, as `constants` of a plant.",
+            "{area: {tolerance: 2 %}}",
+        ),
     },
     "Constant": {
         "nominal": ("of the constant", "Its value. Left out: for a range, the middle.", "2.0"),
@@ -209,15 +241,31 @@ KEYS: Keys = {
     "ScenarioSection": {
         "horizon": ("s", "Length.", "60"),
         "sample_time": ("s", "Time between samples of a continuous plant. A discrete one has its own.", "0.1"),
-        "inputs": ("", "Profile, or list of profiles, of each known input. Left out: zero.", "{power: {kind: step, size: 5}}"),
+        "inputs": (
+            "",
+            "Profile, or list of profiles, of each known input. Left out: zero.",
+            "{power: {kind: step, size: 5}}",
+        ),
         "faults": ("", "The same of each fault.", "{leak: {kind: step, size: 0.1, start: 20}}"),
-        "disturbances": ("", "The same of each unknown input.", "{ambient: {kind: sine, amplitude: 1, frequency: 0.1}}"),
-        "sensors": ("", "What is wrong with a sensor, by output; the model of the plant does not know of it.", "{T1: {kind: stuck, start: 30}}"),
+        "disturbances": (
+            "",
+            "The same of each unknown input.",
+            "{ambient: {kind: sine, amplitude: 1, frequency: 0.1}}",
+        ),
+        "sensors": (
+            "",
+            "What is wrong with a sensor, by output; the model of the plant does not know of it.",
+            "{T1: {kind: stuck, start: 30}}",
+        ),
         "noise": ("", "The plant's own noise as a multiple of what it states; 0 for none.", "1"),
         "sensor_noise": ("of the output", "Standard deviation of more white noise, per sample.", "{T1: 0.02}"),
         "seed": ("", "Seed of the random numbers.", "1"),
         "initial_state": ("of the state", "States at the start; those that are not named are zero.", "{wall: 2.0}"),
-        "observer_state": ("", "State of the observer at the start, one number for each. Left out: zero.", "[0, 0, 0, 0]"),
+        "observer_state": (
+            "",
+            "State of the observer at the start, one number for each. Left out: zero.",
+            "[0, 0, 0, 0]",
+        ),
         "stabilise": (
             "",
             "Add a state feedback that stabilises the plant, in the simulation only (linear-quadratic, unit weights).",
@@ -267,9 +315,21 @@ KEYS: Keys = {
         "noisy": ("", "Equations that noise drives. Left out: all.", "[balance]"),
         "Q": ("(unit of the equation)^2", "Variances of that noise that are known, per step.", "{balance: 1.0e-4}"),
         "R": ("(unit of the output)^2", "Variances of sensors that are known.", "{gauge: 4.0e-6}"),
-        "initial_state": ("of the state", "State in the first row. Left out: nominal values, of linear plants zero.", "{level: 1.2}"),
-        "initial_covariance": ("(unit of the state)^2", "Variances of the state in the first row: one number, or by name.", "{level: 0.01}"),
-        "input_delay": ("rows", "By how many rows inputs act later than the plant assumes; `auto` tries several.", "auto"),
+        "initial_state": (
+            "of the state",
+            "State in the first row. Left out: nominal values, of linear plants zero.",
+            "{level: 1.2}",
+        ),
+        "initial_covariance": (
+            "(unit of the state)^2",
+            "Variances of the state in the first row: one number, or by name.",
+            "{level: 0.01}",
+        ),
+        "input_delay": (
+            "rows",
+            "By how many rows inputs act later than the plant assumes; `auto` tries several.",
+            "auto",
+        ),
         "method": ("", "`simulation` stops at the fit of simulations.", "innovations"),
         "integration": ("", "How equations are stepped. Left out: `auto`.", "radau"),
         "substeps": ("", "Steps of the integration in one sample.", "4"),
@@ -282,7 +342,11 @@ KEYS: Keys = {
             "white. Left out: tried where the innovations ask for it.",
             "{T1: {correlation: unknown}}",
         ),
-        "offset": ("", "Outputs whose constant offset is to be found; `{}` states that there is none.", "{T1: unknown}"),
+        "offset": (
+            "",
+            "Outputs whose constant offset is to be found; `{}` states that there is none.",
+            "{T1: unknown}",
+        ),
         "walks": ("", "Unknown inputs, faults and parameters that are random walks, to be found.", "{room: unknown}"),
         "digest": ("", "SHA-256 of the log that the numbers were found in; checked when it is read.", "9f86d081..."),
     },
@@ -313,7 +377,11 @@ KEYS: Keys = {
 
 #: Section of the page -> class of the schema, in order, with the words before its table.
 SECTIONS: tuple[tuple[str, str, str], ...] = (
-    ("Top level", "SpecDocument", "A spec is one YAML document. Keys that do not exist are refused, with what may be meant."),
+    (
+        "Top level",
+        "SpecDocument",
+        "A spec is one YAML document. Keys that do not exist are refused, with what may be meant.",
+    ),
     (
         "plant: constant matrices",
         "PlantSection",
@@ -353,7 +421,11 @@ SECTIONS: tuple[tuple[str, str, str], ...] = (
     ),
     ("scenario: profiles", "ProfileSection", "How one signal goes with time. Each kind takes the keys that name it."),
     ("inputs", "InputsSection", "See [your own data](../howto/data)."),
-    ("calibrate", "CalibrateSection", "Arguments of `obsynth.calibrate`; see [from a log to a model](../howto/calibrate)."),
+    (
+        "calibrate",
+        "CalibrateSection",
+        "Arguments of `obsynth.calibrate`; see [from a log to a model](../howto/calibrate).",
+    ),
     ("method", "MethodSection", "The options of each method follow."),
 )
 #: Sections that stand in an option of a method.

@@ -56,9 +56,7 @@ def test_motor_with_one_encoder_names_the_load_and_the_sensor() -> None:
     assert found.exact
     assert (torque.detectable, torque.estimable, torque.step_estimable) == (False, False, False)
     text = str(found)
-    assert (
-        "a step of 1 in torque is output-nulling together with a step of -1 in load torque and states theta l = -0.02"
-    ) in text
+    assert "a step of 1 in torque and a step of -1 in load torque and states theta l = -0.02 cancel at" in text
     assert "Measure one of: theta l." in text
     assert "omega l would make it detectable, but not estimable." in text
 
@@ -104,7 +102,7 @@ def test_a_rank_at_the_point_is_not_enough() -> None:
     found = obsynth.diagnose(hidden)["f1"]
     assert found.detectable
     assert not found.detectable_at_rest
-    assert "a step of 1 in f1 is output-nulling" in found.sentences[0]
+    assert "a step of 1 in f1 " in found.sentences[0]
 
 
 def test_estimating_may_take_more_sensors_than_signals() -> None:

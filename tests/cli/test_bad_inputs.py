@@ -130,9 +130,9 @@ SYNTAX = [
     Case("only a comment", whole("# nothing\n"), "is empty"),
     Case("list at the top", whole("[1, 2]"), "the top level must be a mapping"),
     Case("text at the top", whole("spec"), "the top level must be a mapping"),
-    Case("not YAML", whole("schema_version: [1\nname: x"), "is no valid YAML"),
+    Case("not YAML", whole("schema_version: [1\nname: x"), "is not valid YAML"),
     Case("tab as indent", whole("schema_version: 1\nplant:\n\tdt: 1\n"), "line 3"),
-    Case("two documents", whole("a: 1\n---\nb: 2\n"), "is no valid YAML"),
+    Case("two documents", whole("a: 1\n---\nb: 2\n"), "is not valid YAML"),
     Case("another YAML", whole("%YAML 1.1\n---\nschema_version: 1\n"), "%YAML"),
     Case("duplicate key at the top", text('"name": "case"', '"name": "case", "name": "other"'), 'duplicate key "name"'),
     Case("duplicate key in the plant", text('"dt": 1.0', '"dt": 1.0, "dt": 2.0'), 'duplicate key "dt" (line'),
@@ -343,7 +343,7 @@ FILES = [
     Case(
         "names file not JSON",
         put("plant", "state_names", {"file": "n.json"}),
-        "is no JSON document",
+        "is not a JSON document",
         files=written("n.json", "['a']"),
     ),
     Case(
@@ -612,12 +612,12 @@ def nudged_gain(document: dict[str, Any]) -> None:
 
 
 BAD_GAINS: list[tuple[str, Callable[[str], str], str]] = [
-    ("empty", lambda good: "", "is no JSON document"),
-    ("not JSON", lambda good: "gains: 1", "is no JSON document"),
-    ("truncated", lambda good: good[: len(good) // 2], "is no JSON document"),
+    ("empty", lambda good: "", "is not a JSON document"),
+    ("not JSON", lambda good: "gains: 1", "is not a JSON document"),
+    ("truncated", lambda good: good[: len(good) // 2], "is not a JSON document"),
     ("a list", lambda good: "[]", "is no gain set"),
     ("another document", lambda good: '{"kind": "recipe"}', "is no gain set"),
-    ("nested too deeply", lambda good: "[" * 100_000, "is no JSON document"),
+    ("nested too deeply", lambda good: "[" * 100_000, "is not a JSON document"),
     ("another version", lambda good: tampered(good, put("schema_version", 99)), "schema version 99"),
     (
         "NaN as a gain",

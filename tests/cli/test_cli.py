@@ -152,7 +152,7 @@ class TestDesign:
             "active power Bus 3",
             "0.02",
             "Verified: all",
-            "an exact model",
+            "the model is exact",
             "2 % settling time",
         ):
             assert text in printed

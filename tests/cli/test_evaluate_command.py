@@ -116,7 +116,7 @@ def test_a_run_has_threshold_and_alarm_columns(gains, tmp_path, monkeypatch, cap
     run = ["run", "--gains", gains, "--data", "log.csv", "--out", "out.csv"]
     assert main([*run, "--monitor", "pointwise", "--system", WANG, "--threshold", "fhat[actuator 1]=0.9"]) == 0
     printed = capsys.readouterr().out
-    assert "Alarm: pointwise first above its threshold at 81 s; it points to actuator 1." in printed
+    assert "First alarm 81 s (monitor: pointwise). Probable fault: actuator 1." in printed
     assert "The pointwise threshold: never passed without a fault" in printed
     found = pd.read_csv("out.csv")
     assert list(found.columns[-3:]) == ["statistic", "threshold", "alarm"]

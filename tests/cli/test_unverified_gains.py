@@ -115,7 +115,7 @@ def test_proved_never_stands_beside_fails(folder: Path, capsys: pytest.CaptureFi
     assert "claim   " not in told
     assert main(["report", "--gains", "wrong.gains.json", "--out", "page.html"]) == 6
     page = re.sub(r"<[^>]+>", " ", (folder / "page.html").read_text())
-    assert "shipped, proved" not in page
+    assert "proved bound" not in page
     assert "shipped: proved" not in page
     assert "initial-condition response does not decay" in page
     assert "time constant -" not in page

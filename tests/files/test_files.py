@@ -181,7 +181,7 @@ class TestJson:
     )  # fmt: skip
     def test_what_is_refused(self, text, message, tmp_path):
         written("a.json", text)
-        with pytest.raises(SpecError, match=f"(?s)a.json is no JSON document.*{message}"):
+        with pytest.raises(SpecError, match=f"(?s)a.json is not a JSON document.*{message}"):
             read_json(tmp_path / "a.json")
 
     def test_what_is_read(self, tmp_path):

@@ -74,7 +74,7 @@ def test_refusal_names_the_load_and_the_sensor() -> None:
     plant = load_spec(DESIGNS / "motor" / "one_encoder.yaml").plant
     with pytest.raises(obsynth.PreconditionError) as caught:
         obsynth.functional_filter(plant)
-    assert "output-nulling together with a step of -1 in load torque and states theta l = -0.02" in str(caught.value)
+    assert "and a step of -1 in load torque and states theta l = -0.02" in str(caught.value)
     assert "Measure one of: theta l." in str(caught.value)
     assert caught.value.signals == ("torque",)
 

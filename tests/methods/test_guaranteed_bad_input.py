@@ -73,7 +73,7 @@ def test_python_spec_and_command_line_say_what_is_wrong_and_write_nothing(
     assert main(["design", "--system", str(spec), "--output", str(tmp_path / "leak.gains.json")]) == code
     said = " ".join(capsys.readouterr().err.split())
     # What no option of its type can be, the schema of the spec refuses by its path.
-    by_schema = "is no valid spec" in said and all(f"method.options.{option}" in said for option in change)
+    by_schema = "is not a valid spec" in said and all(f"method.options.{option}" in said for option in change)
     assert by_schema or re.search(words, said), said
     assert [file.name for file in tmp_path.iterdir()] == ["spec.yaml"]
 

@@ -83,7 +83,7 @@ def test_a_run_alarms_and_proves_it(proved: Path, tmp_path: Path, capsys: pytest
     arguments = ["--gains", str(proved / "test.gains.json"), "--data", str(proved / "log.csv")]
     written = ["--out", str(tmp_path / "out.csv"), "--prove", str(tmp_path / "alarm.json")]
     assert main(["run", *arguments, "--monitor", "pointwise", *written]) == 0
-    assert "it points to leak 2" in capsys.readouterr().out
+    assert "Probable fault: leak 2." in capsys.readouterr().out
     assert main(["verify", str(tmp_path / "alarm.json"), "--data", str(proved / "log.csv")]) == 0
     assert main(["run", *arguments, "--monitor", "pointwise", "--noise-bound", "2"]) == 2
     assert "noise_bound cannot be given for a guaranteed test" in capsys.readouterr().err

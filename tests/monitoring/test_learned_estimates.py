@@ -256,7 +256,7 @@ def test_faults_that_look_alike_are_not_told_apart_until_they_do_not() -> None:
     assert not short.events[-1].distinguished
     assert short.isolated == ""
     assert [row[4] for row in alarm_rows(short.events, str)[0]] == ["fault", NOT_DISTINGUISHED_YET]
-    assert "points to" not in summary_of_run(short, monitor)
+    assert "Probable fault" not in summary_of_run(short, monitor)
 
 
 @functools.cache
@@ -398,7 +398,7 @@ def test_it_is_told_where_rows_say_too_little_of_faults_for_a_rate() -> None:
             assert (rows_needed(model, 1_000.0, scored(rng, rows, memory)) <= rows) is enough
     few = replace(learned(), needed=learned().rows + 1)
     assert not few.holds
-    assert "what so few rows say of a fault is correlated for so long that they determine no rate" in few.statement
+    assert "the estimates are too strongly correlated for any rate from these rows" in few.statement
 
 
 def test_many_rows_show_their_rate_themselves() -> None:

@@ -266,7 +266,7 @@ def test_the_command_draws_a_file(design, frame, tmp_path, monkeypatch, capsys, 
     arguments = ["plot", "--gains", "tank.gains.json", "--data", "log.csv", "--threshold", "fhat[leak]=0.25"]
     assert main([*arguments, "--out", f"log{suffix}"]) == 0
     printed = capsys.readouterr().out
-    assert "Alarm: fhat[leak] first above its threshold at 2026-05-01T00:00:1" in printed
+    assert "First alarm 2026-05-01T00:00:1" in printed
     assert f"Written: log{suffix}" in printed
     assert Path(f"log{suffix}").stat().st_size > 5000
     if suffix == ".png":

@@ -47,7 +47,7 @@ def test_casadi_is_for_nonlinear_plants_only():
 
 
 def test_the_readme_is_short():
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 100
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 900
 
 
 def test_dir_is_the_public_names_only():

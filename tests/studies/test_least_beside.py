@@ -27,7 +27,7 @@ def test_the_drive_s_filter_beside_the_least() -> None:
     assert bound == pytest.approx(watched.threshold[-1], rel=1e-3)
     # Measured with the same bounds: a fault of any time course, told one sample later.
     assert least == pytest.approx(1.1996048, rel=2e-4)
-    assert "1.18 times the least" in in_words("loss of torque", bound, least)
+    assert "1.18 times the optimum" in in_words("loss of torque", bound, least)
 
 
 def test_compare_and_evaluate_say_how_far_from_the_least_each_method_is(capsys: pytest.CaptureFixture[str]) -> None:
@@ -36,16 +36,16 @@ def test_compare_and_evaluate_say_how_far_from_the_least_each_method_is(capsys: 
     fault = found["fault-estimation-filter"].faults[0]
     assert 1.0 <= fault.bound / fault.least < 2.0
     header, row = found.rows()
-    assert row[header.index("/ least")] == f"{fault.bound / fault.least:.3g}"
+    assert row[header.index("bound / optimum")] == f"{fault.bound / fault.least:.3g}"
     # No number is cut on a terminal of eighty columns.
     printed = io.StringIO()
     comparison_report(found, console=Console(file=printed, width=80))
-    for name in ("deviation", "gain from d", "bound", "/ least", "rms"):
+    for name in ("deviation", "gain from d", "bound", "rms"):
         assert f"  {name.removesuffix(' from d')}" in printed.getvalue()
         assert f" {row[header.index(name)]}" in printed.getvalue()
     assert "…" not in printed.getvalue()
     assert main(["evaluate", "--system", str(DRIVE), "--runs", "2", "--quiet"]) == 0
-    assert "times the least of all tests with its delay on at most 32 samples" in " ".join(
+    assert "times the optimum of all tests with its delay on at most 32 samples" in " ".join(
         capsys.readouterr().out.split()
     )
 

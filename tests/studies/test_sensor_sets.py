@@ -137,7 +137,10 @@ def test_no_set_of_the_size_asked_for() -> None:
     found = obsynth.sensor_sets(plant, goal="estimate", candidates=rows, largest=2)
     assert found.sets == ()
     assert found.exact
-    assert found.notes == ("No set of at most 2 of 3 candidates does it: all were tried.", "One of 3 does: a, b, c.")
+    assert found.notes == (
+        "No set of at most 2 of 3 candidates reaches the goal: all were tried.",
+        "One of 3 does: a, b, c.",
+    )
 
 
 def test_which_sensors_may_fail() -> None:

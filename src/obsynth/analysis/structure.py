@@ -82,6 +82,14 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
     References
     ----------
     .. [Dai1989] L. Dai, "Singular Control Systems", 1989, chapters 1 and 2.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(E=[[1, 0], [0, 0]], A=[[-1, 1], [1, -2]], C=[[1, 0]])
+    >>> structure = obsynth.analyse_structure(plant)
+    >>> structure.index, structure.admissible
+    (1, True)
     """
     plant = linear_plant(plant).dense()
     judge = Evaluator(plant)

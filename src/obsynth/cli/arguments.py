@@ -201,7 +201,7 @@ count = number_type("count", int, lambda value: value >= 1, "is less than 1")
 def refuse_given(options: argparse.Namespace, names: Iterable[str], meant: str) -> None:
     """Refuse arguments that would do nothing; ``meant`` says what they are for."""
     for name in names:
-        if name not in ("verb", "settings") and getattr(options, name, None) not in (None, False, []):
+        if name not in ("verb", "settings", "command") and getattr(options, name, None) not in (None, False, []):
             raise SpecError(f"{flag_of(name)} is for {meant}. Otherwise leave it out.", path=flag_of(name))
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import gc
 import os
+import shlex
 import sys
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -50,7 +51,9 @@ from obsynth.cli.arguments import (
     settings_of,
     verbose,
 )
+from obsynth.cli.examples import EXAMPLES
 from obsynth.cli.output import print_error, print_json
+from obsynth.cli.parser import Parser, meant
 from obsynth.errors import ObsynthError, SolverError, SpecError
 from obsynth.files.inputs import protected_inputs
 from obsynth.version import __version__
@@ -679,7 +682,7 @@ def obsynth_parser(asked: Collection[str] | None = None) -> argparse.ArgumentPar
 
 
 def _parser(name: str, told: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=name,
         description=fill(told, width=78),
         epilog=EXIT_CODES,
@@ -691,6 +694,9 @@ def _parser(name: str, told: str) -> argparse.ArgumentParser:
 
 def _fill(name: str, parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.set_defaults(verb=name)
+    if name in EXAMPLES:
+        parser.description = f"{parser.description}\n\nexample:\n  {EXAMPLES[name]}"
+        parser.formatter_class = Folded
     add_arguments(parser, VERBS[name].arguments)
     if settings := settings_of(VERBS[name].arguments):
         add_settings(parser, settings)
@@ -792,7 +798,9 @@ def _collected_rarely() -> Iterator[None]:
 
 def _options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
     """Return the arguments of a command line, settings among them."""
-    options, rest = parser.parse_known_args(sys.argv[1:] if arguments is None else arguments)
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    options, rest = parser.parse_known_args(words)
+    options.command = shlex.join([parser.prog, *words])
     rest = read_settings(f"{parser.prog} {options.verb}", VERBS[options.verb].arguments, options, rest)
     if rest:
         _refuse_words(parser.prog, options.verb, rest)
@@ -801,16 +809,12 @@ def _options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -
 
 def _refuse_words(prog: str, verb: str, rest: Sequence[str]) -> NoReturn:
     """End the program as words that a verb does not take do: with its usage, and what may be meant."""
-    from difflib import get_close_matches
-
-    own = _fill(verb, argparse.ArgumentParser(prog=prog if prog == verb else f"{prog} {verb}"))
+    own = _fill(verb, Parser(prog=prog if prog == verb else f"{prog} {verb}"))
     known = [*own._option_string_actions, *(name for one in settings_of(VERBS[verb].arguments) for name in one.names)]
     wrong = [word.partition("=")[0] for word in rest if word.startswith("-") and word != "-"]
     if not wrong:
         own.error(f"it does not take {' '.join(map(repr, rest))}: see {own.prog} --help.")
-    close = get_close_matches(wrong[0], known, n=3)
-    meant = f" Did you mean {' or '.join(close)}?" if close else ""
-    own.error(f"there is no option {wrong[0]}.{meant} See {own.prog} --help.")
+    own.error(f"there is no option {wrong[0]}.{meant(wrong[0], known)} See {own.prog} --help.")
 
 
 def _outcome(options: argparse.Namespace) -> int:

@@ -30,7 +30,7 @@ class Parser(argparse.ArgumentParser):
         if choice is not None and choice.group(1) == "COMMAND":
             commands = next(item.choices for item in self._actions if isinstance(item, argparse._SubParsersAction))
             word = choice.group(2)
-            message = f"there is no command {word!r}.{meant(word, list(commands))} {self.prog} --help lists all of them."
+            message = f"there is no command {word!r}.{meant(word, list(commands))} {self.prog} --help lists them all."
         elif message.startswith("the following arguments are required"):
             known = list(self._option_string_actions)
             wrong = [word.partition("=")[0] for word in self._words if word.startswith("--")]

@@ -83,6 +83,18 @@ def bounded_real(
     .. [Hsiung1999] K.-L. Hsiung, L. Lee, IEE Proc. Control Theory Appl. 146 (4), 1999: Lemma 3 of Wang et al. 2015,
        after a Schur complement.
     .. [Boyd1994] S. Boyd et al., Linear matrix inequalities in system and control theory, SIAM 1994, section 2.7.3.
+
+    Examples
+    --------
+    >>> import cvxpy as cp
+    >>> import numpy as np
+    >>> from obsynth.conditions import bounded_real
+    >>> A, B, C, D = (np.array([[value]]) for value in (0.5, 1.0, 1.0, 0.0))
+    >>> P, gamma_squared = cp.Variable((1, 1), symmetric=True), cp.Variable()
+    >>> constraints = bounded_real(A, B, C, D, P, None, 1.0, gamma_squared=gamma_squared)
+    >>> _ = cp.Problem(cp.Minimize(gamma_squared), constraints).solve()
+    >>> round(float(gamma_squared.value) ** 0.5, 2)  # the largest gain of 1 / (z - 0.5)
+    2.0
     """
     n, nw, nz = _sizes(A, B, C, D, P)
     pa, pb = _moved(A, P, Y, Cy), _moved(B, P, Y, Dy)
@@ -154,6 +166,18 @@ def h2(
     References
     ----------
     .. [Scherer1997] C. Scherer, P. Gahinet, M. Chilali, IEEE TAC 42 (7), 1997, section III.
+
+    Examples
+    --------
+    >>> import cvxpy as cp
+    >>> import numpy as np
+    >>> from obsynth.conditions import h2
+    >>> A, B, C, D = (np.array([[value]]) for value in (0.5, 1.0, 1.0, 0.0))
+    >>> P, Z = cp.Variable((1, 1), symmetric=True), cp.Variable((1, 1), symmetric=True)
+    >>> constraints = h2(A, B, C, D, P, Z, 1.0)
+    >>> _ = cp.Problem(cp.Minimize(cp.trace(Z)), constraints).solve()
+    >>> round(float(Z.value[0, 0]), 3)  # the sum of 0.25 ** k
+    1.333
     """
     n, nw, nz = _sizes(A, B, C, D, P)
     require_shape(_shape(Z), (nw, nw), "Z")
@@ -203,6 +227,17 @@ def region(
     References
     ----------
     .. [Chilali1996] M. Chilali, P. Gahinet, IEEE TAC 41 (3), 1996, Theorem 2.2.
+
+    Examples
+    --------
+    >>> import cvxpy as cp
+    >>> import numpy as np
+    >>> from obsynth.conditions import disk, region
+    >>> P = cp.Variable((1, 1), symmetric=True)
+    >>> problem = cp.Problem(cp.Minimize(cp.trace(P)), region(np.array([[0.5]]), P, disk(0, 0.6)))
+    >>> _ = problem.solve()
+    >>> problem.status
+    'optimal'
     """
     where = checked_region(where, "where")
     _square_matrix(A, P)
@@ -249,6 +284,17 @@ def admissible(
     ----------
     .. [Masubuchi1997] I. Masubuchi et al., Automatica 33 (4), 1997: Lemma 2 of Filasova et al.
     .. [Xu1999] S. Xu, C. Yang, Stabilization of discrete-time singular systems, Automatica 35 (9), 1999.
+
+    Examples
+    --------
+    >>> import cvxpy as cp
+    >>> import numpy as np
+    >>> from obsynth.conditions import admissible
+    >>> E, A, P = np.diag([1.0, 0.0]), np.array([[-1.0, 0.5], [0.0, 1.0]]), cp.Variable((2, 2))
+    >>> problem = cp.Problem(cp.Minimize(cp.norm(P)), admissible(E, A, P, 0.0))
+    >>> _ = problem.solve()
+    >>> problem.status
+    'optimal'
     """
     _square_matrix(A, P)
     require_shape(_shape(E), _shape(A), "E")

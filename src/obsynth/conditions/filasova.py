@@ -88,6 +88,15 @@ def filasova_theorem1(
     ----------
     .. [Filasova] Application of descriptor approaches in design of PD observer-based actuator fault estimation,
        Theorem 1, eqs. (40)-(44).
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[-1.0, 0.5], [0.0, -2.0]], C=[[1, 0], [0, 1]], Bf=[[1], [0]])
+    >>> paper = obsynth.conditions.filasova_theorem1(plant, delta=0.1)
+    >>> _ = paper.problem.solve()
+    >>> paper.problem.status, sorted(paper.gains())
+    ('optimal', ['J', 'L', 'M', 'N'])
     """
     return _theorem(plant, 1, delta, reading, decay, margin, region)
 
@@ -136,6 +145,15 @@ def filasova_theorem2(
     ----------
     .. [Filasova] Application of descriptor approaches in design of PD observer-based actuator fault estimation,
        Theorem 2, eqs. (61)-(65).
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[-1.0, 0.5], [0.0, -2.0]], C=[[1, 0], [0, 1]], Bf=[[1], [0]])
+    >>> paper = obsynth.conditions.filasova_theorem2(plant, delta=0.1)
+    >>> _ = paper.problem.solve()
+    >>> paper.problem.status, sorted(paper.gains())
+    ('optimal', ['J', 'L', 'M', 'N'])
     """
     return _theorem(plant, 2, delta, reading, decay, margin, region)
 

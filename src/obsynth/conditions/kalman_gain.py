@@ -81,6 +81,15 @@ def kalman(
     ----------
     .. [MoussaAli2013] Fault diagnosis for linear time-varying descriptor systems, IFAC ALCOSP 2013, eqs. (4)-(16).
     .. [Nikoukhah1992] Kalman filtering and Riccati equations for descriptor systems, IEEE TAC 37 (9), Lemma 2.4.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], dt=1.0)
+    >>> paper = obsynth.conditions.kalman(plant, Q=[[1.0]], R=[[1.0]])
+    >>> _ = paper.problem.solve()
+    >>> paper.problem.status, sorted(paper.gains())
+    ('optimal', ['K', 'L', 'covariance'])
     """
     own = linear_plant(plant).dense()
     held = tuple(kalman_conditions(own))

@@ -142,6 +142,16 @@ class Conditions:
                 f"{solver} failed while solving {self.source} ({error}): the result is inconclusive."
             ) from error
 
+    def letters(self) -> Letters:
+        """Return variables and data by their letters in the paper, as functions of them (``constraints=``) get them.
+
+        Returns
+        -------
+        dict
+            Variables first; a letter that does not exist raises `SpecError` with those that do.
+        """
+        return Letters({**self.data, **self.variables})
+
     def changed(
         self, *, constraints: Iterable[Any] | Mapping[str, Any] = (), drop: Iterable[str] = (), objective: Any = None
     ) -> Conditions:
@@ -199,6 +209,19 @@ def design_of(source: str, *given: Any) -> Callable[[dict[str, FloatArray], str]
     return lambda gains, name: registered("design_of_conditions")(source, *given, gains, name)
 
 
+class Letters(dict[str, Any]):
+    """Variables and data of a condition by letter; one that does not exist is refused with those that do."""
+
+    def __missing__(self, name: str) -> Any:
+        variables = [letter for letter, value in self.items() if isinstance(value, cp.Variable)]
+        data = [letter for letter in self if letter not in variables]
+        raise SpecError(
+            f"There is no variable {name!r}: there are {', '.join(variables)}"
+            + (f", and the data {', '.join(data)}." if data else "."),
+            path="constraints",
+        )
+
+
 def named_constraints(given: Any, count: int = 0) -> dict[str, Any]:
     """Return constraints by name, the others numbered; raise `SpecError` for what is none."""
     from cvxpy.constraints.constraint import Constraint
@@ -211,6 +234,9 @@ def named_constraints(given: Any, count: int = 0) -> dict[str, Any]:
     for name, part in pairs.items():
         wanted = "cvxpy constraints, such as P >> numpy.eye(n)"
         require_kind(part, Constraint, f"Constraint {name!r}", wanted, path="constraints")
+        if not part.is_dcp():
+            who = f"Your constraint {name.removeprefix('own ')}" if name.startswith("own ") else f"Constraint {name!r}"
+            raise SpecError(f"{who} is not convex: {part}", path="constraints")
     return pairs
 
 

@@ -105,6 +105,17 @@ def sharepasand(
     ----------
     .. [SharePasand] Unknown Input-Proportional Integral Observer for Singular Systems: Application to fault detection,
        eqs. (10)-(13), (19), procedure 1.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> paper = obsynth.conditions.sharepasand(plant)
+    >>> _ = paper.problem.solve()
+    >>> paper.problem.status
+    'optimal'
     """
     if poles is not None and region is not None:
         raise SpecError("poles and region are given: use one of them.", path="poles")

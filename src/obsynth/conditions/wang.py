@@ -104,6 +104,17 @@ def wang2015(
     References
     ----------
     .. [Wang2015] Fault estimation filter design for discrete-time descriptor systems, IET Control Theory Appl. 9 (10).
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> paper = obsynth.conditions.wang2015(plant)
+    >>> _ = paper.problem.solve()
+    >>> paper.problem.status, sorted(paper.variables)
+    ('optimal', ['P', 'Y', 'gamma_squared'])
     """
     own = linear_plant(plant).dense()
     held, _ = examine_fault_filter(own)

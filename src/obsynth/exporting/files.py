@@ -132,6 +132,18 @@ def export(
     C and FMU start as `run_on_data` does, and take a missing sample (NaN) as it does on regular rows: of linear designs
     the model of the plant stands in for the sensors, faults are held and residuals are NaN; nonlinear ones predict.
     ``status`` says what a row was, and alarms are raised in rows that are ``OK`` or ``PARTIAL``.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> from tempfile import TemporaryDirectory
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> with TemporaryDirectory() as folder:
+    ...     print([path.name for path in obsynth.export(design, f"{folder}/filter.c")])
+    ['filter.c', 'filter.h']
     """
     target = Path(path)
     suffix = target.suffix.lower()

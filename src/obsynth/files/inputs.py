@@ -132,10 +132,13 @@ def read_json(
         if _HALF_CHARACTER.search(text):
             json.dumps(document, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
-        what = (
-            ": files that obsynth wrote are expected here" if path.suffix.lower() in (".yaml", ".yml", ".csv") else ""
-        )
-        raise SpecError(f"{path} is no JSON document ({error}){what}.", path=place) from error
+        if path.suffix.lower() in (".yaml", ".yml"):
+            told = f"{path} is a spec, not a file that obsynth wrote. Run `obsynth design --system {path}` first."
+        elif path.suffix.lower() == ".csv":
+            told = f"{path} is a table, not a file that obsynth wrote (JSON)."
+        else:
+            told = f"{path} is not a JSON document ({error})."
+        raise SpecError(told, path=place) from error
     return document
 
 

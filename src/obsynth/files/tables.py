@@ -6,6 +6,7 @@ Pages of HTML that stand alone, in one style.
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from importlib.resources import files
@@ -64,15 +65,34 @@ def _cell(value: Any) -> Any:
     return "" if value != value else value
 
 
+#: A number at the begin of a cell of a table, and what follows it, such as a unit.
+_NUMBER_CELL = re.compile(r"(-?(?:\d{1,3}(?:,\d{3})+|\d+))(\.\d+)?(?=$|[ e])(.*)")
+
+
+def aligned(cells: Sequence[str]) -> list[str]:
+    """Return the cells of a column with decimal points below each other; what is no number stays as it is."""
+    parts = [_NUMBER_CELL.fullmatch(cell) for cell in cells]
+    before = max((len(part.group(1)) for part in parts if part), default=0)
+    after = max((len(part.group(2) or "") for part in parts if part), default=0)
+    if sum(part is not None for part in parts) < 2:
+        return list(cells)
+    return [
+        cell if part is None else f"{part.group(1):>{before}}{part.group(2) or '':<{after}}{part.group(3)}"
+        for cell, part in zip(cells, parts, strict=True)
+    ]
+
+
 def text_table(rows: Sequence[Sequence[str]], *, left: int | None = None) -> list[str]:
     """Return the lines of a table; its columns, or the first ``left`` of them, begin at the left, others end right."""
+    head, *body = rows
+    rows = [head, *zip(*(aligned(column) for column in zip(*body, strict=True)), strict=True)] if body else rows
     widths = [max(len(row[j]) for row in rows) for j in range(len(rows[0]))]
     count = len(widths) if left is None else left
-    aligned = (
+    placed = (
         [cell.ljust(w) if j < count else cell.rjust(w) for j, (cell, w) in enumerate(zip(row, widths, strict=True))]
         for row in rows
     )
-    return ["  ".join(cells).rstrip() for cells in aligned]
+    return ["  ".join(cells).rstrip() for cells in placed]
 
 
 def html_table(rows: Sequence[Sequence[str]]) -> str:

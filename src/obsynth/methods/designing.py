@@ -88,6 +88,21 @@ def design(
         The solver gave no usable answer: the result is inconclusive.
     VerificationError
         Gains were found, but the shipped realisation fails a check.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]],
+    ...     C=[[1, 0], [0, 1]],
+    ...     Bf=[[1], [0]],
+    ...     Bd=[[0], [1]],
+    ...     dt=1.0,
+    ...     sensor_noise={"y1": 0.1, "y2": 0.1},
+    ... )
+    >>> design = obsynth.design(plant)
+    >>> design.method, design.report.passed
+    ('ui-pi-observer', True)
     """
     report_stage = progress or silent
     own: Plant
@@ -182,6 +197,16 @@ def check(
         The plant or an option is malformed.
     SolverError
         The numbers are beyond double precision.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> reports = obsynth.check(plant)
+    >>> reports["ui-pi-observer"].passed, reports["guaranteed-test"].passed
+    (True, False)
     """
     own: Plant
     own, _ = plant_and_recovery(plant)
@@ -355,6 +380,15 @@ def design_from_gains(
     .. [Filasova] Application of descriptor approaches in design of PD observer-based actuator fault estimation,
        eqs. (4)-(6), (25).
     .. [SharePasand] Unknown Input-Proportional Integral Observer for Singular Systems, eqs. (4), (19)-(23).
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[-1.0, 0.5], [0.0, -2.0]], C=[[1, 0], [0, 1]], Bf=[[1], [0]])
+    >>> first = obsynth.pd_observer(plant, decay=2.0)
+    >>> design = obsynth.design_from_gains(plant, "pd-observer", **first.gains)
+    >>> design.report.passed
+    True
     """
     own, recovery = plant_and_recovery(plant)
     known = method_class(method)

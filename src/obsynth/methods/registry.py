@@ -42,7 +42,11 @@ __all__ = [
 def method_class(method: str) -> type[Method]:
     """Return the class of a method; raise `SpecError` listing the known ones where there is none."""
     if method not in REGISTRY:
-        raise SpecError(f"There is no method {method!r}; there are: {', '.join(REGISTRY)}.", path="method")
+        raise SpecError(
+            f"There is no method {method!r}; there are: {', '.join(REGISTRY)}. If a plug-in has it, install the "
+            f"package that provides {method}.",
+            path="method",
+        )
     module, _, name = REGISTRY[method].partition(":")
     if method in OWN:
         own: type[Method] = getattr(import_module(module), name)

@@ -42,6 +42,16 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
         The design's method is unknown, or ``printed_digits`` is not between 1 and 15.
     SolverError
         LAPACK fails on the numbers of the design: the result is inconclusive.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> obsynth.verify(design).passed
+    True
     """
     if design.method not in REGISTRY:
         raise SpecError(f"Designs of method {design.method!r} cannot be verified by this version.", path="method")

@@ -89,6 +89,12 @@ def disk(center: float, radius: float) -> LMIRegion:
     ------
     SpecError
         The center is no real number, or the radius is not positive.
+
+    Examples
+    --------
+    >>> from obsynth.conditions import disk
+    >>> disk(0, 0.3).text
+    'disk(0, 0.3)'
     """
     c, r = real_number(center, "center"), real_number(radius, "radius", "a positive number", above=0.0)
     return LMIRegion(
@@ -117,6 +123,12 @@ def half_plane(decay: float) -> LMIRegion:
     ------
     SpecError
         The decay is no real number.
+
+    Examples
+    --------
+    >>> from obsynth.conditions import half_plane
+    >>> half_plane(2.0).text
+    'half_plane(2)'
     """
     a = real_number(decay, "decay")
     return LMIRegion(np.array([[2.0 * a]]), np.array([[1.0]]), f"half_plane({a:g})", ({"half_plane": a},))
@@ -141,6 +153,12 @@ def sector(damping: float) -> LMIRegion:
     ------
     SpecError
         The damping is no number between 0 and 1.
+
+    Examples
+    --------
+    >>> from obsynth.conditions import half_plane, sector
+    >>> (sector(0.7) & half_plane(2.0)).text
+    'sector(0.7) & half_plane(2)'
     """
     c = real_number(damping, "damping", "a ratio between 0 and 1", above=0.0, below=1.0)
     s = float(np.sqrt(1.0 - c**2))

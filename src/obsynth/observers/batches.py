@@ -149,6 +149,18 @@ def run_batch(
         longer than the horizon, or the observer resets.
     SolverError
         A step of a DAE has no solution; the trial, k and the worst equation are named.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> import numpy as np
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> estimates = obsynth.run_batch(design.observer, np.zeros((5, 100, 2)))  # 5 records of 100 samples
+    >>> estimates.faults.shape
+    (5, 100, 1)
     """
     if isinstance(observer, LinearObserver):
         if options:

@@ -85,6 +85,25 @@ def decide(
     SpecError
         It is no such observer, the statistic is unknown or does not go with the observer's form, an option is out of
         range, or the estimates are of another observer.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.TimeVaryingDescriptorSystem(
+    ...     E=None,
+    ...     A=[["0.9 + 0.05 * sin(k)"]],
+    ...     C=[[1.0]],
+    ...     Phi=[[1.0]],
+    ...     dt=1.0,
+    ...     horizon=100,
+    ...     parameter_names=["leak"],
+    ... )
+    >>> design = obsynth.adaptive_observer(plant, Q=1e-4, R=1e-2, forgetting=0.95)
+    >>> scenario = obsynth.Scenario(horizon=99, faults={"leak": obsynth.Step(size=0.5, start=40)}, noise=1.0)
+    >>> run = obsynth.simulate(design, scenario)
+    >>> decision = obsynth.decide(design.observer, run.estimates, nominal=[0.0], false_alarms=0.01)
+    >>> decision.alarm.parameter
+    'leak'
     """
     theta, size = _asked(observer, statistic, nominal, false_alarms, change)
     nq, false_alarms = len(theta), float(false_alarms)

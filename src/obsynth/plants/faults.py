@@ -199,6 +199,13 @@ def fault_model(data: Any) -> FaultModel:
     ------
     SpecError
         There is no such model.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> ramp = obsynth.fault_model("ramp")
+    >>> ramp.Phi.tolist(), ramp.Cw.tolist()
+    ([[0.0, 1.0], [0.0, 0.0]], [[1.0, 0.0]])
     """
     if isinstance(data, FaultModel):
         return data

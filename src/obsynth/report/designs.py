@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -48,7 +49,7 @@ MOST_CURVES, MOST_STATES_OF_CURVES = 3, 80
 
 
 #: What the meaning of a claim says of its proof, which is left out where checks fail.
-_PROOF_WORDS = re.compile(r"[,:;]? ?\bproved( where a row says so)?\b")
+_PROOF_WORDS = re.compile(r"[,:;]? ?\bproved( where the row '[^']*' says so)?\b")
 
 
 #: Without a scenario steps are followed for so many settling times of the plant, at most so many samples.
@@ -64,13 +65,12 @@ FAR_FROM_ONE = 10.0
 def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
     """Return what holds for every plant within its tolerances, as label and text; none for other designs."""
     from obsynth.studies.robustness import robustness
-    from obsynth.verification.over_tolerances.plants_of_the_box import EXACT_MODEL
 
     if not isinstance(design.plant, DescriptorSystem) or not isinstance(design.observer, LinearObserver):
         return []
     uncertain = design.plant.uncertainty
     if uncertain is None or not uncertain.box.names:
-        return [("model", f"{EXACT_MODEL} (no constant has a tolerance).")]
+        return [("model", "none stated; every claim is for the exact model.")]
     if design.report.checks and not design.report.passed:
         return [("bounds", "none: the design fails its verification")]
     try:
@@ -108,7 +108,7 @@ def design_report(design: ObserverDesign, *, console: Console) -> None:
             table.add_row(*map(Text, row))
         print_section(console, f"{headings[0].capitalize()} estimates", table)
     for curve in delay_curves(design):
-        print_section(console, f"Deviation of {curve.fault} against delay", delay_table(curve))
+        print_section(console, f"Noise of the estimate of {curve.fault} against delay", delay_table(curve))
         console.print(Text(curve.sentence))
         console.print()
     if design.recovery is not None:
@@ -116,9 +116,9 @@ def design_report(design: ObserverDesign, *, console: Console) -> None:
     print_checks(design.report.checks, console=console)
     facts = tolerance_facts(design)
     if len(facts) == 1 and facts[0][0] == "model":
-        console.print(Text(f"Model: {facts[0][1]}"))
+        console.print(Text(f"Tolerances: {facts[0][1]}"))
     elif facts:
-        print_section(console, "Within the tolerances of the plant", facts_table(facts))
+        print_section(console, "Tolerances", facts_table(facts))
     for note in design.notes:
         console.print(Text(f"Note: {note}"))
 
@@ -144,9 +144,9 @@ def delay_curves(design: ObserverDesign) -> list[DelayCurve]:
 
 def delay_table(curve: DelayCurve) -> Table:
     """Return deviations by walk (rows) and lag in samples (columns)."""
-    table = headed_table("walk per sample", *(f"lag {lag}" for lag in curve.lags))
+    table = headed_table("assumed fault drift per sample", *(f"delay {lag}" for lag in curve.lags))
     for rate, row in zip(curve.rates, curve.deviations, strict=True):
-        table.add_row(Text(f"{rate:.3g}"), *(Text(number(float(value), digits=3)) for value in row))
+        table.add_row(Text(number(rate, digits=3)), *(Text(number(float(value), digits=3)) for value in row))
     return table
 
 
@@ -172,10 +172,10 @@ def promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
         unit, meaning = (claim.unit, claim.meaning) if claim else ("", "unknown to this version")
         if not design.report.passed:
             meaning = f"{unproved(meaning)} (claimed only: checks fail)"
-        yield name, f"{number(value, digits=7)} {unit}".strip(), meaning
+        yield name.replace("_", " "), f"{number(value)} {unit}".strip(), meaning
     for check in design.report.checks:
         if check.name == "H-infinity norm":
-            yield "norm", number(check.value, digits=7), "the same gain recomputed by a second route"
+            yield "norm", number(check.value), "the same gain recomputed by a second route"
     yield "observer order", str(design.observer.order), "states of the shipped realisation"
 
 
@@ -207,7 +207,7 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
         when = "after the nominal run" if isinstance(plant, DAEModel) else "at the end of the horizon"
         return ("parameter", f"deviation {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]
     linear = design.linear[1]
-    none, noise = "by sampling" if plant.nw else "none stated", "deviation" if plant.is_discrete else "deviation, 1 s"
+    none, noise = "by sampling" if plant.nw else "-", "deviation" if plant.is_discrete else "deviation, 1 s"
     delays = ("delay", "delay in s") if plant.is_discrete else ()
     rows: list[tuple[str, ...]] = []
     for name, lag, disturbance_gains in zip(
@@ -222,6 +222,27 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
             )
         rows.append(row)
     return ("fault", *delays, noise, *(("largest gain",) if plant.nd else ())), rows
+
+
+def estimate_figures(design: ObserverDesign, gains: FaultGains | None) -> Iterator[dict[str, Any]]:
+    """Yield the numbers of `fault_estimates` as data: `None` where there is no such number."""
+    observer, units = design.observer, design.plant.units
+    deviations = {check.name: float(check.value) for check in design.report.checks}
+    delays = getattr(observer, "fault_delays", None) or (0,) * len(observer.fault_names)
+    dt = float(getattr(observer, "dt", 0.0))
+    for i, name in enumerate(observer.fault_names):
+        figures: dict[str, Any] = {
+            "name": name,
+            "unit": units.get(name),
+            "delay": int(delays[i]),
+            "delay_seconds": float(delays[i]) * dt,
+            "deviation": deviations.get(f"noise in fhat[{name}]"),
+        }
+        if gains is not None and isinstance(design.plant, DescriptorSystem) and design.plant.nd:
+            row = gains.disturbance_gains[i]
+            figures["largest_gain"] = float(row.max())
+            figures["largest_gain_from"] = design.plant.disturbance_names[int(row.argmax())]
+        yield figures
 
 
 def _estimating(design: ObserverDesign) -> tuple[DescriptorSystem, LinearObserver] | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from datetime import datetime
 from html import escape
 from itertools import groupby
 from pathlib import Path
@@ -21,7 +22,7 @@ from rich.text import Text
 
 from obsynth.errors import ObsynthError
 from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.files.tables import standing_page
+from obsynth.files.tables import aligned, standing_page
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.monitoring.alarms.events import NO_ALARM, alarm_notes, alarm_rows, silence
 from obsynth.monitoring.calibration.diagnostics import Validation, draw_validation
@@ -41,12 +42,14 @@ from obsynth.report.designs import (
     recovered_states,
     tolerance_facts,
 )
-from obsynth.report.pictures import pictures_of, stacked
+from obsynth.report.headline import headline
+from obsynth.report.pictures import pictures_of, shown_simulation, stacked
 from obsynth.report.summary import summary
-from obsynth.results.checks import FITS, Check, CheckKind, Status
+from obsynth.report.zoom import run_plots, simulation_plots, zoom_parts
+from obsynth.results.checks import FITS, Check, Status
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import gain_set_digest
-from obsynth.results.layout import headed_table, number, verdict, verdict_line, worth
+from obsynth.results.layout import headed_table, number, shown_numbers, verdict, verdict_line, worth
 from obsynth.results.verification_report import VerificationReport
 from obsynth.simulation.scenario import Scenario
 from obsynth.version import __version__
@@ -59,19 +62,10 @@ _SHIPPED = "The shipped observer"
 #: Characters of an option; a solver's log may be long.
 LONGEST_VALUE = 400
 
-#: What each kind of check means.
-CHECK_KINDS: dict[CheckKind, str] = {
-    "proved": "an inequality that was proved, with bounds on every rounding error",
-    "condition": "an existence condition of the method, on the plant alone",
-    "equality": "an identity: its residual, against a bound scaled by the size of its terms; this is no proof",
-    "computed": "a number that was computed again by a second route",
-    "information": "information that no verdict depends on",
-}
-
-#: What each row is worth, whatever its kind.
+#: What each word behind a verdict means.
 CHECK_STATUSES: dict[Status, str] = {
-    "proved": "outward rounding, on the numbers that are stored",
-    "computed twice": "double precision, by a route that shares no intermediate result with the design",
+    "proved": "with a bound on every rounding error, on the numbers that are stored",
+    "recomputed": "in double precision, by a route that shares no intermediate result with the design",
     "estimated": "statistics, with the interval in which chance alone puts the number",
     "assumed": "stated in the gain set, and not checked",
 }
@@ -107,7 +101,8 @@ def copied_table(table: Table) -> Iterator[str]:
 
 def table_lines(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
     """Yield a table with headings; all columns but the first hold numbers."""
-    kinds = ["", *["number"] * (len(headings) - 1)]
+    kinds, rows = ["", *["number"] * (len(headings) - 1)], [tuple(row) for row in rows]
+    rows = list(zip(*map(aligned, zip(*rows, strict=True)), strict=True)) if rows else rows
     yield '<div class="scroll"><table class="copied"><thead><tr>'
     yield "".join(f'<th class="{kind}">{escape(text)}</th>' for kind, text in zip(kinds, headings, strict=True))
     yield "</tr></thead><tbody>"
@@ -130,16 +125,11 @@ def check_rows(checks: Sequence[Check]) -> Iterator[str]:
         yield from map(_row, members)
         yield "</tbody>"
     yield "</table></div>"
-    yield "<h3>What each kind of check means</h3>"
+    yield "<h3>What the words mean</h3>"
     yield from fact_rows(
-        [
-            *((kind, meaning) for kind, meaning in CHECK_KINDS.items() if any(check.kind == kind for check in checks)),
-            *(
-                (f"({status})", meaning)
-                for status, meaning in CHECK_STATUSES.items()
-                if any(check.status == status for check in checks)
-            ),
-        ]
+        (status, meaning)
+        for status, meaning in CHECK_STATUSES.items()
+        if any(check.status == status for check in checks)
     )
 
 
@@ -154,12 +144,10 @@ def _place(check: Check) -> int:
 def _row(check: Check) -> str:
     word = verdict(check).plain
     detail = f"<div>{escape(check.detail)}</div>" if check.detail else ""
-    kind = "" if word == "info" or worth(check) != check.status else check.kind
-    parts = dict.fromkeys([*([kind] if kind else []), f"({worth(check)})"])
-    marked = f'<span class="kind">{escape(" ".join(parts))}</span>'
+    marked = f'<span class="kind">{escape(worth(check))}</span>'
     numbers = "".join(
-        f'<td class="number{" none" if number(value) == "-" else ""}" data-label="{label}">{number(value)}</td>'
-        for label, value in (("value", check.value), ("bound", check.bound), ("margin", check.margin))
+        f'<td class="number{" none" if text in ("", "-") else ""}" data-label="{label}">{text}</td>'
+        for label, text in zip(("value", "bound", "margin"), shown_numbers(check), strict=True)
     )
     return (
         f'<tr><td class="word {word.lower()}" data-label="verdict">{word}{marked}</td>'
@@ -271,8 +259,8 @@ def data_section(design: ObserverDesign, run: DataRun, statement: str) -> Iterat
     shown, count = replace(run, statement=""), panel_count(run, design=design)
     if count:
         text = (
-            "Measured outputs and their estimates, fault estimates, residuals and the monitor's statistic, as far "
-            "as there are any. In grey rows nothing is decided; rows with an alarm are red."
+            "Measured outputs and their estimates, fault estimates, residuals and the monitor's statistic. Grey: "
+            "settling or gap, no decision. Red: alarm."
         )
         yield stacked("", text, count, lambda axes: plot_data(shown, design=design, axes=axes)).html()
     yield from fact_rows(_counts(run, statement))
@@ -327,6 +315,7 @@ def html_report(
     data_file: str | None = None,
     statement: str = "",
     rows: str | None = None,
+    command: str | None = None,
 ) -> Path:
     """Write one HTML page about a design, complete in itself: it needs no network and no other file.
 
@@ -353,6 +342,8 @@ def html_report(
     rows : str, optional
         ``"a:b"``: rows of that run without faults, for the question whether the log agrees with the design, asked of
         recursive and nonlinear designs; all by default.
+    command : str, optional
+        The command line that writes this page, for "How to reproduce this"; by default one is made of the names above.
 
     Returns
     -------
@@ -365,6 +356,18 @@ def html_report(
         The file cannot be written, or the scenario does not fit the plant.
     PreconditionError
         The plant cannot be simulated on the scenario.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> from tempfile import TemporaryDirectory
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> with TemporaryDirectory() as folder:
+    ...     print(obsynth.html_report(design, f"{folder}/report.html").name)
+    report.html
     """
     digest, own = gain_set_digest(design), {}
     if run is not None:
@@ -382,25 +385,47 @@ def html_report(
             *(f'<p class="warning">Warning: {escape(text)}</p>' for text in short.warnings),
         ],
         "Pictures": list(_pictures(shown, scenario)),
+        "Zoom": list(zoom_parts(_zooms(shown, scenario, run))),
         "Claims": [*fact_rows(promises(shown)), *_fault_estimates(shown), *_recovered(shown)],
-        "Within the tolerances of the plant": list(fact_rows(facts)) if facts else [],
-        "Deviation against delay": list(_delay(shown)),
+        "Tolerances": list(fact_rows(facts)) if facts else [],
+        "Noise against delay": list(_delay(shown)),
         "Notes": list(_listed(shown.notes)) if shown.notes else [],
         "The plant": list(fact_rows(plant_facts(shown.plant))),
         "Checks": list(check_rows(shown.report.checks)) if shown.report.checks else [],
         "Gains": list(_gains(shown)),
-        "How to reproduce this": list(_reproduction(shown, digest, gains_file, system_file, data_file)),
+        "How to reproduce this": list(
+            _reproduction(shown, digest, gains_file, command or _command(shown, gains_file, system_file, data_file))
+        ),
     }
     sections = {heading: lines for heading, lines in sections.items() if lines}
     links = "".join(f'<a href="#{_anchor(heading)}">{heading}</a>' for heading in sections)
     state = "holds" if shown.report.passed else "fails"
+    written = datetime.now().astimezone().isoformat(sep=" ", timespec="minutes")
     parts = [
+        *headline(shown, run),
         f'<p class="verdict {state}">{escape(verdict_line(shown.report.checks).plain)}</p>',
+        f'<p class="soft">{escape(written)}; obsynth {__version__}; gain set {digest[:12]}</p>',
         f"<nav>{links}</nav>",
     ]
     for heading, lines in sections.items():
-        parts += [f'<section id="{_anchor(heading)}">', f"<h2>{heading}</h2>", *lines, "</section>"]
+        parts += [f'<section id="{_anchor(heading)}">']
+        if heading in FOLDED and shown.report.passed:
+            parts += [f"<details><summary><h2>{heading}</h2></summary>", *lines, "</details>", "</section>"]
+        else:
+            parts += [f"<h2>{heading}</h2>", *lines, "</section>"]
     return write_atomically(path, standing_page(escape(f"{shown.name}: {shown.method}"), parts))
+
+
+#: Sections that are closed at first, unless a check fails.
+FOLDED = ("Checks", "Gains", "The plant")
+
+
+def _zooms(design: ObserverDesign, scenario: Scenario | None, run: DataRun | None) -> Iterator[str]:
+    """Yield plots of the log, or of the simulation where there is none."""
+    if run is not None:
+        yield from run_plots(run, design.plant.units)
+    elif _fits(design) and (found := shown_simulation(design, scenario)) is not None:
+        yield from simulation_plots(found[1], design.plant.units)
 
 
 def _anchor(heading: str) -> str:
@@ -464,16 +489,17 @@ def _gains(design: ObserverDesign) -> Iterator[str]:
     yield "</div>"
 
 
-def _reproduction(
-    design: ObserverDesign, digest: str, gains_file: str | None, system_file: str | None, data_file: str | None
-) -> Iterator[str]:
+def _command(design: ObserverDesign, gains_file: str | None, system_file: str | None, data_file: str | None) -> str:
+    """Return a command line that writes a page of these files."""
+    words = ["obsynth", "report", "--gains", gains_file or f"{design.name}.gains.json", "--out", "report.html"]
+    for flag, file in (("--system", system_file), ("--data", data_file)):
+        words += [flag, file] if file is not None else []
+    return shlex.join(words)
+
+
+def _reproduction(design: ObserverDesign, digest: str, gains_file: str | None, again: str) -> Iterator[str]:
     file = shlex.quote(gains_file or f"{design.name}.gains.json")
     yield "<p>Every check again, from the gain set alone and without a solver; and this page:</p>"
-    again = f"obsynth report --gains {file} --out report.html"
-    if system_file is not None:
-        again += f" --system {shlex.quote(system_file)}"
-    if data_file is not None:
-        again += f" --data {shlex.quote(data_file)}"
     yield f"<pre>{escape(f'obsynth verify {file}')}\n{escape(again)}</pre>"
     yield from fact_rows([("obsynth", __version__)])
     yield f'<p class="soft">sha256 of the gain set</p><p class="digest">{digest}</p>'

@@ -115,19 +115,24 @@ def _gains_picture(design: ObserverDesign, to: str, title: str, text: str) -> Pi
     return Picture(title, text, drawn((HALF_WIDTH, 4.2), 1, lambda axes: plot_gains(design, to=to, axes=axes[0])))
 
 
-def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Picture]:
-    """Yield faults and states beside their estimates; nothing where the plant has no demonstration."""
-    shown, given = scenario, scenario is not None
+def shown_simulation(design: ObserverDesign, scenario: Scenario | None) -> tuple[Scenario, Simulation] | None:
+    """Return the scenario that a page shows and its simulation; `None` where the plant has no demonstration."""
     try:
-        shown = scenario if given else demonstration_scenario(design)
-        simulation = None if shown is None else simulate(design, shown)
+        shown = scenario if scenario is not None else demonstration_scenario(design)
+        return None if shown is None else (shown, simulate(design, shown))
     except ObsynthError:
         # Without a scenario of its own, a page is whole without this picture.
-        if given:
+        if scenario is not None:
             raise
+        return None
+
+
+def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Picture]:
+    """Yield faults and states beside their estimates; nothing where the plant has no demonstration."""
+    found, given = shown_simulation(design, scenario), scenario is not None
+    if found is None:
         return
-    if simulation is None or shown is None:
-        return
+    shown, simulation = found
     linear = isinstance(design.observer, LinearObserver)
     what = "On the scenario" if given else "Each fault in turn" if linear else "Each parameter in turn"
     text = f"{what}: {_story(shown, given=given, linear=linear)}"

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from obsynth.analysis.structure import Structure
 from obsynth.files.outputs import yaml_text
+from obsynth.files.tables import aligned
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -56,6 +57,8 @@ _PLANT_NAMES = ("state_names", "input_names", "output_names", "fault_names", "di
 
 def plain_table(headings: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> Iterator[tuple[str, str]]:
     """Yield the lines of a table; long names are cut, and the last column takes what is left."""
+    columns = [aligned([row[i] for row in rows]) for i in range(len(headings))]
+    rows = list(zip(*columns, strict=True))
     widths = [max(len(row[i]) for row in (headings, *rows)) for i in range(len(headings))]
     excess = sum(widths) + 2 * (len(widths) - 1) - width
     for column in (0, len(widths) - 1):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import (
     FAR_FROM_ONE,
     design_warnings,
+    estimate_figures,
     fault_estimates,
     followed_steps,
     gains_if_linear,
@@ -69,6 +71,7 @@ class Summary:
     warnings: tuple[str, ...]
     notes: tuple[str, ...]
     file: str = ""
+    figures: tuple[Mapping[str, Any], ...] = ()
 
     def lines(self, width: int = 80) -> Iterator[tuple[str, str]]:
         """Yield text and style of each line, none wider than ``width`` but the file's."""
@@ -110,7 +113,7 @@ class Summary:
             "verdict": self.verdict,
             "passed": self.passed,
             "facts": dict(self.facts),
-            "estimates": [dict(zip(self.headings, row, strict=True)) for row in self.rows],
+            "estimates": [dict(figures) for figures in self.figures],
             "warnings": list(self.warnings),
             "notes": list(self.notes),
         }
@@ -137,6 +140,7 @@ def summary(design: ObserverDesign, *, file: Path | None = None, everything: boo
         warnings,
         notes,
         "" if file is None else str(file),
+        tuple(estimate_figures(design, gains)),
     )
 
 
@@ -200,8 +204,12 @@ def _dynamics(design: ObserverDesign) -> str:
         settling = f"{100.0 * SETTLED_TO:g} % settling time {number(float(f'{seconds:.2g}'))} s"
         return f"{settling}; observer of order {design.observer.order}"
     factor = design.certificate.claims.get("contraction", math.nan)
-    share = f"less than {100.0 * LEAST_CONTRACTION:g}" if factor < LEAST_CONTRACTION else number(100.0 * factor)
-    return f"errors shrink to {share} % per step on average; observer of order {design.observer.order}"
+    order = f"observer of order {design.observer.order}"
+    if not math.isfinite(factor):
+        return order
+    if factor < LEAST_CONTRACTION:
+        return f"the error is gone after a few samples; {order}"
+    return f"the error decays by about {number(100.0 * (1.0 - factor), digits=2)} % per sample; {order}"
 
 
 def _speed(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterator[tuple[str, str]]:
@@ -219,14 +227,21 @@ def _speed(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterato
         yield "step", f"the estimate reaches 90 % after: {listed(told, most=_MOST_IN_SUMMARY)}"
 
 
+#: How a recursive method notes which covariances nobody stated.
+_IDENTITY_NOTE = re.compile(r"No noise is stated: (Q and R|Q|R) taken as the identity")
+
+
 def _assumptions(design: ObserverDesign) -> Iterator[str]:
     if isinstance(design.plant, DescriptorSystem):
         uncertain = design.plant.uncertainty
         some = uncertain is not None and bool(uncertain.box.names)
-        yield "an exact model, except in thresholds over its tolerances" if some else "an exact model"
+        yield "the model is exact; only --monitor pointwise accounts for tolerances" if some else "the model is exact"
+    elif isinstance(design.observer, WindowObserver):
+        yield "a model with the stated bounds"
     else:
-        bounded = isinstance(design.observer, WindowObserver)
-        yield f"a model with the stated {'bounds' if bounded else 'noise'}"
+        chosen = next(filter(None, map(_IDENTITY_NOTE.match, design.notes)), None)
+        names = "" if chosen is None else " = ".join(chosen.group(1).split(" and "))
+        yield f"{names} = identity, because no noise was given" if names else "the stated noise"
     model = design.options.get("fault_model")
     if isinstance(model, str):
         yield f"faults that follow the model '{model}'"
@@ -234,7 +249,7 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
         yield "noise within its stated bounds"
     elif isinstance(design.plant, DescriptorSystem):
         noisy = sum(bool(row.any()) for row in design.plant.Dw)
-        yield f"white noise on {noisy} of {design.plant.ny} sensors" if noisy else "no sensor noise stated"
+        yield f"white noise on {noisy} of {design.plant.ny} sensors" if noisy else "no sensor noise given"
 
 
 def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[str, FaultFigures]) -> Iterator[str]:
@@ -251,8 +266,8 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[s
             gain = float(gains.disturbance_gains[i, j])
             if gain >= UNSEPARATED_GAIN and units.get(fault) == units.get(name):
                 yield (
-                    f"{name} reaches the estimate of {fault} with a gain of up to {number(gain)}: the estimate cannot "
-                    "separate it from the fault."
+                    f"Disturbance {name} leaks into the estimate of {fault} (gain up to {number(gain, digits=3)}) and "
+                    "looks like a fault."
                 )
         followed = float(gains.steady[i])
         if abs(followed - 1.0) > FOLLOWS:

@@ -9,7 +9,10 @@ from typing import Any, Literal
 
 CheckKind = Literal["proved", "equality", "computed", "condition", "information"]
 
-Status = Literal["proved", "computed twice", "estimated", "assumed"]
+Status = Literal["proved", "recomputed", "estimated", "assumed"]
+
+#: What a status was called in files of earlier versions.
+_FORMER_STATUSES: dict[str, Status] = {"computed twice": "recomputed"}
 
 
 #: The check without which observer and plant say nothing of one another.
@@ -43,7 +46,7 @@ class Check:
     detail : str, optional
         One more sentence for the reader.
     status : str, optional
-        What the row is worth: ``proved`` (outward rounding, on the stored numbers), ``computed twice`` (double
+        What the row is worth: ``proved`` (outward rounding, on the stored numbers), ``recomputed`` (double
         precision, by a route that shares no intermediate result with the design), ``estimated`` (statistics: see
         ``interval``) or ``assumed`` (stated in the gain set, and not checked).  That of the kind by default.
     interval : tuple of float, optional
@@ -66,8 +69,10 @@ class Check:
     unclear: bool = False
 
     def __post_init__(self) -> None:
+        if self.status in _FORMER_STATUSES:
+            object.__setattr__(self, "status", _FORMER_STATUSES[self.status])
         if not self.status:
-            object.__setattr__(self, "status", "proved" if self.kind == "proved" else "computed twice")
+            object.__setattr__(self, "status", "proved" if self.kind == "proved" else "recomputed")
         if self.interval is not None:
             low, high = self.interval
             object.__setattr__(self, "interval", (low, high))
@@ -105,7 +110,7 @@ def lower_bound_check(
 
 
 def information(
-    name: str, claim: str, value: float, *, source: str, detail: str = "", status: Status = "computed twice"
+    name: str, claim: str, value: float, *, source: str, detail: str = "", status: Status = "recomputed"
 ) -> Check:
     """Return a row that informs and cannot fail."""
     return Check(name, claim, float(value), math.nan, math.nan, True, source, "information", detail, status)

@@ -77,6 +77,18 @@ def load(path: str | Path) -> ObserverDesign:
     ------
     SpecError
         The file is missing, is no gain set, has an unknown schema version, or was changed.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> from tempfile import TemporaryDirectory
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = obsynth.fault_estimation_filter(plant).save(f"{folder}/my.gains.json")
+    ...     print(obsynth.load(f"{folder}/my.gains.json").method)
+    fault-estimation-filter
     """
     source = path_of(path)
     if source.is_dir() or not source.exists():

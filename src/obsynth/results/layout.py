@@ -16,6 +16,7 @@ from rich.rule import Rule
 from rich.table import Table
 from rich.text import Text
 
+from obsynth.files.tables import aligned
 from obsynth.numerics.arguments import is_number
 from obsynth.results.checks import Check, all_hold
 
@@ -36,17 +37,44 @@ _HEADINGS = ("check", "claim", "value", "bound", "margin", "verdict", "kind")
 
 _NUMBER_WIDTH = 10
 
-#: As wide as "computed twice".
+#: As wide as "not recomputed".
 _KIND_WIDTH = 14
 
 
 def number(value: float, *, digits: int = 4) -> str:
-    """Return ``value`` with a few significant digits; a dash for "not a number", whatever a changed file may hold."""
+    """Return ``value`` with a few significant digits; a dash for "not a number", whatever a changed file may hold.
+
+    Numbers of everyday sizes have no exponent: 2140 and not 2.14e+03, with commas from ten thousand on.
+    """
     if not is_number(value) or math.isnan(value):
         return "-"
     if math.isinf(value):
         return "inf" if value > 0 else "-inf"
-    return f"{value:.{digits}g}"
+    text = f"{value:.{digits}g}"
+    if "e" not in text:
+        return text
+    mantissa, exponent = text.split("e")
+    if 0 < int(exponent) < LEAST_WITH_EXPONENT:
+        rounded = float(text)
+        return f"{rounded:,.0f}" if abs(rounded) >= LEAST_WITH_COMMAS else f"{rounded:.0f}"
+    return f"{mantissa}e{int(exponent)}"
+
+
+#: From these sizes on a number has an exponent (of ten), and commas.
+LEAST_WITH_EXPONENT, LEAST_WITH_COMMAS = 7, 10_000
+#: A time is told in a longer unit as well from so many of it on.
+LONG_TIMES = (("d", 86400.0, 2.0), ("h", 3600.0, 2.0), ("min", 60.0, 10.0))
+
+
+def duration(seconds: float, *, digits: int = 3) -> str:
+    """Return a time in seconds, and in minutes, hours or days where it is long: ``2140 s (35.7 min)``."""
+    text = f"{number(seconds, digits=digits)} s"
+    if not math.isfinite(seconds):
+        return text
+    for unit, size, least in LONG_TIMES:
+        if abs(seconds) >= least * size:
+            return f"{text} ({number(seconds / size, digits=digits)} {unit})"
+    return text
 
 
 def complex_numbers(values: Iterable[complex]) -> str:
@@ -76,8 +104,21 @@ def name_list(names: Sequence[str], *, limit: int = 6) -> str:
     return f"{', '.join(names[:limit])} and {len(names) - limit} more"
 
 
+def align_numbers(table: Table) -> Table:
+    """Put decimal points below each other in the columns of a table; such a column begins at the left."""
+    for column in table.columns[1:]:
+        before = [str(cell) for cell in column.cells]
+        after = aligned(before)
+        if after != before:
+            column.justify = "left"
+            column._cells[:] = [Text(text) for text in after]
+    return table
+
+
 def print_section(console: Console, title: str, content: RenderableType) -> None:
     """Print a title, the content below it, and an empty line."""
+    if isinstance(content, Table) and content.box is box.SIMPLE_HEAD:
+        align_numbers(content)
     console.print(Text(title, style="bold"))
     console.print(content)
     console.print()
@@ -152,8 +193,20 @@ def _claim(check: Check) -> Text:
     return claim.append(f"; {check.detail}", style="dim") if check.detail else claim
 
 
+#: Rows of information that are true or false.
+YES_OR_NO = ("plant: regular", "plant: admissible")
+
+
+def shown_numbers(check: Check) -> tuple[str, str, str]:
+    """Return value, bound and margin of a row; conditions that are true or false have none."""
+    if check.kind == "condition" or check.name in YES_OR_NO:
+        return ("", "", "")
+    value, bound, margin = (number(item) for item in (check.value, check.bound, check.margin))
+    return value, bound, margin
+
+
 def _numbers_and_verdict(check: Check) -> list[Text]:
-    numbers = [Text(number(value)) for value in (check.value, check.bound, check.margin)]
+    numbers = [Text(text) for text in shown_numbers(check)]
     return [*numbers, verdict(check), Text(worth(check), style="dim")]
 
 

@@ -67,6 +67,22 @@ def simulate_dae(
         Shapes do not fit, or something is not finite.
     SolverError
         A step has no solution; k, iteration and worst equation are named.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> import numpy as np
+    >>> tank = obsynth.DAEModel(
+    ...     {"balance": "der(level) = inflow - c * sqrt(level)"},
+    ...     {"gauge": "level"},
+    ...     states={"level": 1.0},
+    ...     inputs={"inflow": 0.5},
+    ...     parameters={"c": 0.5},
+    ...     units={"level": "m", "inflow": "m/s", "c": "m0.5/s", "gauge": "m"},
+    ... )
+    >>> run = obsynth.simulate_dae(tank, np.full((20, 1), 0.5), dt=1.0)
+    >>> run.outputs.shape, run.states[-1].round(6).tolist()
+    ((20, 1), [1.0])
     """
     inputs, length = checked_inputs(model, u), step_length(dt)
     theta = _parameters(model, parameters, len(inputs))

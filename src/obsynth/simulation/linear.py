@@ -257,6 +257,16 @@ def simulate_time_varying(
         A record has the wrong shape.
     PreconditionError
         The state is not determined at some k: the index is higher than one there.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.TimeVaryingDescriptorSystem(
+    ...     E=None, A=[["0.9 + 0.05 * sin(k)"]], C=[[1.0]], Phi=[[1.0]], dt=1.0, parameter_names=["leak"]
+    ... )
+    >>> run = obsynth.simulate_time_varying(plant, samples=50, parameters=[0.1])
+    >>> run.outputs.shape
+    (50, 1)
     """
     nq, samples = plant.nq, whole_number(samples, "samples", "the length of the record")
     given = np.zeros(nq) if parameters is None else real_array(parameters, "parameters")

@@ -240,6 +240,18 @@ def simulate(
     that are constant between samples (steps, intermittent ones, random ones) or linear (ramps); sines and drifts are
     taken as linear between samples.  The continuous observer runs on the samples, by a first-order hold.  A DAE is
     integrated by Radau IIA (fifth order) with inputs that are constant during each step, whatever its observer uses.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> scenario = obsynth.Scenario(horizon=30, faults={"f1": obsynth.Step(size=1.0, start=10)})
+    >>> run = obsynth.simulate(design, scenario)
+    >>> run.estimates.faults[-1].round(3).tolist()
+    [1.0]
     """
     design, _ = plant_and_recovery(design)
     for kind, plant_alone in _PLANT_SIMULATIONS.items():

@@ -59,9 +59,9 @@ def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
             document = YAML(typ="safe", pure=True).load(text)
         count = _values_in(document, {})
     except (YAMLError, YAMLWarning) as error:
-        raise SpecError(f"{path} is no valid YAML: {_one_line(error)}", path=place) from error
+        raise SpecError(f"{path} is not valid YAML: {_one_line(error)}{_quoted(error, text)}", path=place) from error
     except RecursionError as error:
-        raise SpecError(f"{path} is no valid spec: it is nested too deeply.", path=place) from error
+        raise SpecError(f"{path} is not a valid spec: it is nested too deeply.", path=place) from error
     except (ValueError, TypeError, OverflowError, AttributeError) as error:
         raise SpecError(f"{path} has a value that YAML cannot read: {error}.", path=place) from error
     if count > max(len(text), MOST_ALIASED_VALUES):
@@ -122,10 +122,28 @@ def described(value: Any) -> str:
     return "a list" if isinstance(value, list) else a_kind(value)
 
 
+def _quoted(error: Exception, text: str) -> str:
+    """Return the line in which the YAML reader stopped, with a caret below the column; nothing where it says none."""
+    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+    lines = text.splitlines()
+    if mark is None or mark.line >= len(lines):
+        return ""
+    number = str(mark.line + 1)
+    line, column = lines[mark.line].expandtabs(1), mark.column
+    start = max(column - SHOWN_COLUMNS // 2, 0) if len(line) > SHOWN_COLUMNS else 0
+    shown = line[start : start + SHOWN_COLUMNS]
+    return f"\n  {number} | {shown}\n  {' ' * len(number)} | {' ' * (column - start)}^"
+
+
+#: Of a long line so many characters are shown around the place of an error.
+SHOWN_COLUMNS = 100
+
+
 def _one_line(error: Exception) -> str:
     """Return what the YAML reader says about the place and the problem, without the quoted source."""
     problem = getattr(error, "problem", None) or str(error).strip().splitlines()[0]
     # The reader adds what it has of the values, which is empty where they are mappings.
+    problem = re.sub(r"\bbut got\b", "but found", str(problem))
     problem = re.sub(r"^(found duplicate key .*?) with value .*", r"\1", str(problem), flags=re.DOTALL)
     mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
     place = f" (line {mark.line + 1}, column {mark.column + 1})" if mark is not None else ""
@@ -175,7 +193,8 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
     if isinstance(identifier, str) and identifier != AUTO and identifier not in REGISTRY:
         close = suggestion(identifier, list(REGISTRY))
         known = ", ".join(sorted([*REGISTRY, AUTO]))
-        problems.add("method.id", f"unknown method {identifier!r}; the known methods are: {known}.{close}")
+        install = f" If it is that of a plug-in, install the package that provides {identifier}."
+        problems.add("method.id", f"unknown method {identifier!r}; the known methods are: {known}.{close or install}")
     elif isinstance(identifier, str) and identifier != AUTO and isinstance(raw_options, dict):
         gone = method_class(identifier).gone
         for name in (name for name in raw_options if name in gone):
@@ -184,7 +203,7 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
         options = _validated(options_schema(identifier), kept, problems, prefix="method.options")
     problems.raise_if_any()
     if checked is None or options is None:
-        raise SpecError(f"{source} is no valid spec.", path=str(source))
+        raise SpecError(f"{source} is not a valid spec.", path=str(source))
     return checked, {name: getattr(options, name) for name in options.model_fields_set}
 
 

@@ -708,6 +708,19 @@ def load_spec(path: str | Path) -> Spec:
         with its path.
     PreconditionError
         The plant cannot be transformed as asked, for example because its index is not one.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import obsynth
+    >>> text = "{schema_version: 1, name: first, plant: {dt: 1, A: [[0.9]], C: [[1]], Bf: [[1]]}}"
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "spec.yaml"
+    ...     _ = file.write_text(text)
+    ...     spec = obsynth.load_spec(file)
+    >>> spec.name, spec.plant.fault_names
+    ('first', ('f1',))
     """
     source = path_of(path)
     return spec_of(read_yaml(source), source)

@@ -69,6 +69,19 @@ def verify_certificate(path: str | Path, *, data: str | Path | None = None) -> V
     ------
     SpecError
         The file is no certificate (gain sets are read by `load`), or ``data`` does not belong to its kind.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import obsynth
+    >>> plant = obsynth.uncertain_system(
+    ...     {"A": [["a"]], "C": [[1]], "Bf": [[1]], "dt": 1.0}, {"a": {"nominal": 0.5, "tolerance": "5 %"}}
+    ... )
+    >>> found = obsynth.robustness(obsynth.fault_estimation_filter(plant))
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = found.save(f"{folder}/robust.json")
+    ...     print(obsynth.verify_certificate(f"{folder}/robust.json").passed)
+    True
     """
     kind = kind_of_file(path_of(path))
     if data is not None and kind not in (ALARM_KIND, COMPARISON):

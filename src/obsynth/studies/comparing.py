@@ -39,6 +39,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.recovery import Transformation, linear_plant
 from obsynth.results.design import ObserverDesign
+from obsynth.results.layout import duration
 from obsynth.simulation.profiles import Sine, Step
 from obsynth.simulation.scenario import Scenario, scenario_from
 from obsynth.simulation.signals import resolve
@@ -247,6 +248,21 @@ def compare(
     References
     ----------
     Ours: see `Comparison` for what each number means.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]],
+    ...     C=[[1, 0], [0, 1]],
+    ...     Bf=[[1], [0]],
+    ...     Bd=[[0], [1]],
+    ...     dt=1.0,
+    ...     sensor_noise={"y1": 0.1, "y2": 0.1},
+    ... )
+    >>> found = obsynth.compare(plant, methods=["fault-estimation-filter", "ui-pi-observer"], runs=2)
+    >>> found.recommended in ("fault-estimation-filter", "ui-pi-observer")
+    True
     """
     made = linear_plant(plant)
     # Some methods are continuous, and so are tolerances; faults and unknown inputs are those of the plant as written.
@@ -348,13 +364,16 @@ def side_by_side(
     )
     compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.relative_error))
     setting = (
-        f"{runs} runs of {happening.horizon:g} s, sampled every {dt:g} s, disturbances and noise drawn"
+        f"{runs} runs of {duration(happening.horizon)}, sampled every {dt:g} s, disturbances and noise drawn"
         + (", constants within their tolerances" if plant.uncertainty is not None else "")
         + (f", parameters off by up to {tolerance:.0%}" if tolerance else "")
         + (", a state feedback stabilises the plant" if feedback.any() else "")
-        + f"; 90 % of a step to be reached within {limit:.3g} s"
+        + f"; 90 % of a step to be reached within {duration(limit)}"
     )
-    shown = faulty if log is None else log
+    shown, truth = (faulty, faulty.truth) if log is None else (log, np.array(log.truth))
+    if log is not None:
+        # Nobody says what these faults were in the log: zero would be drawn as the truth.
+        truth[:, [name not in log.known for name in plant.fault_names]] = np.nan
     best = next((entry for entry in compared if not entry.refused), None)
     settling = settling_time(plant)
     among = [entry for entry in found if entry.figures and "faults" in method_class(entry.method).purposes]
@@ -366,7 +385,7 @@ def side_by_side(
         _reason(best, compared, sampled, "" if usual is None else usual.method),
         dt,
         read_only(shown.times),
-        read_only(shown.truth),
+        read_only(truth),
         plant.fault_names,
         setting,
         asked if data is None or from_file else {},
@@ -564,8 +583,5 @@ def _reason(
     if slow:
         words.append(f"90 % of a step is reached too late or never: {', '.join(slow)}")
     if by_default not in ("", best.method):
-        words.append(
-            f"auto, which knows no scenario, takes {by_default}, by whether a step is reached, by the gain from "
-            "unknown inputs, and by noise against delay"
-        )
+        words.append(f"`method: auto` would choose {by_default}, because it ranks without your scenario")
     return "; ".join(words)

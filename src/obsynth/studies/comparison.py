@@ -29,6 +29,7 @@ from obsynth.results.certificate_files import SHOWN_DIGITS, result_text
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import design_as_dict
 from obsynth.results.gain_sets import COMPARISON
+from obsynth.results.layout import number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,10 +42,10 @@ LONGEST_WINDOW = 32
 SHOWN_SAMPLES = 0.98
 
 #: Room below and above a fault in its panel, as a share of its range.
-ROOM_AROUND_FAULT = 0.75
+ROOM_AROUND_FAULT = 0.1
 
-#: Opacity of an estimate that reaches beyond its panel.
-FAINT = 0.25
+#: An estimate that reaches so many times as far as the fault and the best estimate is faint, with this opacity.
+NOISIER, FAINT = 3.0, 0.35
 
 #: What the page of a comparison begins with.
 COMPARISON_PAGE = FileKind("a comparison of obsynth", rb'name="generator" content="obsynth compare"', suffix=".html")
@@ -63,10 +64,12 @@ _HEADER = (
     "s to alarm",
     "smallest",
     "bound",
-    "/ least",
+    "bound / optimum",
     "rms",
     "ms",
 )
+#: A gain of at most this is zero but for rounding, and is shown as zero.
+ROUNDED_GAIN = 1e-9
 
 #: What the columns of numbers mean.
 _FIGURE_MEANINGS = {
@@ -80,8 +83,11 @@ _FIGURE_MEANINGS = {
     "bias": "largest mean of the estimate without a fault",
     "s to alarm": "median detection delay",
     "smallest": "step that half of the runs detect",
-    "bound": "what the estimate never exceeds without a fault",
-    "/ least": f"the bound, divided by the least of all tests with this delay on at most {LONGEST_WINDOW} samples",
+    "bound": "largest estimate without a fault, for the exact model (tolerances not counted)",
+    "bound / optimum": (
+        f"1 = as sensitive as the best {LONGEST_WINDOW}-sample test with the same delay; below 1 = better, because the "
+        "observer uses older samples"
+    ),
     "rms": "root mean square error in the runs, or on the log where it has a column of the fault",
     "ms": "milliseconds to design and verify",
 }
@@ -235,7 +241,7 @@ class Comparison:
                     figures.at_horizon,
                     figures.peak,
                     figures.deviation,
-                    figures.unknown_input_gain,
+                    0.0 if figures.unknown_input_gain <= ROUNDED_GAIN else figures.unknown_input_gain,
                     fault.bias,
                     fault.detection_delay,
                     fault.smallest_found,
@@ -342,7 +348,7 @@ class Comparison:
     def plot(self) -> Figure:
         """Return a figure: for each fault, each method's estimate of a unit step, and its estimate on the scenario.
 
-        An estimate that is too noisy for the range of its panel lies faintly behind the others.
+        An estimate that is much noisier than the best one lies faintly behind the others.
         """
         import matplotlib.pyplot as plt
 
@@ -355,9 +361,11 @@ class Comparison:
         axes = figure.subplots(count, 2, squeeze=False)
         for row, name in enumerate(self.fault_names):
             left, right = axes[row]
-            right.plot(self.times, self.truth[:, row], label="fault", **TRUE_STYLE)
+            if np.isfinite(self.truth[:, row]).any():
+                right.plot(self.times, self.truth[:, row], label="fault", **TRUE_STYLE)
             left.axhline(1.0, color="0.8", linewidth=0.8)
             low, high = self._range(shown, row)
+            best = next((_reach(e.estimates[:, 0]) for e in shown if name in [f.figures.fault for f in e.faults]), 0.0)
             for rank, entry in enumerate(shown):
                 names = [fault.figures.fault for fault in entry.faults]
                 if name not in names:
@@ -367,7 +375,7 @@ class Comparison:
                 style: dict[str, Any] = {"color": colour, "zorder": 3.0 + len(shown) - rank}
                 response, estimate = np.clip(entry.responses[:, column], -1.0, 3.0), entry.estimates[:, column]
                 left.plot(np.arange(len(response)) * self.sample_time, response, label=entry.method, **style)
-                noisy = float(np.nanquantile(np.abs(estimate), SHOWN_SAMPLES)) > max(-low, high)
+                noisy = rank > 0 and _reach(estimate) > NOISIER * max(_reach(self.truth[:, row]), best)
                 faint = {"alpha": FAINT, "linewidth": 0.4, "zorder": 1.0} if noisy else {"linewidth": 0.8}
                 right.plot(self.times, estimate, **{**style, **faint})
             times = [f.figures.most for entry in shown for f in entry.faults if np.isfinite(f.figures.most)]
@@ -380,18 +388,23 @@ class Comparison:
                 label_time(panel)
                 tidy(panel)
         legend_above(axes[0, 0])
-        legend_above(axes[0, 1])
+        if axes[0, 1].get_legend_handles_labels()[0]:
+            legend_above(axes[0, 1])
         return figure
 
     def _range(self, shown: Sequence[ComparedMethod], row: int) -> tuple[float, float]:
-        """Return the ends of the panel of a fault: room about the fault, and for the best estimate of the first one."""
+        """Return the ends of the panel of a fault: all of the truth, and nearly all samples of every estimate."""
         known = self.truth[np.isfinite(self.truth[:, row]), row]
         low, high = float(np.min(known, initial=0.0)), float(np.max(known, initial=0.0))
+        for entry in shown:
+            names = [fault.figures.fault for fault in entry.faults]
+            if self.fault_names[row] in names:
+                estimate = entry.estimates[:, names.index(self.fault_names[row])]
+                if np.isfinite(estimate).any():
+                    ends = np.nanquantile(estimate, (1.0 - SHOWN_SAMPLES, SHOWN_SAMPLES))
+                    low, high = min(low, float(ends[0])), max(high, float(ends[1]))
         room = ROOM_AROUND_FAULT * (high - low or 1.0)
-        if row or not shown:
-            return low - room, high + room
-        best = np.nanquantile(shown[0].estimates[:, 0], (1.0 - SHOWN_SAMPLES, SHOWN_SAMPLES))
-        return min(low - room, 1.5 * float(best[0])), max(high + room, 1.5 * float(best[1]))
+        return low - room, high + room
 
     def __repr__(self) -> str:
         table = text_table(self.rows(), left=2)
@@ -446,8 +459,14 @@ def comparison_statement(claims: Mapping[str, Any], digests: Mapping[str, str], 
     )
 
 
+def _reach(values: FloatArray) -> float:
+    """Return how far nearly all values of a signal reach from zero; 0 where none is known."""
+    known = np.abs(values[np.isfinite(values)])
+    return float(np.quantile(known, SHOWN_SAMPLES)) if known.size else 0.0
+
+
 def _number(value: float) -> str:
-    return "-" if np.isnan(value) else "never" if np.isinf(value) else f"{value:.3g}"
+    return "-" if np.isnan(value) else "never" if np.isinf(value) else number(value, digits=3)
 
 
 def rms(errors: Sequence[float] | FloatArray) -> float:

@@ -198,6 +198,22 @@ def evaluate(
         An option is out of range, or as for `simulate`.
     PreconditionError
         As for `simulate`.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> scenario = obsynth.Scenario(
+    ...     horizon=30,
+    ...     faults={"f1": obsynth.Step(size=1.0, start=10)},
+    ...     disturbances={"d1": obsynth.Uniform(low=-0.1, high=0.1)},
+    ... )
+    >>> found = obsynth.evaluate(design, scenario, runs=20, monitor=obsynth.monitor(design, scenario))
+    >>> found.false_alarm_rate.value, found.detection_delay.value
+    (0.0, 1.0)
     """
     runs = max(whole_number(runs, "runs"), 1 if plants is None else whole_number(plants, "plants"))
     seeds = range(scenario.seed, scenario.seed + runs)

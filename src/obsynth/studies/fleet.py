@@ -189,6 +189,23 @@ def run_fleet(
     ------
     SpecError
         There is no gain set or no log, an option is unknown, or the folder cannot be used.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pandas as pd
+    >>> import obsynth
+    >>> from tempfile import TemporaryDirectory
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = obsynth.fault_estimation_filter(plant).save(f"{folder}/a.gains.json")
+    ...     log = pd.DataFrame({"time": range(50), "y1": np.zeros(50), "y2": np.zeros(50)})
+    ...     log.to_csv(f"{folder}/log.csv", index=False)
+    ...     fleet = obsynth.run_fleet(f"{folder}/a.gains.json", f"{folder}/log.csv", f"{folder}/found")
+    ...     print(len(fleet))
+    1
     """
     known = ("columns", "time_column", "scales", "thresholds", "gap", "warm_up", "recovered", "outliers", "unverified")
     wrong = sorted(set(options) - set(known))

@@ -72,13 +72,13 @@ def _least(
 
 def in_words(fault: str, bound: float, least: float, unit: str = "") -> str:
     """Return a sentence on one fault."""
-    own = f"Without a fault the estimate of {fault} stays within {bound:.4g}{f' {unit}' if unit else ''}"
+    own = f"Fault-free, if the model is exact, |estimate of {fault}| <= {bound:.3g}{f' {unit}' if unit else ''}"
     if not np.isfinite(least):
-        return f"{own}; its least threshold is not known."
+        return f"{own}. The smallest possible threshold is not known."
     if least <= SAME_RESPONSE * bound:
-        return f"{own}; a test exists on which disturbances and noise have no effect."
+        return f"{own}. A test immune to disturbances and noise exists (guaranteed-test)."
     return (
-        f"{own}, {bound / least:.2f} times the least of all tests with its delay on at most {LONGEST_WINDOW} "
+        f"{own}, {bound / least:.2f} times the optimum of all tests with its delay on at most {LONGEST_WINDOW} "
         f"samples ({least:.4g})."
     )
 

@@ -173,7 +173,7 @@ class Robustness:
             share = self.largest_tolerance
             percent = "" if share is None else f" ({100.0 * share:.3g} %)"
             yield "largest tolerances", f"{self.largest_factor:.4g} times those stated{percent}"
-        yield "to blame", _top(self.blame)
+        yield "main contributors", _top(self.blame)
         yield "rows of the plant", _top(self.rows)
         for name, gain in self.vertex_gains.items():
             yield f"largest gain, {name}", f"{gain:.4g} at a vertex, from the disturbances"

@@ -127,7 +127,7 @@ class SensorSets:
             if faults
         ]
         free = [name for name, faults in self.lost_without.items() if not faults]
-        return (*lost, *([f"The goal is kept if one of these fails: {', '.join(free)}."] if free else []))
+        return (*lost, *([f"You can lose any one of {', '.join(free)} and still reach the goal."] if free else []))
 
     def _repr_html_(self) -> str:
         texts = "".join(f"<p>{escape(text)}</p>" for text in (*self.out_of_reach, *self.failures(), *self.notes))
@@ -211,6 +211,16 @@ def sensor_sets(
     ----------
     .. [Krysander] M. Krysander, E. Frisk, "Sensor placement for fault diagnosis", IEEE Trans. SMC-A 38, 2008: the
        question, on structure alone.  Here the numbers decide, zeros included.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0, state_names=["a", "b"]
+    ... )
+    >>> found = obsynth.sensor_sets(plant, goal="estimate-step")
+    >>> [item.sensors for item in found.sets]
+    [('b',)]
     """
     plant = linear_plant(plant)
     report_stage = progress or (lambda _: None)
@@ -337,11 +347,13 @@ def _require_positive(given: Mapping[str, Any], sensors: Sequence[Sensor], what:
 
 def _note(search: SensorSearch, exact: bool, bound: int, most: int, count: int) -> str:
     tried = f"at most {bound} of {len(search.sensors)} candidates"
+    if exact and bound == 0 and count:
+        return "There are no further sensors to try; the present ones suffice."
     if exact:
         return (
-            f"These are all sets of {tried} that need each of their sensors."
+            f"These are all minimal sets of {tried}."
             if count
-            else f"No set of {tried} does it: all were tried."
+            else f"No set of {tried} reaches the goal: all were tried."
         )
     if count >= most:
         return f"The first {most} inclusion-minimal sets found, the most sensitive at a generic point first."

@@ -219,6 +219,21 @@ def sweep(
     ------
     SpecError
         The cases or parameters are malformed, or the folder cannot be written.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]],
+    ...     C=[[1, 0], [0, 1]],
+    ...     Bf=[[1], [0]],
+    ...     Bd=[[0], [1]],
+    ...     dt=1.0,
+    ...     sensor_noise={"y1": 0.1, "y2": 0.1},
+    ... )
+    >>> found = obsynth.sweep(plant, {"decay": [0.2, 0.5]}, method="ui-pi-observer")
+    >>> [result.status for result in found.results]
+    ['designed', 'designed']
     """
     made = _cases(cases, parameters or {}, method)
     place = None if folder is None else ResultFolder(folder, _SWEEP_KIND, SweepResult, ending=".gains.json")

@@ -158,8 +158,12 @@ def study_statement(result: Mapping[str, Any], asked: Mapping[str, Any], digest:
     last = int(np.argmax(result["tolerances"]))
     unit = f" {result['unit']}" if result["unit"] else ""
     told = [
-        f"the {name} has a false alarm in {100.0 * alarms:.4g} % of them and detects a step of {result['fault']} "
-        + ("of no size" if least is None else f"from {least:.4g}{unit} on")
+        f"the {name} has a false alarm in {100.0 * alarms:.4g} % of them and detects "
+        + (
+            f"no step of {result['fault']}"
+            if least is None
+            else f"a step of {result['fault']} from {least:.4g}{unit} on"
+        )
         for name, alarms, least in zip(
             result["monitors"], result["false_alarms"][last], result["least_faults"][last], strict=True
         )
@@ -217,6 +221,21 @@ def tolerance_study(
         The plant has no tolerances or no fault, a nominal value is zero, or an option is out of range.
     PreconditionError
         No bound exists over some of the tolerances.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.uncertain_system(
+    ...     {"A": [["a"]], "B": [[1]], "C": [[1]], "Bf": [[1]], "dt": 1.0},
+    ...     {"a": {"nominal": 0.5, "tolerance": "5 %"}},
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> scenario = obsynth.Scenario(
+    ...     horizon=20, inputs={"u1": obsynth.Step(size=1.0)}, faults={"f1": obsynth.Step(size=1.0, start=10)}
+    ... )
+    >>> study = obsynth.tolerance_study(design, scenario, tolerances=(0.0, 0.05), runs=4)
+    >>> study.tolerances.tolist()
+    [0.0, 0.05]
     """
     whole_number(runs, "runs")
     plant, observer = design.linear

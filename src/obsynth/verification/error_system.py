@@ -390,7 +390,7 @@ def error_model_row(model: ErrorModel | None, printed_digits: int | None) -> Che
         bound,
         source=source,
         kind="equality",
-        detail="largest miss, as a share of its terms",
+        detail="relative to the size of the terms",
     )
 
 

@@ -138,8 +138,13 @@ def equality(name: str, claim: str, found: Residual, source: str, *, bound: floa
         found.bound if bound is None else bound,
         source=source,
         kind="equality",
-        detail=f"largest miss {found.error:.1e} among terms of size {found.scale:.1e}{printed}",
+        detail=f"residual {_size(found.error)} (terms of size {_size(found.scale)}){printed}",
     )
+
+
+def _size(value: float) -> str:
+    """Return a size to two digits; an exact zero is 0."""
+    return f"{value:.2g}"
 
 
 def tracking_identities(model: ErrorModel) -> dict[str, Identity]:

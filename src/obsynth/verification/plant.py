@@ -64,7 +64,14 @@ def plant_information(plant: DescriptorSystem) -> Iterator[Check]:
     """Yield rows on regularity, index, eigenvalues and stability of the plant; they inform and never fail."""
     structure = structure_of(plant)
     blocks = structure.infinite_block_sizes
-    rows = [("regular", "det(A - zE) is not identically zero", float(structure.regular), "")]
+    rows = [
+        (
+            "regular",
+            "det(A - zE) is not identically zero",
+            float(structure.regular),
+            "yes" if structure.regular else "no",
+        )
+    ]
     if structure.regular:
         admissible = not unstable_poles(plant) and (structure.index or 0) <= 1
         verdict = "admissible" if admissible else "not admissible: an observer may exist all the same"

@@ -158,6 +158,15 @@ def decouple(
     ----------
     .. [Frisk] E. Frisk, M. Nyberg, "A minimal polynomial basis solution to residual generation for fault diagnosis in
        linear systems", Automatica 37, 2001: the null space; here it is never formed, but reduced to a state space.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> obsynth.decouple(plant).plant.nd
+    0
     """
     plant = linear_plant(plant)
     removed = fault_numbers(plant, without, "without")

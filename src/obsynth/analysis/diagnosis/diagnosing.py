@@ -100,6 +100,16 @@ def diagnose(
     ----------
     .. [Varga] A. Varga, Solving Fault Diagnosis Problems, Springer 2017: fault detectability, weak and strong, and
        isolability.  Here all of it is read from one reduction of a pencil, and decided exactly where that can be.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> found = obsynth.diagnose(plant)
+    >>> [(fault.name, fault.detectable) for fault in found.faults]
+    [('f1', True)]
     """
     plant = linear_plant(plant)
     if not all(is_finite_number(value) and value >= 0.0 for value in frequencies):

@@ -124,8 +124,10 @@ def hidden_motion(plant: DescriptorSystem, fault: int, point: complex, removed: 
     more = len(states) - MOST_NAMED_SIGNALS
     rest = [*states[:MOST_NAMED_SIGNALS], *([f"{more} more states"] if more > 0 else [])]
     others = [*inputs, *([f"states {', '.join(rest)}"] if rest else [])]
-    together = f"together with {' and '.join(others)}" if others else "from some initial state"
-    return f"{_signal(plant.dt, point, own, 1.0)} is output-nulling {together}"
+    signal = _signal(plant.dt, point, own, 1.0)
+    if not others:
+        return f"{signal} has no effect on any sensor from some initial state"
+    return f"{signal} and {' and '.join(others)} cancel at every sensor"
 
 
 def hiding_amplitudes(

@@ -89,6 +89,22 @@ class AdaptiveObserver(DescriptorKalman):
     References
     ----------
     .. [MoussaAli2013] Fault diagnosis for linear time-varying descriptor systems, IFAC ALCOSP 2013, eqs. (17)-(26).
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.TimeVaryingDescriptorSystem(
+    ...     E=None,
+    ...     A=[["0.9 + 0.05 * sin(k)"]],
+    ...     C=[[1.0]],
+    ...     Phi=[[1.0]],
+    ...     dt=1.0,
+    ...     horizon=100,
+    ...     parameter_names=["leak"],
+    ... )
+    >>> design = obsynth.adaptive_observer(plant, Q=1e-4, R=1e-2, forgetting=0.98)
+    >>> design.observer.fault_names, design.report.passed
+    (('leak',), True)
     """
 
     id: ClassVar[str] = "adaptive-observer"

@@ -222,7 +222,7 @@ def _proved_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
         "deviations: lower bound on its smallest eigenvalue",
         proof.lower_bound,
         source="recomputed",
-        status="proved" if proof.proved else "computed twice",
+        status="proved" if proof.proved else "recomputed",
         detail=proof.text,
     )
 

@@ -105,6 +105,21 @@ class DaeAdaptiveObserver(Method):
     ----------
     .. [MoussaAliDAE2013] Adaptive observer based fault diagnosis applied to differential-algebraic systems, IFAC SSSC
        2013, eqs. (5)-(23).
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> tank = obsynth.DAEModel(
+    ...     {"balance": "der(level) = inflow - c * sqrt(level)"},
+    ...     {"gauge": "level"},
+    ...     states={"level": 1.0},
+    ...     inputs={"inflow": 0.5},
+    ...     parameters={"c": 0.5},
+    ...     units={"level": "m", "inflow": "m/s", "c": "m0.5/s", "gauge": "m"},
+    ... )
+    >>> design = obsynth.dae_adaptive_observer(tank, dt=1.0, Q=1e-6, R={"gauge": 1e-4})
+    >>> design.observer.fault_names, design.report.passed
+    (('c',), True)
     """
 
     id: ClassVar[str] = "dae-adaptive-observer"

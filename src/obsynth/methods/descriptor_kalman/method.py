@@ -89,6 +89,20 @@ class DescriptorKalman(Method):
     ----------
     .. [Nikoukhah1992] Kalman filtering and Riccati equations for descriptor systems, IEEE TAC 37 (9), Lemmas 2.3, 2.4.
     .. [MoussaAli2013] Fault diagnosis for linear time-varying descriptor systems, IFAC ALCOSP 2013, eqs. (5)-(13).
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]],
+    ...     C=[[1, 0], [0, 1]],
+    ...     Bf=[[1], [0]],
+    ...     dt=1.0,
+    ...     sensor_noise={"y1": 0.1, "y2": 0.1},
+    ... )
+    >>> design = obsynth.descriptor_kalman(plant, Q=0.01)
+    >>> design.observer.order, design.report.passed
+    (2, True)
     """
 
     id: ClassVar[str] = "descriptor-kalman"

@@ -60,6 +60,16 @@ class DetectionFilterMethod(Method):
     .. [Ding] S. X. Ding, T. Jeinsch, P. M. Frank, E. L. Ding, "A unified approach to the optimization of fault
        detection systems", Int. J. Adaptive Control and Signal Processing 14, 2000.
        Ours: both norms are proved on the stored numbers, at every frequency of the band.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[-1.0]], C=[[1.0]], Bf=[[1.0]], Bd=[[0.5]], sensor_noise={"y1": 0.1}
+    ... )
+    >>> design = obsynth.detection_filter(plant)
+    >>> design.method, design.report.passed
+    ('detection-filter', True)
     """
 
     id: ClassVar[str] = "detection-filter"

@@ -90,7 +90,7 @@ def filter_by_inequality(
         goal, found = cp.trace(Z), replace(found, variables={**found.variables, "Z": Z})
         drop = ("(45)",) if asked.gamma is None else ()
     elif asked.objective is not None:
-        goal = asked.objective(found.variables)
+        goal = asked.objective(found.letters())
     found = found.changed(constraints=_with_own(asked, found, added), objective=goal, drop=drop)
     progress("solving the matrix inequality")
     runs = [_solved(found, asked)]
@@ -129,7 +129,7 @@ def pd_by_inequality(plant: DescriptorSystem, asked: PdObserver, *, progress: Ca
     if delta is None:
         delta = _fitting_delta(default_delta(plant if form is None else form.plant, asked, decay), where)
     found = theorem(plant, delta=delta, decay=decay, region=where)
-    goal = None if asked.objective is None else asked.objective(found.variables)
+    goal = None if asked.objective is None else asked.objective(found.letters())
     found = found.changed(constraints=_with_own(asked, found, {}), objective=goal)
     progress("solving the matrix inequality")
     runs = [_solved(found, asked)]
@@ -152,7 +152,7 @@ def ui_pi_by_inequality(plant: DescriptorSystem, asked: UiPiObserver, *, progres
     found = sharepasand(
         plant, fault_model=asked.fault_model, region=where, E_sharp=asked.E_sharp, C_sharp=asked.C_sharp, G=asked.G
     )
-    goal = asked.objective(found.variables) if callable(asked.objective) else None
+    goal = asked.objective(found.letters()) if callable(asked.objective) else None
     found = found.changed(constraints=_with_own(asked, found, {}), objective=goal)
     progress("solving the matrix inequality")
     runs = [_solved(found, asked)]
@@ -177,7 +177,7 @@ def _fitting_delta(delta: float, where: LMIRegion | None) -> float:
 
 def _with_own(asked: Any, found: Conditions, added: Mapping[str, Any]) -> dict[str, Any]:
     """Return constraints to add, those of the user among them."""
-    own = {} if asked.constraints is None else named_constraints(asked.constraints(found.variables))
+    own = {} if asked.constraints is None else named_constraints(asked.constraints(found.letters()))
     return {**added, **own}
 
 

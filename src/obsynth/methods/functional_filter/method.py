@@ -84,6 +84,21 @@ class FunctionalFilter(Method):
        linear systems", Automatica 37, 2001: the null space.  Ours: one state-space reduction for any index, fault
        models and walks on it, delay, and the proof by T and T0 on the shipped numbers.
     .. [AndersonMoore] B. Anderson, J. Moore, Optimal Filtering, 1979, ch. 7: the fixed lag.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]],
+    ...     C=[[1, 0], [0, 1]],
+    ...     Bf=[[1], [0]],
+    ...     Bd=[[0], [1]],
+    ...     dt=1.0,
+    ...     sensor_noise={"y1": 0.1, "y2": 0.1},
+    ... )
+    >>> design = obsynth.functional_filter(plant)
+    >>> design.observer.fault_names, design.report.passed
+    (('f1',), True)
     """
 
     id: ClassVar[str] = "functional-filter"
@@ -96,9 +111,7 @@ class FunctionalFilter(Method):
     source: ClassVar[str] = "ours, after Frisk, Nyberg 2001 and Anderson, Moore 1979"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "order": ClaimMeaning("", "states of the filter", "order"),
-        "decay": ClaimMeaning(
-            "1/s", "rate of the slowest pole: asymptotically every error decays at least at this rate", "decay"
-        ),
+        "decay": ClaimMeaning("1/s", "slowest decay rate of the estimation error", "decay"),
     }
     witnesses: ClassVar[frozenset[str]] = frozenset(
         {"T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations"}

@@ -112,6 +112,14 @@ class PdObserver(Method):
     ----------
     .. [Filasova] A. Filasova, D. Krokavec, V. Serbak, Application of descriptor approaches in design of PD
        observer-based actuator fault estimation, Theorem 1, eqs. (40)-(44), and Theorem 2, eqs. (61)-(65).
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[-1.0, 0.5], [0.0, -2.0]], C=[[1, 0], [0, 1]], Bf=[[1], [0]])
+    >>> design = obsynth.pd_observer(plant, decay=2.0)
+    >>> design.certificate.claims["decay"], design.report.passed
+    (2.0, True)
     """
 
     id: ClassVar[str] = "pd-observer"

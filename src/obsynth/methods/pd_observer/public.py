@@ -40,6 +40,14 @@ def apply_adaptation_gain(design: ObserverDesign, adaptation_gain: ArrayLike) ->
     ----------
     .. [Filasova] Application of descriptor approaches in design of PD observer-based actuator fault estimation,
        eq. (25), whose G is in neither theorem.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[-1.0, 0.5], [0.0, -2.0]], C=[[1, 0], [0, 1]], Bf=[[1], [0]])
+    >>> design = obsynth.pd_observer(plant, decay=2.0)
+    >>> obsynth.apply_adaptation_gain(design, [[1.2]]).report.passed
+    True
     """
     if design.method != "pd-observer":
         raise SpecError(f"A design of method {design.method!r} has no adaptation gain.", path="design")

@@ -60,6 +60,16 @@ def fault_response(design: ObserverDesign, frequencies: ArrayLike) -> ComplexArr
     ------
     SpecError
         The design holds no tracking map.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.ui_pi_observer(plant, decay=0.5)
+    >>> abs(obsynth.fault_response(design, [1e-6])).round(3).ravel().tolist()
+    [1.0]
     """
     if "tracking" not in design.certificate.matrices:
         raise SpecError("The design holds no tracking map: fhat/f cannot be computed.", path="certificate")

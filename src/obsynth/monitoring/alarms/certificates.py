@@ -46,6 +46,23 @@ def verify_alarm(path: str | Path, *, data: str | Path | None = None) -> Verific
     ------
     SpecError
         The file is no certificate.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import pandas as pd
+    >>> import obsynth
+    >>> plant = obsynth.uncertain_system(
+    ...     {"A": [["a"]], "B": [[1]], "C": [[1]], "Bf": [[1]], "dt": 1.0},
+    ...     {"a": {"nominal": 0.5, "tolerance": "5 %"}},
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> log = pd.DataFrame({"time": range(6), "u1": 0.0, "y1": [0.0, 0.0, 0.0, 1.0, 0.5, 0.25]})  # row 4 jumps
+    >>> proof = obsynth.prove_alarm(design, log, 4, initial_set={"x1": 0.1})
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = proof.save(f"{folder}/alarm.json")
+    ...     print(obsynth.verify_alarm(f"{folder}/alarm.json").passed)
+    True
     """
     again = "prove the alarm again (obsynth prove-alarm)"
     _, body, intact = opened(path_of(path), (ALARM_KIND,), ALARM_VERSION, "certificate of an alarm", again)

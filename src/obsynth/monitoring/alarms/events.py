@@ -25,7 +25,8 @@ CONTRADICTING = ("nis", "learned")
 
 #: What a summary says where such an interval is in its table.
 NOT_VALID = (
-    "An interval is not valid where its alarm contradicts the stated noise and random walks: the fault may lie outside."
+    "Not valid: the alarm contradicts the noise and random walks that the interval assumes, so that the fault may lie "
+    "outside."
 )
 
 #: How a run begins to say that nothing alarmed.
@@ -33,12 +34,12 @@ NO_ALARM = "No alarm"
 
 #: Why a row cannot alarm, by its status.
 REASONS = {
-    WARM_UP: "the initial-condition response has not settled yet (--warm-up)",
-    RECOVERING: "the effect of a gap before them has not settled yet (--warm-up)",
+    WARM_UP: "the observer was still settling (shorten with --warm-up)",
+    RECOVERING: "the observer was still settling after a gap (shorten with --warm-up)",
     GAP: "samples are missing, or left out as outliers",
-    REPEATED_STAMP: "their stamps are those of the rows before",
-    OUT_OF_ORDER: "their stamps are earlier than those of the rows before",
-    NO_DECISION: "the monitor takes no decision there: its window is not full, or a warm-up or a gap is not over",
+    REPEATED_STAMP: "the time stamp repeats the one before",
+    OUT_OF_ORDER: "the time stamp is earlier than the one before",
+    NO_DECISION: "the window of the monitor was not full, or a warm-up or a gap was not over",
 }
 
 
@@ -204,7 +205,9 @@ def silence(run: Any, by: str) -> list[str]:
         told = f" in the {run.rows - silent} rows that could alarm" if silent else ""
         found.append(f"{NO_ALARM} by {by}{told}.")
     if silent:
-        why = [f"{count} {status}: {REASONS.get(status, status)}"
-               for status, count in run.silent.items() if status != PARTIAL]  # fmt: skip
-        found.append(f"{silent} of {run.rows} rows were without a decision: {'; '.join(why)}.")
+        causes = {status: count for status, count in run.silent.items() if status != PARTIAL}
+        why = [f"{f'{count}: ' if len(causes) > 1 else ''}{REASONS.get(status, status)}"
+               for status, count in causes.items()]  # fmt: skip
+        first = "the first " if set(causes) == {WARM_UP} else ""
+        found.append(f"No decision in {first}{silent} of {run.rows} rows: {'; '.join(why)}.")
     return found

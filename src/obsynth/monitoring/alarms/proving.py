@@ -86,6 +86,20 @@ def prove_alarm(
     -----
     A. Neumaier and O. Shcherbina, "Safe bounds in linear and mixed-integer linear programming", Math. Programming 99,
     2004; G. McCormick, "Computability of global solutions to factorable nonconvex programs", 1976.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> import obsynth
+    >>> plant = obsynth.uncertain_system(
+    ...     {"A": [["a"]], "B": [[1]], "C": [[1]], "Bf": [[1]], "dt": 1.0},
+    ...     {"a": {"nominal": 0.5, "tolerance": "5 %"}},
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> log = pd.DataFrame({"time": range(6), "u1": 0.0, "y1": [0.0, 0.0, 0.0, 1.0, 0.5, 0.25]})  # row 4 jumps
+    >>> proof = obsynth.prove_alarm(design, log, 4, initial_set={"x1": 0.1})
+    >>> proof.proved
+    True
     """
     whole_number(row, "row", "the number of a row", least=2)
     if isinstance(design.observer, WindowObserver):

@@ -172,6 +172,28 @@ def calibrate(
     .. [Chung2013] Y. Chung et al., "A nondegenerate penalized likelihood estimator for variance parameters",
        Psychometrika 78, 2013: the weight that keeps variances from zero, which we give only to those that the log
        cannot distinguish from it.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> import numpy as np
+    >>> tank = obsynth.DAEModel(
+    ...     {"balance": "der(level) = inflow - c * level"},
+    ...     {"gauge": "level"},
+    ...     states={"level": 1.0},
+    ...     inputs={"inflow": 0.5},
+    ...     constants={"c": 0.4},
+    ...     units={"level": "m", "inflow": "m/s", "c": "1/s", "gauge": "m"},
+    ... )
+    >>> k, rng = np.arange(200), np.random.default_rng(0)
+    >>> inflow = 0.5 + 0.2 * np.sign(np.sin(0.1 * k))
+    >>> level = [1.0]
+    >>> for u in inflow[1:]:
+    ...     level.append((level[-1] + u) / (1 + 0.5))  # backward Euler with c = 0.5
+    >>> log = {"time": k, "inflow": inflow, "gauge": np.array(level) + 0.01 * rng.normal(size=200)}
+    >>> found = obsynth.calibrate(tank, log, {"c": (0.1, 1.0)})
+    >>> round(found.nominal["c"], 2)
+    0.5
     """
     if not isinstance(level, (int, float)) or not 0.0 < level < 1.0:
         raise SpecError(f"level is {level!r}: give a probability, such as 0.95.", path="level")

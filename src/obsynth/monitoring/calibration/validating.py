@@ -264,6 +264,25 @@ def validate(
         The design has no innovations with a covariance, a name is unknown, or the log cannot be used.
     SolverError
         A step of a nonlinear plant has no solution along the log.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> import obsynth
+    >>> plant = obsynth.TimeVaryingDescriptorSystem(
+    ...     E=None,
+    ...     A=[["0.9 + 0.05 * sin(k)"]],
+    ...     C=[[1.0]],
+    ...     Phi=[[1.0]],
+    ...     dt=1.0,
+    ...     horizon=100,
+    ...     parameter_names=["leak"],
+    ... )
+    >>> design = obsynth.adaptive_observer(plant, Q=1e-4, R=1e-2, forgetting=0.95)
+    >>> log = obsynth.simulate(design, obsynth.Scenario(horizon=99, noise=1.0)).outputs
+    >>> found = obsynth.validate(design, pd.DataFrame({"time": range(len(log)), "y1": log[:, 0]}))
+    >>> found.passed
+    True
     """
     note = progress or (lambda text: None)
     found = _usable_log(design, log, rows=rows, columns=columns, scales=scales)

@@ -145,6 +145,24 @@ def validity(
         The linear model is of another plant, or the log cannot be used.
     SolverError
         The plant has no solution along the log's inputs.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import obsynth
+    >>> tank = obsynth.DAEModel(
+    ...     {"balance": "der(level) = inflow - c * sqrt(level)"},
+    ...     {"gauge": "level"},
+    ...     states={"level": 1.0},
+    ...     inputs={"inflow": 0.5},
+    ...     parameters={"c": 0.5},
+    ...     units={"level": "m", "inflow": "m/s", "c": "m0.5/s", "gauge": "m"},
+    ... )
+    >>> linear = obsynth.linearise(tank, given={"inflow": 0.5})
+    >>> log = {"time": np.arange(20), "inflow": 0.5 + 0.1 * (np.arange(20) > 5), "gauge": np.ones(20)}
+    >>> found = obsynth.validity(tank, linear, log, deviations={"gauge": 0.01})
+    >>> round(found.largest, 2)  # in deviations of the sensors
+    3.0
     """
     names = {*linear.input_names, *linear.disturbance_names} - {DRIFT}
     if names != set(model.input_names) or linear.output_names != model.output_names or linear.is_discrete:

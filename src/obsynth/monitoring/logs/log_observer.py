@@ -183,8 +183,8 @@ class Clock:
         # One gap may be the first interval of a log.
         if count > 1 and self.longest == 0.0 and self.count > 0:
             raise SpecError(
-                f"Row {row}: the data begin with intervals of {step:.10g} s and the like, but the design has dt = "
-                f"{self.dt:.10g} s: the sampling time does not fit.",
+                f"Row {row}: the log is sampled every {step:.6g} s, but the design needs {self.dt:.6g} s: resample the "
+                f"log, or design with sample_time: {step:.6g}.",
                 path=f"row {row}",
             )
         self.away = average

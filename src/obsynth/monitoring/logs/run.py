@@ -230,6 +230,20 @@ def run_on_data(
     within the largest changes that they have made before, by which deviations grow; the rows after that are
     ``recovering`` until the warm-up is over.  ``r`` is the innovation at the parameters estimated one sample before
     (whitened, for recursive designs).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pandas as pd
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> log = pd.DataFrame({"time": range(50), "y1": np.zeros(50), "y2": np.zeros(50)})
+    >>> run = obsynth.run_on_data(design, log, thresholds={"fhat[f1]": 0.5})
+    >>> run.rows, len(run.alarms)
+    (50, 0)
     """
     whole_number(chunk_rows, "chunk_rows")
     whole_number(state_every, "state_every")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -164,4 +165,5 @@ def _advice(header: tuple[str, ...], missing: list[str]) -> str:
     found = found or next((name for name in header if name.lower() == "t"), None)
     if TIME_HEADER in missing and found is not None:
         return f"If {found!r} is the time: --time-column {found!r}, or columns={{'time': {found!r}}}."
-    return "Map signals to columns where their names differ."
+    first = next((name for name in missing if name != TIME_HEADER), TIME_HEADER)
+    return f"Map it: --map {shlex.quote(first)}=YOUR_COLUMN."

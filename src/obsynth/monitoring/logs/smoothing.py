@@ -164,6 +164,24 @@ def smooth(
     .. [Paige1977] Paige, Saunders, Least squares estimation of discrete linear dynamic systems using orthogonal
        transformations, SIAM Journal on Numerical Analysis 14 (2), 180-193: the square-root form; ours keeps the way
        back of each step instead of one large factorisation, and lets E be singular.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.TimeVaryingDescriptorSystem(
+    ...     E=None,
+    ...     A=[["0.9 + 0.05 * sin(k)"]],
+    ...     C=[[1.0]],
+    ...     Phi=[[1.0]],
+    ...     dt=1.0,
+    ...     horizon=100,
+    ...     parameter_names=["leak"],
+    ... )
+    >>> design = obsynth.adaptive_observer(plant, Q=1e-4, R=1e-2, form="random-walk", random_walk=[[1e-4]])
+    >>> run = obsynth.simulate(design, obsynth.Scenario(horizon=99, noise=1.0))
+    >>> smoothed = obsynth.smooth(design, run.outputs)
+    >>> bool((smoothed.parameter_deviations[50] < run.estimates.parameter_deviations[50]).all())
+    True
     """
     waited = checked_lag(lag)
     if isinstance(design.observer, LinearObserver):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.monitoring.alarms.events import CONTRADICTING
 from obsynth.monitoring.logs.log_observer import DECIDING
 from obsynth.monitoring.logs.run import DataRun
 from obsynth.numerics.arguments import arguments_checked
@@ -17,12 +18,13 @@ from obsynth.observers.estimates import BAND_WIDTH
 from obsynth.report.plots.estimates import MODEL_BAND
 from obsynth.report.plots.panels import (
     BAND_STYLE,
+    CONTRADICTED_STYLE,
     ESTIMATE_STYLE,
     LINE_COLOURS,
+    MEASURED_STYLE,
     PANEL_HEIGHT,
     RESIDUAL_STYLE,
     THRESHOLD_STYLES,
-    TRUE_STYLE,
     WIDTH,
     label_time,
     legend_above,
@@ -92,6 +94,21 @@ def plot_data(
     ------
     SpecError
         The run holds no table, ``show`` names something else, or there are too few or too many axes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pandas as pd
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> log = pd.DataFrame({"time": range(50), "y1": np.zeros(50), "y2": np.zeros(50)})
+    >>> run = obsynth.run_on_data(design, log, thresholds={"fhat[f1]": 0.5})
+    >>> axes = obsynth.plotting.plot_data(run, design=design, show=["faults"])
+    >>> len(axes)
+    1
     """
     if run.table is None or run.measured is None:
         raise SpecError("The run holds no table, since it was written to a file: run it without out.", path="run")
@@ -183,7 +200,7 @@ class _Drawing:
     def outputs(self, panel: Axes, name: str) -> None:
         """Draw a measured output with its estimate."""
         measured: Any = self.run.measured
-        panel.plot(measured["time"], measured[name], label="measured", **{**TRUE_STYLE, "linewidth": 2.5})
+        panel.plot(measured["time"], measured[name], label="measured", **MEASURED_STYLE)
         column = f"xhat[{name}]"
         if column in self.table:
             panel.plot(self._times(column), self.table[column], label="estimate", **ESTIMATE_STYLE)
@@ -201,8 +218,14 @@ class _Drawing:
         elif deviation is not None and not adaptive:
             low, high = values - BAND_WIDTH * deviation, values + BAND_WIDTH * deviation
             band = MODEL_BAND if f"sd {column}" in table else "95 % interval of the stated noise"
-            panel.fill_between(times, low, high, label=band, **BAND_STYLE)
-        panel.plot(times, values, label="estimate", **{**ESTIMATE_STYLE, "linestyle": "-"})
+            contradicted = self._contradicted()
+            where = ~contradicted & np.isfinite(low)
+            if where.any():
+                panel.fill_between(times, low, high, where=where, label=band, **BAND_STYLE)
+            if contradicted.any():
+                told = "interval not valid: the alarm contradicts its noise"
+                panel.fill_between(times, low, high, where=contradicted, label=told, **CONTRADICTED_STYLE)
+        panel.plot(times, values, label="estimate", **ESTIMATE_STYLE)
         if adaptive:
             limit = table[f"threshold {column}"].to_numpy(float)
             for side, label in ((limit, "threshold without a fault"), (-limit, None)):
@@ -260,6 +283,14 @@ class _Drawing:
         )
         panel.set_ylim(0.0, 100.0)
         panel.set_ylabel("share of the\nthreshold (%)")
+
+    def _contradicted(self) -> Any:
+        """Return the rows of alarms that contradict the noise on which intervals rest."""
+        rows = np.zeros(len(self.table), dtype=bool)
+        for event in self.run.events:
+            if event.by in CONTRADICTING:
+                rows[event.first_row - 1 : event.last_row] = True
+        return rows
 
     def _times(self, column: str) -> Any:
         """Return the time of which a column is the estimate."""

@@ -210,8 +210,7 @@ class LearnedThresholds:
         model, lasting = self.statistics.model, self.every * self.dt
         text = (
             f"learned from {self.rows} rows without faults: at most one false alarm per {self.every:.6g} rows "
-            f"({_duration(lasting)}) on average, in {_counted(len(self.columns), 'column')}, whitened by an "
-            f"autoregression of order {model.order}"
+            f"({_duration(lasting)}) on average, in {_counted(len(self.columns), 'column')}"
             + (
                 f", and in changes of {_counted(len(self.statistics.estimates), 'fault')}"
                 if self.statistics.estimates
@@ -244,12 +243,12 @@ class LearnedThresholds:
             f"({_duration(rarest * self.dt)})"
         )
         if rows_needed(model, 1.0) > self.rows:
-            other = "the residuals are correlated for so long, or are so many, that these rows determine no rate"
+            other = "the residuals are too strongly correlated, or too many, for any rate from these rows"
         elif self.needed > rows_needed(model, self.every):
-            other = "what so few rows say of a fault is correlated for so long that they determine no rate"
+            other = "the estimates are too strongly correlated for any rate from these rows"
         return (
-            f"{text}. The rate is uncertain: it needs {self.needed} rows without faults "
-            f"({_duration(self.needed * self.dt)}); {other}"
+            f"{text}. Too few rows for this rate ({self.rows}; about {self.needed:,} needed, "
+            f"{_duration(self.needed * self.dt)}): {other}"
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -328,6 +327,27 @@ def load_thresholds(path: str | Path) -> LearnedThresholds:
     ------
     SpecError
         The file is none of these, or was changed.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import pandas as pd
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]],
+    ...     C=[[1, 0], [0, 1]],
+    ...     Bf=[[1], [0]],
+    ...     Bd=[[0], [1]],
+    ...     dt=1.0,
+    ...     sensor_noise={"y1": 0.1, "y2": 0.1},
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> log = obsynth.simulate(design, obsynth.Scenario(horizon=2000, noise=1.0)).outputs
+    >>> normal = pd.DataFrame({"time": range(len(log)), "y1": log[:, 0], "y2": log[:, 1]})
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = obsynth.learn_thresholds(design, normal, false_alarms="1 per 100 rows").save(f"{folder}/t.json")
+    ...     print(obsynth.load_thresholds(f"{folder}/t.json").columns)
+    ('fhat[f1]',)
     """
     file = path_of(path)
     again = "learn the thresholds again (obsynth thresholds)"

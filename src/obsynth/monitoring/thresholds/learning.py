@@ -109,6 +109,25 @@ def learn_thresholds(
     References
     ----------
     Alwan & Roberts (1988), Lowry et al. (1992), Willsky & Jones (1976), Politis & Romano (1994), Gandy & Kvaloy (2013).
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]],
+    ...     C=[[1, 0], [0, 1]],
+    ...     Bf=[[1], [0]],
+    ...     Bd=[[0], [1]],
+    ...     dt=1.0,
+    ...     sensor_noise={"y1": 0.1, "y2": 0.1},
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> log = obsynth.simulate(design, obsynth.Scenario(horizon=2000, noise=1.0)).outputs
+    >>> normal = pd.DataFrame({"time": range(len(log)), "y1": log[:, 0], "y2": log[:, 1]})
+    >>> found = obsynth.learn_thresholds(design, normal, false_alarms="1 per 100 rows")
+    >>> found.columns
+    ('fhat[f1]',)
     """
     # Both are refused before the log is read.
     watched_names(design)

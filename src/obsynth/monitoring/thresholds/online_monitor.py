@@ -133,6 +133,18 @@ def online_monitor(
         No bound exists over the tolerances: the message says why.
     VerificationError
         The report of the design fails.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> import numpy as np
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> monitor = obsynth.online_monitor(design, disturbance_bounds={"d1": 0.1}, initial_error=0.0)
+    >>> monitor.kind
+    'pointwise'
     """
     require_verified(design, unverified=unverified)
     recursive = isinstance(design.observer, (RecursiveObserver, DAEObserver))

@@ -115,6 +115,23 @@ def monitor(
     computed and added.  Plants of index 2 and more have no such bound.  Where the residual does not see the faults that
     are modelled (``ui-pi-observer``), ``pointwise`` and ``window`` are of the fault estimates.  The statistical kinds
     use disturbances that are held between samples, and exact covariances of the noise.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> scenario = obsynth.Scenario(
+    ...     horizon=30,
+    ...     faults={"f1": obsynth.Step(size=1.0, start=10)},
+    ...     disturbances={"d1": obsynth.Uniform(low=-0.1, high=0.1)},
+    ... )
+    >>> monitor = obsynth.monitor(design, scenario)
+    >>> found = monitor.watch(obsynth.simulate(design, scenario).estimates)
+    >>> found.fault, found.time
+    ('f1', 11.0)
     """
     require_verified(design, unverified=unverified)
     chosen(kind, "kind", MONITOR_KINDS)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,6 +26,7 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import protect, protect_stream
 from obsynth.files.tables import text_table
 from obsynth.monitoring.thresholds.options import LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW, refuse_idle
+from obsynth.plants.signal_names import listed
 
 #: Rows from the alarm on at whose windows a proof is tried, in windows.
 _LATER = (0.0, 0.1, 0.25, 0.5, 0.95)
@@ -146,11 +146,8 @@ def summary_of_run(found: obsynth.types.DataRun, watched: obsynth.types.Monitor 
     counts = ", ".join(f"{count} {status}" for status, count in found.statuses.items())
     lines = [f"{found.rows} rows: {counts}."]
     if found.recovered:
-        kinds = Counter(found.recovered.values())
-        told = ", ".join(f"{count} {kind.replace('needs', 'with')}" for kind, count in kinds.items())
-        count = len(found.recovered)
-        states = "states of the plant as written are" if count > 1 else "state of the plant as written is"
-        lines.append(f"{count} {states} recovered as well: {told}.")
+        states = [f"{name} ({kind.replace('needs', 'with')})" for name, kind in found.recovered.items()]
+        lines.append(f"Also estimated, of the plant as written: {listed(states)}.")
     if found.outliers:
         told = ", ".join(f"{count} of {name}" for name, count in found.outliers.items())
         count = sum(found.outliers.values())
@@ -158,8 +155,9 @@ def summary_of_run(found: obsynth.types.DataRun, watched: obsynth.types.Monitor 
     for name, time in found.alarms.items():
         first = next((event for event in found.events if event.by == name), None)
         clear = watched is not None and name == watched.kind and first is not None and first.clear
-        fault = f"; it points to {first.fault}" if clear and first is not None else ""
-        lines.append(f"Alarm: {name} first above its threshold at {found.stamps.shown(time)}{fault}.")
+        fault = f" Probable fault: {first.fault}." if clear and first is not None else ""
+        by = f"threshold of {name}" if name in found.thresholds else f"monitor: {name}"
+        lines.append(f"First alarm {found.stamps.shown(time)} ({by}).{fault}")
     rows, more = alarm_rows(found.events, found.stamps.shown)
     table = [*(text_table(rows) if rows else []), *([f"and {more} more"] if more else [])]
     lines += [*(f"  {line}" for line in table), *alarm_notes(found.events)]

@@ -148,7 +148,7 @@ def run_report(options: argparse.Namespace) -> int:
     if options.out.suffix.lower() == ".json":
         return _run_robustness(options)
     if options.data is None:
-        own = ("gains", "unverified", "system", "out", "force", "json")
+        own = ("gains", "unverified", "system", "out", "force", "json", "command")
         refuse_given(options, [name for name in vars(options) if name not in own], "a log: give --data")
     from obsynth.report.page import PAGE, html_report
 
@@ -167,13 +167,14 @@ def run_report(options: argparse.Namespace) -> int:
         design,
         options.out,
         report=report,
-        gains_file=options.gains.name,
+        gains_file=str(options.gains),
         scenario=scenario,
         system_file=system,
         run=run,
         data_file=options.data,
         statement="" if watched is None else watched.statement,
         rows=options.rows,
+        command=options.command,
     )
     if mark := unverified_mark(report):
         print(f"Warning: {options.gains}: {mark}", file=sys.stderr)
@@ -185,7 +186,7 @@ def _run_robustness(options: argparse.Namespace) -> int:
     """Write what holds for every plant within its tolerances as a certificate."""
     refuse_given(
         options,
-        [name for name in vars(options) if name not in ("gains", "out", "force", "json")],
+        [name for name in vars(options) if name not in ("gains", "out", "force", "json", "command")],
         "the page: a certificate (.json) is of the gain set alone",
     )
     output_file(options.out, RESULT_FILE, options)

@@ -43,11 +43,9 @@ def run_thresholds(options: argparse.Namespace) -> int:
         )
     lines = [f"{found.statement[0].upper()}{found.statement[1:]}.", f"Monitored: {', '.join(found.columns)}."]
     if found.seldom:
-        lines.append(f"Not monitored, as most rows lack them: {', '.join(found.seldom)}.")
+        lines.append(f"Left out (missing in most rows): {', '.join(found.seldom)}.")
     if dependent := [name for name in found.left_out if name not in found.seldom]:
-        lines.append(
-            f"Not monitored, as they depend on the others or are correlated for too long: {', '.join(dependent)}."
-        )
+        lines.append(f"Left out (redundant or too slowly varying): {', '.join(dependent)}.")
     estimates_are_left_out = not any(name.startswith("fhat[") for name in found.columns)
     if found.left_out and expects_fault_courses(design) and estimates_are_left_out:
         lines.append(

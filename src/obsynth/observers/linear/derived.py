@@ -89,6 +89,14 @@ def sample_observer(observer: LinearObserver, dt: float) -> LinearObserver:
     ------
     SpecError
         The observer is discrete in time already, or ``dt`` is not positive and finite.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[-1.0, 0.5], [0.0, -2.0]], C=[[1, 0], [0, 1]], Bf=[[1], [0]])
+    >>> observer = obsynth.sample_observer(obsynth.pd_observer(plant, decay=2.0).observer, 0.01)
+    >>> observer.dt, observer.order
+    (0.01, 3)
     """
     if observer.dt > 0.0:
         raise SpecError(f"The observer is discrete in time already (dt = {observer.dt:g} s).", path="dt")

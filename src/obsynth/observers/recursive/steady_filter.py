@@ -97,6 +97,14 @@ def steady_state_filter(
     References
     ----------
     .. [MoussaAli2013] Fault diagnosis for linear time-varying descriptor systems, IFAC ALCOSP 2013, eq. (16).
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], dt=1.0)
+    >>> steady = obsynth.steady_state_filter(plant, Q=1.0, R=1.0)
+    >>> sorted(name for name in dir(steady) if not name.startswith("_"))
+    ['K', 'L', 'P', 'P_predicted', 'rate']
     """
     varying = as_time_varying(plant)
     if not varying.is_time_invariant:

@@ -58,6 +58,15 @@ def from_andes(
     SpecError
         ANDES is not installed (it is licensed under the GPL and no dependency of ours), it cannot read or solve the
         case, or a name is unknown.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.from_andes(  # a folder of the repository: a pencil that ANDES wrote
+    ...     "designs/smib", outputs={"GENCLS 1": ["omega"], "Bus 1": ["a", "v"]}, faults={"GENCLS 1": ["tm"]}
+    ... )
+    >>> plant.ny, plant.nf
+    (3, 1)
     """
     point: dict[str, float] = {}
     if isinstance(case, (str, Path)) and Path(case).is_dir():

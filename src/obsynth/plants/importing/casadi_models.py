@@ -55,6 +55,16 @@ def from_casadi(
     ----------
     .. [Andersson2019] J. Andersson et al., CasADi: a software framework for nonlinear optimization and optimal control,
        Math. Prog. Comp. 11 (1), 2019.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> import casadi
+    >>> x, p = casadi.SX.sym("x"), casadi.SX.sym("p")
+    >>> system = {"x": x, "p": p, "ode": -p * x, "y": x}
+    >>> model = obsynth.from_casadi(system, states={"x": 1.0}, parameters={"p": 0.5})
+    >>> model.nx, model.parameter_names
+    (1, ('p',))
     """
     casadi = imported("casadi", extra="nonlinear", what="A plant of CasADi")
     function = _function(casadi, system)

@@ -266,6 +266,13 @@ def from_fmu(
         fmpy is not installed, the file is no such FMU, or a name is unknown.
     PreconditionError
         The operating point is no equilibrium (a linear model of deviations would not be one), or none is found.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.from_fmu("plant.fmu", equilibrium=True)  # doctest: +SKIP
+    >>> plant.state_names  # doctest: +SKIP
+    ('level', 'temperature')
     """
     for name, value in (at or {}).items():
         real_number(value, f"at[{name!r}]", "a finite number", path="at")

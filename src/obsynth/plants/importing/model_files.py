@@ -82,6 +82,16 @@ def from_matlab(
     ------
     SpecError
         The file cannot be read, holds no such struct, or its matrices do not fit together.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> from tempfile import TemporaryDirectory
+    >>> from scipy.io import savemat
+    >>> with TemporaryDirectory() as folder:
+    ...     savemat(f"{folder}/plant.mat", {"A": [[-1.0]], "C": [[1.0]], "Ts": 0.0})
+    ...     print(obsynth.from_matlab(f"{folder}/plant.mat").A.tolist())
+    [[-1.0]]
     """
     source = path_of(path)
     content = _content(source)
@@ -192,6 +202,24 @@ def from_modelica(path: str | Path, **plant: Any) -> DescriptorSystem:
     -----
     The file does not hold the outputs at the operating point: add them by ``operating_point={...}``.  Constant terms
     are not in it either: linearise in a steady state.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import obsynth
+    >>> text = (
+    ...     "model linearized_model parameter Integer n = 1; parameter Integer m = 1; parameter Integer p = 1;"
+    ...     " parameter Real A[n, n] = [-1]; parameter Real B[n, m] = [1]; parameter Real C[p, n] = [1];"
+    ...     " parameter Real D[p, m] = [0]; Real 'x_level' = x[1]; Real 'u_inflow' = u[1]; Real 'y_gauge' = y[1];"
+    ...     " end linearized_model;"
+    ... )
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "linearized_model.mo"
+    ...     _ = file.write_text(text)
+    ...     plant = obsynth.from_modelica(file)
+    >>> plant.A.tolist()
+    [[-1.0]]
     """
     source = path_of(path)
     if not source.exists():

@@ -54,6 +54,13 @@ def from_control(
     ------
     SpecError
         It is no linear system, python-control is not installed, a name is unknown, or the sampling time is missing.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> import control
+    >>> obsynth.from_control(control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]])).A.tolist()
+    [[-1.0]]
     """
     control = imported("control", extra=None)
     if isinstance(system, control.TransferFunction):
@@ -106,6 +113,13 @@ def from_scipy(
     ------
     SpecError
         It is no linear system of scipy, a name is unknown, or a discrete system does not say its ``dt``.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> from scipy.signal import StateSpace
+    >>> obsynth.from_scipy(StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]])).A.tolist()
+    [[-1.0]]
     """
     signal = imported("scipy.signal", extra=None)
     require_kind(system, (signal.lti, signal.dlti), "system", "a scipy.signal.StateSpace")
@@ -156,6 +170,14 @@ def from_sympy(
     ------
     SpecError
         A symbol has no value, a value has no symbol, an entry is no real number, or sympy is not installed.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> import sympy
+    >>> m = sympy.Symbol("m")
+    >>> obsynth.from_sympy(sympy.Matrix([[-1 / m]]), C=sympy.Matrix([[1]]), parameters={m: 2.0}).A.tolist()
+    [[-0.5]]
     """
     sympy = imported("sympy", extra="sympy")
     given = {"A": A, "B": B, "C": C, **plant}
@@ -196,6 +218,14 @@ def from_pandas(A: Any, B: Any = None, C: Any = None, **plant: Any) -> Descripto
     ------
     SpecError
         Labels differ between frames, or are repeated.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> import pandas as pd
+    >>> A = pd.DataFrame([[-1.0, 0.5], [0.0, -2.0]], index=["a", "b"], columns=["a", "b"])
+    >>> obsynth.from_pandas(A, C=pd.DataFrame([[1.0, 0.0]], index=["gauge"], columns=["a", "b"])).output_names
+    ('gauge',)
     """
     return DescriptorSystem(**{"E": None, "A": A, "B": B, "C": C, **plant})
 

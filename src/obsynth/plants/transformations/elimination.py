@@ -69,6 +69,14 @@ def eliminate_algebraic_states(plant: DescriptorSystem | Transformation) -> Tran
     Up to 64 states the equations are solved in rational arithmetic and every entry is rounded once.  Beyond that, and
     where data were computed, results so small beside the terms they come from that they are only rounding are set to
     zero: the flags of the recovery depend on what is exactly zero.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(E=[[1, 0], [0, 0]], A=[[-1, 1], [1, -2]], C=[[1, 0]])
+    >>> reduced = obsynth.eliminate_algebraic_states(plant)
+    >>> reduced.plant.A.tolist(), reduced.plant.nx
+    ([[-0.5]], 1)
     """
     if isinstance(plant, Transformation):
         return plant.then(eliminate_algebraic_states(plant.plant))

@@ -65,6 +65,14 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
     References
     ----------
     .. [VanLoan1978] C. Van Loan, "Computing integrals involving the matrix exponential", IEEE TAC 23, 1978.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(A=[[-1.0]], B=[[1.0]], C=[[1.0]])
+    >>> sampled = obsynth.discretise(plant, 0.1).plant
+    >>> sampled.A.round(4).tolist(), sampled.B.round(4).tolist(), sampled.dt
+    ([[0.9048]], [[0.0952]], 0.1)
     """
     if isinstance(plant, Transformation):
         return plant.then(discretise(plant.plant, sample_time))

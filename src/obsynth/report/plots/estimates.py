@@ -25,6 +25,7 @@ from obsynth.report.plots.panels import (
     mark,
     new_panels,
     one_panel,
+    share_scale,
     tidy,
     with_unit,
 )
@@ -75,6 +76,19 @@ def plot_faults(
     ------
     SpecError
         ``faults`` has the wrong shape, or there are too few or too many axes.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> scenario = obsynth.Scenario(horizon=30, faults={"f1": obsynth.Step(size=1.0, start=10)})
+    >>> run = obsynth.simulate(design, scenario)
+    >>> axes = obsynth.plotting.plot_faults(run.estimates, faults=run.faults, dt=1.0)
+    >>> len(axes)
+    1
     """
     panels = new_panels(axes, len(estimates.fault_names))
     _draw(
@@ -88,6 +102,7 @@ def plot_faults(
         what="faults",
         delays=estimates.fault_delays,
     )
+    share_scale(panels, [(units or {}).get(name) for name in estimates.fault_names])
     for panel in panels:
         legend_above(panel)
     return panels
@@ -126,6 +141,25 @@ def plot_parameters(
     ------
     SpecError
         The true parameters have the wrong shape, or there are too few or too many axes.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.TimeVaryingDescriptorSystem(
+    ...     E=None,
+    ...     A=[["0.9 + 0.05 * sin(k)"]],
+    ...     C=[[1.0]],
+    ...     Phi=[[1.0]],
+    ...     dt=1.0,
+    ...     horizon=100,
+    ...     parameter_names=["leak"],
+    ... )
+    >>> design = obsynth.adaptive_observer(plant, Q=1e-4, R=1e-2, forgetting=0.95)
+    >>> scenario = obsynth.Scenario(horizon=99, faults={"leak": obsynth.Step(size=0.5, start=40)}, noise=1.0)
+    >>> run = obsynth.simulate(design, scenario)
+    >>> axes = obsynth.plotting.plot_parameters(run.estimates, parameters=run.parameters)
+    >>> len(axes)
+    1
     """
     panels = new_panels(axes, len(estimates.parameter_names))
     _draw(
@@ -140,6 +174,27 @@ def plot_parameters(
         deviations=estimates.parameter_deviations,
     )
     return panels
+
+
+#: Of more states the worst are drawn, unless axes or names are given.
+MOST_STATE_PANELS = 12
+
+
+def _worst_states(estimates: Estimates, states: ArrayLike | None) -> tuple[list[int], str]:
+    """Return the states with the largest errors, relative to their ranges, and a sentence that says so; without a truth
+    those with the widest bands."""
+    true, values = _matching(states, estimates.states.shape, "states"), estimates.states
+    if true is not None:
+        misses = [true[: len(true) - late, i] - values[late:, i] for i, late in enumerate(estimates.state_delays)]
+        size, ranges = np.array([np.nanmean(miss**2) ** 0.5 for miss in misses]), np.ptp(true, axis=0)
+        what = "largest errors relative to their ranges"
+    elif estimates.has_deviations:
+        size, ranges, what = np.nanmedian(estimates.state_deviations, axis=0), np.ptp(values, axis=0), "widest bands"
+    else:
+        size, ranges, what = np.ptp(values, axis=0), np.ones(values.shape[1]), "largest motion"
+    order = np.argsort(-size / np.where(ranges > 0.0, ranges, 1.0), kind="stable")[:MOST_STATE_PANELS]
+    told = f"The {MOST_STATE_PANELS} of {values.shape[1]} states with the {what}"
+    return [int(i) for i in order], told
 
 
 @arguments_checked
@@ -178,9 +233,25 @@ def plot_states(
     ------
     SpecError
         The true states have the wrong shape, a name is unknown, or there are too few or too many axes.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> scenario = obsynth.Scenario(horizon=30, faults={"f1": obsynth.Step(size=1.0, start=10)})
+    >>> run = obsynth.simulate(design, scenario)
+    >>> axes = obsynth.plotting.plot_states(run.estimates, states=run.states, dt=1.0)
+    >>> len(axes)
+    2
     """
     known = estimates.state_names
     chosen = range(len(known)) if names is None else [index_of(name, known, what="The estimates") for name in names]
+    told = ""
+    if names is None and axes is None and len(known) > MOST_STATE_PANELS:
+        chosen, told = _worst_states(estimates, states)
     panels = new_panels(axes, len(chosen))
     _draw(
         panels,
@@ -194,6 +265,8 @@ def plot_states(
         delays=estimates.state_delays,
         deviations=estimates.state_deviations if estimates.has_deviations else None,
     )
+    if told and (figure := panels[0].get_figure()) is not None:
+        figure.suptitle(told, fontsize="medium")
     return panels
 
 
@@ -296,6 +369,19 @@ def plot_residuals(
     ------
     SpecError
         A threshold has the wrong length, or there are more than three.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> scenario = obsynth.Scenario(horizon=30, faults={"f1": obsynth.Step(size=1.0, start=10)})
+    >>> run = obsynth.simulate(design, scenario)
+    >>> axes = obsynth.plotting.plot_residuals(run.estimates, dt=1.0)
+    >>> axes.get_xlabel()
+    'time (s)'
     """
     steps = len(estimates.residuals)
     named = threshold if isinstance(threshold, Mapping) else {} if threshold is None else {"threshold": threshold}
@@ -315,7 +401,7 @@ def plot_residuals(
             first = int(crossed[0])
             label = f"first above it at k = {first} ({time[first]:g} s)"
             mark(panel, time[first], size[first], label, marker=marker, color=style["color"])
-    return finish(panel, "norm of the residual")
+    return finish(panel, "norm of the residual\n(units of the outputs)")
 
 
 def _curve(value: ArrayLike, name: str, steps: int) -> FloatArray:

@@ -81,6 +81,17 @@ def estimate_gains(design: ObserverDesign, *, to: str = "faults") -> EstimateGai
     ------
     SpecError
         The design is recursive, or has no such output.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> gains = obsynth.plotting.estimate_gains(design)
+    >>> sorted(gains.gains)
+    ['disturbances', 'faults']
     """
     plant, observer = design.linear
     chosen(to, "to", tuple(TARGETS))
@@ -221,6 +232,16 @@ def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None 
     ------
     SpecError
         The design is recursive, or has no such output.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> obsynth.plotting.plot_gains(design).get_xlabel()
+    'frequency (rad/s)'
     """
     found, target = estimate_gains(design, to=to), TARGETS.get(to, "")
     panel = one_panel(axes, size=(WIDTH, 4.0))
@@ -241,7 +262,7 @@ def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None 
     plain_decades(panel)
     plain_decades(panel, across=True)
     panel.set_xlabel("frequency (rad/s)")
-    panel.set_ylabel("singular value")
+    panel.set_ylabel("singular value\n(unit of the estimate / of the input)")
     if found.gains:
         panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
     else:

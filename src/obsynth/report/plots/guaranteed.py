@@ -10,7 +10,17 @@ from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.observers.estimates import Estimates
-from obsynth.report.plots.panels import PANEL_HEIGHT, WIDTH, finish, one_panel, plain_decades, with_unit
+from obsynth.report.plots.panels import (
+    BAND_STYLE,
+    LINE_COLOURS,
+    PANEL_HEIGHT,
+    RESIDUAL_STYLE,
+    WIDTH,
+    finish,
+    one_panel,
+    plain_decades,
+    with_unit,
+)
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:
@@ -45,6 +55,21 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
     ------
     SpecError
         The design is by another method.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]],
+    ...     C=[[1, 0], [0, 1]],
+    ...     Bf=[[1], [0]],
+    ...     Bd=[[0], [1]],
+    ...     dt=1.0,
+    ...     sensor_noise={"y1": 0.1, "y2": 0.1},
+    ... )
+    >>> test = obsynth.guaranteed_test(plant, disturbance_bounds=0.1, noise_bound=3)
+    >>> obsynth.plotting.plot_least_thresholds(test).get_xlabel()
+    'from the step to the last sample (s)'
     """
     found = GuaranteedTest.of(design)
     panel = one_panel(axes, size=(WIDTH, 1.6 * PANEL_HEIGHT))
@@ -97,17 +122,36 @@ def plot_intervals(design: ObserverDesign, estimates: Estimates, *, axes: Axes |
     ------
     SpecError
         The design is by another method.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]],
+    ...     C=[[1, 0], [0, 1]],
+    ...     Bf=[[1], [0]],
+    ...     Bd=[[0], [1]],
+    ...     dt=1.0,
+    ...     sensor_noise={"y1": 0.1, "y2": 0.1},
+    ... )
+    >>> test = obsynth.guaranteed_test(
+    ...     plant, course="constant", disturbance_bounds=0.1, noise_bound=3, exact=True
+    ... )
+    >>> scenario = obsynth.Scenario(horizon=30, faults={"f1": obsynth.Step(size=1.0, start=10)})
+    >>> run = obsynth.simulate(test, scenario)
+    >>> obsynth.plotting.plot_intervals(test, run.estimates).get_xlabel()
+    'time (s)'
     """
     found = GuaranteedTest.of(design)
     panel = one_panel(axes, size=(WIDTH, 1.6 * PANEL_HEIGHT))
     low, high = found.interval(estimates)
     seconds = np.arange(len(low)) * found.observer.dt
-    panel.fill_between(seconds, low, high, color="0.85", label="interval")
-    panel.plot(seconds, found.residual(estimates), color="black", linewidth=1.0, label="residual")
+    panel.fill_between(seconds, low, high, label="interval", **BAND_STYLE)
+    panel.plot(seconds, found.residual(estimates), label="residual", **RESIDUAL_STYLE)
     panel.axhline(0.0, color="0.4", linewidth=0.8)
     alarms = np.flatnonzero(found.alarms(estimates))
     if alarms.size:
-        panel.axvline(float(seconds[alarms[0]]), color="tab:red", linestyle="--", label="alarm")
+        panel.axvline(float(seconds[alarms[0]]), color="#B2182B", linestyle=":", label="alarm")
     return finish(panel, with_unit(found.fault, found.plant.units))
 
 
@@ -133,6 +177,21 @@ def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes
     ------
     SpecError
         The design is by another method, or nothing hides the fault.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]],
+    ...     C=[[1, 0], [0, 1]],
+    ...     Bf=[[1], [0]],
+    ...     Bd=[[0], [1]],
+    ...     dt=1.0,
+    ...     sensor_noise={"y1": 0.1, "y2": 0.1},
+    ... )
+    >>> test = obsynth.guaranteed_test(plant, disturbance_bounds=0.1, noise_bound=3)
+    >>> obsynth.plotting.plot_hidden_course(test).get_xlabel()
+    'time (s)'
     """
     found = GuaranteedTest.of(design)
     plant, courses = found.plant, found.hidden_course(fault)
@@ -145,12 +204,13 @@ def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes
     largest = max(sizes.values())
     shown = [name for name in courses if sizes[name] > ROUNDED_COURSE * largest]
     # Faults first, then disturbances, then states.
-    for name in sorted(shown, key=lambda name: ("-", "--", ":").index(styles.get(name, ":"))):
+    for i, name in enumerate(sorted(shown, key=lambda name: ("-", "--", ":").index(styles.get(name, ":")))):
         style, unit = styles.get(name, ":"), plant.units.get(name, "")
         panel.plot(
             np.arange(len(courses[name])) * found.observer.dt,
             courses[name] / sizes[name],
             style,
+            color=LINE_COLOURS[i % len(LINE_COLOURS)],
             # What acts on a sampled plant is held between samples.
             drawstyle="default" if style == ":" else "steps-post",
             linewidth=1.0 if style == ":" else 1.8,

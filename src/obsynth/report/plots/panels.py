@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,23 +27,30 @@ PANEL_HEIGHT = 2.2
 #: Dots per inch of a picture made of dots: sharp on a screen that shows two for each pixel.
 RESOLUTION = 160
 
-#: The true signal lies under the estimate: wide, grey, solid.  The estimate on it: thin, dark, dashed.
-TRUE_STYLE: dict[str, Any] = {"color": "0.72", "linewidth": 4.0, "linestyle": "-", "solid_capstyle": "butt"}
+#: Okabe and Ito's colours, which most eyes that see no red distinguish, with the two brightest made darker: each has a
+#: contrast of 3 to 1 with white.
+LINE_COLOURS = ("black", "#0072B2", "#D55E00", "#008F66", "#A3478A", "#8A6200")
 
-#: Colours that are distinguished in print and by most eyes that see no red, by Okabe and Ito.
-LINE_COLOURS = ("black", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
+#: In every picture the truth is black and solid, an estimate coloured, an interval shaded, a threshold dashed.  The
+#: estimate is thinner, and lighter in print, so that it is seen on the truth.
+TRUE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 2.6, "linestyle": "-", "solid_capstyle": "butt"}
 
-ESTIMATE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 1.1, "linestyle": "--"}
+ESTIMATE_STYLE: dict[str, Any] = {"color": "#D55E00", "linewidth": 1.2, "linestyle": "-", "zorder": 2.2}
 
-RESIDUAL_STYLE: dict[str, Any] = {"color": "black", "linewidth": 1.0, "linestyle": "-"}
+MEASURED_STYLE: dict[str, Any] = {"color": "0.55", "linewidth": 2.4, "linestyle": "-", "solid_capstyle": "butt"}
 
-BAND_STYLE: dict[str, Any] = {"color": "tab:blue", "alpha": 0.25, "linewidth": 0.0}
+RESIDUAL_STYLE: dict[str, Any] = {"color": "#0072B2", "linewidth": 1.0, "linestyle": "-"}
+
+BAND_STYLE: dict[str, Any] = {"color": "#D55E00", "alpha": 0.22, "linewidth": 0.0}
+
+#: An interval that the data contradict.
+CONTRADICTED_STYLE: dict[str, Any] = {"facecolor": "none", "edgecolor": "0.6", "hatch": "////", "linewidth": 0.0}
 
 #: One line style for each threshold, in order.
 THRESHOLD_STYLES: tuple[dict[str, Any], ...] = (
-    {"color": "tab:red", "linewidth": 1.6, "linestyle": "--"},
-    {"color": "tab:blue", "linewidth": 1.6, "linestyle": "-."},
-    {"color": "tab:green", "linewidth": 1.6, "linestyle": ":"},
+    {"color": "#B2182B", "linewidth": 1.6, "linestyle": "--"},
+    {"color": "#5E3C99", "linewidth": 1.6, "linestyle": "-."},
+    {"color": "#00695C", "linewidth": 1.6, "linestyle": ":"},
 )
 
 #: A ring where something happens.
@@ -55,6 +63,8 @@ MARK_STYLE: dict[str, Any] = {
 
 #: Units of a long time: its name, its seconds, and how many of it a record is longer than that is drawn in it.
 LONG_UNITS = (("d", 86400, 4), ("h", 3600, 3), ("min", 60, 10))
+#: Letters of a line beside a panel: longer names are broken.
+LABEL_LETTERS = 24
 
 #: Letters of small print that fit in an inch, and those that the sample of a line takes.
 LETTERS_PER_INCH, KEY_LETTERS = 12.5, 8
@@ -140,6 +150,8 @@ def tidy(panel: Axes) -> None:
     for side in ("top", "right"):
         panel.spines[side].set_visible(False)
     panel.margins(x=0.01)
+    if "\n" not in (label := panel.get_ylabel()):
+        panel.set_ylabel(fill(label, LABEL_LETTERS, break_long_words=False))
     # A factor such as 1e-5 stands at the right: at the left is the legend.
     panel.yaxis.set_offset_position("right")
     names_as_they_are(panel)
@@ -232,6 +244,25 @@ def short_dates(panel: Axes, zone: tzinfo | None) -> None:
     panel.xaxis.set_major_locator(locator)
     panel.xaxis.set_major_formatter(make_formatter(locator, tz=zone))
     panel.set_xlabel("time" if zone is None else f"time ({zone})")
+
+
+def share_scale(panels: Sequence[Axes], units: Sequence[str | None]) -> None:
+    """Give panels of signals in one unit one scale, so that noise does not look as large as a fault.
+
+    Signals without a stated unit share a scale where their ranges differ by less than `UNLIKE_RANGES`.
+    """
+    for unit in dict.fromkeys(units):
+        alike = [panel for panel, own in zip(panels, units, strict=True) if own == unit]
+        ranges = [panel.get_ylim() for panel in alike]
+        spans = [high - low for low, high in ranges]
+        if len(alike) < 2 or (not unit and max(spans) > UNLIKE_RANGES * min(spans)):
+            continue
+        for panel in alike:
+            panel.set_ylim(min(low for low, _ in ranges), max(high for _, high in ranges))
+
+
+#: Signals whose ranges differ by this factor, and whose units nobody states, are not compared.
+UNLIKE_RANGES = 100.0
 
 
 def with_unit(name: str, units: Mapping[str, str] | None) -> str:

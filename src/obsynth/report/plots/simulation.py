@@ -52,7 +52,7 @@ _DETECTIONS = {
 NOISY_SHARE = 0.05
 
 #: Such a band lies under the truth.
-_BAND_LINE = {"color": "0.7", "linewidth": 0.6, "linestyle": "-", "zorder": 1.8}
+_BAND_LINE = {"linewidth": 0.6, "zorder": 1.8}
 
 _TRUTH_ON_BAND = {"color": "black", "linewidth": 1.8, "zorder": 2.5}
 
@@ -85,6 +85,25 @@ def plot_decision(decision: Decision, *, dt: float = 1.0, axes: Axes | None = No
     ------
     SpecError
         Never for a decision as `obsynth.decide` makes it.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.TimeVaryingDescriptorSystem(
+    ...     E=None,
+    ...     A=[["0.9 + 0.05 * sin(k)"]],
+    ...     C=[[1.0]],
+    ...     Phi=[[1.0]],
+    ...     dt=1.0,
+    ...     horizon=100,
+    ...     parameter_names=["leak"],
+    ... )
+    >>> design = obsynth.adaptive_observer(plant, Q=1e-4, R=1e-2, forgetting=0.95)
+    >>> scenario = obsynth.Scenario(horizon=99, faults={"leak": obsynth.Step(size=0.5, start=40)}, noise=1.0)
+    >>> run = obsynth.simulate(design, scenario)
+    >>> decision = obsynth.decide(design.observer, run.estimates, nominal=[0.0])
+    >>> obsynth.plotting.plot_decision(decision).get_xlabel()
+    'time (s)'
     """
     panel = one_panel(axes)
     time = dt * np.arange(len(decision.values))
@@ -131,6 +150,18 @@ def plot_simulation(
     ------
     SpecError
         There are too few or too many axes.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> scenario = obsynth.Scenario(horizon=30, faults={"f1": obsynth.Step(size=1.0, start=10)})
+    >>> axes = obsynth.plotting.plot_simulation(obsynth.simulate(design, scenario))
+    >>> axes[-1].get_xlabel()
+    'time (s)'
     """
     dt = float(simulation.time[1]) if len(simulation.time) > 1 else 1.0
     count = len(simulation.estimates.fault_names)
@@ -184,6 +215,22 @@ def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None)
     ------
     SpecError
         Never for a detection as `obsynth.types.Monitor` makes it.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> scenario = obsynth.Scenario(
+    ...     horizon=30,
+    ...     faults={"f1": obsynth.Step(size=1.0, start=10)},
+    ...     disturbances={"d1": obsynth.Uniform(low=-0.1, high=0.1)},
+    ... )
+    >>> found = obsynth.monitor(design, scenario).watch(obsynth.simulate(design, scenario).estimates)
+    >>> obsynth.plotting.plot_detection(found, dt=1.0).get_xlabel()
+    'time (s)'
     """
     panel = one_panel(axes)
     time = dt * np.arange(len(detection.values))

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.ticker import NullLocator
 
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.methods.registry import REGISTRY, method_class
@@ -75,6 +76,16 @@ def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
     ------
     SpecError
         The design is recursive.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> design = obsynth.ui_pi_observer(plant, decay=0.5)
+    >>> obsynth.plotting.plot_poles(design).get_xlabel()
+    'real part'
     """
     plant, observer = design.linear
     sampled = observer.dt > 0.0
@@ -88,7 +99,8 @@ def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
         _continuous_plane(axes, poles, zeros)
     _draw_region(axes, region_asked_for(design))
     axes.plot(poles.real, poles.imag, label=f"observer eigenvalues ({len(poles)})", **_POLE_MARKS)
-    axes.plot(zeros.real, zeros.imag, label=f"fault zeros ({len(zeros)})", **_ZEROS)
+    if zeros.size:
+        axes.plot(zeros.real, zeros.imag, label=f"fault zeros ({len(zeros)})", **_ZEROS)
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
     return axes
 
@@ -101,6 +113,7 @@ def _discrete_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> Non
     reach = 1.1 * max(1.05, float(np.max(np.abs(np.concatenate([poles, zeros])), initial=0.0)))
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-reach, reach)
+    _damping_grid(axes, sampled=True)
     axes.set_xlabel("real part")
     axes.set_ylabel("imaginary part")
 
@@ -118,12 +131,42 @@ def _continuous_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> N
             limits(-1.0, 1.0)
         elif alive.max() > WIDE_RATES * alive.min():
             scale("symlog", linthresh=float(alive.min()))
+            axis = axes.xaxis if scale == axes.set_xscale else axes.yaxis
+            locator: Any = axis.get_major_locator()
+            locator.set_params(numticks=MOST_DECADE_TICKS)
+            axis.set_minor_locator(NullLocator())
             limits(*(side * 3.0 * float(max(np.max(side * values), alive.min())) for side in (-1.0, 1.0)))
         else:
             reach = 0.15 * float(alive.max())
             limits(float(min(np.min(values), 0.0)) - reach, float(max(np.max(values), 0.0)) + reach)
+    _damping_grid(axes, sampled=False)
     axes.set_xlabel("real part (1/s)")
     axes.set_ylabel("imaginary part (1/s)")
+
+
+#: Damping ratios of the grid behind poles, and the natural frequencies along its lines: many decades in 1/s, of sampled
+#: poles rad per sample.
+DAMPING_RATIOS = (0.2, 0.4, 0.6, 0.8)
+RATES = np.concatenate([[0.0], np.geomspace(1e-9, 1e9, 400)])
+RATES_PER_SAMPLE = np.linspace(0.0, np.pi, 200)
+#: Ticks of a logarithmic axis on both sides of zero.
+MOST_DECADE_TICKS = 7
+
+
+def _damping_grid(axes: Axes, *, sampled: bool) -> None:
+    """Draw where poles have the same damping ratio, each line with its ratio, within the limits of the axes."""
+    limits = axes.get_xlim(), axes.get_ylim()
+    for ratio in DAMPING_RATIOS:
+        pole = -ratio + 1j * np.sqrt(1.0 - ratio**2)
+        line = np.exp(RATES_PER_SAMPLE / pole.imag * pole) if sampled else RATES * pole
+        for side in (line, line.conj()):
+            axes.plot(side.real, side.imag, color="0.85", linewidth=0.7, zorder=0)
+        inside = (line.real > limits[0][0]) & (line.real < limits[0][1]) & (line.imag < limits[1][1])
+        if inside.any():
+            place = line[np.flatnonzero(inside)[len(line) // 3 if sampled else -1]]
+            axes.annotate(f"{ratio:g}", (place.real, place.imag), color="0.45", fontsize=7, ha="right", va="top")
+    axes.set_xlim(*limits[0])
+    axes.set_ylim(*limits[1])
 
 
 def region_asked_for(design: ObserverDesign) -> list[Excess]:

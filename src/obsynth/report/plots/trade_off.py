@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arguments import arguments_checked, is_number
-from obsynth.report.plots.panels import PANEL_HEIGHT, WIDE_AXIS, WIDTH, new_panels, plain_decades, tidy
+from obsynth.report.plots.panels import PANEL_HEIGHT, WIDE_AXIS, WIDTH, new_panels, plain_decades, tidy, with_unit
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:
@@ -60,6 +61,17 @@ def plot_trade_off(
     ------
     SpecError
         No design, or one that has no such number (the names that it has are listed).
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
+    ... )
+    >>> designs = [obsynth.ui_pi_observer(plant, decay=decay) for decay in (0.2, 0.5, 1.0)]
+    >>> axes = obsynth.plotting.plot_trade_off(designs, "decay", "noise_amplification")
+    >>> len(axes)
+    1
     """
     if len(designs) == 0:
         raise SpecError("A trade-off needs designs: give at least one.", path="designs")
@@ -73,12 +85,19 @@ def plot_trade_off(
         for values in (x, y):
             if values.min() > 0.0 and values.max() > WIDE_AXIS * values.min():
                 plain_decades(panel, across=values is x)
-        panel.set_ylabel(name)
+        panel.set_ylabel(_claim_label(name, [design.method for design in designs]))
         tidy(panel)
         panel.margins(x=0.03)
     if panels:
-        panels[-1].set_xlabel(along)
+        panels[-1].set_xlabel(_claim_label(along, [design.method for design in designs]))
     return panels
+
+
+def _claim_label(name: str, methods: Sequence[str]) -> str:
+    """Return the name of a claim with its unit, as the methods state it."""
+    known = (method_class(method).claims for method in dict.fromkeys(methods) if method in REGISTRY)
+    found = next((claims[name.partition("[")[0]] for claims in known if name.partition("[")[0] in claims), None)
+    return with_unit(name.replace("_", " "), {name.replace("_", " "): found.unit if found else ""})
 
 
 def _number(design: ObserverDesign, name: str) -> float:
@@ -98,8 +117,8 @@ def plot_sweep(results: Sequence[Any], claim: str | None = None, *, parameter: s
     """Draw a claim of every case over a parameter, one line for each combination of the others."""
     import matplotlib.pyplot as plt
 
-    claim = _claim(results, claim)
     along = _parameter(results, parameter)
+    claim = _claim(results, claim, along)
     figure, panel = plt.subplots(figsize=(WIDTH, SWEEP_HEIGHT), layout="constrained")
     lines: dict[str, list[tuple[float, Any]]] = {}
     for number, result in enumerate(results, 1):
@@ -134,18 +153,20 @@ def plot_sweep(results: Sequence[Any], claim: str | None = None, *, parameter: s
         panel.set_yscale("log")
     if along is not None and _spread([place for points in lines.values() for place, _ in points]):
         panel.set_xscale("log")
-    panel.set_xlabel("case" if along is None else along)
-    panel.set_ylabel(claim)
+    panel.set_xlabel("case" if along is None else _claim_label(along, [result.method for result in results]))
+    panel.set_ylabel(_claim_label(claim, [result.method for result in results]))
     tidy(panel)
     if panel.get_legend_handles_labels()[1]:
         panel.legend(frameon=False, fontsize="small")
     return figure
 
 
-def _claim(results: Sequence[Any], claim: str | None) -> str:
+def _claim(results: Sequence[Any], claim: str | None, along: str | None) -> str:
+    """Return the claim that is drawn: by default the most frequent one that is not the parameter itself."""
     counts: Counter[str] = Counter(name for result in results for name in result.claims)
     if claim is None and counts:
-        return max(counts, key=lambda name: counts[name])
+        varied = "" if along is None else along.rpartition(".")[2]
+        return max(counts, key=lambda name: (name != varied, counts[name]))
     if claim is None or claim not in counts:
         known = ", ".join(counts) or "none"
         raise SpecError(f"No design of the sweep claims {claim!r}; there are: {known}.", path="claim")

@@ -42,10 +42,26 @@ def plot_tolerances(study: ToleranceStudy, *, axes: Iterable[Axes] | None = None
     ------
     SpecError
         The argument is something else, or there are too few or too many axes.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.uncertain_system(
+    ...     {"A": [["a"]], "B": [[1]], "C": [[1]], "Bf": [[1]], "dt": 1.0},
+    ...     {"a": {"nominal": 0.5, "tolerance": "5 %"}},
+    ... )
+    >>> design = obsynth.fault_estimation_filter(plant)
+    >>> scenario = obsynth.Scenario(
+    ...     horizon=20, inputs={"u1": obsynth.Step(size=1.0)}, faults={"f1": obsynth.Step(size=1.0, start=10)}
+    ... )
+    >>> study = obsynth.tolerance_study(design, scenario, tolerances=(0.0, 0.05), runs=4)
+    >>> axes = obsynth.plotting.plot_tolerances(study)
+    >>> len(axes)
+    2
     """
     panels = new_panels(axes, 2, size=(WIDTH, 2.0 * PANEL_HEIGHT + 0.8))
     unit = f" ({study.unit})" if study.unit else ""
-    labels = ("runs with a\nfalse alarm (%)", f"least {study.fault}\nfound in every run{unit}")
+    labels = ("runs with a\nfalse alarm (%)", f"smallest {study.fault}\ndetected in every run{unit}")
     across = 100.0 * study.tolerances
     least = np.where(np.isfinite(study.least_faults), study.least_faults, np.nan)
     for panel, values, label in zip(panels, (100.0 * study.false_alarms, least), labels, strict=True):

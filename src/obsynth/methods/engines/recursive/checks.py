@@ -152,7 +152,7 @@ def _dynamic_rows(
             kind="equality",
             detail=said,
         )
-    # Where both hold the same matrices, they need not be computed twice.
+    # Where both hold the same matrices, they need not be recomputed.
     proof = horizon_proof(observer if same else stated, observer, looked_at(observer), gains=gains)
     yield _contraction_row(facts, proof)
     if proof is not None:
@@ -193,7 +193,7 @@ def _contraction_row(facts: GainScheduleSummary, proof: HorizonProof | None) -> 
     value = proof.contraction if proof is not None and proved else facts.contraction
     if facts.steps < STEPS_TO_CONTRACT:
         return information(
-            "contraction", claim, value, source=source, detail=detail, status="proved" if proved else "computed twice"
+            "contraction", claim, value, source=source, detail=detail, status="proved" if proved else "recomputed"
         )
     return upper_bound_check(
         "contraction",

@@ -1,0 +1,97 @@
+"""What a page says first: what can be detected, how small, how soon, and with which rate of false alarms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from html import escape
+from statistics import NormalDist
+from typing import TYPE_CHECKING
+
+from obsynth.methods.guaranteed_test.method import is_guaranteed
+from obsynth.methods.guaranteed_test.result import GuaranteedTest
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.report.designs import estimate_figures, followed_steps, gains_if_linear
+from obsynth.results.layout import duration, number
+
+if TYPE_CHECKING:
+    from obsynth.monitoring.logs.run import DataRun
+    from obsynth.results.design import ObserverDesign
+
+#: A level of so many standard deviations is named for estimates with noise.
+DEVIATIONS = 5
+#: Share of the samples of Gaussian noise beyond that level, on either side.
+BEYOND = 2.0 * NormalDist().cdf(-float(DEVIATIONS))
+#: Faults that are told.
+MOST_TOLD = 6
+
+
+def headline(design: ObserverDesign, run: DataRun | None) -> Iterator[str]:
+    """Yield the first lines of a page: what happened in a log, then what the design can detect."""
+    if run is not None:
+        yield _of_run(run)
+    lines = list(_of_test(GuaranteedTest.of(design)) if is_guaranteed(design) else _of_estimates(design))
+    if lines:
+        yield "<h2>What can be detected</h2>"
+        yield "<ul>"
+        yield from (f"<li>{escape(line)}</li>" for line in lines[:MOST_TOLD])
+        yield "</ul>"
+        if len(lines) > MOST_TOLD:
+            yield f'<p class="soft">and {len(lines) - MOST_TOLD} more: see Claims.</p>'
+
+
+def _of_run(run: DataRun) -> str:
+    if not run.events:
+        watched = run.statement or run.thresholds
+        told = f"No alarm in {run.rows} rows." if watched else f"{run.rows} rows; nothing was monitored."
+        return f'<p class="verdict holds">{told}</p>'
+    first = run.events[0]
+    named = f" Probable fault: {first.fault}." if first.clear else ""
+    more = f" {len(run.events)} alarms in all." if len(run.events) > 1 else ""
+    return f'<p class="verdict fails">ALARM from {escape(run.stamps.shown(first.start))} on.{escape(named)}{more}</p>'
+
+
+def _of_test(test: GuaranteedTest) -> Iterator[str]:
+    """Yield what a guaranteed test detects: its numbers are proved."""
+    unit = test.plant.units.get(test.fault, "")
+    if len(test.tests) > 1:
+        for own in test.tests:
+            size = _size(own.threshold, test.plant.units.get(own.fault, ""))
+            yield f"{own.fault}: estimated within {size}, proved."
+        return
+    claims = test.certificate.claims
+    soon = f", at the latest after {duration(claims['delay'])}" if "delay" in claims else ""
+    sure = claims.get("surely_found", 2.0 * test.threshold)
+    yield (
+        f"{test.fault}: {_size(sure, unit)} is certain to be detected{soon}; no false alarm while disturbances and "
+        "noise keep their bounds (proved)."
+    )
+
+
+def _of_estimates(design: ObserverDesign) -> Iterator[str]:
+    """Yield for each fault how small a step exceeds the noise of its estimate, how soon, and what looks like it."""
+    observer = design.observer
+    steps = followed_steps(design) if isinstance(observer, LinearObserver) else {}
+    for figures in estimate_figures(design, gains_if_linear(design)):
+        name, unit = figures["name"], figures["unit"] or ""
+        told = f"{name}: "
+        deviation = figures["deviation"]
+        if deviation is not None and math.isfinite(deviation) and deviation > 0.0:
+            told += (
+                f"{_size(DEVIATIONS * deviation, unit)} exceeds {DEVIATIONS} standard deviations of the noise (false "
+                f"alarms: about 1 in {number(1.0 / BEYOND, digits=2)} samples, if the model is exact)"
+            )
+        else:
+            told += "no sensor noise is stated, so that no smallest size is known"
+        found = steps.get(name)
+        if found is not None and found.reaches:
+            told += f"; 90 % of a step is reached after {duration(found.most)}"
+        elif figures["delay"]:
+            told += f"; delay {duration(figures['delay_seconds'])}"
+        if gain := figures.get("largest_gain", 0.0):
+            told += f"; {figures['largest_gain_from']} of 1 moves the estimate by up to {number(gain, digits=3)}"
+        yield f"{told}."
+
+
+def _size(value: float, unit: str) -> str:
+    return f"{number(value, digits=3)} {'' if unit == '1' else unit}".strip()
