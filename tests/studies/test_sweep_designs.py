@@ -144,7 +144,7 @@ def test_plants_in_memory():
     assert found.results[0].name.startswith("one")
     assert found.counts["designed"] == 4
     figure = found.plot("gamma_min")
-    assert figure.axes[0].get_ylabel() == "gamma_min"
+    assert figure.axes[0].get_ylabel() == "gamma min"
     plt.close(figure)
 
 

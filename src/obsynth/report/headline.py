@@ -30,14 +30,14 @@ def headline(design: ObserverDesign, run: DataRun | None) -> Iterator[str]:
     """Yield the first lines of a page: what happened in a log, then what the design can detect."""
     if run is not None:
         yield _of_run(run)
+    if not design.report.passed:
+        return  # nothing that such a design claims is told as what it can do
     lines = list(_of_test(GuaranteedTest.of(design)) if is_guaranteed(design) else _of_estimates(design))
     if lines:
-        yield "<h2>What can be detected</h2>"
-        yield "<ul>"
+        yield '<div class="detected"><strong>What can be detected</strong><ul>'
         yield from (f"<li>{escape(line)}</li>" for line in lines[:MOST_TOLD])
-        yield "</ul>"
-        if len(lines) > MOST_TOLD:
-            yield f'<p class="soft">and {len(lines) - MOST_TOLD} more: see Claims.</p>'
+        more = len(lines) - MOST_TOLD
+        yield f"</ul>{f'<p>and {more} more: see Claims.</p>' if more > 0 else ''}</div>"
 
 
 def _of_run(run: DataRun) -> str:

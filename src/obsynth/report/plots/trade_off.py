@@ -153,8 +153,10 @@ def plot_sweep(results: Sequence[Any], claim: str | None = None, *, parameter: s
         panel.set_yscale("log")
     if along is not None and _spread([place for points in lines.values() for place, _ in points]):
         panel.set_xscale("log")
-    panel.set_xlabel("case" if along is None else _claim_label(along, [result.method for result in results]))
-    panel.set_ylabel(_claim_label(claim, [result.method for result in results]))
+    panel.set_xlabel(
+        "case" if along is None else _claim_label(along, [result.facts.get("method", "") for result in results])
+    )
+    panel.set_ylabel(_claim_label(claim, [result.facts.get("method", "") for result in results]))
     tidy(panel)
     if panel.get_legend_handles_labels()[1]:
         panel.legend(frameon=False, fontsize="small")
