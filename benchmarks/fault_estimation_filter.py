@@ -23,7 +23,7 @@ import numpy as np
 
 import obsynth
 from obsynth.analysis.existence.restricted_equivalent import prepare
-from obsynth.methods.fault_estimation_filter.synthesis import gain_problem, with_weight_limit
+from obsynth.methods.fault_estimation_filter.convex_problem import gain_problem, with_weight_limit
 from obsynth.numerics.injection_problem import GainProblem
 from obsynth.numerics.norms import hinf_norm
 from obsynth.proofs.definiteness import prove_positive_definite

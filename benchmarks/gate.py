@@ -36,7 +36,7 @@ from run_on_data import made_up
 
 import obsynth
 from obsynth.analysis.existence.restricted_equivalent import prepare
-from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
+from obsynth.methods.fault_estimation_filter.convex_problem import gain_problem
 
 HERE = Path(__file__).resolve().parent
 ROOT, BOUNDS = HERE.parent, HERE / "gate_bounds.json"

@@ -130,7 +130,7 @@ def least_gains(first: int, cases: int) -> None:
     from benchmarks.campaigns.conditions import _plant
 
     from obsynth.analysis.existence.wang2015 import examine_fault_filter
-    from obsynth.methods.fault_estimation_filter.synthesis import centred, gain_problem
+    from obsynth.methods.fault_estimation_filter.convex_problem import centred, gain_problem
     from obsynth.numerics.central_filter import NEGLIGIBLE_GAIN, search_least_gain
 
     for seed in range(first, first + cases):

@@ -16,7 +16,7 @@ from benchmarks.campaigns.frame import Outcome
 
 import obsynth
 from obsynth.analysis.existence.wang2015 import examine_fault_filter
-from obsynth.methods.fault_estimation_filter.synthesis import _gains, centred, gain_problem
+from obsynth.methods.fault_estimation_filter.convex_problem import _gains, centred, gain_problem
 from obsynth.numerics.central_filter import search_least_gain
 
 CASES = 50

@@ -16,7 +16,7 @@ import obsynth
 from obsynth import conditions
 from obsynth.analysis.existence.wang2015 import examine_fault_filter
 from obsynth.conditions.wang import error_norm
-from obsynth.methods.fault_estimation_filter.synthesis import _gains, centred, gain_problem
+from obsynth.methods.fault_estimation_filter.convex_problem import centred, gain_problem, gains_in_given_units
 from obsynth.methods.pd_observer import inequalities
 from obsynth.methods.pd_observer.realisation import with_faults_as_states
 from obsynth.numerics.central_filter import least_level, search_least_gain
@@ -84,7 +84,7 @@ def test_least_gains_agree(name):
     found.problem.solve(solver="CLARABEL")
     assert error_norm(plant, found.gains()) >= gain - 1e-6 * max(gain, 1.0)
     _, prepared, parts = engine_problem(plant)
-    gains = _gains(prepared, parts, least(name).injection)
+    gains = gains_in_given_units(prepared, parts, least(name).injection)
     level = gain + 1e-6 * max(gain, 1.0)
     design = obsynth.design_from_gains(plant, "fault-estimation-filter", **{x: gains[x] for x in "TNLW"}, gamma=level)
     assert design.report["LMI"].passed

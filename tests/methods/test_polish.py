@@ -10,7 +10,7 @@ import pytest
 
 import obsynth
 from obsynth.errors import SolverError
-from obsynth.methods.fault_estimation_filter import synthesis
+from obsynth.methods.fault_estimation_filter import small_gains
 
 
 def plant(nd: int) -> obsynth.DescriptorSystem:
@@ -72,7 +72,7 @@ def test_a_solver_that_fails_costs_the_polish_only(monkeypatch: pytest.MonkeyPat
     def broken(_problem: object, what: str, _solver: str) -> None:
         raise SolverError("broken", record={"what": what, "solver": "CLARABEL", "status": "failed"})
 
-    monkeypatch.setattr(synthesis, "solved", broken)
+    monkeypatch.setattr(small_gains, "solved", broken)
     design = obsynth.fault_estimation_filter(plant(nd=9), engine="lmi")
     assert design.report.passed
     outcomes = [run["outcome"] for run in design.solver["runs"] if run["solver"] == "CLARABEL"]

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from obsynth.numerics.central_filter import NOISE_WEIGHTS, USUAL_WEIGHT, GammaIteration, last_found
+from obsynth.numerics.central_filter import NOISE_WEIGHTS, USUAL_WEIGHT, last_found
 from obsynth.numerics.injection_problem import Injection
+from obsynth.numerics.least_level import GammaIteration
 
 TOLERANCE = 1e-7
 

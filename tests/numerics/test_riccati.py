@@ -8,13 +8,8 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, solve_continuous_are, solve_discrete_are
 
-from obsynth.numerics.central_filter import (
-    CentralEquation,
-    Whitened,
-    central_filter_at,
-    central_injection,
-    search_central_filter,
-)
+from obsynth.numerics.central_equation import CentralEquation, Whitened, central_injection
+from obsynth.numerics.central_filter import central_filter_at, search_central_filter
 from obsynth.numerics.doubling import (
     FIRST_POWER,
     RankWatch,

@@ -22,7 +22,7 @@ from obsynth.cli.main import main
 from obsynth.errors import SpecError
 from obsynth.monitoring.logs.text_logs import number_in_cell
 from obsynth.specs.documents import read_yaml
-from obsynth.specs.loader import read_matrix
+from obsynth.specs.matrix_files import read_matrix
 
 FMU = """<?xml version="1.0"?><fmiModelDescription fmiVersion="2.0" modelName="m" guid="{x}"><ModelExchange
 modelIdentifier="m" providesDirectionalDerivative="true"/><ModelVariables><ScalarVariable name="x" valueReference="1"

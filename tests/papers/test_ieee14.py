@@ -13,7 +13,8 @@ from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencils import reduced, structure_of_reduced
 from obsynth.simulation.linear import simulate_plant
 from obsynth.specs.documents import read_yaml
-from obsynth.specs.loader import load_spec, read_matrix_market
+from obsynth.specs.loader import load_spec
+from obsynth.specs.matrix_files import read_matrix_market
 
 FOLDER = Path(__file__).parents[2] / "designs" / "ieee14"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")

@@ -10,7 +10,8 @@ import pytest
 from exact_runs import Together, ramp_and_sine
 
 import obsynth
-from obsynth.analysis.existence.sharepasand import decoupling_rank, existence
+from obsynth.analysis.existence.sharepasand import existence
+from obsynth.analysis.existence.sharepasand_decoupling import decoupling_rank
 from obsynth.analysis.existence.statements import Evaluator
 from obsynth.plants.faults import exosystem
 from obsynth.simulation.linear import simulate_plant

@@ -16,7 +16,8 @@ import obsynth
 from obsynth.analysis.existence.restricted_equivalent import prepare, restricted_equivalent_from
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import InfeasibleError
-from obsynth.methods.fault_estimation_filter.synthesis import PrintedInequality, gain_problem
+from obsynth.methods.fault_estimation_filter.convex_problem import gain_problem
+from obsynth.methods.fault_estimation_filter.small_gains import PrintedInequality
 from obsynth.numerics.central_filter import search_least_gain
 from obsynth.numerics.norms import hinf_norm, spectral_radius
 from obsynth.simulation.linear import simulate_plant

@@ -5,7 +5,7 @@ import pytest
 
 import obsynth
 from obsynth.analysis.existence.restricted_equivalent import prepare
-from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
+from obsynth.methods.fault_estimation_filter.convex_problem import gain_problem
 
 
 def random_plant(seed: int, units: list[float]) -> obsynth.DescriptorSystem:

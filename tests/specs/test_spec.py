@@ -15,7 +15,8 @@ import scipy.sparse
 import obsynth
 from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY
-from obsynth.specs.loader import load_spec, read_matrix
+from obsynth.specs.loader import load_spec
+from obsynth.specs.matrix_files import read_matrix
 from obsynth.specs.schema_values import options_schema
 
 DESIGNS = Path(__file__).parents[2] / "designs"

@@ -1,10 +1,4 @@
-"""When a fault-estimation filter exists: Wang et al. 2015, section 2 and Theorem 2 (i); the zero condition is ours.
-
-A plant within rounding of the data for which two faults first reach the outputs in the same direction.
-
-``C (TA)^k T`` does not depend on the faults, so one column of Bf is changed: by what makes its first visible vector a
-combination of the others', and leaves what came before it invisible.
-"""
+"""When a fault-estimation filter exists: Wang et al. 2015, section 2 and Theorem 2 (i); the zero condition is ours."""
 
 from __future__ import annotations
 

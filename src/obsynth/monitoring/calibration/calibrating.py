@@ -1,9 +1,4 @@
-"""Fitting a model's constants and noise to a log: the public function, and the order in which it asks.
-
-Linear descriptor plants for calibration: constants in their matrices, continuous, discrete, or varying with k.
-
-An algebraic equation of a discrete plant (a row of zeros in E) is taken with the state it constrains, one sample later.
-"""
+"""Fitting a model's constants and noise to a log: the public function, and the order of its steps."""
 
 from __future__ import annotations
 

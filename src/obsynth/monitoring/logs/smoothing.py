@@ -21,15 +21,8 @@ from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import deviations_in
 from obsynth.observers.running import changed
-from obsynth.observers.smoothing import (
-    Chain,
-    Smoothed,
-    checked_lag,
-    links_of,
-    parameters_of,
-    smoothed_estimates,
-    smoothed_record,
-)
+from obsynth.observers.smoothing import checked_lag, links_of, parameters_of, smoothed_estimates, smoothed_record
+from obsynth.observers.smoothing_chain import Chain, Smoothed
 from obsynth.results.design import ObserverDesign
 
 

@@ -14,7 +14,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import as_run
-from obsynth.observers.smoothing import Chain
+from obsynth.observers.smoothing_chain import Chain
 from obsynth.results.design import ObserverDesign
 
 

@@ -1,0 +1,107 @@
+"""The convex problem behind Theorem 2 of Wang et al. 2015: an output injection, with a weight that may be free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from obsynth.analysis.existence.restricted_equivalent import PreparedPlant
+from obsynth.errors import InfeasibleError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.injection_problem import GainProblem, Injection, WeightLimit, null_basis
+
+#: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
+BACKGROUND_NOISE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class GainParts:
+    """Fixed parts of the gains in balanced coordinates: L = L0 + R V', W = W0 + Vw V'."""
+
+    L0: FloatArray
+    W0: FloatArray
+    V: FloatArray
+
+
+def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainProblem, GainParts]:
+    """Return the convex problem behind Theorem 2, with (32) solved exactly, and the fixed parts of the gains."""
+    detectability = prepared.detectability
+    upsilon = detectability.Upsilon
+    w0, v = _left_inverse(upsilon), null_basis(upsilon.T)
+    l0 = prepared.TA @ detectability.Psi @ w0
+    measure, na = v.T, prepared.TA.shape[0]
+    if prepared.Bw.shape[1]:
+        size = BACKGROUND_NOISE * max(
+            float(np.linalg.norm(measure @ prepared.Dw)),
+            # In units of the outputs: W may be large.
+            float(np.linalg.norm(w0 @ prepared.Dw) / np.linalg.norm(w0)),
+        )
+        background = size if size > 0.0 else BACKGROUND_NOISE
+        bn = np.hstack([prepared.Bw - l0 @ prepared.Dw, np.zeros((na, v.shape[1]))])
+        dn = np.hstack([measure @ prepared.Dw, -background * np.eye(v.shape[1])])
+        zn = np.hstack([w0 @ prepared.Dw, np.zeros((w0.shape[0], v.shape[1]))])
+    else:
+        # Unit noise on the free measurements: the variance is then the size of R (and V) itself.
+        bn, dn, zn = np.zeros((na, v.shape[1])), -np.eye(v.shape[1]), np.zeros((w0.shape[0], v.shape[1]))
+    problem = GainProblem(
+        A=prepared.TA - l0 @ prepared.C,
+        C=measure @ prepared.C,
+        Z=w0 @ prepared.C,
+        B=prepared.Bd - l0 @ prepared.Dd,
+        D=measure @ prepared.Dd,
+        Zd=w0 @ prepared.Dd,
+        Bn=bn,
+        Dn=dn,
+        Zn=zn,
+        free_weight=free_weight,
+    )
+    return problem, GainParts(l0, w0, v)
+
+
+def _left_inverse(upsilon: FloatArray) -> FloatArray:
+    """Return the left inverse of least norm of a matrix of full column rank, whatever the units of the faults."""
+    units = np.exp2(np.round(np.log2(np.linalg.norm(upsilon, axis=0))))
+    return np.asarray(np.linalg.pinv(upsilon / units) / units[:, None])
+
+
+def gains_in_given_units(prepared: PreparedPlant, parts: GainParts, chosen: Injection) -> dict[str, FloatArray]:
+    """Return the gains in the user's coordinates; the factors are powers of two, so this is exact."""
+    states, equations, outputs = (
+        prepared.scaling.states[:, None],
+        prepared.scaling.equations,
+        prepared.scaling.outputs,
+    )
+    free = chosen.R @ parts.V.T
+    return {
+        "T": states * prepared.T * equations,
+        "N": states * prepared.N * outputs,
+        "L": states * (parts.L0 + free) * outputs,
+        "W": (parts.W0 + chosen.V @ parts.V.T) * outputs,
+        "Psi": states * prepared.detectability.Psi,
+        "Upsilon": prepared.detectability.Upsilon / outputs[:, None],
+        "R": states * free * outputs,
+    }
+
+
+def centred(problem: GainProblem, prepared: PreparedPlant, parts: GainParts) -> tuple[GainProblem, GainParts]:
+    """Return the problem written so that V = 0 is the W of least norm in the user's output units, not balanced ones."""
+    outputs = prepared.scaling.outputs
+    w0 = _left_inverse(prepared.detectability.Upsilon / outputs[:, None]) / outputs
+    v = (w0 - parts.W0) @ parts.V
+    moved = replace(problem, Z=problem.Z + v @ problem.C, Zd=problem.Zd + v @ problem.D, Zn=problem.Zn + v @ problem.Dn)
+    return moved, replace(parts, W0=w0)
+
+
+def with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: GainParts, bound: float) -> GainProblem:
+    """Return the problem with the norm of W bounded, in the user's output units."""
+    outputs = prepared.scaling.outputs
+    smallest = 1.0 / float(np.linalg.svd(prepared.detectability.Upsilon / outputs[:, None], compute_uv=False)[-1])
+    if smallest >= bound:
+        raise InfeasibleError(
+            f"No residual weight W with W Upsilon = I has a norm of {bound:.6g} or less: the least is {smallest:.6g}. "
+            "Raise residual_weight_limit.",
+            necessary=True,
+            lower_bound=smallest,
+        )
+    return replace(problem, weight_limit=WeightLimit(parts.W0 * outputs, parts.V.T * outputs, bound))

@@ -1,0 +1,260 @@
+"""Matrices in files beside a spec: ``.mtx``, ``.npz``, ``.mat`` and ``.csv``.
+
+The reader of Matrix Market is ours, since that of scipy (1.17) crashes the interpreter on some damaged files.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.files.inputs import input_file
+from obsynth.numerics.arrays import MAXIMUM_ENTRIES, FloatArray, as_matrix, read_only, require_readable
+from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
+
+# What the readers of numpy and scipy raise for a damaged file.
+_READING_ERRORS = (
+    OSError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    EOFError,
+    OverflowError,
+    RuntimeError,
+    MemoryError,
+    AttributeError,
+    UserWarning,
+    struct.error,
+    zlib.error,
+    zipfile.BadZipFile,
+)
+
+
+#: Smaller matrices become arrays: nothing is gained by sparsity.
+SPARSE_FROM = 300
+
+#: A sparse matrix needs memory for each row and column as well: this many entries' worth, generously.
+ENTRIES_PER_LINE = 1000
+
+#: Whole numbers with more digits are damage.
+MOST_DIGITS = 15
+
+
+def read_matrix(path: Path, *, variable: str | None = None, where: str, keep_sparse: bool = False) -> Any:
+    """Return the matrix in a file; a CSR array where it is stored by coordinates and may stay sparse."""
+    return _checked(_read_array(path, variable=variable, where=where, keep_sparse=keep_sparse), path.name, where)
+
+
+def _checked(given: Any, name: str, where: str) -> Any:
+    try:
+        matrix = as_sparse_matrix(given, name) if is_sparse(given) else as_matrix(given, name)
+    except SpecError as error:
+        raise SpecError(str(error), path=where) from error
+    if 0 in matrix.shape:
+        raise SpecError(f"{name} holds an empty matrix.", path=where)
+    return matrix
+
+
+def read_matrices(path: Path, *, variable: str | None = None, count: int | None = None, where: str) -> FloatArray:
+    """Return the matrix in a file, or a stack of matrices ``(entries, rows, columns)``."""
+    array = _read_array(path, variable=variable, where=where)
+    if np.ndim(array) != 3:
+        matrix: FloatArray = _checked(array, path.name, where)
+        if count is None:
+            return matrix
+        rows, columns = matrix.shape
+        if rows % count:
+            raise SpecError(
+                f"{path.name} has {rows} rows, which cannot be shared out among {count} matrices.", path=where
+            )
+        return read_only(matrix.reshape(count, rows // count, columns))
+    stack = np.moveaxis(array, -1, 0) if path.suffix.lower() == ".mat" else array
+    if not stack.size:
+        raise SpecError(f"{path.name} holds an empty stack of matrices.", path=where)
+    if count is not None and len(stack) != count:
+        raise SpecError(f"{path.name} holds a stack of {len(stack)} matrices, not {count}.", path=where)
+    named = ((f"{path.name}, matrix {k} of the stack,", matrix) for k, matrix in enumerate(stack, 1))
+    return read_only(np.array([_checked(matrix, name, where) for name, matrix in named]))
+
+
+def _read_array(path: Path, *, variable: str | None, where: str, keep_sparse: bool = False) -> Any:
+    """Return what a file holds as an array of any kind, or as a sparse one."""
+    readers: dict[str, Callable[[Path], Any]] = {
+        ".mtx": partial(read_matrix_market, maximum_entries=MAXIMUM_ENTRIES, keep_sparse=keep_sparse),
+        ".csv": partial(np.loadtxt, delimiter=",", ndmin=2, encoding="utf-8-sig"),
+    }
+    archives: dict[str, Callable[[Path], Mapping[str, Any]]] = {".npz": _numpy_archive, ".mat": _matlab_archive}
+    suffix = path.suffix.lower()
+    if suffix not in readers and suffix not in archives:
+        known = ", ".join(sorted([*readers, *archives]))
+        raise SpecError(f"{path.name} has an unknown suffix: matrices are read from {known} files.", path=where)
+    if variable is not None and suffix in readers:
+        raise SpecError(f"{path.name} holds one matrix only: remove 'variable'.", path=where)
+    input_file(path, where=where)
+    try:
+        with warnings.catch_warnings(action="error", category=UserWarning):
+            content = readers[suffix](path) if suffix in readers else archives[suffix](path)
+            raw = content if suffix in readers else _selected(content, variable, path, where)
+            return raw if keep_sparse and is_sparse(raw) and suffix == ".mtx" else _as_dense(raw)
+    except _READING_ERRORS as error:
+        raise SpecError(f"{path} cannot be read as a matrix: {_reason(error)}", path=where) from error
+
+
+def _numpy_archive(path: Path) -> dict[str, Any]:
+    # Opened here, because numpy leaves a damaged file open.
+    with path.open("rb") as stream:
+        if not zipfile.is_zipfile(stream):
+            raise ValueError("it is no .npz archive")
+        stream.seek(0)
+        with np.load(stream, allow_pickle=False) as archive:
+            # A small file may unpack to more than the memory holds.
+            require_readable(sum(item.file_size for item in archive.zip.infolist()) / np.float64().nbytes)
+            return dict(archive)
+
+
+def _matlab_archive(path: Path) -> dict[str, Any]:
+    from obsynth.plants.importing.model_files import mat_arrays
+
+    return mat_arrays(path)
+
+
+def _selected(content: Mapping[str, Any], variable: str | None, path: Path, where: str) -> Any:
+    known = ", ".join(map(repr, content)) or "none"
+    if variable is not None:
+        if variable not in content:
+            raise SpecError(f"{path} has no array {variable!r}; it has: {known}.", path=where)
+        return content[variable]
+    if len(content) != 1:
+        raise SpecError(f"{path} must say which array is meant ('variable: name'); it has: {known}.", path=where)
+    return next(iter(content.values()))
+
+
+def _as_dense(raw: Any) -> Any:
+    """Return an array for whatever a reader gave; a damaged sparse matrix must not reach scipy's loops."""
+    require_readable(math.prod(int(length) for length in getattr(raw, "shape", ())))
+    if not hasattr(raw, "toarray"):
+        return raw
+    if hasattr(raw, "check_format"):
+        raw.check_format(full_check=True)
+    return raw.toarray()
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.strerror}."
+    text = str(error).strip().splitlines()
+    return f"{text[0].rstrip('.')}." if text else f"{type(error).__name__}."
+
+
+def read_matrix_market(path: Path, *, maximum_entries: int, keep_sparse: bool = False) -> Any:
+    """Return the matrix in a Matrix Market file: an array, or a CSR array of a large one that may stay sparse."""
+    with path.open(encoding="utf-8") as stream:
+        layout, field, symmetry = _checked_header(stream.readline(200))
+        lines = (line for line in stream if line.strip() and not line.startswith("%"))
+        size = next(lines, "").split()
+        tokens = [token for line in lines for token in line.split()]
+    counts = [_whole(token, "the sizes") for token in size]
+    if len(counts) != (3 if layout == "coordinate" else 2) or min(counts) < 0:
+        raise ValueError("the line with the sizes is damaged")
+    rows, columns = counts[:2]
+    sparse = keep_sparse and layout == "coordinate" and max(rows, columns) >= SPARSE_FROM
+    entries = max(rows, columns) * ENTRIES_PER_LINE if sparse else rows * columns
+    if max(entries, *counts) > maximum_entries:
+        raise ValueError(f"it is too large ({max(rows * columns, *counts):.1e} entries)")
+    if symmetry != "general" and rows != columns:
+        raise ValueError(f"it is {symmetry}, but {rows} by {columns}")
+    if layout == "array":
+        return _from_array(tokens, rows, columns, symmetry)
+    return _from_coordinates(tokens, (rows, columns, counts[2]), field, symmetry, sparse=sparse)
+
+
+def _checked_header(line: str) -> tuple[str, str, str]:
+    words = line.lower().split()
+    if len(words) != 5 or words[:2] != ["%%matrixmarket", "matrix"]:
+        raise ValueError("its first line is no Matrix Market header")
+    _, _, layout, field, symmetry = words
+    if field == "complex" or symmetry == "hermitian":
+        raise ValueError("it holds complex numbers")
+    known = (
+        layout in ("coordinate", "array")
+        and field in ("real", "double", "integer", "unsigned-integer", "pattern")
+        and symmetry in ("general", "symmetric", "skew-symmetric")
+        and (layout, field) != ("array", "pattern")
+    )
+    if not known:
+        raise ValueError(f"'{' '.join(words[2:])}' is no known kind of Matrix Market file")
+    return layout, field, symmetry
+
+
+def _from_array(tokens: list[str], rows: int, columns: int, symmetry: str) -> FloatArray:
+    values = _numbers(tokens)
+    if symmetry == "general":
+        _require_count(len(values), rows * columns)
+        return values.reshape(columns, rows).T
+    # The lower triangle, column by column.
+    column, row = np.triu_indices(rows, 1 if symmetry == "skew-symmetric" else 0)
+    _require_count(len(values), len(row))
+    matrix = np.zeros((rows, columns))
+    (row, column), values = _both_triangles([row, column], values, symmetry)
+    matrix[row, column] = values
+    return matrix
+
+
+def _from_coordinates(tokens: list[str], size: tuple[int, int, int], field: str, symmetry: str, *, sparse: bool) -> Any:
+    rows, columns, stored = size
+    width = 2 if field == "pattern" else 3
+    _require_count(len(tokens), width * stored)
+    positions = [_indices(tokens[k::width]) - 1 for k in (0, 1)]
+    for position, limit in zip(positions, (rows, columns), strict=True):
+        if np.any(position < 0) or np.any(position >= limit):
+            raise ValueError("an index is outside the matrix")
+    values = np.ones(stored) if field == "pattern" else _numbers(tokens[2::width])
+    if symmetry != "general":
+        positions, values = _both_triangles(positions, values, symmetry)
+    # Entries that are given twice are added, as the format says.
+    from scipy.sparse import coo_array
+
+    found = coo_array((values, (positions[0], positions[1])), shape=(rows, columns))
+    return found.tocsr() if sparse else found.toarray()
+
+
+def _both_triangles(positions: list[Any], values: FloatArray, symmetry: str) -> tuple[list[Any], FloatArray]:
+    """Return the coordinates of a lower triangle and of what it stands for above the diagonal."""
+    row, column = positions
+    if np.any(column[values != 0.0] > row[values != 0.0]):
+        raise ValueError(f"it is {symmetry}, but has entries above the diagonal")
+    sign, below = (-1.0 if symmetry == "skew-symmetric" else 1.0), row > column
+    mirrored = [np.concatenate([row, column[below]]), np.concatenate([column, row[below]])]
+    return mirrored, np.concatenate([values, sign * values[below]])
+
+
+def _numbers(tokens: list[str]) -> FloatArray:
+    return np.fromiter(map(float, tokens), dtype=np.float64, count=len(tokens))
+
+
+def _indices(tokens: list[str]) -> Any:
+    if not all(map(str.isdecimal, tokens)) or max(map(len, tokens), default=0) > MOST_DIGITS:
+        return np.array([_whole(token, "an index") for token in tokens], dtype=np.int64)
+    return np.fromiter(map(int, tokens), dtype=np.int64, count=len(tokens))
+
+
+def _whole(token: str, what: str) -> int:
+    if not token.isdecimal() or len(token) > MOST_DIGITS:
+        raise ValueError(f"{what} must be whole numbers, not {token[:20]!r}")
+    return int(token)
+
+
+def _require_count(found: int, expected: int) -> None:
+    if found != expected:
+        raise ValueError(f"it has {found} numbers after the sizes, but {expected} are needed")
