@@ -1,0 +1,991 @@
+"""Check a proof file of obsynth by exact integer arithmetic, with nothing but Python's standard library.
+
+    python -I check_proof.py proof.json
+
+A proof file holds integers: a plant, an observer, claims about the two, and for each claim the numbers ("witnesses")
+that prove it.  This program forms every inequality and identity anew from plant and observer.  Nothing is rounded and
+nothing is searched for, so an accepted claim is a theorem about the numbers of the file.  Exit code 0: every claim is
+proved; 1: one is not; 2: the file cannot be read.  The format is described in docs/explanation/proof_files.md.
+
+How to read this file (about an hour): sections 1 and 2 are the arithmetic and the one lemma on positive definite
+matrices; section 3 forms the error system; sections 4 and 5 have one function a claim, each with its proof in its
+docstring; section 6 reads the file and prints the verdicts.
+
+Notation: the plant is ``E x+ = A x + B u + Bf f + Bd d + Bw w``, ``y = C x + D u + Df f + Dd d + Dw w``, where x+ is the
+next state or, with sample time zero, the derivative.  The observer is ``z+ = Az z + Bu u + By y``, and its rows are
+``r = Cz z + Du u + Dy y``.  A' is a transpose.
+"""
+
+import json
+import sys
+from fractions import Fraction
+
+FORMAT, VERSION = "obsynth-proof", 1
+#: Files with larger exponents are refused: a few bytes could otherwise fill the memory.
+LARGEST_EXPONENT = 100_000
+#: The identities of an observer must hold to this share of the terms that they consist of.
+LARGEST_SHARE = Fraction(1, 1000)
+
+
+class Refused(Exception):
+    """A claim is not proved, or the file is not what it should be."""
+
+
+def require(condition, reason):
+    """Refuse unless a condition holds."""
+    if not condition:
+        raise Refused(reason)
+
+
+# 1. Exact matrices --------------------------------------------------------------------------------------------------
+
+
+class Matrix:
+    """A matrix of numbers ``integer * 2**exponent``: sums and products of these are exact."""
+
+    def __init__(self, rows, columns, entries, exponent=0):
+        self.rows, self.columns, self.entries, self.exponent = rows, columns, entries, exponent
+
+    @staticmethod
+    def zero(rows, columns):
+        """Return a matrix of zeros."""
+        return Matrix(rows, columns, [[0] * columns for _ in range(rows)])
+
+    @staticmethod
+    def identity(size):
+        """Return the identity."""
+        return Matrix(size, size, [[int(i == j) for j in range(size)] for i in range(size)])
+
+    @staticmethod
+    def blocks(parts):
+        """Return a matrix of blocks, given by rows of blocks."""
+        exponent = min(part.exponent for row in parts for part in row)
+        entries = []
+        for row in parts:
+            require(len({part.rows for part in row}) == 1, "blocks do not fit")
+            aligned = [part.integers(exponent) for part in row]
+            entries += [sum((part[i] for part in aligned), []) for i in range(row[0].rows)]
+        columns = sum(part.columns for part in parts[0])
+        require(all(len(row) == columns for row in entries), "blocks do not fit")
+        return Matrix(len(entries), columns, entries, exponent)
+
+    def integers(self, exponent):
+        """Return the entries as multiples of ``2**exponent``, which must not be above the own exponent."""
+        shift = self.exponent - exponent
+        return [[value << shift for value in row] for row in self.entries] if shift else self.entries
+
+    def __add__(self, other):
+        require((self.rows, self.columns) == (other.rows, other.columns), "matrices of different sizes are added")
+        exponent = min(self.exponent, other.exponent)
+        both = zip(self.integers(exponent), other.integers(exponent))
+        entries = [[a + b for a, b in zip(one, two)] for one, two in both]
+        return Matrix(self.rows, self.columns, entries, exponent)
+
+    def __neg__(self):
+        return Matrix(self.rows, self.columns, [[-value for value in row] for row in self.entries], self.exponent)
+
+    def __sub__(self, other):
+        return self + (-other)
+
+    def __matmul__(self, other):
+        require(self.columns == other.rows, "matrices that do not fit are multiplied")
+        across = list(zip(*other.entries)) if other.rows else [()] * other.columns
+        entries = []
+        for row in self.entries:
+            used = [k for k, value in enumerate(row) if value]
+            entries.append([sum(row[k] * column[k] for k in used) for column in across])
+        return Matrix(self.rows, other.columns, entries, self.exponent + other.exponent)
+
+    @property
+    def T(self):
+        """The transpose."""
+        entries = [list(column) for column in zip(*self.entries)] if self.rows else [[] for _ in range(self.columns)]
+        return Matrix(self.columns, self.rows, entries, self.exponent)
+
+    def absolute(self):
+        """Return the absolute values."""
+        return Matrix(self.rows, self.columns, [[abs(v) for v in row] for row in self.entries], self.exponent)
+
+    def times(self, number):
+        """Return the product with a matrix of one entry."""
+        require((number.rows, number.columns) == (1, 1), "one number is needed")
+        value = number.entries[0][0]
+        entries = [[value * entry for entry in row] for row in self.entries]
+        return Matrix(self.rows, self.columns, entries, self.exponent + number.exponent)
+
+    def part(self, rows=None, columns=None):
+        """Return some rows and columns, given as lists of numbers; all where there is none."""
+        rows = range(self.rows) if rows is None else rows
+        columns = range(self.columns) if columns is None else columns
+        entries = [[self.entries[i][j] for j in columns] for i in rows]
+        return Matrix(len(rows), len(columns), entries, self.exponent)
+
+    def is_zero(self):
+        """Whether every entry is zero."""
+        return not any(map(any, self.entries))
+
+    def fraction(self, i, j):
+        """Return one entry."""
+        return Fraction(self.entries[i][j]) * Fraction(2) ** self.exponent
+
+    def number(self):
+        """Return the only entry."""
+        require((self.rows, self.columns) == (1, 1), "one number is needed")
+        return self.fraction(0, 0)
+
+
+def shown(value, down=False):
+    """Return a number for readers with four digits, rounded upwards or downwards: what is printed must hold too."""
+    value = Fraction(value)
+    if not value:
+        return "0"
+    digits = len(str(abs(value.numerator))) - len(str(value.denominator)) + 1
+    while abs(value) < Fraction(10) ** (digits - 1):
+        digits -= 1
+    unit = Fraction(10) ** (digits - 4)
+    units = value // unit if down else -((-value) // unit)
+    return f"{float(units):.0f}e{digits - 4}" if abs(digits) > 290 else f"{float(units * unit):.5g}"
+
+
+# 2. The lemma on positive definite matrices -------------------------------------------------------------------------
+
+
+def require_positive_definite(matrix, witness, what):
+    """Prove ``S > 0`` for a symmetric matrix S.
+
+    The witness is a matrix F and positive integers d, one for each row.  With ``R = S - F'F``, which is computed
+    exactly, ``x'Sx = |Fx|^2 + x'Rx``.  If ``d_i R_ii > sum of d_j |R_ij| over the other j`` in every row i, then R, each
+    row and column times its d, is strictly diagonally dominant with a positive diagonal, so that ``x'Rx > 0`` for all
+    x that are not zero (Gershgorin), and so is ``x'Sx``.  Any F and d will do: they need not be trusted.
+    """
+    size = matrix.rows
+    require(matrix.columns == size and (matrix - matrix.T).is_zero(), f"{what}: the matrix is not symmetric")
+    factor, weights = read_matrix(witness["factor"]), [read_integer(value) for value in witness["weights"]]
+    require(factor.columns == size and len(weights) == size, f"{what}: the factor does not fit")
+    require(all(weight > 0 for weight in weights), f"{what}: a weight is not positive")
+    rest = (matrix - factor.T @ factor).entries
+    for i, row in enumerate(rest):
+        others = sum(abs(value) * weight for value, weight in zip(row, weights)) - abs(row[i]) * weights[i]
+        require(row[i] * weights[i] > others, f"{what}: the matrix is not proved to be positive definite (row {i + 1})")
+
+
+# 3. The error system ------------------------------------------------------------------------------------------------
+
+
+class System:
+    """The plant, the observer and what its state follows: everything that claims are about.
+
+    The observer's state z follows ``T E xa``.  Here xa is the plant's state x; with a lag it holds the last states too,
+    the newest first; with a fault model ``w+ = Phi w``, ``f = Cw w`` it holds w.  ``T0``, where there is one, combines
+    equations of the plant with ``T0 E = 0`` and is added to the rows.
+    """
+
+    def __init__(self, file):
+        plant, observer, follows = file["plant"], file["observer"], file["follows"]
+        for name in ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw"):
+            setattr(self, name, read_matrix(plant[name]))
+        for name in ("Az", "Bu", "By", "Cz", "Du", "Dy"):
+            setattr(self, name, read_matrix(observer[name]))
+        self.dt = read_matrix(plant["sample_time"]).number()
+        require(self.dt >= 0, "the sample time is negative")
+        self.discrete = self.dt > 0
+        self.shapes()
+        self.names = {kind: list(map(str, plant["names"][kind])) for kind in ("states", "faults", "disturbances")}
+        self.row_kinds = [(str(kind), str(name), int(delay)) for kind, name, delay in observer["rows"]]
+        require(len(self.row_kinds) == self.Cz.rows, "each row of the observer needs a kind, a name and a delay")
+        self.lag, self.decoupled = int(follows["lag"]), bool(follows["decoupled"])
+        require(0 <= self.lag <= 1000 and (self.discrete or not self.lag), "the lag is no number of samples")
+        self.Phi, self.Cw = read_matrix(follows["Phi"]), read_matrix(follows["Cw"])
+        self.T, self.T0 = read_matrix(follows["T"]), read_matrix(follows["T0"])
+        self.witness, self.proved_contraction = file.get("contraction"), None
+        self.extend()
+
+    def contraction(self):
+        """Return the contraction of the file, proved once."""
+        if self.proved_contraction is None:
+            require(self.witness is not None, "the file has no contraction")
+            self.proved_contraction = Contraction(self, self.witness)
+        return self.proved_contraction
+
+    def shapes(self):
+        """Refuse matrices that do not fit each other."""
+        n, nu, ny, nz = self.E.rows, self.B.columns, self.C.rows, self.Az.rows
+        wanted = {"E": (n, n), "A": (n, n), "B": (n, nu), "C": (ny, n), "D": (ny, nu)}
+        for state, output in (("Bf", "Df"), ("Bd", "Dd"), ("Bw", "Dw")):
+            count = getattr(self, state).columns
+            wanted |= {state: (n, count), output: (ny, count)}
+        rows = self.Cz.rows
+        wanted |= {"Az": (nz, nz), "Bu": (nz, nu), "By": (nz, ny), "Cz": (rows, nz), "Du": (rows, nu), "Dy": (rows, ny)}
+        for name, shape in wanted.items():
+            found = getattr(self, name)
+            require((found.rows, found.columns) == shape, f"{name} is {found.rows} x {found.columns}, not {shape}")
+
+    def extend(self):
+        """Form the equations of xa (``Ea, Aa, Ba, Ca, Bda``), and what each row of the observer should equal: goal xa."""
+        n, past, count = self.E.rows, self.lag * self.E.rows, self.Phi.rows
+        require(self.Phi.columns == self.Cw.columns == count, "Phi and Cw do not fit")
+        require(not count or self.Cw.rows == self.Bf.columns, "Cw does not have a row for each fault")
+        zero, one = Matrix.zero, Matrix.identity
+        cw = self.Cw if count else zero(self.Bf.columns, 0)
+        shift = Matrix.blocks([[one(past), zero(past, n)]])
+        self.Ea = diagonal(self.E, one(past), one(count))
+        first = Matrix.blocks([[self.A, zero(n, past)]])
+        moved = Matrix.blocks([[first], [shift]])
+        into = Matrix.blocks([[self.Bf @ cw], [zero(past, count)]])
+        self.Aa = Matrix.blocks([[moved, into], [zero(count, n + past), self.Phi]])
+        self.Ba = Matrix.blocks([[self.B], [zero(past + count, self.B.columns)]])
+        self.Bda = Matrix.blocks([[self.Bd], [zero(past + count, self.Bd.columns)]])
+        self.Ca = Matrix.blocks([[self.C, zero(self.C.rows, past), self.Df @ cw]])
+        total = n + past + count
+        require((self.T.rows, self.T.columns) == (self.Az.rows, total), "T does not fit")
+        require((self.T0.rows, self.T0.columns) == (self.Cz.rows, total), "T0 does not fit")
+        goal = zero(self.Cz.rows, total)
+        for i, (kind, name, delay) in enumerate(self.row_kinds):
+            require(kind in ("state", "fault", "residual"), f"row {i + 1} is of an unknown kind")
+            if kind == "state":
+                require(delay == self.lag, "the delay of a state is not the lag")
+                goal.entries[i][past + self.index("states", name)] = 1
+            if kind == "fault" and count:
+                fault = self.index("faults", name)
+                row = cw.part([fault])
+                for j in range(count):
+                    require(delay == 0 or not row.entries[0][j], "a fault model with a delay is not followed by T")
+                goal = goal + Matrix.blocks([[zero(i, total)], [Matrix.blocks([[zero(1, n + past), row]])],
+                                             [zero(goal.rows - i - 1, total)]])
+        self.goal = goal
+
+    def index(self, kind, name):
+        """Return the number of a signal."""
+        require(name in self.names[kind], f"{name!r} is none of the {kind}")
+        return self.names[kind].index(name)
+
+    def rows_of(self, kinds):
+        """Return the numbers of the rows of the observer that are of some kinds."""
+        return [i for i, (kind, _, _) in enumerate(self.row_kinds) if kind in kinds]
+
+    def identities(self):
+        """Return what must vanish, and the sum of the absolute values of its terms, by name.
+
+        With ``eps = z - T Ea xa``, the equations of plant and observer give, without faults, noise and (unless they are
+        decoupled) disturbances::
+
+            eps+ = Az eps + K xa + U u + V d,      K = Az T Ea + By Ca - T Aa,   U = Bu + By D - T Ba,
+            r - goal xa = Cz eps + J xa + L u + W d,   J = Cz T Ea + Dy Ca + T0 Aa - goal,   L = Du + Dy D + T0 Ba,
+
+        and ``V = By Dd - T Bda``, ``W = Dy Dd + T0 Bda``; for J, L and W, ``T0 (Aa xa + Ba u + Bda d) = T0 Ea xa+ = 0``
+        was added, and so ``Z = T0 Ea`` must vanish too.  What is stored was rounded: these are small, not zero.
+        """
+        te = self.T @ self.Ea
+        terms = {
+            "K": [self.Az @ te, self.By @ self.Ca, -(self.T @ self.Aa)],
+            "U": [self.Bu, self.By @ self.D, -(self.T @ self.Ba)],
+            "J": [self.Cz @ te, self.Dy @ self.Ca, self.T0 @ self.Aa, -self.goal],
+            "L": [self.Du, self.Dy @ self.D, self.T0 @ self.Ba],
+        }
+        sizes = {
+            "K": [self.Az.absolute() @ (self.T.absolute() @ self.Ea.absolute()), product(self.By, self.Ca),
+                  product(self.T, self.Aa)],
+            "U": [self.Bu.absolute(), product(self.By, self.D), product(self.T, self.Ba)],
+            "J": [self.Cz.absolute() @ (self.T.absolute() @ self.Ea.absolute()), product(self.Dy, self.Ca),
+                  product(self.T0, self.Aa), self.goal.absolute()],
+            "L": [self.Du.absolute(), product(self.Dy, self.D), product(self.T0, self.Ba)],
+        }
+        terms["Z"], sizes["Z"] = [self.T0 @ self.Ea], [product(self.T0, self.Ea)]
+        if self.decoupled:
+            terms |= {"V": [self.By @ self.Dd, -(self.T @ self.Bda)], "W": [self.Dy @ self.Dd, self.T0 @ self.Bda]}
+            sizes |= {"V": [product(self.By, self.Dd), product(self.T, self.Bda)],
+                      "W": [product(self.Dy, self.Dd), product(self.T0, self.Bda)]}
+        return {name: (total(terms[name]), total(sizes[name])) for name in terms}
+
+    def driven(self, signal):
+        """Return B and D with ``e+ = Az e + B s`` and ``r - goal xa = -Cz e + D s`` for a signal s; e is ``T Ea xa - z``.
+
+        ``fault model``: s is added to w+, so that the fault may have any course.
+        """
+        if signal == "fault model":
+            columns = list(range(self.T.columns - self.Phi.rows, self.T.columns))
+            return self.T.part(None, columns), self.T0.part(None, columns)
+        both = Matrix.blocks([[self.Bd, self.Bw]]), Matrix.blocks([[self.Dd, self.Dw]])
+        known = {"faults": (self.Bf, self.Df), "disturbances": (self.Bd, self.Dd), "noise": (self.Bw, self.Dw),
+                 "disturbances and noise": both}
+        require(signal in known, f"{signal!r} is no signal")
+        b, d = known[signal]
+        own = list(range(self.E.rows))
+        return (self.T.part(None, own) @ b - self.By @ d, self.Dy @ d + self.T0.part(None, own) @ b)
+
+
+def diagonal(*parts):
+    """Return the blocks of a diagonal."""
+    rows = [[part if i == j else Matrix.zero(part.rows, other.columns) for j, other in enumerate(parts)]
+            for i, part in enumerate(parts)]
+    return Matrix.blocks(rows)
+
+
+def product(one, two):
+    """Return the product of the absolute values."""
+    return one.absolute() @ two.absolute()
+
+
+def total(parts):
+    """Return the sum of some matrices."""
+    found = parts[0]
+    for part in parts[1:]:
+        found = found + part
+    return found
+
+
+# 4. Claims on the error system --------------------------------------------------------------------------------------
+# Each takes the system and a claim, refuses what is not proved, and returns the sentence that is proved.
+
+
+def identities_hold(system, claim):
+    """Without faults the observer follows what it should, but for rounding of its stored numbers.
+
+    Each entry of what the identities miss (see ``System.identities``) is at most ``share`` times the sum of the
+    absolute values of its terms, or ``share`` times the largest such sum of its column where this is far larger
+    (``floor`` times it: what is nothing but rounding of large terms is compared with these).
+    """
+    share, floor = read_matrix(claim["share"]).number(), read_matrix(claim["floor"]).number()
+    require(0 <= share <= LARGEST_SHARE and 0 <= floor <= 1, "the identities are allowed to miss too much")
+    for name, (missed, sizes) in system.identities().items():
+        require_small(missed, sizes, share, floor, f"identity {name}")
+    besides = ", whatever the disturbances do" if system.decoupled else ""
+    return f"without faults{besides}, z follows T E x, and the rows what they stand for, to {shown(share)} of all terms"
+
+
+def lyapunov(system, claim, rate, a):
+    """Prove ``P > 0`` and ``a'Pa < rate^2 P`` or, in continuous time, ``a'P + Pa + 2 rate P < 0``; return P.
+
+    Then ``V(e) = e'Pe`` decreases faster than ``rate^(2k)`` or ``exp(-2 rate t)`` along ``e+ = a e``.
+    """
+    p = read_matrix(claim["P"])
+    require_positive_definite(p, claim["P_positive"], "P")
+    if system.discrete:
+        left = p.times(rate).times(rate) - a.T @ p @ a
+    else:
+        half = a.T @ p + p.times(rate)
+        left = -(half + half.T)
+    require_positive_definite(left, claim["decreases"], "the Lyapunov inequality")
+    return p
+
+
+class Contraction:
+    """A bound on what a column k of inputs does to a row c of outputs: ``eps+ = Az eps + k s``, ``|s| <= 1``, from zero.
+
+    P and a rate are as in ``lyapunov``; the norm ``|eps|_P`` stays below ``|k|_P / (1 - rate)`` or ``|k|_P / rate``.  G
+    with ``[P, I; I, G] > 0`` is above the inverse of P, so that ``|c eps|^2 <= c G c' |eps|_P^2`` (Cauchy-Schwarz).
+    """
+
+    def __init__(self, system, witness):
+        rate = read_matrix(witness["rate"])
+        value, one = rate.number(), Matrix.identity(system.Az.rows)
+        require(0 < value < 1 if system.discrete else value > 0, "the rate is none of decay")
+        self.p, self.g = lyapunov(system, witness, rate, system.Az), read_matrix(witness["G"])
+        require_positive_definite(Matrix.blocks([[self.p, one], [one, self.g]]), witness["G_covers"], "G")
+        self.slowness = 1 - value if system.discrete else value
+        rows = [system.Cz.part([i]) for i in range(system.Cz.rows)]
+        self.heights = [(c @ self.g @ c.T).number() for c in rows]
+
+    def require_bounds(self, bounds, columns, own, what):
+        """Refuse unless each entry of ``bounds`` is at least ``own``, and what ``columns`` add to it."""
+        require((bounds.rows, bounds.columns) == (own.rows, own.columns), f"the bounds for {what} do not fit")
+        for j in range(own.columns):
+            column = columns.part(None, [j])
+            length = (column.T @ self.p @ column).number()
+            for i in range(own.rows):
+                left = bounds.fraction(i, j) - own.fraction(i, j)
+                require(left >= 0 and (left * self.slowness) ** 2 >= self.heights[i] * length,
+                        f"the bound of row {i + 1} and column {j + 1} for {what} is not proved")
+
+
+def stable(system, claim):
+    """Errors decay: a Lyapunov inequality (see ``lyapunov``) with a rate below one, or, in continuous time, above zero."""
+    rate = read_matrix(claim["rate"])
+    value = rate.number()
+    require(0 < value < 1 if system.discrete else value >= 0, "the rate is none of decay")
+    lyapunov(system, claim, rate, system.Az)
+    if system.discrete:
+        return f"every error decays, faster than {shown(value)}^k"
+    return f"every error decays, faster than exp(-{shown(value, down=True)} t)" if value else "every error decays"
+
+
+def gain_is_below(system, claim):
+    """The l2 gain from a signal to the errors of some rows is below gamma, and these errors decay: bounded real lemma.
+
+    For ``e+ = a e + b s``, ``r = c e + d s``, ``V = e'Pe`` with P > 0: if ``|r|^2 - gamma^2 |s|^2 + V(e+) - V(e) < 0``
+    for all e, s that are not zero, sums over time give ``sum |r|^2 < gamma^2 sum |s|^2`` from e = 0.  In continuous time
+    the derivative of V is in the place of ``V(e+) - V(e)``.  With s = 0 it is a Lyapunov inequality.  States after the
+    first ``states`` ones are left out where neither those nor the rows depend on them.
+    """
+    gamma, first = read_matrix(claim["gamma"]), int(claim["states"])
+    rows, core = system.rows_of(claim["rows"]), list(range(first))
+    require(rows and 0 <= first <= system.Az.rows, "there are no such rows or states")
+    beyond = list(range(first, system.Az.rows))
+    require(system.Az.part(core, beyond).is_zero() and system.Cz.part(rows, beyond).is_zero(), "states were left out")
+    require(gamma.number() > 0, "gamma is not positive")
+    b, d = system.driven(claim["signal"])
+    a, b, c, d = system.Az.part(core, core), b.part(core), -system.Cz.part(rows, core), d.part(rows)
+    p = read_matrix(claim["P"])
+    require(p.rows == first, "P does not fit")
+    require_positive_definite(p, claim["P_positive"], "P")
+    level = Matrix.identity(b.columns).times(gamma).times(gamma) - d.T @ d
+    if system.discrete:
+        corner, side = p - a.T @ p @ a - c.T @ c, -(a.T @ p @ b + c.T @ d)
+        level = level - b.T @ p @ b
+    else:
+        corner, side = -(a.T @ p + p @ a + c.T @ c), -(p @ b + c.T @ d)
+    whole = Matrix.blocks([[corner, side], [side.T, level]])
+    require_positive_definite(whole, claim["bounded_real"], "the bounded real inequality")
+    return f"the l2 gain from the {claim['signal']} to the error of the {' and '.join(claim['rows'])} rows is below " \
+           f"{shown(gamma.number())}"
+
+
+def deviation_is_below(system, claim):
+    """Under white noise of unit variance (density) each row's error has at most a standard deviation (H2 norm).
+
+    If ``X >= a X a' + b b'`` or, in continuous time, ``a X + X a' + b b' <= 0``, X is above the covariance of e in the
+    steady state, and ``c X c' + d d'`` above that of the row: e depends on earlier noise alone.
+    """
+    a, (b, d) = system.Az, system.driven("noise")
+    x, bounds = read_matrix(claim["X"]), read_matrix(claim["deviations"])
+    require_positive_definite(x, claim["X_positive"], "X")
+    moved = a @ x
+    rest = x - moved @ a.T - b @ b.T if system.discrete else -(moved + moved.T) - b @ b.T
+    require_positive_definite(rest, claim["covers"], "the covariance inequality")
+    rows = system.rows_of(claim["rows"])
+    require(rows and (bounds.rows, bounds.columns) == (len(rows), 1), "there is not a bound for each row")
+    for place, i in enumerate(rows):
+        c, through = system.Cz.part([i]), d.part([i])
+        require(system.discrete or through.is_zero(), "white noise of infinite variance reaches a row")
+        variance = (c @ x @ c.T + through @ through.T).number() if system.discrete else (c @ x @ c.T).number()
+        bound = bounds.fraction(place, 0)
+        require(bound >= 0 and variance <= bound**2, f"the deviation of row {i + 1} is not proved")
+    listed = ", ".join(shown(bounds.fraction(k, 0)) for k in range(len(rows)))
+    return f"white noise as modelled makes errors of at most these standard deviations: {listed}"
+
+
+def rounding_adds_little(system, claim):
+    """What rounding of the stored numbers adds to each row, per unit of each state, known input (and disturbance).
+
+    eps, the distance of z from what it follows, is driven by columns of K, U and V (see ``System.identities``), and the
+    row's own part, J, L or W, is added.  A fault's estimate must be within a thousandth of the fault of a fault model.
+    """
+    contraction, found, worst = system.contraction(), system.identities(), Fraction(0)
+    own = {seen: found[seen][0].absolute() for seen in ("J", "L", "W") if seen in found}
+    # The next state keeps the bounds of the state; its rate has none.
+    require(system.discrete or found["Z"][0].is_zero(), "T0 E is not zero, and rates have no bounds")
+    own["J"] = own["J"] + found["Z"][0].absolute()
+    pairs = {"states": ("K", "J"), "inputs": ("U", "L")} | ({"disturbances": ("V", "W")} if system.decoupled else {})
+    require(set(claim["bounds"]) == set(pairs), "there are not bounds for each kind of signal")
+    for kind, (moved, seen) in pairs.items():
+        bounds = read_matrix(claim["bounds"][kind])
+        contraction.require_bounds(bounds, found[moved][0], own[seen], kind)
+        worst = max([worst, *entries_of(bounds)])
+        first = system.T.columns - system.Phi.rows
+        for i in system.rows_of(["fault"]) if kind == "states" else []:
+            for j in range(first, bounds.columns):
+                size = abs(system.goal.fraction(i, j))
+                require(not size or bounds.fraction(i, j) <= LARGEST_SHARE * size, "an estimate is not that of its fault")
+    return f"rounding of the stored numbers adds at most {shown(worst)} to any row, per unit of any state or input"
+
+
+def faults_are_estimated(system, claim):
+    """A fault of any course shows in its own estimate, after its delay, and in no other row, but for rounding.
+
+    For sampled filters.  A fault impulse leaves ``a^(k-1) b`` in e; row i responds to it with ``d`` at once and with
+    ``-c a^(k-1) b`` after k samples.  That should be one where row i is named like the fault and k is its delay, and zero
+    elsewhere.  ``bounds`` are at least the sum of all differences: those up to the largest delay, each, and by the
+    contraction those after it, which start with the column ``a^delay b``.
+    """
+    require(system.discrete, "the claim is for sampled filters")
+    contraction, bounds, (b, d) = system.contraction(), read_matrix(claim["bounds"]), system.driven("faults")
+    delays = {name: delay for kind, name, delay in system.row_kinds if kind == "fault"}
+    require(set(delays) == set(system.names["faults"]) and min(delays.values()) >= 1, "not every fault is estimated late")
+    missed, trace = d.absolute(), b
+    for step in range(1, max(delays.values()) + 1):
+        wanted = Matrix.zero(d.rows, d.columns)
+        for i, (kind, name, _) in enumerate(system.row_kinds):
+            if kind in ("fault", "residual") and delays.get(name) == step:
+                wanted.entries[i][system.index("faults", name)] = 1
+        missed = missed + (system.Cz @ trace + wanted).absolute()
+        trace = system.Az @ trace
+    contraction.require_bounds(bounds, trace, missed, "faults")
+    for i in system.rows_of(["fault"]):
+        own = bounds.fraction(i, system.index("faults", system.row_kinds[i][1]))
+        require(own <= LARGEST_SHARE, "an estimate is not that of its fault")
+    listed = ", ".join(f"{name} {delay}" for name, delay in delays.items())
+    return f"each fault is estimated as it was so many samples ago ({listed}), and shows nowhere else, to " \
+           f"{shown(max(entries_of(bounds)))} per unit of it"
+
+
+def fault_models_are_followed(system, claim):
+    """Faults that follow their models ``w+ = Phi w``, ``f = Cw w`` are estimated as they are, but for rounding.
+
+    If ``Az Pi + (By Df - T Bf) Cw = Pi Phi``, then ``z - T E x = Pi w`` is a motion of the filter, to which all others
+    decay.  There row i is ``(Cz Pi + (Dy Df + T0 Bf) Cw) w``: the mean of the fault over ``mean`` samples, of which the
+    newest is ``delay`` samples old, or zero for residuals (both sides are multiplied by a power of Phi).  ``bounds`` are
+    of the errors for model states w within one at all times: what the equation of Pi misses drives a difference.
+    """
+    phi, cw, pi = (read_matrix(claim[name]) for name in ("Phi", "Cw", "Pi"))
+    delay, mean, bounds = int(claim["delay"]), int(claim["mean"]), read_matrix(claim["bounds"])
+    require(0 <= delay <= 10_000 and 1 <= mean <= 10_000, "delay and mean are no numbers of samples")
+    require(system.discrete or (delay == 0 and mean == 1), "a delay needs samples")
+    b, d = system.driven("faults")
+    drives = system.Az @ pi - b @ cw - pi @ phi
+    powers = [Matrix.identity(phi.rows)]
+    for _ in range(delay + mean - 1):
+        powers.append(powers[-1] @ phi)
+    seen, many = (system.Cz @ pi + d @ cw) @ powers[-1], Matrix(1, 1, [[mean]])
+    wanted = []
+    for kind, name, _ in system.row_kinds:
+        row = cw.part([system.index("faults", name)]) if kind == "fault" else Matrix.zero(1, phi.rows)
+        wanted.append([total([row @ powers[mean - 1 - j] for j in range(mean)])])
+    wanted = Matrix.blocks(wanted)
+    system.contraction().require_bounds(bounds.times(many), drives.times(many),
+                                        (seen.times(many) - wanted).absolute(), "fault models")
+    for i in system.rows_of(["fault"]):
+        for j in range(phi.rows):
+            size = abs(wanted.fraction(i, j)) / mean
+            require(not size or bounds.fraction(i, j) <= LARGEST_SHARE * size, "an estimate is not that of its fault")
+    after = f", {delay} samples late" if delay else ""
+    return f"faults that follow their models are estimated as they are{after}, to " \
+           f"{shown(max(entries_of(bounds), default=0))} per unit of a model's state"
+
+
+def entries_of(matrix):
+    """Return all entries."""
+    return [matrix.fraction(i, j) for i in range(matrix.rows) for j in range(matrix.columns)]
+
+
+def plant_follows(system, claim):
+    """The plant's equations follow from those as written: algebraic states are eliminated, and nothing else.
+
+    Written: ``E0 x0+ = A0 x0 + B0 s``, ``y = C0 x0 + D0 s`` with s all signals.  For M and N with ``N E0 = 0``, the state
+    ``x = X x0`` with ``X = M E0`` obeys ``x+ = M A0 x0 + M B0 s``, and adding ``N (A0 x0 + B0 s) = 0`` changes no output.
+    So if ``M A0 = A X``, ``M B0 = B``, ``C0 + N A0 = C X``, ``D0 + N B0 = D``, every motion of the plant as written is
+    one of the plant with E = I.  Each holds to ``share`` of its terms, or of the largest of its column times ``floor``.
+    """
+    written = {name: read_matrix(value) for name, value in claim["written"].items()}
+    m, n = read_matrix(claim["M"]), read_matrix(claim["N"])
+    share, floor = read_matrix(claim["share"]).number(), read_matrix(claim["floor"]).number()
+    require(0 <= share <= LARGEST_SHARE and 0 <= floor <= 1, "the equations are allowed to miss too much")
+    require((system.E - Matrix.identity(system.E.rows)).is_zero(), "the plant without algebraic states needs E = I")
+    together = {name: Matrix.blocks([[written[part] for part in parts]])
+                for name, parts in (("B0", ("B", "Bf", "Bd", "Bw")), ("D0", ("D", "Df", "Dd", "Dw")))}
+    b = Matrix.blocks([[system.B, system.Bf, system.Bd, system.Bw]])
+    d = Matrix.blocks([[system.D, system.Df, system.Dd, system.Dw]])
+    e0, a0, c0, x = written["E"], written["A"], written["C"], m @ written["E"]
+    require((n @ e0).is_zero(), "N E0 is not zero")
+    for parts in (
+        [m @ a0, -(system.A @ x)], [m @ together["B0"], -b],
+        [c0, n @ a0, -(system.C @ x)], [together["D0"], n @ together["B0"], -d],
+    ):
+        require_small(total(parts), total([part.absolute() for part in parts]), share, floor, "the equations as written")
+    return f"the plant is the one as written without its algebraic states, to {shown(share)} of all terms"
+
+
+def require_small(missed, sizes, share, floor, what):
+    """Refuse unless each entry is within ``share`` of its size, or of ``floor`` times the largest of its column."""
+    for j in range(missed.columns):
+        largest = max((sizes.fraction(i, j) for i in range(sizes.rows)), default=Fraction(0))
+        for i in range(missed.rows):
+            allowed = share * max(sizes.fraction(i, j), floor * largest)
+            require(abs(missed.fraction(i, j)) <= allowed, f"{what}: entry {i + 1}, {j + 1} does not hold")
+
+
+# 5. Claims on windows of samples: guaranteed tests and alarms -------------------------------------------------------
+
+
+class Window:
+    """The equations of a plant over some samples, ``M z = b``, with a bound for each entry of z, or none.
+
+    Rows are ``E x(k+1) - A x(k) - Bf f(k) - Bd d(k) - G w(k) = B u(k)`` for the equations from ``-prior`` on, and
+    ``C x(k) + Df f(k) + Dd d(k) + H w(k) = y(k) - D u(k)`` for the samples 0 to ``samples - 1``.  Entries of z are the
+    size theta of the fault that is looked for, states, noise w, disturbances d, and what else the faults do.  Bounds of
+    disturbances and noise are about ``middles``, which are moved to the right.
+    """
+
+    def __init__(self, system, question):
+        require(system.discrete, "a window needs samples")
+        self.system, self.question = system, question
+        self.samples, self.prior, self.equations = (int(question[key]) for key in ("samples", "prior", "equations"))
+        require(self.samples >= 1 and self.prior >= 0 and self.equations >= 0, "the window has no samples")
+        require(self.samples + self.prior + self.equations <= 100_000, "the window is too long")
+        self.G, self.H = read_matrix(question["noise_state"]), read_matrix(question["noise_output"])
+        self.bounds, self.groups, self.entries, self.offsets = [], [], [], []
+        self.row_count = self.equations * system.E.rows + self.samples * system.C.rows
+        self.fill()
+
+    def column(self, bound, group=None):
+        """Add an entry of z with its bound (none: free), and return its number."""
+        require(bound is None or bound >= 0, "a bound is negative")
+        self.bounds.append(bound)
+        self.groups.append(group)
+        return len(self.bounds) - 1
+
+    def put(self, row, column, value):
+        """Add a number to M."""
+        if value:
+            self.entries.append((row, column, value))
+
+    def equation(self, k, i):
+        """Return the row of equation i of the step from k to k + 1; None outside of the window."""
+        place = k + self.prior
+        return place * self.system.E.rows + i if 0 <= place < self.equations else None
+
+    def output(self, k, i):
+        """Return the row of output i at sample k; None outside of the window."""
+        first = self.equations * self.system.E.rows
+        return first + k * self.system.C.rows + i if 0 <= k < self.samples else None
+
+    def acts(self, k, state, output, i, column, times=1):
+        """Let a column of z act at k as signal i does, by these matrices of states and outputs."""
+        for r in range(state.rows):
+            row = self.equation(k, r)
+            if row is not None:
+                self.put(row, column, -times * state.fraction(r, i))
+        for r in range(output.rows):
+            row = self.output(k, r)
+            if row is not None:
+                self.put(row, column, times * output.fraction(r, i))
+
+    def fill(self):
+        """Form M."""
+        system, question = self.system, self.question
+        bounds = {name: [None if v is None else read_matrix(v).number() for v in values]
+                  for name, values in question["bounds"].items()}
+        span = range(-self.prior, max(self.equations - self.prior, self.samples))
+        self.theta = self.column(None)
+        n = system.E.rows
+        states = {}
+        for k in range(-self.prior, self.equations - self.prior + 1):
+            for i in range(n):
+                bound = bounds["states"][i]
+                if k == 0 and bounds["first"][i] is not None:
+                    bound = bounds["first"][i] if bound is None else min(bound, bounds["first"][i])
+                states[k, i] = self.column(bound)
+        for k in range(-self.prior, self.equations - self.prior):
+            for r in range(n):
+                for i in range(n):
+                    self.put(self.equation(k, r), states[k + 1, i], system.E.fraction(r, i))
+                    self.put(self.equation(k, r), states[k, i], -system.A.fraction(r, i))
+        for k in range(self.samples):
+            for r in range(system.C.rows):
+                for i in range(n):
+                    require((k, i) in states or not system.C.fraction(r, i), "a sample is seen without its state")
+                    if (k, i) in states:
+                        self.put(self.output(k, r), states[k, i], system.C.fraction(r, i))
+        for k in span:
+            for i, bound in enumerate(bounds["noise"]):
+                if bound:
+                    self.acts(k, self.G, self.H, i, self.column(bound, ("w", k)))
+        self.disturb(bounds, span)
+        self.look_for(bounds, span)
+        for fault in question["free"]:
+            require(int(fault) != int(question["fault"]), "the fault that is looked for is free")
+            column = None
+            for k in span:
+                if column is None or question["free_course"] == "any":
+                    column = self.column(None)
+                self.acts(k, system.Bf, system.Df, int(fault), column)
+        require(question["free_course"] in ("any", "constant"), "the course of free faults is unknown")
+        self.move_middles(bounds, span)
+
+    def disturb(self, bounds, span):
+        """Disturbances: new at each sample (jump), the same at all (held), or with bounded changes (rate)."""
+        system, kind = self.system, self.question["disturbance"]
+        require(kind in ("jump", "held", "rate"), "the course of disturbances is unknown")
+        require(len(bounds["disturbances"]) == system.Bd.columns, "each disturbance needs a bound")
+        for i, bound in enumerate(bounds["disturbances"]):
+            before = column = None
+            require(bound is not None, "each disturbance needs a bound")
+            for k in span if bound else ():
+                if column is None or kind != "held":
+                    column = self.column(bound, ("d", k) if kind == "jump" else None)
+                self.acts(k, system.Bd, system.Dd, i, column)
+                if kind == "rate" and before is not None:
+                    change = self.column(bounds["rates"][i])
+                    for place, value in ((column, 1), (before, -1), (change, -1)):
+                        self.put(self.row_count, place, value)
+                    self.row_count += 1
+                before = column
+
+    def look_for(self, bounds, span):
+        """The fault that is looked for: what theta does, and what else this fault may do."""
+        system, course, fault = self.system, self.question["course"], int(self.question["fault"])
+        target = self.samples - 1 - int(self.question["lag"])
+        require(course in ("step", "constant", "any", "ramp", "rate"), "the course of the fault is unknown")
+
+        def acts(k, column, times=1):
+            self.acts(k, system.Bf, system.Df, fault, column, times)
+
+        slope = self.column(None) if course == "ramp" else None
+        for k in span:
+            if course != "any" and not (course == "step" and k < int(self.question["before"])):
+                acts(k, self.theta)
+            if course == "ramp":
+                acts(k, slope, k - target)
+            if course == "any":
+                acts(k, self.theta if k == target else self.column(None))
+        for k in list(span)[1:] if course == "rate" else ():
+            change = self.column(bounds["fault_rate"][0])
+            for there in span:
+                if k > target and there >= k:
+                    acts(there, change)
+                if k <= target and there < k:
+                    acts(there, change, -1)
+
+    def move_middles(self, bounds, span):
+        """What the middles of bounds put into each row, to be taken from the right side."""
+        system, self.offsets = self.system, [Fraction(0)] * self.row_count
+        matrices = {"disturbances": (system.Bd, system.Dd), "noise": (self.G, self.H)}
+        for kind, (state, output) in matrices.items():
+            for i, number in enumerate(self.question["middles"][kind]):
+                middle = read_matrix(number).number()
+                for k in span if middle else ():
+                    for r in range(state.rows):
+                        if self.equation(k, r) is not None:
+                            self.offsets[self.equation(k, r)] -= middle * state.fraction(r, i)
+                    for r in range(output.rows):
+                        if self.output(k, r) is not None:
+                            self.offsets[self.output(k, r)] += middle * output.fraction(r, i)
+
+    def seen(self, multipliers):
+        """Return ``M' lambda``."""
+        found = [Fraction(0)] * len(self.bounds)
+        for column, value in sums((c, v, multipliers[r]) for r, c, v in self.entries).items():
+            found[column] = value
+        return found
+
+    def largest(self, parts):
+        """Return at least the largest sum of ``part * entry``, the entries being within their bounds.
+
+        With the norm ``ellipsoid`` the entries of one sample, in their bounds, keep a sum of squares of at most one.
+        """
+        alone, groups = Fraction(0), {}
+        for part, bound, group in zip(parts, self.bounds, self.groups):
+            if bound:
+                if self.question["norm"] == "ellipsoid" and group is not None:
+                    groups[group] = groups.get(group, 0) + (bound * part) ** 2
+                else:
+                    alone += abs(part) * bound
+        return alone + sum(map(root_above, groups.values()), Fraction(0))
+
+    def weights(self, multipliers):
+        """Return what ``lambda' b`` makes of y and u, by sample: ``{k: row of numbers}`` for each."""
+        system, on_y, on_u = self.system, {}, {}
+        for k in range(-self.prior, max(self.equations - self.prior, self.samples)):
+            of_y = [multipliers[self.output(k, r)] if self.output(k, r) is not None else Fraction(0)
+                    for r in range(system.C.rows)]
+            on_y[k] = of_y
+            on_u[k] = []
+            for j in range(system.B.columns):
+                value = -sum((of_y[r] * system.D.fraction(r, j) for r in range(system.C.rows)), Fraction(0))
+                if 0 <= k + self.prior < self.equations:
+                    value += sum((multipliers[self.equation(k, r)] * system.B.fraction(r, j)
+                                  for r in range(system.E.rows)), Fraction(0))
+                on_u[k].append(value)
+        return on_y, on_u
+
+
+def sums(terms):
+    """Return the sums of products by key."""
+    found = {}
+    for key, one, two in terms:
+        if one and two:
+            found[key] = found.get(key, 0) + one * two
+    return found
+
+
+def root_above(value):
+    """Return a number at least as large as the square root of a fraction."""
+    from math import isqrt
+
+    scale = 2**256
+    numerator = isqrt(value.numerator * scale * scale // value.denominator + 1) + 1
+    return Fraction(numerator, scale)
+
+
+def read_fractions(given, count):
+    """Read a list of fractions with one denominator."""
+    denominator, entries = read_integer(given["denominator"]), [read_integer(v) for v in given["numerators"]]
+    require(denominator > 0 and len(entries) == count, "the multipliers do not fit the window")
+    return [Fraction(value, denominator) for value in entries]
+
+
+def threshold_holds(system, claim):
+    """A guaranteed test never passes its threshold while its fault is absent.
+
+    Multipliers lambda weigh every free entry of z with zero and theta with one: ``lambda' b = theta + sum of
+    (M' lambda)_j z_j`` over the entries with bounds, whose sum is at most the threshold.  So ``|lambda' b| <= threshold``
+    without the fault, and a fault above twice the threshold passes it.  The weights that run are the response of the
+    observer's row; by ``rounding`` they differ from those of lambda at most, per unit of each known signal.
+    """
+    window = Window(system, claim["window"])
+    multipliers = read_fractions(claim["multipliers"], window.row_count)
+    seen, threshold = window.seen(multipliers), read_matrix(claim["threshold"]).number()
+    require(seen[window.theta] == 1, "the fault does not count with weight one")
+    free = [j for j, bound in enumerate(window.bounds) if bound is None and j != window.theta]
+    require(not any(seen[j] for j in free), "a signal without a bound reaches the test")
+    seen[window.theta] = Fraction(0)
+    require(window.largest(seen) <= threshold, "the threshold is not proved")
+    require_weights_run(system, claim, window, multipliers)
+    return f"without {system.names['faults'][int(claim['window']['fault'])]}, its test never passes {shown(threshold)} " \
+           f"(and the rounding of its weights); a fault of twice that passes it"
+
+
+def require_weights_run(system, claim, window, multipliers):
+    """Refuse unless the observer's row has the weights of the multipliers, but for rounding."""
+    row, rounding = int(claim["row"]), [read_matrix(value).number() for value in claim["rounding"]]
+    require(0 <= row < system.Cz.rows and len(rounding) == system.B.columns + system.C.rows, "there is no such row")
+    on_y, on_u = window.weights(multipliers)
+    used = [k for k in on_y if any(on_y[k]) or any(on_u[k])]
+    last, state = max([*used, window.samples - 1]), system.Cz.part([row])
+    missed = [Fraction(0)] * len(rounding)
+    response = (system.Du.part([row]), system.Dy.part([row]))
+    for k in range(last, -window.prior - 1, -1):
+        wanted = [*on_u[k], *on_y[k]]
+        found = entries_of(response[0]) + entries_of(response[1])
+        missed = [m + abs(a - b) for m, a, b in zip(missed, wanted, found)]
+        response = (state @ system.Bu, state @ system.By)
+        state = state @ system.Az
+    require(response[0].is_zero() and response[1].is_zero() and state.is_zero(), "the test looks at more samples")
+    require(all(m <= r for m, r in zip(missed, rounding)), "the weights that run are not those of the multipliers")
+    constant = -sum((m * offset for m, offset in zip(multipliers, window.offsets)), Fraction(0))
+    require(abs(read_matrix(claim["constant"]).number() - constant) <= read_matrix(claim["constant_rounding"]).number(),
+            "the constant of the test is another one")
+
+
+def least_is_hidden(system, claim):
+    """No function of a window's samples tells a fault of this size from its opposite: weak duality.
+
+    A point z with ``M z = 0`` and theta = ``least`` keeps all bounds, and so does -z: both give the same samples.  The
+    equations are those of the window, from ``prior`` steps before its first sample to the last of ``equations``.
+    """
+    window = Window(system, claim["window"])
+    point, least = read_fractions(claim["point"], len(window.bounds)), read_matrix(claim["least"]).number()
+    require(least >= 0 and point[window.theta] == least, "the point is of another fault")
+    require(not any(sums((r, v, point[c]) for r, c, v in window.entries).values()), "the point violates an equation")
+    groups = {}
+    for j, (value, bound) in enumerate(zip(point, window.bounds)):
+        if bound is not None and j != window.theta:
+            require(abs(value) <= bound, "the point violates a bound")
+            if claim["window"]["norm"] == "ellipsoid" and window.groups[j] is not None and bound:
+                groups[window.groups[j]] = groups.get(window.groups[j], 0) + (value / bound) ** 2
+    require(all(value <= 1 for value in groups.values()), "the point violates a bound")
+    begun = f"begins {window.prior} samples before the window" if window.prior else "begins with the window"
+    return f"for a plant that {begun}, no function of {window.samples} samples estimates " \
+           f"{system.names['faults'][int(claim['window']['fault'])]} to within less than {shown(least, down=True)}"
+
+
+def alarm_is_right(system, claim):
+    """These samples cannot occur without the fault: ``lambda' b`` passes what disturbances and noise can do.
+
+    As in ``threshold_holds``, but lambda need not weigh theta: without the fault it is zero.
+    """
+    window = Window(system, claim["window"])
+    multipliers = read_fractions(claim["multipliers"], window.row_count)
+    seen = window.seen(multipliers)
+    seen[window.theta] = Fraction(0)
+    require(not any(value for value, bound in zip(seen, window.bounds) if bound is None), "a free signal is seen")
+    y, u = read_matrix(claim["y"]), read_matrix(claim["u"])
+    require(y.columns == system.C.rows and u.columns == system.B.columns and y.rows == u.rows, "the samples do not fit")
+    require(window.prior == 0 and y.rows >= max(window.samples, window.equations), "there are too few samples")
+    on_y, on_u = window.weights(multipliers)
+    value = sum((weight * y.fraction(k, r) for k, row in on_y.items() for r, weight in enumerate(row) if weight),
+                Fraction(0))
+    value += sum((weight * u.fraction(k, r) for k, row in on_u.items() for r, weight in enumerate(row) if weight),
+                 Fraction(0))
+    value -= sum((m * offset for m, offset in zip(multipliers, window.offsets)), Fraction(0))
+    allowed, margin = window.largest(seen), read_matrix(claim["margin"]).number()
+    require(allowed > 0 and margin > 0, "nothing is uncertain, or the margin is not positive")
+    require(abs(value) >= (1 + margin) * allowed, "the samples may occur without the fault")
+    return f"the {window.samples} samples of the alarm cannot occur without " \
+           f"{system.names['faults'][int(claim['window']['fault'])]}: all bounds would have to be exceeded by " \
+           f"{shown(margin * 100, down=True)} %"
+
+
+CLAIMS = {
+    "plant": plant_follows,
+    "identities": identities_hold,
+    "stable": stable,
+    "gain": gain_is_below,
+    "deviation": deviation_is_below,
+    "rounding": rounding_adds_little,
+    "faults": faults_are_estimated,
+    "fault models": fault_models_are_followed,
+    "threshold": threshold_holds,
+    "least": least_is_hidden,
+    "alarm": alarm_is_right,
+}
+
+
+# 6. Reading, and verdicts -------------------------------------------------------------------------------------------
+
+
+def read_integer(value):
+    """Read an integer: a number of JSON, or hexadecimal digits in quotes where it is long."""
+    if isinstance(value, str):
+        require(set(value.removeprefix("-")) <= set("0123456789abcdef") and value not in ("", "-"), "not an integer")
+        return int(value, 16)
+    require(isinstance(value, int) and not isinstance(value, bool), "not an integer")
+    return value
+
+
+def read_matrix(given):
+    """Read a matrix: its size, its exponent, and its integers row by row (``entry * 2**exponent``)."""
+    rows, columns = (read_integer(value) for value in given["size"])
+    exponent, entries = read_integer(given["exponent"]), given["entries"]
+    require(rows >= 0 and columns >= 0 and rows * columns == len(entries), "a matrix has another size than it says")
+    require(abs(exponent) <= LARGEST_EXPONENT, "an exponent is too large")
+    integers = [read_integer(value) for value in entries]
+    return Matrix(rows, columns, [integers[i * columns : (i + 1) * columns] for i in range(rows)], exponent)
+
+
+def check(file):
+    """Return for each claim its name, whether it is proved, and the sentence or the reason; and what is not covered."""
+    require(isinstance(file, dict), "this is no proof file")
+    require(file.get("format") == FORMAT, "this is no proof file")
+    require(file.get("version") == VERSION, f"the version of the file is not {VERSION}")
+    system = System(file)
+    require(file["claims"], "there are no claims")
+    verdicts = []
+    for claim in file["claims"]:
+        name = str(claim.get("claim"))
+        try:
+            require(name in CLAIMS, "this program knows no such claim: it is not proved")
+            verdicts.append((name, True, CLAIMS[name](system, claim)))
+        except Refused as refused:
+            verdicts.append((name, False, str(refused)))
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            verdicts.append((name, False, f"the claim cannot be read: {type(error).__name__} {error}"))
+    return verdicts, [str(text) for text in file.get("not_covered", [])]
+
+
+def main(arguments):
+    """Check one file, print what is proved, and return the exit code."""
+    if len(arguments) != 1:
+        print("usage: python -I check_proof.py proof.json", file=sys.stderr)
+        return 2
+    try:
+        with open(arguments[0], encoding="utf-8") as stream:
+            file = json.load(stream)
+        verdicts, left = check(file)
+    except (OSError, Refused, ArithmeticError, AttributeError, LookupError, TypeError, ValueError,
+            RecursionError) as error:
+        print(f"Not a proof file that can be checked: {type(error).__name__}: {error}", file=sys.stderr)
+        return 2
+    print(f"{file.get('about', '')}")
+    for name, proved, text in verdicts:
+        print(f"{'PROVED' if proved else 'NOT PROVED'}  {name}: {text}")
+    for text in left:
+        print(f"NOT COVERED by this file: {text}")
+    if all(proved for _, proved, _ in verdicts):
+        print(f"All {len(verdicts)} claims are proved, for the numbers in this file.")
+        return 0
+    print(f"{sum(not proved for _, proved, _ in verdicts)} of {len(verdicts)} claims are NOT PROVED.")
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

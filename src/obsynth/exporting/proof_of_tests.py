@@ -1,0 +1,351 @@
+"""Guaranteed tests and their alarms in proof files: multipliers and hidden faults as fractions, exact to the last digit.
+
+Shipped doubles lie next to exact solutions.  Here these are solved for in fractions: a square part of the window's
+equations, chosen in double precision, by lifting.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from flint import fmpq, fmpq_mat
+
+from obsynth.errors import ObsynthError, PreconditionError, SpecError
+from obsynth.exporting.proof_file import PROOF_VERSION, proof_of
+from obsynth.methods.guaranteed_test.checks import is_bank, tests_of
+from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
+from obsynth.methods.guaranteed_test.problem import window_as_designed
+from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.numerics.arguments import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.witnesses import Dyadic, above, root_above, written
+from obsynth.results.design import ObserverDesign
+
+#: Windows with more equations have no exact fractions in a file: their numerators have as many words.
+MOST_EQUATIONS = 400
+#: Diagonal of a pivoted triangle, as a share of its first entry, below which rows are taken as dependent.
+DEPENDENT = 1e-13
+#: Room of a stated bound of rounding above what it is computed as.
+ROUNDING_ROOM = 1.0 + 2.0**-20
+
+
+def test_claims(design: ObserverDesign) -> Iterator[tuple[str, dict[str, Any] | None]]:
+    """Yield the claims of each test of a design: its name, and the claim or ``None`` where it is not exported."""
+    bank = is_bank(design)
+    tests = tests_of(design, GuaranteedTestMethod.of) if bank else (design,)
+    for place, test in enumerate(tests):
+        of = f" of the test of {test.options['fault']}" if bank else ""
+        window = window_as_designed(test.linear[0], GuaranteedTestMethod.of(test.options))
+        row = len(design.linear[1].state_names) + place
+        yield f"the threshold{of}: its window has too many equations", _threshold(design, test, window, row)
+        if test.certificate.claims.get("least"):
+            yield f"the least threshold{of}: its window has too many equations", _least(test, window)
+
+
+def _threshold(whole: ObserverDesign, test: ObserverDesign, window: Window, row: int) -> dict[str, Any] | None:
+    threshold = float(test.certificate.claims["threshold"])
+    exact = exact_test(window, test.certificate.matrices["multipliers"].ravel(), all_columns=threshold == 0.0)
+    if exact is None:
+        return None
+    parts = _seen(window, exact)
+    proved = _largest(window, parts)
+    # The exact multipliers are next to the shipped ones: their own threshold may be larger by rounding.
+    stated = max(threshold, above(proved)) if threshold else 0.0
+    rounding, constant = _rounding(whole, window, exact, row)
+    return {
+        "claim": "threshold",
+        "window": question_of_window(window),
+        "multipliers": _fractions(exact),
+        "threshold": _number(stated),
+        "row": row,
+        "rounding": [_number(value) for value in rounding],
+        "constant": _number(float(whole.linear[1].added[row])),
+        "constant_rounding": _number(constant),
+    }
+
+
+def _least(test: ObserverDesign, window: Window) -> dict[str, Any] | None:
+    shipped = test.certificate.matrices.get("witness")
+    point = None if shipped is None else exact_point(window, shipped.ravel()[: len(window.bar)])
+    if point is None:
+        return None
+    worst = max(Fraction(1), _excess(window, point))
+    least = -above(-(point[0] / worst))
+    if not least > 0.0:
+        return None
+    share = Fraction(least) / point[0]
+    return {
+        "claim": "least",
+        "window": question_of_window(window),
+        "point": _fractions([value * share for value in point]),
+        "least": _number(least),
+    }
+
+
+def alarm_proof_of(certificate: str | Path | Mapping[str, Any]) -> dict[str, Any]:
+    """Return the proof file of an alarm of a guaranteed test: that of its gain set, and the claim on the alarm.
+
+    Parameters
+    ----------
+    certificate : str, Path or mapping
+        An alarm certificate, or its file.
+
+    Raises
+    ------
+    SpecError
+        The alarm is of another method: its proof is a linear programme over the state, which is left to `obsynth verify`.
+    PreconditionError
+        The numbers of the certificate prove nothing.
+    """
+    from obsynth.results.design import design_from_dict
+
+    data = certificate if isinstance(certificate, Mapping) else json.loads(Path(certificate).read_text(encoding="utf-8"))
+    body = data.get("certificate", data)
+    if "multipliers" not in body or "test" not in body:
+        raise SpecError(
+            "The alarm is proved by a linear programme over the states of its window, not by a guaranteed test: only "
+            "alarms of guaranteed tests have proof files. `obsynth verify` checks this one.",
+            path="certificate",
+        )
+    design = design_from_dict(body["gain_set"])
+    tests = tests_of(design, GuaranteedTestMethod.of) if is_bank(design) else (design,)
+    test = next(each for each in tests if each.options["fault"] in (body["test"], None))
+    window = window_as_designed(test.linear[0], GuaranteedTestMethod.of(test.options))
+    claim = {
+        "claim": "alarm",
+        "window": question_of_window(window),
+        "multipliers": _fractions([Fraction(text) for text in body["multipliers"]]),
+        "y": Dyadic.of(np.atleast_2d(body["y"])).data(),
+        "u": _samples(body["u"], len(body["y"]), test.linear[0].nu).data(),
+        "margin": _number(float(body["margin"])),
+    }
+    found = proof_of(design)
+    return {**found, "about": f"alarm at row {body['row']}, {found['about']}", "claims": [*found["claims"], claim]}
+
+
+def _samples(values: Any, count: int, columns: int) -> Dyadic:
+    return Dyadic.of(np.asarray(values, dtype=np.float64).reshape(count, columns))
+
+
+def question_of_window(window: Window) -> dict[str, Any]:
+    """Return what the checker forms the same equations from."""
+    question, bounds = window.question, window.bounds
+    middles = {
+        "disturbances": bounds.disturbance_middle,
+        "noise": bounds.noise_middle,
+    }
+    counts = {"disturbances": len(bounds.disturbance), "noise": len(bounds.noise)}
+    rates = question.disturbance_rate if len(question.disturbance_rate) else np.zeros(counts["disturbances"])
+    return {
+        "samples": question.samples,
+        "prior": 0,
+        "equations": window.equations,
+        "fault": question.fault,
+        "course": question.course,
+        "lag": question.lag,
+        "before": question.before,
+        "free": list(question.free),
+        "free_course": question.free_course,
+        "disturbance": question.disturbance,
+        "norm": "ellipsoid" if question.ellipsoid else "box",
+        "noise_state": Dyadic.of(bounds.noise_state).data(),
+        "noise_output": Dyadic.of(bounds.noise_output).data(),
+        "bounds": {
+            "disturbances": [_bound(value) for value in bounds.disturbance],
+            "noise": [_bound(value) for value in bounds.noise],
+            "states": [_bound(value) for value in bounds.state],
+            "first": [_bound(value) for value in bounds.first],
+            "rates": [_bound(value) for value in rates],
+            "fault_rate": [_bound(question.fault_rate)],
+        },
+        "middles": {
+            kind: [_number(float(value)) for value in (np.zeros(counts[kind]) if given is None else given)]
+            for kind, given in middles.items()
+        },
+    }
+
+
+def exact_test(window: Window, multipliers: FloatArray, *, all_columns: bool = False) -> list[Fraction] | None:
+    """Return fractions next to multipliers: theta has weight one, every free column zero; ``None``: not found."""
+    told = [0, *(range(1, len(window.bar)) if all_columns else np.flatnonzero(window.free).tolist())]
+    seen = _seen(window, [Fraction(float(value)) for value in multipliers])
+    missing = [Fraction(int(column == 0)) - seen[column] for column in told]
+    return _next_to(window.matrix[:, told].toarray().T, multipliers, missing, _entries(window, told, columns=True))
+
+
+def exact_point(window: Window, point: FloatArray) -> list[Fraction] | None:
+    """Return fractions next to a hidden fault that satisfy every equation; ``None``: not found."""
+    rows = list(range(window.rows))
+    values = [Fraction(float(value)) for value in point]
+    missing = [Fraction(0)] * window.rows
+    for i, j, entry in _exact_entries(window):
+        missing[i] -= entry * values[j]
+    # What has room may move: free numbers, and those inside of their bounds; theta stays.
+    room = np.where(window.bounded, np.maximum(window.bar - np.abs(point), 1e-4 * np.where(window.bounded, window.bar, 0.0)),
+                    np.maximum(1.0, np.abs(point)))  # fmt: skip
+    room[0] = 0.0
+    return _next_to(window.matrix.toarray(), point, missing, _entries(window, rows, columns=False), weight=room)
+
+
+def _next_to(
+    matrix: FloatArray,
+    values: FloatArray,
+    missing: list[Fraction],
+    exact: Mapping[tuple[int, int], Fraction],
+    *,
+    weight: FloatArray | None = None,
+) -> list[Fraction] | None:
+    """Return ``values + step`` with ``matrix step = missing``, of as few entries as there are independent rows."""
+    from scipy.linalg import qr
+
+    if len(matrix) > MOST_EQUATIONS:
+        return None
+    heavy = np.abs(values) if weight is None else weight
+    heavy = heavy if weight is not None else np.maximum(heavy, 1e-3 * float(np.max(heavy, initial=0.0)))
+    scaled = matrix * heavy
+    largest = np.abs(scaled).max(axis=1, initial=0.0)
+    scaled = scaled / np.where(largest > 0.0, largest, 1.0)[:, None]
+    triangle, by_row = qr(scaled.T, mode="r", pivoting=True)
+    diagonal = np.abs(np.diag(triangle))
+    rank = int(np.sum(diagonal > DEPENDENT * max(float(np.max(diagonal, initial=0.0)), np.finfo(float).tiny)))
+    rows = np.sort(by_row[:rank]).tolist()
+    _, by_column = qr(scaled[rows], mode="r", pivoting=True)
+    columns = np.sort(by_column[:rank]).tolist()
+    part = fmpq_mat(rank, rank, [_rational(exact.get((i, j), Fraction(0))) for i in rows for j in columns])
+    right = fmpq_mat(rank, 1, [_rational(missing[i]) for i in rows])
+    try:
+        step = part.solve(right, algorithm="dixon") if rank else right
+    except ZeroDivisionError:
+        return None
+    found = [Fraction(float(value)) for value in values]
+    added = {column: Fraction(int(step[k, 0].p), int(step[k, 0].q)) for k, column in enumerate(columns)}
+    kept = set(rows)
+    sums = [Fraction(0)] * len(matrix)
+    for (i, j), entry in exact.items():
+        if i not in kept and j in added:
+            sums[i] += entry * added[j]
+    if any(sums[i] != missing[i] for i in range(len(matrix)) if i not in kept):
+        return None
+    for column, value in added.items():
+        found[column] += value
+    return found
+
+
+def _rational(value: Fraction) -> Any:
+    return fmpq(value.numerator, value.denominator)
+
+
+def _exact_entries(window: Window) -> Iterator[tuple[int, int, Fraction]]:
+    entries = (window.i.tolist(), window.j.tolist(), window.value.tolist(), window.times.tolist())
+    for i, j, value, times in zip(*entries, strict=True):
+        yield i, j, Fraction(value) * times
+
+
+def _entries(window: Window, told: list[int], *, columns: bool) -> dict[tuple[int, int], Fraction]:
+    """Return exact entries: of some columns, transposed, or of some rows."""
+    place = {number: k for k, number in enumerate(told)}
+    found: dict[tuple[int, int], Fraction] = {}
+    for i, j, entry in _exact_entries(window):
+        key = (place.get(j), i) if columns else (place.get(i), j)
+        if key[0] is not None:
+            found[key[0], key[1]] = found.get((key[0], key[1]), Fraction(0)) + entry
+    return found
+
+
+def _seen(window: Window, multipliers: list[Fraction]) -> list[Fraction]:
+    found = [Fraction(0)] * len(window.bar)
+    for i, j, entry in _exact_entries(window):
+        if multipliers[i]:
+            found[j] += entry * multipliers[i]
+    return found
+
+
+def _largest(window: Window, parts: list[Fraction]) -> Fraction:
+    """Return the threshold, as the checker sums it."""
+    alone, groups = Fraction(0), dict[int, Fraction]()
+    for j in np.flatnonzero(window.bounded).tolist():
+        part, group = Fraction(float(window.bar[j])) * abs(parts[j]), int(window.group[j])
+        if window.question.ellipsoid and group >= 0:
+            groups[group] = groups.get(group, Fraction(0)) + part**2
+        else:
+            alone += part
+    return alone + sum((Fraction(root_above(value)) for value in groups.values()), start=Fraction(0))
+
+
+def _excess(window: Window, point: list[Fraction]) -> Fraction:
+    """Return by which factor a point exceeds its bounds."""
+    worst, groups = Fraction(0), dict[int, Fraction]()
+    for j in np.flatnonzero(window.bounded).tolist():
+        bar, group = Fraction(float(window.bar[j])), int(window.group[j])
+        if not bar:
+            continue
+        share = abs(point[j]) / bar
+        worst = max(worst, share)
+        if window.question.ellipsoid and group >= 0:
+            groups[group] = groups.get(group, Fraction(0)) + share**2
+    return max([worst, *(Fraction(root_above(value)) for value in groups.values())])
+
+
+def _rounding(
+    whole: ObserverDesign, window: Window, multipliers: list[Fraction], row: int
+) -> tuple[FloatArray, float]:
+    """Return how far the weights that run are from exact ones, summed over the samples, and the constant from its own."""
+    observer, plant = whole.linear[1], window.plant
+    exact = _Weights(window, multipliers)
+    response = [Dyadic.of(observer.Du[[row]]), Dyadic.of(observer.Dy[[row]])]
+    state, (az, bu, by) = Dyadic.of(observer.Cz[[row]]), (Dyadic.of(m) for m in (observer.Az, observer.Bu, observer.By))
+    missed = [Fraction(0)] * (plant.nu + plant.ny)
+    for k in range(exact.last, -1, -1):
+        found = [part.fraction(0, j) for part in response for j in range(part.shape[1])]
+        missed = [m + abs(a - b) for m, a, b in zip(missed, exact.at(k), found, strict=True)]
+        response, state = [state @ bu, state @ by], state @ az
+    constant = -sum((m * side for m, side in zip(multipliers, window.standing or (), strict=False)), start=Fraction(0))
+    away = above(abs(Fraction(float(observer.added[row])) - constant))
+    return np.array([above(value) * ROUNDING_ROOM for value in missed]), away * ROUNDING_ROOM
+
+
+class _Weights:
+    """What exact multipliers make of known inputs and outputs, by sample."""
+
+    def __init__(self, window: Window, multipliers: list[Fraction]) -> None:
+        self.window, self.multipliers = window, multipliers
+        length = max(window.equations, window.question.samples)
+        used = [k for k in range(length) if any(self.at(k))]
+        self.last = max([*used, window.question.samples - 1])
+
+    def at(self, k: int) -> list[Fraction]:
+        """Return the weights of u and y at sample k."""
+        window, plant = self.window, self.window.plant
+        nx, ny, zero = plant.nx, plant.ny, [Fraction(0)] * plant.ny
+        first = window.outputs_at + k * ny
+        of_y = self.multipliers[first : first + ny] if k < window.question.samples else zero
+        of_x = self.multipliers[k * nx : (k + 1) * nx] if k < window.equations else [Fraction(0)] * nx
+        on_u = [
+            sum((w * Fraction(float(plant.B[r, j])) for r, w in enumerate(of_x)), start=Fraction(0))
+            - sum((w * Fraction(float(plant.D[r, j])) for r, w in enumerate(of_y)), start=Fraction(0))
+            for j in range(plant.nu)
+        ]
+        return [*on_u, *of_y]
+
+
+def _fractions(values: list[Fraction]) -> dict[str, Any]:
+    denominator = math.lcm(*(value.denominator for value in values)) if values else 1
+    numerators = [value.numerator * (denominator // value.denominator) for value in values]
+    return {"denominator": written(denominator), "numerators": [written(value) for value in numerators]}
+
+
+def _number(value: float) -> dict[str, Any]:
+    return Dyadic.of(np.array([[value]])).data()
+
+
+def _bound(value: float) -> dict[str, Any] | None:
+    return _number(float(value)) if np.isfinite(value) else None
+
+
+__all__ = ["PROOF_VERSION", "DescriptorSystem", "ObsynthError", "PreconditionError", "alarm_proof_of", "test_claims"]
