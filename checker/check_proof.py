@@ -11,8 +11,8 @@ How to read this file (about an hour): sections 1 and 2 are the arithmetic and t
 matrices; section 3 forms the error system; sections 4 and 5 have one function a claim, each with its proof in its
 docstring; section 6 reads the file and prints the verdicts.
 
-Notation: the plant is ``E x+ = A x + B u + Bf f + Bd d + Bw w``, ``y = C x + D u + Df f + Dd d + Dw w``, where x+ is the
-next state or, with sample time zero, the derivative.  The observer is ``z+ = Az z + Bu u + By y``, and its rows are
+Notation: the plant is ``E x+ = A x + B u + Bf f + Bd d + Bw w``, ``y = C x + D u + Df f + Dd d + Dw w``, where x+ is
+the next state or, with sample time zero, the derivative.  The observer is ``z+ = Az z + Bu u + By y``, and its rows are
 ``r = Cz z + Du u + Dy y``.  A' is a transpose.
 """
 
@@ -25,6 +25,7 @@ FORMAT, VERSION = "obsynth-proof", 1
 LARGEST_EXPONENT = 100_000
 #: The identities of an observer must hold to this share of the terms that they consist of.
 LARGEST_SHARE = Fraction(1, 1000)
+NOT_ITS_FAULT = "an estimate is not that of its fault"
 
 
 class Refused(Exception):
@@ -64,7 +65,7 @@ class Matrix:
         for row in parts:
             require(len({part.rows for part in row}) == 1, "blocks do not fit")
             aligned = [part.integers(exponent) for part in row]
-            entries += [sum((part[i] for part in aligned), []) for i in range(row[0].rows)]
+            entries += [[value for part in aligned for value in part[i]] for i in range(row[0].rows)]
         columns = sum(part.columns for part in parts[0])
         require(all(len(row) == columns for row in entries), "blocks do not fit")
         return Matrix(len(entries), columns, entries, exponent)
@@ -77,8 +78,8 @@ class Matrix:
     def __add__(self, other):
         require((self.rows, self.columns) == (other.rows, other.columns), "matrices of different sizes are added")
         exponent = min(self.exponent, other.exponent)
-        both = zip(self.integers(exponent), other.integers(exponent))
-        entries = [[a + b for a, b in zip(one, two)] for one, two in both]
+        both = zip(self.integers(exponent), other.integers(exponent), strict=True)
+        entries = [[a + b for a, b in zip(one, two, strict=True)] for one, two in both]
         return Matrix(self.rows, self.columns, entries, exponent)
 
     def __neg__(self):
@@ -89,7 +90,7 @@ class Matrix:
 
     def __matmul__(self, other):
         require(self.columns == other.rows, "matrices that do not fit are multiplied")
-        across = list(zip(*other.entries)) if other.rows else [()] * other.columns
+        across = list(zip(*other.entries, strict=True)) if other.rows else [()] * other.columns
         entries = []
         for row in self.entries:
             used = [k for k, value in enumerate(row) if value]
@@ -99,7 +100,11 @@ class Matrix:
     @property
     def T(self):
         """The transpose."""
-        entries = [list(column) for column in zip(*self.entries)] if self.rows else [[] for _ in range(self.columns)]
+        entries = (
+            [list(column) for column in zip(*self.entries, strict=True)]
+            if self.rows
+            else [[] for _ in range(self.columns)]
+        )
         return Matrix(self.columns, self.rows, entries, self.exponent)
 
     def absolute(self):
@@ -154,9 +159,9 @@ def require_positive_definite(matrix, witness, what):
     """Prove ``S > 0`` for a symmetric matrix S.
 
     The witness is a matrix F and positive integers d, one for each row.  With ``R = S - F'F``, which is computed
-    exactly, ``x'Sx = |Fx|^2 + x'Rx``.  If ``d_i R_ii > sum of d_j |R_ij| over the other j`` in every row i, then R, each
-    row and column times its d, is strictly diagonally dominant with a positive diagonal, so that ``x'Rx > 0`` for all
-    x that are not zero (Gershgorin), and so is ``x'Sx``.  Any F and d will do: they need not be trusted.
+    exactly, ``x'Sx = |Fx|^2 + x'Rx``.  If ``d_i R_ii > sum of d_j |R_ij| over the other j`` in every row i, then R,
+    each row and column times its d, is strictly diagonally dominant with a positive diagonal, so that ``x'Rx > 0`` for
+    all x that are not zero (Gershgorin), and so is ``x'Sx``.  Any F and d will do: they need not be trusted.
     """
     size = matrix.rows
     require(matrix.columns == size and (matrix - matrix.T).is_zero(), f"{what}: the matrix is not symmetric")
@@ -165,7 +170,7 @@ def require_positive_definite(matrix, witness, what):
     require(all(weight > 0 for weight in weights), f"{what}: a weight is not positive")
     rest = (matrix - factor.T @ factor).entries
     for i, row in enumerate(rest):
-        others = sum(abs(value) * weight for value, weight in zip(row, weights)) - abs(row[i]) * weights[i]
+        others = sum(abs(value) * weight for value, weight in zip(row, weights, strict=True)) - abs(row[i]) * weights[i]
         require(row[i] * weights[i] > others, f"{what}: the matrix is not proved to be positive definite (row {i + 1})")
 
 
@@ -221,7 +226,7 @@ class System:
             require((found.rows, found.columns) == shape, f"{name} is {found.rows} x {found.columns}, not {shape}")
 
     def extend(self):
-        """Form the equations of xa (``Ea, Aa, Ba, Ca, Bda``), and what each row of the observer should equal: goal xa."""
+        """Form the equations of xa (``Ea, Aa, Ba, Ca, Bda``), and the goal: row i should equal row i of ``goal xa``."""
         n, past, count = self.E.rows, self.lag * self.E.rows, self.Phi.rows
         require(self.Phi.columns == self.Cw.columns == count, "Phi and Cw do not fit")
         require(not count or self.Cw.rows == self.Bf.columns, "Cw does not have a row for each fault")
@@ -250,8 +255,9 @@ class System:
                 row = cw.part([fault])
                 for j in range(count):
                     require(delay == 0 or not row.entries[0][j], "a fault model with a delay is not followed by T")
-                goal = goal + Matrix.blocks([[zero(i, total)], [Matrix.blocks([[zero(1, n + past), row]])],
-                                             [zero(goal.rows - i - 1, total)]])
+                goal = goal + Matrix.blocks(
+                    [[zero(i, total)], [Matrix.blocks([[zero(1, n + past), row]])], [zero(goal.rows - i - 1, total)]]
+                )
         self.goal = goal
 
     def index(self, kind, name):
@@ -283,22 +289,31 @@ class System:
             "L": [self.Du, self.Dy @ self.D, self.T0 @ self.Ba],
         }
         sizes = {
-            "K": [self.Az.absolute() @ (self.T.absolute() @ self.Ea.absolute()), product(self.By, self.Ca),
-                  product(self.T, self.Aa)],
+            "K": [
+                self.Az.absolute() @ (self.T.absolute() @ self.Ea.absolute()),
+                product(self.By, self.Ca),
+                product(self.T, self.Aa),
+            ],
             "U": [self.Bu.absolute(), product(self.By, self.D), product(self.T, self.Ba)],
-            "J": [self.Cz.absolute() @ (self.T.absolute() @ self.Ea.absolute()), product(self.Dy, self.Ca),
-                  product(self.T0, self.Aa), self.goal.absolute()],
+            "J": [
+                self.Cz.absolute() @ (self.T.absolute() @ self.Ea.absolute()),
+                product(self.Dy, self.Ca),
+                product(self.T0, self.Aa),
+                self.goal.absolute(),
+            ],
             "L": [self.Du.absolute(), product(self.Dy, self.D), product(self.T0, self.Ba)],
         }
         terms["Z"], sizes["Z"] = [self.T0 @ self.Ea], [product(self.T0, self.Ea)]
         if self.decoupled:
             terms |= {"V": [self.By @ self.Dd, -(self.T @ self.Bda)], "W": [self.Dy @ self.Dd, self.T0 @ self.Bda]}
-            sizes |= {"V": [product(self.By, self.Dd), product(self.T, self.Bda)],
-                      "W": [product(self.Dy, self.Dd), product(self.T0, self.Bda)]}
+            sizes |= {
+                "V": [product(self.By, self.Dd), product(self.T, self.Bda)],
+                "W": [product(self.Dy, self.Dd), product(self.T0, self.Bda)],
+            }
         return {name: (total(terms[name]), total(sizes[name])) for name in terms}
 
     def driven(self, signal):
-        """Return B and D with ``e+ = Az e + B s`` and ``r - goal xa = -Cz e + D s`` for a signal s; e is ``T Ea xa - z``.
+        """Return B and D with ``e+ = Az e + B s``, ``r - goal xa = -Cz e + D s`` for a signal s; e is ``T Ea xa - z``.
 
         ``fault model``: s is added to w+, so that the fault may have any course.
         """
@@ -306,8 +321,12 @@ class System:
             columns = list(range(self.T.columns - self.Phi.rows, self.T.columns))
             return self.T.part(None, columns), self.T0.part(None, columns)
         both = Matrix.blocks([[self.Bd, self.Bw]]), Matrix.blocks([[self.Dd, self.Dw]])
-        known = {"faults": (self.Bf, self.Df), "disturbances": (self.Bd, self.Dd), "noise": (self.Bw, self.Dw),
-                 "disturbances and noise": both}
+        known = {
+            "faults": (self.Bf, self.Df),
+            "disturbances": (self.Bd, self.Dd),
+            "noise": (self.Bw, self.Dw),
+            "disturbances and noise": both,
+        }
         require(signal in known, f"{signal!r} is no signal")
         b, d = known[signal]
         own = list(range(self.E.rows))
@@ -316,8 +335,10 @@ class System:
 
 def diagonal(*parts):
     """Return the blocks of a diagonal."""
-    rows = [[part if i == j else Matrix.zero(part.rows, other.columns) for j, other in enumerate(parts)]
-            for i, part in enumerate(parts)]
+    rows = [
+        [part if i == j else Matrix.zero(part.rows, other.columns) for j, other in enumerate(parts)]
+        for i, part in enumerate(parts)
+    ]
     return Matrix.blocks(rows)
 
 
@@ -370,10 +391,11 @@ def lyapunov(system, claim, rate, a):
 
 
 class Contraction:
-    """A bound on what a column k of inputs does to a row c of outputs: ``eps+ = Az eps + k s``, ``|s| <= 1``, from zero.
+    """A bound on what a column k of inputs does to a row c of outputs, where ``eps+ = Az eps + k s``, ``|s| <= 1``.
 
-    P and a rate are as in ``lyapunov``; the norm ``|eps|_P`` stays below ``|k|_P / (1 - rate)`` or ``|k|_P / rate``.  G
-    with ``[P, I; I, G] > 0`` is above the inverse of P, so that ``|c eps|^2 <= c G c' |eps|_P^2`` (Cauchy-Schwarz).
+    P and a rate are as in ``lyapunov``: from zero, the norm ``|eps|_P`` stays below ``|k|_P / (1 - rate)`` or, in
+    continuous time, ``|k|_P / rate``.  G with ``[P, I; I, G] > 0`` is above the inverse of P, so that
+    ``|c eps|^2 <= c G c' |eps|_P^2`` (Cauchy-Schwarz).
     """
 
     def __init__(self, system, witness):
@@ -394,12 +416,14 @@ class Contraction:
             length = (column.T @ self.p @ column).number()
             for i in range(own.rows):
                 left = bounds.fraction(i, j) - own.fraction(i, j)
-                require(left >= 0 and (left * self.slowness) ** 2 >= self.heights[i] * length,
-                        f"the bound of row {i + 1} and column {j + 1} for {what} is not proved")
+                require(
+                    left >= 0 and (left * self.slowness) ** 2 >= self.heights[i] * length,
+                    f"the bound of row {i + 1} and column {j + 1} for {what} is not proved",
+                )
 
 
 def stable(system, claim):
-    """Errors decay: a Lyapunov inequality (see ``lyapunov``) with a rate below one, or, in continuous time, above zero."""
+    """Errors decay: a Lyapunov inequality with a rate below one or, in continuous time, not below zero."""
     rate = read_matrix(claim["rate"])
     value = rate.number()
     require(0 < value < 1 if system.discrete else value >= 0, "the rate is none of decay")
@@ -413,9 +437,9 @@ def gain_is_below(system, claim):
     """The l2 gain from a signal to the errors of some rows is below gamma, and these errors decay: bounded real lemma.
 
     For ``e+ = a e + b s``, ``r = c e + d s``, ``V = e'Pe`` with P > 0: if ``|r|^2 - gamma^2 |s|^2 + V(e+) - V(e) < 0``
-    for all e, s that are not zero, sums over time give ``sum |r|^2 < gamma^2 sum |s|^2`` from e = 0.  In continuous time
-    the derivative of V is in the place of ``V(e+) - V(e)``.  With s = 0 it is a Lyapunov inequality.  States after the
-    first ``states`` ones are left out where neither those nor the rows depend on them.
+    for all e, s that are not zero, sums over time give ``sum |r|^2 < gamma^2 sum |s|^2`` from e = 0.  In continuous
+    time the derivative of V is in the place of ``V(e+) - V(e)``.  With s = 0 it is a Lyapunov inequality.  States after
+    the first ``states`` ones are left out where neither those nor the rows depend on them.
     """
     gamma, first = read_matrix(claim["gamma"]), int(claim["states"])
     rows, core = system.rows_of(claim["rows"]), list(range(first))
@@ -436,8 +460,10 @@ def gain_is_below(system, claim):
         corner, side = -(a.T @ p + p @ a + c.T @ c), -(p @ b + c.T @ d)
     whole = Matrix.blocks([[corner, side], [side.T, level]])
     require_positive_definite(whole, claim["bounded_real"], "the bounded real inequality")
-    return f"the l2 gain from the {claim['signal']} to the error of the {' and '.join(claim['rows'])} rows is below " \
-           f"{shown(gamma.number())}"
+    return (
+        f"the l2 gain from the {claim['signal']} to the error of the {' and '.join(claim['rows'])} rows is below "
+        f"{shown(gamma.number())}"
+    )
 
 
 def deviation_is_below(system, claim):
@@ -485,7 +511,7 @@ def rounding_adds_little(system, claim):
         for i in system.rows_of(["fault"]) if kind == "states" else []:
             for j in range(first, bounds.columns):
                 size = abs(system.goal.fraction(i, j))
-                require(not size or bounds.fraction(i, j) <= LARGEST_SHARE * size, "an estimate is not that of its fault")
+                require(not size or bounds.fraction(i, j) <= LARGEST_SHARE * size, NOT_ITS_FAULT)
     return f"rounding of the stored numbers adds at most {shown(worst)} to any row, per unit of any state or input"
 
 
@@ -493,14 +519,15 @@ def faults_are_estimated(system, claim):
     """A fault of any course shows in its own estimate, after its delay, and in no other row, but for rounding.
 
     For sampled filters.  A fault impulse leaves ``a^(k-1) b`` in e; row i responds to it with ``d`` at once and with
-    ``-c a^(k-1) b`` after k samples.  That should be one where row i is named like the fault and k is its delay, and zero
-    elsewhere.  ``bounds`` are at least the sum of all differences: those up to the largest delay, each, and by the
+    ``-c a^(k-1) b`` after k samples.  That should be one where row i is named like the fault and k is its delay, and
+    zero elsewhere.  ``bounds`` are at least the sum of all differences: those up to the largest delay, each, and by the
     contraction those after it, which start with the column ``a^delay b``.
     """
     require(system.discrete, "the claim is for sampled filters")
     contraction, bounds, (b, d) = system.contraction(), read_matrix(claim["bounds"]), system.driven("faults")
     delays = {name: delay for kind, name, delay in system.row_kinds if kind == "fault"}
-    require(set(delays) == set(system.names["faults"]) and min(delays.values()) >= 1, "not every fault is estimated late")
+    require(set(delays) == set(system.names["faults"]), "not every fault is estimated")
+    require(min(delays.values()) >= 1, "a fault is estimated without delay")
     missed, trace = d.absolute(), b
     for step in range(1, max(delays.values()) + 1):
         wanted = Matrix.zero(d.rows, d.columns)
@@ -512,10 +539,12 @@ def faults_are_estimated(system, claim):
     contraction.require_bounds(bounds, trace, missed, "faults")
     for i in system.rows_of(["fault"]):
         own = bounds.fraction(i, system.index("faults", system.row_kinds[i][1]))
-        require(own <= LARGEST_SHARE, "an estimate is not that of its fault")
+        require(own <= LARGEST_SHARE, NOT_ITS_FAULT)
     listed = ", ".join(f"{name} {delay}" for name, delay in delays.items())
-    return f"each fault is estimated as it was so many samples ago ({listed}), and shows nowhere else, to " \
-           f"{shown(max(entries_of(bounds)))} per unit of it"
+    return (
+        f"each fault is estimated as it was so many samples ago ({listed}), and shows nowhere else, to "
+        f"{shown(max(entries_of(bounds)))} per unit of it"
+    )
 
 
 def fault_models_are_followed(system, claim):
@@ -523,8 +552,8 @@ def fault_models_are_followed(system, claim):
 
     If ``Az Pi + (By Df - T Bf) Cw = Pi Phi``, then ``z - T E x = Pi w`` is a motion of the filter, to which all others
     decay.  There row i is ``(Cz Pi + (Dy Df + T0 Bf) Cw) w``: the mean of the fault over ``mean`` samples, of which the
-    newest is ``delay`` samples old, or zero for residuals (both sides are multiplied by a power of Phi).  ``bounds`` are
-    of the errors for model states w within one at all times: what the equation of Pi misses drives a difference.
+    newest is ``delay`` samples old, or zero for residuals (both sides are multiplied by a power of Phi).  ``bounds``
+    are of the errors for model states w within one at all times: what the equation of Pi misses drives a difference.
     """
     phi, cw, pi = (read_matrix(claim[name]) for name in ("Phi", "Cw", "Pi"))
     delay, mean, bounds = int(claim["delay"]), int(claim["mean"]), read_matrix(claim["bounds"])
@@ -541,15 +570,18 @@ def fault_models_are_followed(system, claim):
         row = cw.part([system.index("faults", name)]) if kind == "fault" else Matrix.zero(1, phi.rows)
         wanted.append([total([row @ powers[mean - 1 - j] for j in range(mean)])])
     wanted = Matrix.blocks(wanted)
-    system.contraction().require_bounds(bounds.times(many), drives.times(many),
-                                        (seen.times(many) - wanted).absolute(), "fault models")
+    system.contraction().require_bounds(
+        bounds.times(many), drives.times(many), (seen.times(many) - wanted).absolute(), "fault models"
+    )
     for i in system.rows_of(["fault"]):
         for j in range(phi.rows):
             size = abs(wanted.fraction(i, j)) / mean
-            require(not size or bounds.fraction(i, j) <= LARGEST_SHARE * size, "an estimate is not that of its fault")
+            require(not size or bounds.fraction(i, j) <= LARGEST_SHARE * size, NOT_ITS_FAULT)
     after = f", {delay} samples late" if delay else ""
-    return f"faults that follow their models are estimated as they are{after}, to " \
-           f"{shown(max(entries_of(bounds), default=0))} per unit of a model's state"
+    return (
+        f"faults that follow their models are estimated as they are{after}, to "
+        f"{shown(max(entries_of(bounds), default=0))} per unit of a model's state"
+    )
 
 
 def entries_of(matrix):
@@ -560,27 +592,33 @@ def entries_of(matrix):
 def plant_follows(system, claim):
     """The plant's equations follow from those as written: algebraic states are eliminated, and nothing else.
 
-    Written: ``E0 x0+ = A0 x0 + B0 s``, ``y = C0 x0 + D0 s`` with s all signals.  For M and N with ``N E0 = 0``, the state
-    ``x = X x0`` with ``X = M E0`` obeys ``x+ = M A0 x0 + M B0 s``, and adding ``N (A0 x0 + B0 s) = 0`` changes no output.
-    So if ``M A0 = A X``, ``M B0 = B``, ``C0 + N A0 = C X``, ``D0 + N B0 = D``, every motion of the plant as written is
-    one of the plant with E = I.  Each holds to ``share`` of its terms, or of the largest of its column times ``floor``.
+    Written: ``E0 x0+ = A0 x0 + B0 s``, ``y = C0 x0 + D0 s`` with s all signals.  For M and N with ``N E0 = 0``, the
+    state ``x = X x0`` with ``X = M E0`` obeys ``x+ = M A0 x0 + M B0 s``, and adding ``N (A0 x0 + B0 s) = 0`` changes no
+    output.  So if ``M A0 = A X``, ``M B0 = B``, ``C0 + N A0 = C X``, ``D0 + N B0 = D``, every motion of the plant as
+    written is one of the plant with E = I.  Each holds to ``share`` of its terms, or of the largest of its column times
+    ``floor``.
     """
     written = {name: read_matrix(value) for name, value in claim["written"].items()}
     m, n = read_matrix(claim["M"]), read_matrix(claim["N"])
     share, floor = read_matrix(claim["share"]).number(), read_matrix(claim["floor"]).number()
     require(0 <= share <= LARGEST_SHARE and 0 <= floor <= 1, "the equations are allowed to miss too much")
     require((system.E - Matrix.identity(system.E.rows)).is_zero(), "the plant without algebraic states needs E = I")
-    together = {name: Matrix.blocks([[written[part] for part in parts]])
-                for name, parts in (("B0", ("B", "Bf", "Bd", "Bw")), ("D0", ("D", "Df", "Dd", "Dw")))}
+    together = {
+        name: Matrix.blocks([[written[part] for part in parts]])
+        for name, parts in (("B0", ("B", "Bf", "Bd", "Bw")), ("D0", ("D", "Df", "Dd", "Dw")))
+    }
     b = Matrix.blocks([[system.B, system.Bf, system.Bd, system.Bw]])
     d = Matrix.blocks([[system.D, system.Df, system.Dd, system.Dw]])
     e0, a0, c0, x = written["E"], written["A"], written["C"], m @ written["E"]
     require((n @ e0).is_zero(), "N E0 is not zero")
     for parts in (
-        [m @ a0, -(system.A @ x)], [m @ together["B0"], -b],
-        [c0, n @ a0, -(system.C @ x)], [together["D0"], n @ together["B0"], -d],
+        [m @ a0, -(system.A @ x)],
+        [m @ together["B0"], -b],
+        [c0, n @ a0, -(system.C @ x)],
+        [together["D0"], n @ together["B0"], -d],
     ):
-        require_small(total(parts), total([part.absolute() for part in parts]), share, floor, "the equations as written")
+        sizes = total([part.absolute() for part in parts])
+        require_small(total(parts), sizes, share, floor, "the equations as written")
     return f"the plant is the one as written without its algebraic states, to {shown(share)} of all terms"
 
 
@@ -652,8 +690,10 @@ class Window:
     def fill(self):
         """Form M."""
         system, question = self.system, self.question
-        bounds = {name: [None if v is None else read_matrix(v).number() for v in values]
-                  for name, values in question["bounds"].items()}
+        bounds = {
+            name: [None if v is None else read_matrix(v).number() for v in values]
+            for name, values in question["bounds"].items()
+        }
         span = range(-self.prior, max(self.equations - self.prior, self.samples))
         self.theta = self.column(None)
         n = system.E.rows
@@ -763,7 +803,7 @@ class Window:
         With the norm ``ellipsoid`` the entries of one sample, in their bounds, keep a sum of squares of at most one.
         """
         alone, groups = Fraction(0), {}
-        for part, bound, group in zip(parts, self.bounds, self.groups):
+        for part, bound, group in zip(parts, self.bounds, self.groups, strict=True):
             if bound:
                 if self.question["norm"] == "ellipsoid" and group is not None:
                     groups[group] = groups.get(group, 0) + (bound * part) ** 2
@@ -775,15 +815,19 @@ class Window:
         """Return what ``lambda' b`` makes of y and u, by sample: ``{k: row of numbers}`` for each."""
         system, on_y, on_u = self.system, {}, {}
         for k in range(-self.prior, max(self.equations - self.prior, self.samples)):
-            of_y = [multipliers[self.output(k, r)] if self.output(k, r) is not None else Fraction(0)
-                    for r in range(system.C.rows)]
+            of_y = [
+                multipliers[self.output(k, r)] if self.output(k, r) is not None else Fraction(0)
+                for r in range(system.C.rows)
+            ]
             on_y[k] = of_y
             on_u[k] = []
             for j in range(system.B.columns):
                 value = -sum((of_y[r] * system.D.fraction(r, j) for r in range(system.C.rows)), Fraction(0))
                 if 0 <= k + self.prior < self.equations:
-                    value += sum((multipliers[self.equation(k, r)] * system.B.fraction(r, j)
-                                  for r in range(system.E.rows)), Fraction(0))
+                    value += sum(
+                        (multipliers[self.equation(k, r)] * system.B.fraction(r, j) for r in range(system.E.rows)),
+                        Fraction(0),
+                    )
                 on_u[k].append(value)
         return on_y, on_u
 
@@ -817,9 +861,9 @@ def threshold_holds(system, claim):
     """A guaranteed test never passes its threshold while its fault is absent.
 
     Multipliers lambda weigh every free entry of z with zero and theta with one: ``lambda' b = theta + sum of
-    (M' lambda)_j z_j`` over the entries with bounds, whose sum is at most the threshold.  So ``|lambda' b| <= threshold``
-    without the fault, and a fault above twice the threshold passes it.  The weights that run are the response of the
-    observer's row; by ``rounding`` they differ from those of lambda at most, per unit of each known signal.
+    (M' lambda)_j z_j`` over the entries with bounds, whose sum is at most the threshold.  So without the fault
+    ``|lambda' b| <= threshold``, and a fault above twice the threshold passes it.  The weights that run are the
+    response of the observer's row; per unit of each known signal they differ from those of lambda by ``rounding``.
     """
     window = Window(system, claim["window"])
     multipliers = read_fractions(claim["multipliers"], window.row_count)
@@ -830,8 +874,10 @@ def threshold_holds(system, claim):
     seen[window.theta] = Fraction(0)
     require(window.largest(seen) <= threshold, "the threshold is not proved")
     require_weights_run(system, claim, window, multipliers)
-    return f"without {system.names['faults'][int(claim['window']['fault'])]}, its test never passes {shown(threshold)} " \
-           f"(and the rounding of its weights); a fault of twice that passes it"
+    return (
+        f"without {system.names['faults'][int(claim['window']['fault'])]}, its test never passes {shown(threshold)} "
+        f"(and the rounding of its weights); a fault of twice that passes it"
+    )
 
 
 def require_weights_run(system, claim, window, multipliers):
@@ -846,14 +892,19 @@ def require_weights_run(system, claim, window, multipliers):
     for k in range(last, -window.prior - 1, -1):
         wanted = [*on_u[k], *on_y[k]]
         found = entries_of(response[0]) + entries_of(response[1])
-        missed = [m + abs(a - b) for m, a, b in zip(missed, wanted, found)]
+        missed = [m + abs(a - b) for m, a, b in zip(missed, wanted, found, strict=True)]
         response = (state @ system.Bu, state @ system.By)
         state = state @ system.Az
     require(response[0].is_zero() and response[1].is_zero() and state.is_zero(), "the test looks at more samples")
-    require(all(m <= r for m, r in zip(missed, rounding)), "the weights that run are not those of the multipliers")
-    constant = -sum((m * offset for m, offset in zip(multipliers, window.offsets)), Fraction(0))
-    require(abs(read_matrix(claim["constant"]).number() - constant) <= read_matrix(claim["constant_rounding"]).number(),
-            "the constant of the test is another one")
+    require(
+        all(m <= r for m, r in zip(missed, rounding, strict=True)),
+        "the weights that run are not those of the multipliers",
+    )
+    constant = -sum((m * offset for m, offset in zip(multipliers, window.offsets, strict=True)), Fraction(0))
+    require(
+        abs(read_matrix(claim["constant"]).number() - constant) <= read_matrix(claim["constant_rounding"]).number(),
+        "the constant of the test is another one",
+    )
 
 
 def least_is_hidden(system, claim):
@@ -867,15 +918,17 @@ def least_is_hidden(system, claim):
     require(least >= 0 and point[window.theta] == least, "the point is of another fault")
     require(not any(sums((r, v, point[c]) for r, c, v in window.entries).values()), "the point violates an equation")
     groups = {}
-    for j, (value, bound) in enumerate(zip(point, window.bounds)):
+    for j, (value, bound) in enumerate(zip(point, window.bounds, strict=True)):
         if bound is not None and j != window.theta:
             require(abs(value) <= bound, "the point violates a bound")
             if claim["window"]["norm"] == "ellipsoid" and window.groups[j] is not None and bound:
                 groups[window.groups[j]] = groups.get(window.groups[j], 0) + (value / bound) ** 2
     require(all(value <= 1 for value in groups.values()), "the point violates a bound")
     begun = f"begins {window.prior} samples before the window" if window.prior else "begins with the window"
-    return f"for a plant that {begun}, no function of {window.samples} samples estimates " \
-           f"{system.names['faults'][int(claim['window']['fault'])]} to within less than {shown(least, down=True)}"
+    return (
+        f"for a plant that {begun}, no function of {window.samples} samples estimates "
+        f"{system.names['faults'][int(claim['window']['fault'])]} to within less than {shown(least, down=True)}"
+    )
 
 
 def alarm_is_right(system, claim):
@@ -887,24 +940,33 @@ def alarm_is_right(system, claim):
     multipliers = read_fractions(claim["multipliers"], window.row_count)
     seen = window.seen(multipliers)
     seen[window.theta] = Fraction(0)
-    require(not any(value for value, bound in zip(seen, window.bounds) if bound is None), "a free signal is seen")
+    require(
+        not any(value for value, bound in zip(seen, window.bounds, strict=True) if bound is None),
+        "a free signal is seen",
+    )
     y, u = read_matrix(claim["y"]), read_matrix(claim["u"])
     require(y.columns == system.C.rows and u.columns == system.B.columns and y.rows == u.rows, "the samples do not fit")
     require(window.prior == 0 and y.rows >= max(window.samples, window.equations), "there are too few samples")
     on_y, on_u = window.weights(multipliers)
-    value = sum((weight * y.fraction(k, r) for k, row in on_y.items() for r, weight in enumerate(row) if weight),
-                Fraction(0))
-    value += sum((weight * u.fraction(k, r) for k, row in on_u.items() for r, weight in enumerate(row) if weight),
-                 Fraction(0))
-    value -= sum((m * offset for m, offset in zip(multipliers, window.offsets)), Fraction(0))
+    value = sum(
+        (weight * y.fraction(k, r) for k, row in on_y.items() for r, weight in enumerate(row) if weight), Fraction(0)
+    )
+    value += sum(
+        (weight * u.fraction(k, r) for k, row in on_u.items() for r, weight in enumerate(row) if weight), Fraction(0)
+    )
+    value -= sum((m * offset for m, offset in zip(multipliers, window.offsets, strict=True)), Fraction(0))
     allowed, margin = window.largest(seen), read_matrix(claim["margin"]).number()
     require(allowed > 0 and margin > 0, "nothing is uncertain, or the margin is not positive")
     require(abs(value) >= (1 + margin) * allowed, "the samples may occur without the fault")
-    return f"the {window.samples} samples of the alarm cannot occur without " \
-           f"{system.names['faults'][int(claim['window']['fault'])]}: all bounds would have to be exceeded by " \
-           f"{shown(margin * 100, down=True)} %"
+    return (
+        f"the {window.samples} samples of the alarm cannot occur without "
+        f"{system.names['faults'][int(claim['window']['fault'])]}: all bounds would have to be exceeded by "
+        f"{shown(margin * 100, down=True)} %"
+    )
 
 
+#: What reading a file raises that is not what the format says.
+UNREADABLE = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 CLAIMS = {
     "plant": plant_follows,
     "identities": identities_hold,
@@ -957,7 +1019,7 @@ def check(file):
             verdicts.append((name, True, CLAIMS[name](system, claim)))
         except Refused as refused:
             verdicts.append((name, False, str(refused)))
-        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        except UNREADABLE as error:
             verdicts.append((name, False, f"the claim cannot be read: {type(error).__name__} {error}"))
     return verdicts, [str(text) for text in file.get("not_covered", [])]
 
@@ -971,8 +1033,7 @@ def main(arguments):
         with open(arguments[0], encoding="utf-8") as stream:
             file = json.load(stream)
         verdicts, left = check(file)
-    except (OSError, Refused, ArithmeticError, AttributeError, LookupError, TypeError, ValueError,
-            RecursionError) as error:
+    except (OSError, Refused, RecursionError, *UNREADABLE) as error:
         print(f"Not a proof file that can be checked: {type(error).__name__}: {error}", file=sys.stderr)
         return 2
     print(f"{file.get('about', '')}")

@@ -14,7 +14,7 @@ import obsynth
 from obsynth.cli.arguments import refuse_given
 from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json, progress, stdout_console
 from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
-from obsynth.files.inputs import read_json
+from obsynth.files.inputs import input_file, read_json
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import AUTO
 from obsynth.numerics.libraries import failure_of
@@ -225,6 +225,8 @@ def run_verify(options: argparse.Namespace) -> int:
     from obsynth.studies.certificates import kind_of_file, verify_certificate
 
     options.gains = options.gains or options.file
+    if options.independent:
+        return _verify_independently(options)
     # A pipe would keep us waiting; who reads a gain set says what is wrong with it.
     found = kind_of_file(options.gains) if options.gains.is_file() else ""
     kind = {ALARM_KIND: "alarm", CALIBRATION_KIND: "calibration"}.get(found, found.removeprefix("obsynth "))
@@ -288,6 +290,35 @@ def _with_calibration(
     if uncertain is None:
         raise SpecError(f"{design.name!r} has no tolerances, which a calibration could give.", path="--calibration")
     return obsynth.VerificationReport.of((*report.checks, box_row(uncertain.box, path)))
+
+
+def _verify_independently(options: argparse.Namespace) -> int:
+    """Have the program without obsynth check a gain set, an alarm or a proof file."""
+    from obsynth.exporting.independent import (
+        HEAD_BYTES,
+        check_alarm_independently,
+        check_design_independently,
+        check_independently,
+        is_proof_file,
+    )
+    from obsynth.monitoring.alarms.proof_file import ALARM_KIND
+    from obsynth.studies.certificates import kind_of_file
+
+    for name in ("data", "calibration", "system", "printed_digits"):
+        if getattr(options, name) is not None:
+            option = f"--{name.replace('_', '-')}"
+            raise SpecError(f"--independent looks at one file alone: leave {option} out.", path=option)
+    file = input_file(options.gains)
+    with file.open("rb") as stream:
+        is_proof = is_proof_file(stream.read(HEAD_BYTES))
+    if is_proof:
+        found = check_independently(file)
+    elif kind_of_file(options.gains) == ALARM_KIND:
+        found = check_alarm_independently(read_json(options.gains))
+    else:
+        found = check_design_independently(obsynth.load(options.gains))
+    answer(options, {"file": str(options.gains), "passed": found.passed, "text": found.text}, found.text)
+    return 0 if found.passed else VerificationError.exit_code
 
 
 def _verify_gain_set(options: argparse.Namespace) -> int:

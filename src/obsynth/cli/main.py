@@ -236,6 +236,11 @@ VERBS = {
                     ),
                 )
             ),
+            flag(
+                "--independent",
+                "check a gain set, the alarm of a guaranteed test, or a proof file (export --to proof.json) by "
+                "check_proof.py alone, in a process without obsynth",
+            ),
             verbose("every claim and every check"),
             JSON,
         ),
@@ -441,12 +446,15 @@ VERBS = {
     ),
     "export": Verb(
         "obsynth.monitoring.verbs.logs:run_export",
-        "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h), or as a functional mock-up unit for "
-        "co-simulation (.fmu). A recursive design for a time-invariant plant is written as its steady state.",
+        "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h), as a functional mock-up unit for "
+        "co-simulation (.fmu), or the proof of its claims in whole numbers (.json). A recursive design "
+        "for a time-invariant plant is written as its steady state.",
         (
             GAINS,
             UNVERIFIED,
-            option("--to", "FILE", ".mat, .npz, .c (with a header), or .fmu", type=Path, required=True),
+            option(
+                "--to", "FILE", ".mat, .npz, .c (with a header), .fmu, or .json (a proof)", type=Path, required=True
+            ),
             Settings(
                 (
                     option(
@@ -481,6 +489,7 @@ VERBS = {
                         "fhat[pump], passes a level; may be repeated",
                     ),
                     option("--warm-up", "SECONDS", "for .c and .fmu: no alarms in these seconds", type=float),
+                    flag("--checker", "for .json: copy check_proof.py, which checks it without obsynth, beside it"),
                 )
             ),
             FORCE,

@@ -17,6 +17,8 @@ from obsynth.exporting.c_window import is_window, require_fixed, window_c_texts
 from obsynth.exporting.dae_c_source import dae_alarms, threshold_header, threshold_source, write_dae_c
 from obsynth.exporting.dae_float import in_precision
 from obsynth.exporting.float_error import float_error
+from obsynth.exporting.independent import copy_checker
+from obsynth.exporting.proof_file import write_proof
 from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.monitoring.thresholds.learned import LearnedRule, LearnedThresholds
@@ -30,7 +32,7 @@ from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.results.gain_set_writing import gain_set_digest
 from obsynth.verification.over_tolerances.adaptive_bound import AdaptiveBound
 
-EXPORT_SUFFIXES = (".mat", ".npz", ".c", ".fmu")
+EXPORT_SUFFIXES = (".mat", ".npz", ".c", ".fmu", ".json")
 
 #: What an existing file has to be for another export to take its place.
 _C_FILE = FileKind("C code that obsynth has exported", rb"sha256 of the gain set")
@@ -41,6 +43,7 @@ EXPORTED = {
     ".c": _C_FILE,
     ".h": _C_FILE,
     ".fmu": FileKind("an observer that obsynth has exported", rb"\APK(?s:.*)sources/observer\.c"),
+    ".json": FileKind("a proof file", rb'\A\{"format":"obsynth-proof"'),
 }
 
 
@@ -64,9 +67,10 @@ def export(
     monitor: Monitor | None = None,
     precision: Literal["double", "float"] | None = None,
     outliers: Outliers | None = None,
+    checker: bool = False,
     unverified: bool = False,
 ) -> tuple[Path, ...]:
-    """Write the observer of a design for MATLAB and Simulink, for numpy, as C99, or as a functional mock-up unit.
+    """Write the observer of a design for MATLAB, numpy, as C99 or an FMU, or the proof of its claims.
 
     Parameters
     ----------
@@ -85,6 +89,7 @@ def export(
         ``.fmu``: a functional mock-up unit for co-simulation with that C inside, and a binary for this machine where
         a compiler is: inputs by the names of the signals, outputs ``xhat[...]``, ``fhat[...]``, ``r[...]`` and
         ``alarm[...]``, parameters ``operating_point[...]``, ``threshold[...]`` and ``warm_up``, with units.
+        ``.json``: a proof file in whole numbers, which a program of one file checks without obsynth.
     sample_time : float, optional, seconds
         Samples a continuous-time observer by a first-order hold; needed for C and an FMU.
     fmi : str, optional
@@ -104,6 +109,8 @@ def export(
     outliers : {"gate", "huber", "none"}, optional
         Of a nonlinear design: what is done with outliers, in place of what the design states, as for `run_on_data`.
         Where neither states it, they are left out; ``"none"`` uses every sample.
+    checker : bool, optional
+        Whether the program that checks a proof file is copied beside it (``check_proof.py``); for ``.json``.
     unverified : bool, optional
         Whether a design whose report fails is written all the same, with a mark in the file that says so.
 
@@ -156,6 +163,20 @@ def export(
             path=str(target),
         )
     require_verified(design, unverified=unverified)
+    if checker and suffix != ".json":
+        raise SpecError("checker is for proof files (.json): others need none.", path="checker")
+    if suffix == ".json":
+        _require_fitting_options(
+            suffix, fmi=fmi, thresholds=thresholds, warm_up=warm_up, monitor=monitor, precision=precision
+        )
+        if sample_time is not None or outliers is not None or unverified:
+            raise SpecError(
+                "A proof is of the design as it is, and of one that holds: leave sample_time, outliers and unverified "
+                "out.",
+                path="sample_time",
+            )
+        written = write_proof(design, target)
+        return (written, copy_checker(written.parent)) if checker else (written,)
     require_fixed(design, suffix)
     if isinstance(design.observer, RecursiveObserver):
         require_plain(design.observer, "An export")

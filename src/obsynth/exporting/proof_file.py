@@ -7,7 +7,7 @@ What a design claims and the file does not prove is listed in it by name.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
@@ -15,13 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from flint import fmpz_mat
 
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
+from obsynth.exporting.proof_of_tests import test_claims
 from obsynth.files.outputs import write_atomically
 from obsynth.methods.registry import error_model
-from obsynth.numerics.arguments import FloatArray
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balanced_matrix
-from obsynth.observers.linear.observer import LinearObserver, poles_of
+from obsynth.observers.linear.derived import poles_of
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.witnesses import (
     Dyadic,
@@ -32,9 +35,11 @@ from obsynth.proofs.witnesses import (
     inverse_above,
     lyapunov_solution,
     lyapunov_witness,
+    number_data,
     root_above,
 )
-from obsynth.results.design import ObserverDesign, gain_set_digest
+from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_set_writing import gain_set_digest
 from obsynth.verification.error_system import ErrorModel
 
 PROOF_FORMAT, PROOF_VERSION = "obsynth-proof", 1
@@ -84,8 +89,8 @@ def proof_of(design: ObserverDesign) -> dict[str, Any]:
     found.collect()
     if not found.claims:
         raise PreconditionError(
-            f"No claim of design {design.name!r} could be written as a proof: {'; '.join(found.left)}. `obsynth verify` "
-            "checks it.",
+            f"No claim of design {design.name!r} could be written as a proof: {'; '.join(found.left)}. "
+            "`obsynth verify` checks it.",
             condition="proof file",
         )
     return found.data()
@@ -158,7 +163,7 @@ class _Proof:
             "about": f"design {self.design.name} by {self.design.method}, gain set {gain_set_digest(self.design)}",
             "plant": {
                 **{name: _shaped(getattr(plant, name)) for name in _PLANT_MATRICES},
-                "sample_time": _number(plant.dt),
+                "sample_time": number_data(plant.dt),
                 "names": {kind: list(each) for kind, each in names.items()},
             },
             "observer": {
@@ -178,8 +183,6 @@ class _Proof:
     def collect(self) -> None:
         """Write every claim that can be proved, and name the others."""
         if self.design.method == "guaranteed-test":
-            from obsynth.exporting.proof_of_tests import test_claims
-
             for name, claim in test_claims(self.design):
                 self._add(name, claim)
         elif self.model is None:
@@ -189,7 +192,7 @@ class _Proof:
         self.left += _NOT_COVERED.get(self.design.method, [])
         if self.design.source is not None:
             self.left.append(
-                "that the plant follows from the plant as written (elimination, sampling): `obsynth verify` does it again"
+                "that the plant follows from the plant as written (elimination, sampling): `obsynth verify` repeats it"
             )
 
     def _add(self, name: str, claim: Mapping[str, Any] | None) -> None:
@@ -213,7 +216,7 @@ class _Proof:
         rates = [float(np.nextafter(np.exp(-rate * dt), 1.0)) for rate in rates] if dt > 0.0 else rates
         for rate in [*rates, *system.rates((0.9, 0.5, 0.1, 0.01))]:
             if (found := lyapunov_witness(system.az, system.units, rate, discrete=dt > 0.0)) is not None:
-                return {"claim": "stable", "rate": _number(rate), **_written(found)}
+                return {"claim": "stable", "rate": number_data(rate), **_written(found)}
         return None
 
     def _add_contraction(self, system: _Exact) -> None:
@@ -263,7 +266,7 @@ _NOT_COVERED: Mapping[str, list[str]] = {
     "fault-estimation-filter": ["that no filter has a smaller gain (gamma_min)", "which gains the realisation has"],
     "pd-observer": ["the gain from noise and its derivative", "a range of adaptation rates", "a disk of poles"],
     "ui-pi-observer": ["that the poles are the claimed ones: their decay alone", "a region of poles"],
-    "functional-filter": ["deviations of the error with random walks of the faults", "that estimates are free of other faults"],
+    "functional-filter": ["deviations with random walks of the faults", "that estimates are free of other faults"],
     "detection-filter": ["the least sensitivity to faults over the band"],
     "guaranteed-test": ["the mean threshold over tolerances", "that no test is insensitive to more faults"],
 }  # fmt: skip
@@ -351,7 +354,10 @@ class _Exact:
         if model.decoupled:
             bd, dd = _exact(model.Bd), _exact(model.Dd)
             found |= {"V": [by @ dd, -(t @ bd)], "W": [dy @ dd, self.t0 @ bd]}
-            sizes |= {"V": [size(by) @ size(dd), size(t) @ size(bd)], "W": [size(dy) @ size(dd), size(self.t0) @ size(bd)]}
+            sizes |= {
+                "V": [size(by) @ size(dd), size(t) @ size(bd)],
+                "W": [size(dy) @ size(dd), size(self.t0) @ size(bd)],
+            }
         return {name: (_sum(found[name]), _sum(sizes[name])) for name in found}
 
     def identities_claim(self) -> dict[str, Any] | None:
@@ -359,7 +365,7 @@ class _Exact:
         stated = 0.0 if not share else float(2.0 ** np.ceil(np.log2(float(share)) + 1e-9))
         if stated > ESTIMATE_SHARE:
             return None
-        return {"claim": "identities", "share": _number(stated), "floor": _number(IDENTITY_FLOOR)}
+        return {"claim": "identities", "share": number_data(stated), "floor": number_data(IDENTITY_FLOOR)}
 
     def contraction(self) -> tuple[_Contraction, dict[str, Any]] | None:
         """Return the contraction with the smallest bounds of a few, and the same as data of the file."""
@@ -377,7 +383,7 @@ class _Exact:
             inverted = None if found is None else inverse_above(found["P"])
             if found is not None and inverted is not None:
                 g, covers = inverted
-                data = {"rate": _number(rate), **_written(found), "G": g.data(), "G_covers": covers}
+                data = {"rate": number_data(rate), **_written(found), "G": g.data(), "G_covers": covers}
                 slowness = 1 - Fraction(rate) if self.discrete else Fraction(rate)
                 return _Contraction(self.cz, found["P"], g, slowness), data
         return None
@@ -483,8 +489,8 @@ class _Exact:
             proved = definite_witness(blocks([[corner, side], [side.T, level]]))
             if proved is not None:
                 return {
-                    "claim": "gain", "signal": signal, "rows": kinds, "states": first, "gamma": _number(gamma * room),
-                    "P": p.data(), "P_positive": positive, "bounded_real": proved,
+                    "claim": "gain", "signal": signal, "rows": kinds, "states": first,
+                    "gamma": number_data(gamma * room), "P": p.data(), "P_positive": positive, "bounded_real": proved,
                 }  # fmt: skip
         return None
 
@@ -550,10 +556,6 @@ def _shaped(matrix: Any) -> dict[str, Any]:
     return _exact(matrix).data()
 
 
-def _number(value: float) -> dict[str, Any]:
-    return Dyadic.of(np.array([[value]])).data()
-
-
 def _written(found: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value.data() if isinstance(value, Dyadic) else value for name, value in found.items()}
 
@@ -568,8 +570,6 @@ def _sum(parts: list[Dyadic]) -> Dyadic:
 def _rows(matrix: Dyadic, rows: Any) -> Dyadic:
     kept = matrix.integers.tolist()
     chosen = [kept[i] for i in rows]
-    from flint import fmpz_mat
-
     entries = [value for row in chosen for value in row]
     return Dyadic(fmpz_mat(len(chosen), matrix.shape[1], entries), matrix.exponent)
 
@@ -593,9 +593,3 @@ def _share(missed: Dyadic, sizes: Dyadic) -> Fraction:
             if value:
                 worst = max(worst, value / max(size, floor))
     return worst
-
-
-def claims_in_words(data: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the names of the claims of a proof file."""
-    for claim in data["claims"]:
-        yield str(claim["claim"])

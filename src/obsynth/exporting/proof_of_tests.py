@@ -1,4 +1,4 @@
-"""Guaranteed tests and their alarms in proof files: multipliers and hidden faults as fractions, exact to the last digit.
+"""Guaranteed tests in proof files: multipliers and hidden faults as fractions, exact to the last digit.
 
 Shipped doubles lie next to exact solutions.  Here these are solved for in fractions: a square part of the window's
 equations, chosen in double precision, by lifting.
@@ -6,31 +6,30 @@ equations, chosen in double precision, by lifting.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from obsynth.errors import ObsynthError, PreconditionError, SpecError
-from obsynth.exporting.proof_file import PROOF_VERSION, proof_of
-from obsynth.methods.guaranteed_test.checks import is_bank, tests_of
+from obsynth.methods.guaranteed_test.bank import is_bank, tests_of
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
 from obsynth.methods.guaranteed_test.windows import Window
-from obsynth.numerics.arguments import FloatArray
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.witnesses import Dyadic, above, root_above, written
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.witnesses import Dyadic, above, number_data, root_above, written
 from obsynth.results.design import ObserverDesign
 
 #: Windows with more equations have no exact fractions in a file: their numerators have as many words.
 MOST_EQUATIONS = 400
 #: Diagonal of a pivoted triangle, as a share of its first entry, below which rows are taken as dependent.
 DEPENDENT = 1e-13
+#: Share of a bound that an entry at it counts for when those to correct are chosen.
+LEAST_ROOM = 1e-4
+#: Weights below this share of the largest count as if they were as large.
+LEAST_WEIGHT = 1e-3
 #: Room of a stated bound of rounding above what it is computed as.
 ROUNDING_ROOM = 1.0 + 2.0**-20
 
@@ -41,7 +40,7 @@ def test_claims(design: ObserverDesign) -> Iterator[tuple[str, dict[str, Any] | 
     tests = tests_of(design, GuaranteedTestMethod.of) if bank else (design,)
     for place, test in enumerate(tests):
         of = f" of the test of {test.options['fault']}" if bank else ""
-        window = window_as_designed(test.linear[0], GuaranteedTestMethod.of(test.options))
+        window = window_of_test(test)
         row = len(design.linear[1].state_names) + place
         yield f"the threshold{of}: its window has too many equations", _threshold(design, test, window, row)
         if test.certificate.claims.get("least"):
@@ -61,12 +60,12 @@ def _threshold(whole: ObserverDesign, test: ObserverDesign, window: Window, row:
     return {
         "claim": "threshold",
         "window": question_of_window(window),
-        "multipliers": _fractions(exact),
-        "threshold": _number(stated),
+        "multipliers": fractions_data(exact),
+        "threshold": number_data(stated),
         "row": row,
-        "rounding": [_number(value) for value in rounding],
-        "constant": _number(float(whole.linear[1].added[row])),
-        "constant_rounding": _number(constant),
+        "rounding": [number_data(value) for value in rounding],
+        "constant": number_data(float(whole.linear[1].added[row])),
+        "constant_rounding": number_data(constant),
     }
 
 
@@ -83,54 +82,14 @@ def _least(test: ObserverDesign, window: Window) -> dict[str, Any] | None:
     return {
         "claim": "least",
         "window": question_of_window(window),
-        "point": _fractions([value * share for value in point]),
-        "least": _number(least),
+        "point": fractions_data([value * share for value in point]),
+        "least": number_data(least),
     }
 
 
-def alarm_proof_of(certificate: str | Path | Mapping[str, Any]) -> dict[str, Any]:
-    """Return the proof file of an alarm of a guaranteed test: that of its gain set, and the claim on the alarm.
-
-    Parameters
-    ----------
-    certificate : str, Path or mapping
-        An alarm certificate, or its file.
-
-    Raises
-    ------
-    SpecError
-        The alarm is of another method: its proof is a linear programme over the state, which is left to `obsynth verify`.
-    PreconditionError
-        The numbers of the certificate prove nothing.
-    """
-    from obsynth.results.design import design_from_dict
-
-    data = certificate if isinstance(certificate, Mapping) else json.loads(Path(certificate).read_text(encoding="utf-8"))
-    body = data.get("certificate", data)
-    if "multipliers" not in body or "test" not in body:
-        raise SpecError(
-            "The alarm is proved by a linear programme over the states of its window, not by a guaranteed test: only "
-            "alarms of guaranteed tests have proof files. `obsynth verify` checks this one.",
-            path="certificate",
-        )
-    design = design_from_dict(body["gain_set"])
-    tests = tests_of(design, GuaranteedTestMethod.of) if is_bank(design) else (design,)
-    test = next(each for each in tests if each.options["fault"] in (body["test"], None))
-    window = window_as_designed(test.linear[0], GuaranteedTestMethod.of(test.options))
-    claim = {
-        "claim": "alarm",
-        "window": question_of_window(window),
-        "multipliers": _fractions([Fraction(text) for text in body["multipliers"]]),
-        "y": Dyadic.of(np.atleast_2d(body["y"])).data(),
-        "u": _samples(body["u"], len(body["y"]), test.linear[0].nu).data(),
-        "margin": _number(float(body["margin"])),
-    }
-    found = proof_of(design)
-    return {**found, "about": f"alarm at row {body['row']}, {found['about']}", "claims": [*found["claims"], claim]}
-
-
-def _samples(values: Any, count: int, columns: int) -> Dyadic:
-    return Dyadic.of(np.asarray(values, dtype=np.float64).reshape(count, columns))
+def window_of_test(test: ObserverDesign) -> Window:
+    """Return the equations that a test was designed on."""
+    return window_as_designed(test.linear[0], GuaranteedTestMethod.of(test.options))
 
 
 def question_of_window(window: Window) -> dict[str, Any]:
@@ -165,7 +124,7 @@ def question_of_window(window: Window) -> dict[str, Any]:
             "fault_rate": [_bound(question.fault_rate)],
         },
         "middles": {
-            kind: [_number(float(value)) for value in (np.zeros(counts[kind]) if given is None else given)]
+            kind: [number_data(float(value)) for value in (np.zeros(counts[kind]) if given is None else given)]
             for kind, given in middles.items()
         },
     }
@@ -187,8 +146,8 @@ def exact_point(window: Window, point: FloatArray) -> list[Fraction] | None:
     for i, j, entry in _exact_entries(window):
         missing[i] -= entry * values[j]
     # What has room may move: free numbers, and those inside of their bounds; theta stays.
-    room = np.where(window.bounded, np.maximum(window.bar - np.abs(point), 1e-4 * np.where(window.bounded, window.bar, 0.0)),
-                    np.maximum(1.0, np.abs(point)))  # fmt: skip
+    bar, sizes = np.where(window.bounded, window.bar, 0.0), np.abs(point)
+    room = np.where(window.bounded, np.maximum(bar - sizes, LEAST_ROOM * bar), np.maximum(1.0, sizes))
     room[0] = 0.0
     return _next_to(window.matrix.toarray(), point, missing, _entries(window, rows, columns=False), weight=room)
 
@@ -207,7 +166,7 @@ def _next_to(
     if len(matrix) > MOST_EQUATIONS:
         return None
     heavy = np.abs(values) if weight is None else weight
-    heavy = heavy if weight is not None else np.maximum(heavy, 1e-3 * float(np.max(heavy, initial=0.0)))
+    heavy = heavy if weight is not None else np.maximum(heavy, LEAST_WEIGHT * float(np.max(heavy, initial=0.0)))
     scaled = matrix * heavy
     largest = np.abs(scaled).max(axis=1, initial=0.0)
     scaled = scaled / np.where(largest > 0.0, largest, 1.0)[:, None]
@@ -217,7 +176,7 @@ def _next_to(
     rows = np.sort(by_row[:rank]).tolist()
     _, by_column = qr(scaled[rows], mode="r", pivoting=True)
     columns = np.sort(by_column[:rank]).tolist()
-    part = fmpq_mat(rank, rank, [_rational(exact.get((i, j), Fraction(0))) for i in rows for j in columns])
+    part: Any = fmpq_mat(rank, rank, [_rational(exact.get((i, j), Fraction(0))) for i in rows for j in columns])
     right = fmpq_mat(rank, 1, [_rational(missing[i]) for i in rows])
     try:
         step = part.solve(right, algorithm="dixon") if rank else right
@@ -292,10 +251,8 @@ def _excess(window: Window, point: list[Fraction]) -> Fraction:
     return max([worst, *(Fraction(root_above(value)) for value in groups.values())])
 
 
-def _rounding(
-    whole: ObserverDesign, window: Window, multipliers: list[Fraction], row: int
-) -> tuple[FloatArray, float]:
-    """Return how far the weights that run are from exact ones, summed over the samples, and the constant from its own."""
+def _rounding(whole: ObserverDesign, window: Window, multipliers: list[Fraction], row: int) -> tuple[FloatArray, float]:
+    """Return how far the weights that run are from exact ones, summed over samples, and the constant from its own."""
     observer, plant = whole.linear[1], window.plant
     exact = _Weights(window, multipliers)
     response = [Dyadic.of(observer.Du[[row]]), Dyadic.of(observer.Dy[[row]])]
@@ -334,18 +291,12 @@ class _Weights:
         return [*on_u, *of_y]
 
 
-def _fractions(values: list[Fraction]) -> dict[str, Any]:
+def fractions_data(values: list[Fraction]) -> dict[str, Any]:
+    """Return fractions as data of a proof file, with one denominator."""
     denominator = math.lcm(*(value.denominator for value in values)) if values else 1
     numerators = [value.numerator * (denominator // value.denominator) for value in values]
     return {"denominator": written(denominator), "numerators": [written(value) for value in numerators]}
 
 
-def _number(value: float) -> dict[str, Any]:
-    return Dyadic.of(np.array([[value]])).data()
-
-
 def _bound(value: float) -> dict[str, Any] | None:
-    return _number(float(value)) if np.isfinite(value) else None
-
-
-__all__ = ["PROOF_VERSION", "DescriptorSystem", "ObsynthError", "PreconditionError", "alarm_proof_of", "test_claims"]
+    return number_data(float(value)) if np.isfinite(value) else None

@@ -2,8 +2,8 @@ r"""Witnesses of matrix inequalities in whole numbers, which exact arithmetic ac
 
 Numbers are dyadic, ``integer 2^e``.  That a symmetric S is positive definite is shown by F and positive d: with
 ``R = S - F'F``, each row of R dominates its others in units d, so that ``x'Sx = |Fx|^2 + x'Rx > 0``.  F is the Cholesky
-factor of S less a small part of its diagonal.  Solutions of Lyapunov equations are sums by doubling in as many digits as
-the inequality needs: any approximate solution that satisfies it is a proof.
+factor of S less a small part of its diagonal.  Solutions of Lyapunov equations are sums by doubling, in as many digits
+as the inequality needs: any approximate solution that satisfies it is a proof.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import flint
 import numpy as np
 from flint import arb, arb_mat, fmpz, fmpz_mat
 
-from obsynth.numerics.arguments import FloatArray
+from obsynth.numerics.arrays import FloatArray
 
 #: Bits that are tried: few where the inequality has room, many for poles near to each other or to the boundary.
 PRECISIONS = (160, 320, 640, 1280)
@@ -44,7 +44,7 @@ class Dyadic:
         ratios = [value.as_integer_ratio() for value in array.ravel().tolist()]
         shift = max((bottom.bit_length() - 1 for _, bottom in ratios), default=0)
         entries = [top << (shift - bottom.bit_length() + 1) for top, bottom in ratios]
-        return cls(fmpz_mat(*array.shape, entries), -shift)
+        return cls(fmpz_mat(array.shape[0], array.shape[1], entries), -shift)
 
     @classmethod
     def identity(cls, size: int) -> Dyadic:
@@ -108,6 +108,11 @@ class Dyadic:
         }
 
 
+def number_data(value: float) -> dict[str, Any]:
+    """Return a double as data of a proof file."""
+    return Dyadic.of(np.array([[value]])).data()
+
+
 def written(value: int) -> int | str:
     """Return an integer as JSON has it, in hexadecimal digits where other readers would round it."""
     return value if abs(value) < 2**53 else f"{value:x}"
@@ -119,7 +124,7 @@ def blocks(parts: Sequence[Sequence[Dyadic]]) -> Dyadic:
     rows: list[list[Any]] = []
     for row in parts:
         aligned = [part._at(exponent).tolist() for part in row]
-        rows += [sum((part[i] for part in aligned), []) for i in range(row[0].shape[0])]
+        rows += [[value for part in aligned for value in part[i]] for i in range(row[0].shape[0])]
     columns = sum(part.shape[1] for part in parts[0])
     return Dyadic(fmpz_mat(len(rows), columns, [value for row in rows for value in row]), exponent)
 
@@ -206,7 +211,7 @@ def lyapunov_solution(a: Dyadic, q: Dyadic, rate: float, *, discrete: bool, bits
 
 
 def _size(matrix: Any) -> float:
-    """Return the geometric mean of the absolute values of eigenvalues, about; of a singular matrix its largest entry."""
+    """Return about the geometric mean of the absolute values of eigenvalues; of a singular matrix its largest entry."""
     size = max(int(matrix.nrows()), 1)
     found = float(abs(matrix.det()).mid()) if size < 400 else 0.0
     largest = max((abs(float(value.mid())) for value in matrix.entries()), default=1.0)
@@ -228,8 +233,7 @@ def _sum_over_time(moved: Any, total: Any, bits: int) -> Dyadic | None:
 def rounded(matrix: Any, bits: int, *, symmetric: bool = False) -> Dyadic:
     """Return the middles of balls, to so many bits of the root of the product of their diagonal entries."""
     size, columns = int(matrix.nrows()), int(matrix.ncols())
-    entries = [tuple(int(part) for part in value.mid().man_exp()) if value != 0 else (0, 0)
-               for value in matrix.entries()]  # fmt: skip
+    entries = [_mantissa(value) for value in matrix.entries()]
     rows = [entries[i * columns : (i + 1) * columns] for i in range(size)]
     place = min((_top(rows[i][i]) for i in range(min(size, columns)) if rows[i][i][0]), default=0)
     exponent = place - bits
@@ -237,6 +241,13 @@ def rounded(matrix: Any, bits: int, *, symmetric: bool = False) -> Dyadic:
     if symmetric:
         integers = [[integers[min(i, j)][max(i, j)] for j in range(columns)] for i in range(size)]
     return Dyadic(fmpz_mat(size, columns, [value for row in integers for value in row]), exponent)
+
+
+def _mantissa(ball: Any) -> tuple[int, int]:
+    if ball == 0:
+        return 0, 0
+    mantissa, exponent = ball.mid().man_exp()
+    return int(mantissa), int(exponent)
 
 
 def _top(value: tuple[int, int]) -> int:
@@ -299,4 +310,3 @@ def above(value: Fraction) -> float:
     """Return a double that is not below a fraction, by less than 2^-20 of it."""
     found = float(value)
     return found if Fraction(found) >= value else math.nextafter(found, math.inf)
-

@@ -111,6 +111,7 @@ def run_export(options: argparse.Namespace) -> int:
         monitor=monitor,
         precision=options.precision,
         outliers=options.outliers,
+        checker=options.checker,
         unverified=options.unverified,
     )
     answer(options, {"gains": options.gains, "files": files, **({"unverified": mark} if mark else {})}, mark)
