@@ -128,20 +128,15 @@ def alarm_proof_of(certificate: Mapping[str, Any]) -> dict[str, Any]:
         certificate["test"]
     )
     window = window_of_test(tests[place])
-    count = len(certificate["y"])
+    y, u = (np.asarray(restored(certificate[name]), dtype=np.float64) for name in ("y", "u"))
     claim = {
         "claim": "alarm",
         "window": question_of_window(window),
         "multipliers": fractions_data([Fraction(text) for text in certificate["multipliers"]]),
-        "y": _samples(certificate["y"], count).data(),
-        "u": _samples(certificate["u"], count).data(),
+        "y": Dyadic.of(y.reshape(len(y), -1)).data(),
+        "u": Dyadic.of(u.reshape(len(y), -1) if u.size else np.zeros((len(y), 0))).data(),
         "margin": number_data(float(certificate["margin"])),
     }
     found = proof_of(design)
     about = f"alarm at row {certificate['row']}, {found['about']}"
     return {**found, "about": about, "claims": [*found["claims"], claim]}
-
-
-def _samples(values: Any, count: int) -> Dyadic:
-    array = np.asarray(restored(values), dtype=np.float64)
-    return Dyadic.of(array.reshape(count, -1) if array.size else np.zeros((count, 0)))

@@ -1,0 +1,356 @@
+"""Proof files: the program of one file accepts what they prove, and refuses what is changed."""
+
+from __future__ import annotations
+
+import ast
+import copy
+import json
+import subprocess
+import sys
+import tomllib
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from benchmarks.campaigns._changed_proofs import as_array, as_data, changes, checker
+
+import obsynth
+from obsynth.cli.main import main
+from obsynth.exporting.independent import (
+    alarm_proof_of,
+    check_alarm_independently,
+    check_design_independently,
+    check_independently,
+    checker_path,
+)
+from obsynth.exporting.proof_file import proof_bytes, proof_of, write_proof
+
+ROOT = Path(__file__).parents[2]
+CHECKER = ROOT / "checker/check_proof.py"
+A = np.array([[0.9, 0.1, 0.0], [-0.2, 0.7, 0.1], [0.0, 0.3, 0.6]])
+SAMPLED = obsynth.DescriptorSystem(
+    None, A, [[0.0], [1.0], [0.0]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], Bf=[[0.0], [1.0], [0.0]],
+    Bd=[[0.1], [0.0], [0.2]], dt=0.1,
+)  # fmt: skip
+SMALL = SAMPLED.replace(Bd=None, Dd=None, disturbance_names=None)
+SMOOTH = SMALL.replace(A=A - 2.0 * np.eye(3), dt=0.0)
+NOISY = SMOOTH.replace(Bd=[[0.3], [0.0], [0.1]], Dd=np.zeros((2, 1)), Bw=np.zeros((3, 2)), Dw=0.3 * np.eye(2))
+TEST = {"noise_bound": {"y1": 0.1, "y2": 0.1}, "disturbance_bounds": {"d1": 0.05}, "course": "constant", "samples": 8}
+#: What the file of each method proves.
+CLAIMS: dict[str, tuple[obsynth.DescriptorSystem, dict[str, Any], set[str]]] = {
+    "fault-estimation-filter": (SAMPLED, {}, {"identities", "stable", "rounding", "faults", "gain"}),
+    "pd-observer": (SMOOTH, {"fault_rate_gain": True}, {"identities", "stable", "rounding"}),
+    "ui-pi-observer": (SMALL, {}, {"identities", "stable", "rounding"}),
+    "functional-filter": (
+        SMALL.replace(Bw=0.1 * np.eye(3, 5), Dw=0.2 * np.eye(2, 5, 3), noise_names=None), {},
+        {"identities", "stable", "rounding", "fault models", "deviation"},
+    ),
+    "detection-filter": (NOISY, {}, {"identities", "stable", "rounding", "gain"}),
+    "guaranteed-test": (SAMPLED, TEST, {"threshold", "least"}),
+}  # fmt: skip
+EACH = pytest.mark.parametrize("method", CLAIMS)
+
+
+@cache
+def design_of(method: str) -> obsynth.ObserverDesign:
+    plant, options, _ = CLAIMS[method]
+    if method == "pd-observer":
+        options = {}
+    return obsynth.design(plant, method, **options)
+
+
+@cache
+def proof_text(method: str) -> bytes:
+    return proof_bytes(proof_of(design_of(method)))
+
+
+def proof(method: str) -> dict[str, Any]:
+    return json.loads(proof_text(method))
+
+
+@cache
+def program() -> ModuleType:
+    return checker()
+
+
+def refused(file: Any) -> str:
+    """Return why a file is not accepted; empty where it is."""
+    module = program()
+    try:
+        verdicts, _ = module.check(file)
+    except (module.Refused, *module.UNREADABLE) as error:
+        return str(error) or type(error).__name__
+    return "; ".join(text for _, proved, text in verdicts if not proved)
+
+
+def run(path: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-I", str(CHECKER), str(path)], capture_output=True, text=True, check=False)
+
+
+@EACH
+def test_every_linear_method_is_proved_by_a_process_of_its_own(method: str, tmp_path: Path) -> None:
+    place = tmp_path / "proof.json"
+    write_proof(design_of(method), place)
+    found = run(place)
+    assert found.returncode == 0, found.stdout
+    proved = {
+        line.removeprefix("PROVED  ").partition(":")[0] for line in found.stdout.splitlines() if "PROVED  " in line
+    }
+    assert proved == CLAIMS[method][2]
+    assert not found.stderr
+
+
+@EACH
+def test_every_change_is_refused(method: str) -> None:
+    whole = proof(method)
+    assert not refused(whole)
+    accepted = []
+    for name, change in changes(whole):
+        changed = copy.deepcopy(whole)
+        change(changed)
+        assert changed != whole, name
+        if not refused(changed):
+            accepted.append(name)
+    assert not accepted
+
+
+@EACH
+def test_a_file_of_integers_alone(method: str) -> None:
+    def numbers(value: Any) -> list[Any]:
+        if isinstance(value, dict):
+            return [entry for part in value.values() for entry in numbers(part)]
+        if isinstance(value, list):
+            return [entry for part in value for entry in numbers(part)]
+        return [] if isinstance(value, (str, bool)) or value is None else [value]
+
+    assert {type(value) for value in numbers(proof(method))} == {int}
+
+
+def test_the_program_imports_nothing_but_the_standard_library() -> None:
+    tree = ast.parse(CHECKER.read_text(encoding="utf-8"))
+    imported = {
+        name.name.split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names
+    }
+    imported |= {str(node.module).split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert imported <= {"json", "sys", "fractions", "math"}
+    floats = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, float)]
+    assert not floats, "nothing is decided by a floating-point number"
+
+
+def test_floating_point_is_for_printing_alone() -> None:
+    tree = ast.parse(CHECKER.read_text(encoding="utf-8"))
+    for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+        called = {
+            node.func.id
+            for node in ast.walk(function)
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        }
+        assert "float" not in called or function.name == "shown", function.name
+
+
+def test_the_gain_of_the_paper_is_proved_and_one_below_the_norm_is_not() -> None:
+    plant = obsynth.load_spec(ROOT / "designs/wang2015/spec.yaml").plant
+    design = obsynth.fault_estimation_filter(plant)
+    whole = json.loads(proof_bytes(proof_of(design)))
+    gain = next(claim for claim in whole["claims"] if claim["claim"] == "gain")
+    assert as_array(gain["gamma"])[0, 0] == pytest.approx(design.certificate.claims["gamma"], rel=1e-8)
+    assert not refused(whole)
+    for claim in whole["claims"]:
+        if claim["claim"] == "gain":
+            claim["gamma"] = as_data([[0.9999 * as_array(claim["gamma"])[0, 0]]])
+    assert "bounded real" in refused(whole)
+
+
+def test_no_witness_is_found_for_a_gain_below_the_norm() -> None:
+    design = obsynth.fault_estimation_filter(obsynth.load_spec(ROOT / "designs/wang2015/spec.yaml").plant)
+    certificate = design.certificate
+    claims = {**certificate.claims, "gamma": 0.9999 * certificate.claims["gamma"]}
+    false = design.replace(certificate=obsynth.Certificate(certificate.matrices, claims))
+    found = proof_of(false)
+    assert "gain" not in {claim["claim"] for claim in found["claims"]}
+    assert any("l2 gain" in text for text in found["not_covered"])
+
+
+@pytest.mark.parametrize("decay", [0.99, 1.01])
+def test_the_decay_is_that_of_the_slowest_pole(decay: float) -> None:
+    file = proof("ui-pi-observer")
+    claim = next(claim for claim in file["claims"] if claim["claim"] == "stable")
+    rate, slowest = as_array(claim["rate"])[0, 0], np.abs(np.linalg.eigvals(as_array(file["observer"]["Az"]))).max()
+    assert slowest < rate < 1.0
+    claim["rate"] = as_data([[slowest**decay if decay > 1.0 else rate]])
+    assert bool(refused(file)) == (decay > 1.0)
+
+
+def test_deviations_are_those_of_the_covariance() -> None:
+    file = proof("functional-filter")
+    claim = next(claim for claim in file["claims"] if claim["claim"] == "deviation")
+    observer, plant = design_of("functional-filter").linear[1], CLAIMS["functional-filter"][0]
+    t = design_of("functional-filter").certificate.matrices["T"]
+    b = t @ plant.Bw - observer.By @ plant.Dw
+    x = np.zeros((observer.order, observer.order))
+    for _ in range(4000):
+        x = observer.Az @ x @ observer.Az.T + b @ b.T
+    rows = observer.fault_rows
+    through = observer.Dy[rows] @ plant.Dw - design_of("functional-filter").certificate.matrices["T0"][rows] @ plant.Bw
+    deviation = np.sqrt(np.diag(observer.Cz[rows] @ x @ observer.Cz[rows].T + through @ through.T))
+    assert as_array(claim["deviations"]).ravel() == pytest.approx(deviation, rel=1e-5)
+    assert np.all(as_array(claim["deviations"]).ravel() >= deviation * (1.0 - 1e-9))
+
+
+HOSTILE = {
+    "an exponent that would fill the memory": lambda file: file["plant"]["A"].update(exponent=10**9),
+    "a matrix of another size": lambda file: file["plant"]["A"].update(size=[2, 3]),
+    "a float": lambda file: file["plant"]["A"]["entries"].__setitem__(0, 0.5),
+    "a truth value": lambda file: file["plant"]["A"]["entries"].__setitem__(0, True),
+    "words": lambda file: file["plant"]["A"]["entries"].__setitem__(0, "one"),
+    "underscores": lambda file: file["plant"]["A"]["entries"].__setitem__(0, "1_0"),
+    "a size below zero": lambda file: file["plant"]["A"].update(size=[-1, -9]),
+    "no observer": lambda file: file.pop("observer"),
+    "claims that are no list": lambda file: file.update(claims=7),
+    "a claim that is no mapping": lambda file: file.update(claims=["gain"]),
+    "a sample time below zero": lambda file: file["plant"].update(sample_time=as_data([[-0.1]])),
+    "a row of an unknown kind": lambda file: file["observer"]["rows"][0].__setitem__(0, "wish"),
+    "a lag without samples": lambda file: file["follows"].update(lag=-1),
+    "an infinite share": lambda file: file["claims"][0].update(share=as_data([[1.0]])),
+    "no contraction": lambda file: file.update(contraction=None),
+}
+
+
+@pytest.mark.parametrize("hostile", HOSTILE)
+def test_what_is_no_proof_file_is_refused_in_one_line(hostile: str, tmp_path: Path) -> None:
+    file = proof("fault-estimation-filter")
+    HOSTILE[hostile](file)
+    place = tmp_path / "proof.json"
+    place.write_text(json.dumps(file), encoding="utf-8")
+    found = run(place)
+    assert found.returncode in (1, 2)
+    assert "Traceback" not in found.stderr
+
+
+@pytest.mark.parametrize("text", ["", "[]", "null", "{", '{"format": "obsynth-proof"}', "[" * 100_000])
+def test_files_of_other_kinds_are_refused(text: str, tmp_path: Path) -> None:
+    place = tmp_path / "proof.json"
+    place.write_text(text, encoding="utf-8")
+    found = run(place)
+    assert found.returncode == 2
+    assert len(found.stderr.splitlines()) == 1, found.stderr
+
+
+def test_methods_with_varying_gains_are_refused_by_name() -> None:
+    plant = obsynth.DescriptorSystem(None, [[1.1, 0.1], [0.0, 0.9]], [[0.0], [1.0]], np.eye(2), dt=0.1)
+    design = obsynth.design(plant, "descriptor-kalman", Q=0.01, R=0.01)
+    with pytest.raises(obsynth.SpecError, match="gains that change with k"):
+        proof_of(design)
+
+
+def test_export_writes_the_proof_and_the_program_beside_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gains, place = tmp_path / "gains.json", tmp_path / "out/proof.json"
+    design_of("fault-estimation-filter").save(gains)
+    place.parent.mkdir()
+    assert main(["export", "--gains", str(gains), "--to", str(place), "--checker"]) == 0
+    copied = place.with_name("check_proof.py")
+    assert copied.read_bytes() == CHECKER.read_bytes()
+    assert (
+        subprocess.run([sys.executable, "-I", str(copied), str(place)], capture_output=True, check=False).returncode
+        == 0
+    )
+    # A proof file is replaced, a file of another kind is not.
+    assert main(["export", "--gains", str(gains), "--to", str(place)]) == 0
+    other = tmp_path / "other.json"
+    other.write_text("{}", encoding="utf-8")
+    assert main(["export", "--gains", str(gains), "--to", str(other)]) == obsynth.SpecError.exit_code
+    assert "other.json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [["--sample-time", "0.1"], ["--precision", "float"], ["--unverified"]])
+def test_options_that_do_nothing_for_a_proof_are_refused(options: list[str], tmp_path: Path) -> None:
+    gains = tmp_path / "gains.json"
+    design_of("fault-estimation-filter").save(gains)
+    command = ["export", "--gains", str(gains), "--to", str(tmp_path / "proof.json"), *options]
+    assert main(command) == obsynth.SpecError.exit_code
+    with pytest.raises(obsynth.SpecError, match="checker"):
+        obsynth.export(design_of("fault-estimation-filter"), tmp_path / "gains.mat", checker=True)
+
+
+def test_verify_independent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gains, place = tmp_path / "gains.json", tmp_path / "proof.json"
+    design = design_of("ui-pi-observer")
+    design.save(gains)
+    write_proof(design, place)
+    for file in (gains, place):
+        assert main(["verify", str(file), "--independent"]) == 0
+        assert "All 3 claims are proved" in capsys.readouterr().out
+    assert main(["verify", str(gains), "--independent", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["passed"] is True
+    false = proof("ui-pi-observer")
+    claim = next(claim for claim in false["claims"] if claim["claim"] == "stable")
+    claim["rate"] = as_data([[0.01]])
+    place.write_text(json.dumps(false), encoding="utf-8")
+    assert main(["verify", str(place), "--independent"]) == obsynth.VerificationError.exit_code
+    assert "NOT PROVED  stable" in capsys.readouterr().out
+    assert main(["verify", str(place), "--independent", "--printed-digits", "3"]) == obsynth.SpecError.exit_code
+    assert main(["verify", str(tmp_path / "none.json"), "--independent"]) == obsynth.SpecError.exit_code
+
+
+@cache
+def alarm() -> dict[str, Any]:
+    design = design_of("guaranteed-test")
+    rng, x = np.random.default_rng(5), np.zeros(3)
+    y, u = [], rng.standard_normal((20, 1))
+    for k in range(20):
+        y.append(SAMPLED.C @ x + rng.uniform(-0.1, 0.1, 2))
+        x = A @ x + SAMPLED.B @ u[k] + SAMPLED.Bf[:, 0] * 2.0 + SAMPLED.Bd[:, 0] * rng.uniform(-0.05, 0.05)
+    log = pd.DataFrame({"time": 0.1 * np.arange(20), "u1": u[:, 0], "y1": np.array(y)[:, 0], "y2": np.array(y)[:, 1]})
+    found = obsynth.prove_alarm(design, log, 20)
+    assert found.proved
+    return {"certificate": dict(found.certificate)}
+
+
+def test_the_alarm_of_a_guaranteed_test_is_proved() -> None:
+    found = check_alarm_independently(alarm())
+    assert found.passed, found.text
+    assert "PROVED  alarm: the 8 samples" in found.text
+
+
+def test_an_alarm_with_other_samples_or_a_larger_margin_is_not() -> None:
+    whole = json.loads(proof_bytes(alarm_proof_of(alarm()["certificate"])))
+    assert not refused(whole)
+    names = []
+    for name, change in changes(whole):
+        changed = copy.deepcopy(whole)
+        change(changed)
+        names.append(name)
+        assert refused(changed), name
+    assert {"a larger margin", "other samples"} <= set(names)
+
+
+def test_alarms_of_other_methods_are_named() -> None:
+    with pytest.raises(obsynth.SpecError, match="linear programme over the states"):
+        check_alarm_independently({"certificate": {"equal": []}})
+
+
+def test_a_bank_proves_each_test() -> None:
+    plant = SAMPLED.replace(
+        Bf=[[0.0, 1.0], [1.0, 0.0], [0.0, 0.0]], Df=None, fault_names=None, Bd=None, Dd=None, disturbance_names=None
+    )
+    options = {**TEST, "disturbance_bounds": None, "isolate": True, "course": "step", "before": 4, "samples": 10}
+    found = check_design_independently(obsynth.design(plant, "guaranteed-test", **options))
+    assert found.passed, found.text
+    assert found.text.count("PROVED  threshold") == 2
+
+
+def test_the_program_is_part_of_what_is_installed() -> None:
+    assert checker_path().read_bytes() == CHECKER.read_bytes()
+    built = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["build"]["targets"]
+    assert built["wheel"]["force-include"]["checker/check_proof.py"] == "obsynth/exporting/check_proof.py"
+
+
+def test_a_file_that_cannot_be_read_is_said_so(tmp_path: Path) -> None:
+    place = tmp_path / "proof.json"
+    place.write_text("{}", encoding="utf-8")
+    with pytest.raises(obsynth.SpecError, match="could not be checked"):
+        check_independently(place)
