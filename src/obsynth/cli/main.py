@@ -234,12 +234,12 @@ VERBS = {
                         "treat the gains as rounded to N decimals, as in a printed table",
                         type=digits,
                     ),
+                    flag(
+                        "--independent",
+                        "check a gain set, the alarm of a guaranteed test, or a proof file (export --to proof.json) by "
+                        "check_proof.py alone, in a process without obsynth",
+                    ),
                 )
-            ),
-            flag(
-                "--independent",
-                "check a gain set, the alarm of a guaranteed test, or a proof file (export --to proof.json) by "
-                "check_proof.py alone, in a process without obsynth",
             ),
             verbose("every claim and every check"),
             JSON,

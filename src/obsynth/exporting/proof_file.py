@@ -47,8 +47,12 @@ PROOF_FORMAT, PROOF_VERSION = "obsynth-proof", 1
 RATE_SHARE = 1e-4
 #: Shares of the slowest mode's decay that are tried for a contraction: the first has the smallest bounds.
 CONTRACTION_SHARES = (0.5, 0.9, 0.1, 0.01)
+#: The same of a decay that no claim states.
+STABILITY_SHARES = (0.9, 0.5, 0.1, 0.01)
 #: A norm is proved for the claimed one, or for one larger by rounding.
 NORM_ROOM = (1.0, 1.0 + 1e-12, 1.0 + 1e-9)
+#: A share that is a power of two itself is stated as the next one: its logarithm is rounded.
+LOGARITHM_ROOM = 1e-9
 #: Identities are stated to a power of two of their terms, and of this share of the largest in a column.
 IDENTITY_FLOOR = 2.0**-20
 #: Relative room of bounds above what they are computed as.
@@ -214,7 +218,7 @@ class _Proof:
         decay, dt = self.design.certificate.claims.get("decay"), self.plant.dt
         rates = [] if not decay or not np.isfinite(decay) else [decay * (1.0 - RATE_SHARE)]
         rates = [float(np.nextafter(np.exp(-rate * dt), 1.0)) for rate in rates] if dt > 0.0 else rates
-        for rate in [*rates, *system.rates((0.9, 0.5, 0.1, 0.01))]:
+        for rate in [*rates, *system.rates(STABILITY_SHARES)]:
             if (found := lyapunov_witness(system.az, system.units, rate, discrete=dt > 0.0)) is not None:
                 return {"claim": "stable", "rate": number_data(rate), **_written(found)}
         return None
@@ -362,7 +366,7 @@ class _Exact:
 
     def identities_claim(self) -> dict[str, Any] | None:
         share = max((_share(*both) for both in self.missed.values()), default=Fraction(0))
-        stated = 0.0 if not share else float(2.0 ** np.ceil(np.log2(float(share)) + 1e-9))
+        stated = 0.0 if not share else float(2.0 ** np.ceil(np.log2(float(share)) + LOGARITHM_ROOM))
         if stated > ESTIMATE_SHARE:
             return None
         return {"claim": "identities", "share": number_data(stated), "floor": number_data(IDENTITY_FLOOR)}

@@ -26,6 +26,10 @@ PRECISIONS = (160, 320, 640, 1280)
 LEFT_TO_REST = (-8, -20, -40, -70, -110, -160, -240, -400, -700)
 #: Bits of a witness that are spent beyond its margin.
 SPARE_BITS = 24
+#: Numbers above two to this are those of a sum that grows.
+LARGEST_POWER = 20_000
+#: The speed of Cayley's transform is not below this.
+SLOWEST = 2.0**-500
 #: Doublings of a sum over time: after so many nothing that decays at a rate of double precision is left.
 MOST_DOUBLINGS = 80
 
@@ -202,7 +206,7 @@ def lyapunov_solution(a: Dyadic, q: Dyadic, rate: float, *, discrete: bool, bits
             else:
                 # Cayley's transform with a speed between the slowest and the fastest mode.
                 own = own + one * arb(rate)
-                speed = arb(max(_size(own), 2.0**-500))
+                speed = arb(max(_size(own), SLOWEST))
                 back = (one * speed - own).inv().mid()
                 moved, total = (one * speed + own) * back, back.transpose() * total * back * (2 * speed)
         except ZeroDivisionError:
@@ -223,7 +227,7 @@ def _sum_over_time(moved: Any, total: Any, bits: int) -> Dyadic | None:
         added = (moved.transpose() * total * moved).mid()
         total, moved = (total + added).mid(), (moved * moved).mid()
         largest, most = (max((abs(value) for value in part.entries()), default=arb(0)) for part in (moved, total))
-        if not largest < arb(2) ** 4000 or not most < arb(2) ** 20_000:
+        if not largest < arb(2) ** LARGEST_POWER or not most < arb(2) ** LARGEST_POWER:
             return None
         if largest < arb(2) ** (-bits):
             return rounded(total, bits, symmetric=True)
