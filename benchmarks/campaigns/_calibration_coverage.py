@@ -17,10 +17,10 @@ import numpy as np
 
 from obsynth.monitoring.calibration.innovations_fit import guarded_maximum
 from obsynth.monitoring.calibration.intervals import profile_root, quantile
-from obsynth.monitoring.calibration.logs import Log
+from obsynth.monitoring.calibration.logs import RecordedLog
 from obsynth.monitoring.calibration.maximum import Objective
 from obsynth.monitoring.calibration.plants import NonlinearPlant
-from obsynth.monitoring.calibration.problem import Problem, calibration_problem
+from obsynth.monitoring.calibration.problem import CalibrationProblem, calibration_problem
 from obsynth.monitoring.calibration.simulation_error import simulation_fits
 from obsynth.plants.dae import DAEModel
 from obsynth.simulation.dae import simulate_dae
@@ -44,7 +44,7 @@ def plant(rows: int) -> DAEModel:
     return model.replace(constants={**model.constants, **TRUTH}, parameters={"leak": leak})
 
 
-def simulated(model: DAEModel, rows: int, seed: int, quantum: float) -> Log:
+def simulated(model: DAEModel, rows: int, seed: int, quantum: float) -> RecordedLog:
     """Return one log with the inputs that were measured."""
     import pandas as pd
 
@@ -57,11 +57,11 @@ def simulated(model: DAEModel, rows: int, seed: int, quantum: float) -> Log:
         R=np.diag(sensors), integration="backward-euler", seed=seed,
     )  # fmt: skip
     y = np.round(true.outputs / quantum) * quantum if quantum else np.array(true.outputs)
-    return Log(np.arange(float(rows)), u, y, 1.0, model.input_names, model.output_names, (0, rows))
+    return RecordedLog(np.arange(float(rows)), u, y, 1.0, model.input_names, model.output_names, (0, rows))
 
 
 @lru_cache(maxsize=4)
-def asked(rows: int, quantum: float) -> tuple[DAEModel, Problem]:
+def asked(rows: int, quantum: float) -> tuple[DAEModel, CalibrationProblem]:
     """Return the plant and what is asked of its logs: the same functions serve them all."""
     model = plant(rows)
     problem = calibration_problem(

@@ -16,7 +16,7 @@ from benchmarks.campaigns.frame import Outcome
 
 from obsynth import DescriptorSystem
 from obsynth.analysis.diagnosis.exact_fault_columns import ExactQuestion
-from obsynth.analysis.diagnosis.fault_columns import Question, Removal
+from obsynth.analysis.diagnosis.fault_columns import FaultColumnsQuestion, Removal
 
 CASES = 500
 LIMIT = 60.0
@@ -34,7 +34,7 @@ def case(seed: int) -> Outcome:
             pencil = ExactQuestion(Removal(plant, removed), fault, reduced=False)
             if exact.polynomial not in (pencil.polynomial, -pencil.polynomial):
                 wrong.append(f"{removed}, {fault}: polynomials differ")
-            rounded = Question(Removal(other, removed), fault)
+            rounded = FaultColumnsQuestion(Removal(other, removed), fault)
             facts, found = _facts(exact, exact.order), _facts(rounded, rounded.order)
             if facts != found:
                 wrong.append(f"{removed}, {fault}: {facts} exactly, {found} in other units")

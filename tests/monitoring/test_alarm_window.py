@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.monitoring.alarms.proof_window import Programme, Rows, WindowData, window_programme
+from obsynth.monitoring.alarms.proof_window import Programme, WindowData, WindowRows, window_programme
 from obsynth.plants.transformations.uncertain_plant import affine_plant
 
 STEPS = 5
@@ -131,7 +131,7 @@ def test_the_proved_least_is_never_above_the_solvers() -> None:
 def test_a_multiplier_of_the_wrong_sign_proves_nothing() -> None:
     """Of ``x <= 10`` with ``|x| <= 1`` nothing follows, whatever number a certificate holds for it."""
     scales = np.ones(2)
-    equal, below = Rows(scales), Rows(scales)
+    equal, below = WindowRows(scales), WindowRows(scales)
     below.add({0: 1.0}, 10.0)
     programme = Programme(equal, below, np.array([-1.0, 0.0]), np.array([1.0, 1e3]))
     assert programme.proved_least(np.zeros(0), np.array([5.0])) <= 0

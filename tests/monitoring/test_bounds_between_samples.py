@@ -14,7 +14,7 @@ from scipy.linalg import expm
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.monitoring.thresholds.between_samples import BetweenSamples
+from obsynth.monitoring.thresholds.between_samples import IntersampleErrorSystem
 from obsynth.monitoring.thresholds.residual_model import residual_model
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import prove_contraction
@@ -267,7 +267,7 @@ def test_straight_lines_miss_no_more_of_an_output_than_is_added(name: str):
     a, c, bd, dd, h = STRAIGHT_LINES[name]
     plant = obsynth.DescriptorSystem(None, a, C=c, Bd=bd, Dd=dd)
     none: Any = None
-    found = BetweenSamples(plant, h, none, none, none, none, none, none, none, slice(0, 1), 0.0)
+    found = IntersampleErrorSystem(plant, h, none, none, none, none, none, none, none, slice(0, 1), 0.0)
     one: Any = SimpleNamespace(Az=-np.eye(1), By=np.eye(1), Cz=np.eye(1))
     added = found.at_any_stamps(np.ones(plant.nd), one)
     if name == "at once":

@@ -42,7 +42,7 @@ MOST_OBSERVER_STATES = 150
 ROUNDING_POINTS = (0.0, 1e-2, 1e-1, 1.0)
 
 
-def require_all_told(conditions: Iterable[Condition]) -> None:
+def require_all_conditions(conditions: Iterable[Condition]) -> None:
     """Raise `PreconditionError` for the first condition that fails, and say which others fail too."""
     failed = [condition for condition in conditions if not condition.holds]
     if not failed:

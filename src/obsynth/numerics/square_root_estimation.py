@@ -294,7 +294,7 @@ def _require_consistent(left: FloatArray, terms: FloatArray) -> None:
         )
 
 
-class Gaussian(NamedTuple):
+class SquareRootGaussian(NamedTuple):
     """Coordinates as far as they are known: ``mean (c, columns) + factor (c, any) e + diffuse (c, any) w``, w unknown.
 
     The first column is the mean, the others its derivatives by parameters.
@@ -322,7 +322,7 @@ def joint_step(
     unknown: FloatArray,
     *,
     complete: bool = True,
-) -> tuple[Gaussian, SmootherGain]:
+) -> tuple[SquareRootGaussian, SmootherGain]:
     """Solve ``H x = right + [known noise] e + unknown d``, where known and unknown multiply the coordinates before;
     return x, and the way back.
 
@@ -338,7 +338,7 @@ def joint_step(
 
 def _regular(
     H: FloatArray, S: FloatArray, width: int, right: FloatArray, least: float
-) -> tuple[Gaussian, SmootherGain] | None:
+) -> tuple[SquareRootGaussian, SmootherGain] | None:
     """Solve a step by LAPACK alone, or return ``None`` where a rank has to be decided."""
     from scipy.linalg import solve_triangular
 
@@ -357,12 +357,12 @@ def _regular(
     head = orthogonal[:width]
     back = SmootherGain(head[:, :m] @ white, head[:, m:rows], head[:, rows:], np.zeros((width, 0)))
     columns = right.shape[1]
-    return Gaussian(solved[:, :columns], solved[:, columns:], np.zeros((n, 0))), back
+    return SquareRootGaussian(solved[:, :columns], solved[:, columns:], np.zeros((n, 0))), back
 
 
 def _by_rank(
     H: FloatArray, S: FloatArray, width: int, right: FloatArray, unknown: FloatArray
-) -> tuple[Gaussian, SmootherGain]:
+) -> tuple[SquareRootGaussian, SmootherGain]:
     """Solve a step in which x may be undetermined, noise may be missing, and earlier directions are unknown."""
     n, columns = H.shape[1], right.shape[1]
     lengths, q1, q2, head, places, free = _by_columns(H, unknown)
@@ -392,7 +392,7 @@ def _by_rank(
         np.vstack((before @ compact[:, most:], solved[n:, columns:] @ compact[:, most:])),
         np.vstack((np.zeros((width, free.shape[1] - kept)), lost @ right_vectors[kept:].T)),
     )
-    return Gaussian(solved[:n, :columns], triangle[:most].T, basis), back
+    return SquareRootGaussian(solved[:n, :columns], triangle[:most].T, basis), back
 
 
 def _told_by_parity(q2: FloatArray, S: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray, int]:
@@ -404,7 +404,7 @@ def _told_by_parity(q2: FloatArray, S: FloatArray, right: FloatArray) -> tuple[F
     return (-_substituted(t[:count, :count].T, data, lower=True) if count else data), turned, count
 
 
-def stepped_back(later: Gaussian, back: SmootherGain) -> Gaussian:
+def stepped_back(later: SquareRootGaussian, back: SmootherGain) -> SquareRootGaussian:
     """Return what is known of the coordinates before a step from what is known of those after it."""
     mean = back.offset + back.from_next @ later.mean
     factor = np.hstack((back.from_next @ later.factor, back.noise))
@@ -414,14 +414,14 @@ def stepped_back(later: Gaussian, back: SmootherGain) -> Gaussian:
     if diffuse.shape[1]:
         left, values, _ = np.linalg.svd(diffuse, full_matrices=False)
         diffuse = left[:, values > RANK_TOLERANCE * max(float(values[0]), 1.0)]
-    return Gaussian(mean, factor, diffuse)
+    return SquareRootGaussian(mean, factor, diffuse)
 
 
-def nothing_later(width: int, unknown: int, columns: int) -> Gaussian:
+def nothing_later(width: int, unknown: int, columns: int) -> SquareRootGaussian:
     """Return what a filter knows of its own coordinates: c ~ N(0, I), and nothing of d."""
     factor, diffuse = np.zeros((width + unknown, width)), np.zeros((width + unknown, unknown))
     factor[:width], diffuse[width:] = np.eye(width), np.eye(unknown)
-    return Gaussian(np.zeros((width + unknown, columns)), factor, diffuse)
+    return SquareRootGaussian(np.zeros((width + unknown, columns)), factor, diffuse)
 
 
 class ParameterState(NamedTuple):

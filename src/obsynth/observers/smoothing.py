@@ -31,18 +31,18 @@ from obsynth.observers.recursive.observer import (
     recursive_estimates,
 )
 from obsynth.observers.recursive.step_model import StepMatrices, right_side, stacked_noise
-from obsynth.observers.smoothing_chain import Chain, Lesson, Links, Node, Smoothed
+from obsynth.observers.smoothing_chain import Node, ParameterInformation, Smoothed, SmootherHistory, StepLinearisation
 from obsynth.observers.taken_inputs import taken_inputs
 from obsynth.plants.dae import checked_inputs
 
 SmoothedObserver = RecursiveObserver | DAEObserver
 
 
-def links_of(observer: RecursiveObserver | DAEObserver) -> Links:
+def linearisation_of(observer: RecursiveObserver | DAEObserver) -> StepLinearisation:
     """Return how a chain is made of the steps of an observer."""
     if isinstance(observer, RecursiveObserver):
-        return _RecursiveLinks(observer.recursion)
-    return (_ConstantLinks if observer.form == "forgetting" else _WalkingLinks)(observer.steps)
+        return _RecursiveLinearisation(observer.recursion)
+    return (_ConstantParameters if observer.form == "forgetting" else _WalkingParameters)(observer.steps)
 
 
 class _Sample(NamedTuple):
@@ -59,7 +59,7 @@ class _Sample(NamedTuple):
     R: FloatArray
 
 
-class _DAELinks(Links):
+class _DAELinearisation(StepLinearisation):
     """Those of an observer of a nonlinear plant: linearised along what it found, as the observer is itself."""
 
     def __init__(self, steps: Steps) -> None:
@@ -109,7 +109,7 @@ class _DAELinks(Links):
         return np.asarray(np.linalg.qr(factor.T, mode="r")).T
 
 
-class _ConstantLinks(_DAELinks):
+class _ConstantParameters(_DAELinearisation):
     """States at given parameters, and what each sample says of the parameters."""
 
     def __init__(self, steps: Steps) -> None:
@@ -159,7 +159,9 @@ class _ConstantLinks(_DAELinks):
             (self.steps.part(state, "posterior") - through @ self.steps.part(state, "theta"), through)
         )
 
-    def _learnt(self, before: DAEState, after: DAEState, at: _Sample, factor: FloatArray) -> Lesson | None:
+    def _learnt(
+        self, before: DAEState, after: DAEState, at: _Sample, factor: FloatArray
+    ) -> ParameterInformation | None:
         """Return what a sample says of the parameters: its innovation at parameters zero, and how it follows them."""
         Omega = at.H @ self.steps.part(after, "Upsilon") + at.L
         spread = at.H @ np.hstack((at.F @ factor, at.noise))
@@ -173,15 +175,17 @@ class _ConstantLinks(_DAELinks):
         found = self._lesson(after, v, G, noise)
         return found if found is None else found._replace(is_reset=after.resets > before.resets)
 
-    def _lesson(self, after: DAEState, v: FloatArray, G: FloatArray, noise: FloatArray) -> Lesson | None:
+    def _lesson(self, after: DAEState, v: FloatArray, G: FloatArray, noise: FloatArray) -> ParameterInformation | None:
         if not self.nq:
             return None
         theta, S, spread = (self.steps.part(after, name) for name in ("theta", "S", "spread"))
         triangle = np.linalg.inv(np.linalg.cholesky(S))
-        return Lesson(theta, triangle, covariance_factor(0.5 * (spread + spread.T), "spread"), v, G, noise)
+        return ParameterInformation(
+            theta, triangle, covariance_factor(0.5 * (spread + spread.T), "spread"), v, G, noise
+        )
 
 
-class _WalkingLinks(_DAELinks):
+class _WalkingParameters(_DAELinearisation):
     """States and parameters together."""
 
     def begun(self, state: DAEState) -> Node:
@@ -229,7 +233,7 @@ class _WalkingLinks(_DAELinks):
         return Node(self._posterior(after)[:, None], found.factor, found.diffuse, back)
 
 
-class _RecursiveLinks(Links):
+class _RecursiveLinearisation(StepLinearisation):
     """Those of a recursive observer."""
 
     def __init__(self, recursion: Recursion) -> None:
@@ -257,7 +261,9 @@ class _RecursiveLinks(Links):
         known, nq = state.parameters, len(state.parameters.theta)
         lesson = None
         if nq:
-            lesson = Lesson(known.theta, known.triangle, known.spread, np.zeros(0), np.zeros((0, nq)), np.zeros((0, 0)))
+            lesson = ParameterInformation(
+                known.theta, known.triangle, known.spread, np.zeros(0), np.zeros((0, nq)), np.zeros((0, 0))
+            )
         return Node(np.column_stack((state.x, state.Upsilon)), state.factor, state.diffuse, None, lesson)
 
     def next(self, node: Node, before: RecursiveState, after: RecursiveState, row: RawEstimate, u: FloatArray) -> Node:
@@ -277,12 +283,12 @@ class _RecursiveLinks(Links):
         found, back = joint_step(*(parts if complete else tuple(part[kept] for part in parts)), complete=complete)
         return Node(*found, back)
 
-    def _lesson(self, before: RecursiveState, after: RecursiveState, row: RawEstimate) -> Lesson | None:
+    def _lesson(self, before: RecursiveState, after: RecursiveState, row: RawEstimate) -> ParameterInformation | None:
         known = after.parameters
         if not len(known.theta):
             return None
         G = row.regressor if row.regressor.size else np.zeros((len(row.innovation), len(known.theta)))
-        return Lesson(
+        return ParameterInformation(
             known.theta,
             known.triangle,
             known.spread,
@@ -338,7 +344,7 @@ def smoothed_record(observer: SmoothedObserver, y: ArrayLike, u: ArrayLike | Non
         inputs = checked_inputs(observer.model, u, len(outputs))
     if not len(outputs):
         return observer.run(outputs, inputs)
-    state, chain, found = observer.init(), Chain(links_of(observer)), list[Smoothed]()
+    state, chain, found = observer.init(), SmootherHistory(linearisation_of(observer)), list[Smoothed]()
     for k in range(len(outputs)):
         state, _ = observer.accept(state, outputs[k], inputs[k], chain.add)
         if lag is not None and k >= lag:

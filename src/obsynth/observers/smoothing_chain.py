@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.square_root_estimation import Gaussian, SmootherGain, nothing_later, stepped_back
+from obsynth.numerics.square_root_estimation import SmootherGain, SquareRootGaussian, nothing_later, stepped_back
 from obsynth.observers.outliers import projected
 
 #: What later samples say of constant parameters: weight and weighted data ``(any, nq + 1)``, and a square root of the
@@ -16,7 +16,7 @@ from obsynth.observers.outliers import projected
 Later: TypeAlias = tuple[FloatArray, FloatArray]
 
 
-class Lesson(NamedTuple):
+class ParameterInformation(NamedTuple):
     """What the samples up to one, and that one itself, say of constant parameters."""
 
     theta: FloatArray  # ``(nq,)``: the estimate
@@ -35,7 +35,7 @@ class Node(NamedTuple):
     factor: FloatArray  # ``(n, any)``
     diffuse: FloatArray  # ``(n, r)``
     back: SmootherGain | None  # to the coordinates of the sample before; `None` at the first
-    lesson: Lesson | None = None  # of constant parameters; `None` where there are none
+    lesson: ParameterInformation | None = None  # of constant parameters; `None` where there are none
 
 
 class Smoothed(NamedTuple):
@@ -49,7 +49,7 @@ class Smoothed(NamedTuple):
     spread: FloatArray
 
 
-def with_lesson(later: Later, lesson: Lesson, forgetting: float) -> Later:
+def with_information(later: Later, lesson: ParameterInformation, forgetting: float) -> Later:
     """Return what one more sample says as well, before those that were taken in; weights fall by the factor.
     It is independent of what earlier samples have learnt, and of the errors of the states at given parameters."""
     triangle, noise = later
@@ -63,7 +63,7 @@ def with_lesson(later: Later, lesson: Lesson, forgetting: float) -> Later:
     return triangle, np.asarray(np.linalg.qr(noise.T, mode="r")).T if noise.shape[1] > nq else noise
 
 
-def beside(lesson: Lesson, later: Later) -> tuple[FloatArray, FloatArray]:
+def beside(lesson: ParameterInformation, later: Later) -> tuple[FloatArray, FloatArray]:
     """Return the parameters, and a square root of their covariance, from both sides."""
     if not len(later[0]):
         return lesson.theta, lesson.spread
@@ -76,7 +76,7 @@ def beside(lesson: Lesson, later: Later) -> tuple[FloatArray, FloatArray]:
     return theta, np.asarray(np.linalg.solve(triangle, np.linalg.solve(triangle.T, sums)))
 
 
-class Links(ABC):
+class StepLinearisation(ABC):
     """How an observer makes a chain."""
 
     forgetting = 1.0  # lambda of constant parameters
@@ -97,10 +97,10 @@ class Links(ABC):
         """Return the node of the next sample, from the states before and after it, its row and its input."""
 
 
-class Chain:
+class SmootherHistory:
     """The samples of one run from its start, or from where it went on; the first that is kept is at k ``begin``."""
 
-    def __init__(self, links: Links) -> None:
+    def __init__(self, links: StepLinearisation) -> None:
         self.links = links
         self.nodes: list[Node] = []
         self.rows: list[Any] = []
@@ -124,7 +124,7 @@ class Chain:
             if k > first and node.back is not None:
                 known = stepped_back(known, node.back)
                 if node.lesson is not None:
-                    later = with_lesson(later, node.lesson, self.links.forgetting)
+                    later = with_information(later, node.lesson, self.links.forgetting)
         return found[::-1]
 
     def row(self, k: int) -> Any:
@@ -151,7 +151,7 @@ class Chain:
         self.rows.append(row)
 
 
-def _smoothed(links: Links, node: Node, known: Gaussian, later: Later) -> Smoothed:
+def _smoothed(links: StepLinearisation, node: Node, known: SquareRootGaussian, later: Later) -> Smoothed:
     both = np.hstack((node.factor, node.diffuse))
     x, factor, diffuse = node.origin + both @ known.mean, both @ known.factor, both @ known.diffuse
     theta, spread = np.zeros(0), np.zeros((0, 0))

@@ -19,7 +19,7 @@ from flint import arb, arb_mat, fmpq_mat
 from obsynth.proofs.exact_pencils import BASE_BITS, BITS_PER_STATE, POINTS_SEED
 
 #: Rows of enclosures, real or complex.
-Rows: TypeAlias = list[list[Any]]
+EnclosedRows: TypeAlias = list[list[Any]]
 
 
 def bits_for(states: int) -> int:
@@ -32,7 +32,7 @@ def exponential(matrix: fmpq_mat) -> Any:
     return arb_mat(matrix).exp()
 
 
-def rank_to_digits(rows: Rows) -> int:
+def rank_to_digits(rows: EnclosedRows) -> int:
     """Return the rank: at least this for certain, at most this to digits."""
     work = [list(row) for row in rows]
     rank, width = 0, len(work[0]) if work else 0
@@ -60,7 +60,7 @@ class EnclosedPencil:
     """The pencil ``A - z E (m, n)``; E is rational, A enclosed in a precision of ``bits``."""
 
     E: fmpq_mat
-    A: Rows
+    A: EnclosedRows
     bits: int
 
     @property
@@ -68,7 +68,7 @@ class EnclosedPencil:
         """Rows and columns."""
         return int(self.E.nrows()), int(self.E.ncols())
 
-    def at(self, point: Any) -> Rows:
+    def at(self, point: Any) -> EnclosedRows:
         """Return ``A - point E``."""
         return [
             [value if entry == 0 else value - point * arb(entry) for value, entry in zip(row, entries, strict=True)]

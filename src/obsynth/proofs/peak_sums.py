@@ -29,7 +29,7 @@ from obsynth.proofs.contraction import (
 from obsynth.proofs.products import exponential
 
 #: More than the square root of what underflows in a square.
-LOST_SQUARES = 2.0**-510
+SQRT_UNDERFLOW = 2.0**-510
 
 #: Length of an interval in units of one over the norm of A, and the largest order, for gains in continuous time.
 LENGTH, MOST_CONTINUOUS_STATES = 0.4, 12
@@ -121,7 +121,7 @@ def _seen(
 
 def _norms(sizes: FloatArray) -> FloatArray:
     """Return Euclidean norms of columns, up to roundings that the caller counts; what squares lose is added."""
-    return np.asarray(np.sqrt(np.sum(sizes * sizes, axis=-2)) + sizes.shape[-2] * LOST_SQUARES)
+    return np.asarray(np.sqrt(np.sum(sizes * sizes, axis=-2)) + sizes.shape[-2] * SQRT_UNDERFLOW)
 
 
 class Pieces(NamedTuple):

@@ -24,7 +24,7 @@ from obsynth.studies.comparing import compared_again
 from obsynth.studies.robustness import robustness
 from obsynth.studies.robustness_result import robustness_statement
 from obsynth.studies.tolerance_study import study_statement, tolerance_study
-from obsynth.verification.assumptions import Log, file_digest
+from obsynth.verification.assumptions import LogReference, file_digest
 
 #: A file may ask for no more runs than this: whoever wrote it does not wait for them.
 MOST_RUNS = 100_000
@@ -127,7 +127,7 @@ def _rows(kind: str, body: dict[str, Any], log_file: Path | None) -> Iterator[Ch
     for name, design in designs.items():
         label = "gain set" if kind != COMPARISON else f"gain set of {name}"
         yield gain_set_row(design, body["gain_sets"][name]["sha256"], label)
-    log = None if stored["log"] is None else Log.from_dict(stored["log"])
+    log = None if stored["log"] is None else LogReference.from_dict(stored["log"])
     if log is not None or log_file is not None:
         yield _log_row(log, log_file)
     result, statement, wrong = _AGAIN[kind]({**stored, "gain_sets": body["gain_sets"]}, designs, log_file)
@@ -146,7 +146,7 @@ def _rows(kind: str, body: dict[str, Any], log_file: Path | None) -> Iterator[Ch
     )
 
 
-def _log_row(log: Log | None, file: Path | None) -> Check:
+def _log_row(log: LogReference | None, file: Path | None) -> Check:
     if log is not None and file is None:
         return information(
             "log", f"errors are those on {log.name}, sha256 {log.sha256}: assumed, as the log was not given (--data)",

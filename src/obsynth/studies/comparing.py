@@ -52,7 +52,7 @@ from obsynth.studies.comparison import (
     rms,
 )
 from obsynth.studies.least_thresholds import thresholds_beside_least
-from obsynth.verification.assumptions import Log
+from obsynth.verification.assumptions import LogReference
 from obsynth.verification.over_tolerances.plants_of_the_box import plant_at
 
 #: Entries of A, B, Bf, Bd that tolerances do not touch: they are kinematics, not parameters.
@@ -389,7 +389,7 @@ def side_by_side(
         plant.fault_names,
         setting,
         asked if data is None or from_file else {},
-        Log.of(Path(data), columns, scales).as_dict() if from_file else None,
+        LogReference.of(Path(data), columns, scales).as_dict() if from_file else None,
         () if log is None else log.notes,
     )
 

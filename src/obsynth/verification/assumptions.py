@@ -119,7 +119,7 @@ def _enough(each: Sequence[str], otherwise: str) -> str:
 
 
 @dataclass(frozen=True)
-class Log:
+class LogReference:
     """A log by its name and digest, and how its columns were read."""
 
     name: str
@@ -128,7 +128,7 @@ class Log:
     scales: tuple[tuple[str, float], ...] = ()
 
     @classmethod
-    def of(cls, path: Path, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None) -> Log:
+    def of(cls, path: Path, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None) -> LogReference:
         """Return the log in a file."""
         return cls(
             path.name,
@@ -142,7 +142,7 @@ class Log:
         return {"name": self.name, "sha256": self.sha256, "columns": dict(self.columns), "scales": dict(self.scales)}
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Log:
+    def from_dict(cls, data: Mapping[str, Any]) -> LogReference:
         """Return the log that `as_dict` described."""
         return cls(
             str(data["name"]),

@@ -20,7 +20,7 @@ from obsynth.verification.error_system import ErrorModel, natural_scaling
 EQUALITY_TOLERANCE = 1e-9
 
 #: Sizes of states that are told by what drives them alone are known to within this factor.
-ROUGHLY = 4.0
+STATE_SCALE_FACTOR = 4.0
 
 
 #: What an observer of the plant's own states has in common with it.
@@ -152,7 +152,9 @@ def tracking_identities(model: ErrorModel) -> dict[str, Identity]:
     plain = _tracking_identities(model)
     found, others = (_in_units(plain, model, scaling) for scaling in _balances(model.plant))
     return {
-        name: identity if identity.units is None else replace(identity, also=replace(others[name], rough=ROUGHLY))
+        name: identity
+        if identity.units is None
+        else replace(identity, also=replace(others[name], rough=STATE_SCALE_FACTOR))
         for name, identity in found.items()
     }
 

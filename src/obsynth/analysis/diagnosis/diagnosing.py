@@ -20,7 +20,7 @@ from obsynth.analysis.diagnosis.explanations import (
     listed_sets,
     state_sensors,
 )
-from obsynth.analysis.diagnosis.fault_columns import Question, Removal, dc_point, others
+from obsynth.analysis.diagnosis.fault_columns import FaultColumnsQuestion, Removal, dc_point, others
 from obsynth.analysis.diagnosis.sensor_search import SensorResponses
 from obsynth.analysis.diagnosis.verdicts import MOST_PATTERN_FAULTS, Diagnosis, FaultDiagnosis, residual_bank
 from obsynth.errors import SpecError
@@ -158,8 +158,8 @@ def model_points(model: Exosystem, fault: int) -> list[complex]:
 
 def _verdict(
     plant: DescriptorSystem,
-    shown: Question,
-    free: Question,
+    shown: FaultColumnsQuestion,
+    free: FaultColumnsQuestion,
     frequencies: Sequence[float],
     modes: Sequence[complex],
     candidates: _Candidates | None,
@@ -184,7 +184,9 @@ def _verdict(
     )
 
 
-def _sentences(plant: DescriptorSystem, shown: Question, free: Question, candidates: _Candidates | None) -> list[str]:
+def _sentences(
+    plant: DescriptorSystem, shown: FaultColumnsQuestion, free: FaultColumnsQuestion, candidates: _Candidates | None
+) -> list[str]:
     """Return what hides a fault, at which point, and what would help."""
     name, rest = plant.fault_names[shown.number], dc_point(plant.dt)
     letter = "z" if plant.dt > 0.0 else "s"
@@ -257,15 +259,15 @@ class _Candidates:
         return least_additions(self.plant, self.sensors, reached, promising=promising)
 
 
-def _suggestion(candidates: _Candidates, name: str, shown: Question, *, step: bool) -> list[str]:
+def _suggestion(candidates: _Candidates, name: str, shown: FaultColumnsQuestion, *, step: bool) -> list[str]:
     """Return which states to measure, computed; and those that would only show the fault."""
     plant, fault = candidates.plant, shown.number
     rest = others(plant, fault)
-    answered: dict[tuple[str, ...], Question] = {}
+    answered: dict[tuple[str, ...], FaultColumnsQuestion] = {}
 
-    def free(changed: DescriptorSystem) -> Question:
+    def free(changed: DescriptorSystem) -> FaultColumnsQuestion:
         added = changed.output_names[plant.ny :]
-        return answered.setdefault(added, Question(Removal(changed, rest), fault))
+        return answered.setdefault(added, FaultColumnsQuestion(Removal(changed, rest), fault))
 
     full = candidates.additions(fault, rest, lambda changed: free(changed).estimable)
     constant = () if step else candidates.additions(fault, rest, lambda changed: free(changed).shows_at_rest)
@@ -275,7 +277,9 @@ def _suggestion(candidates: _Candidates, name: str, shown: Question, *, step: bo
     elif constant:
         texts.append(f"{name}: Measure one of: {listed_sets(constant)} (then a step of it can be estimated).")
     if not shown.visible:
-        showing = candidates.additions(fault, (), lambda changed: Question(Removal(changed, ()), fault).visible)
+        showing = candidates.additions(
+            fault, (), lambda changed: FaultColumnsQuestion(Removal(changed, ()), fault).visible
+        )
         more = [names for names in showing if names not in (*full, *constant)]
         if more:
             texts.append(f"{name}: {listed_sets(more)} would make it detectable, but not estimable.")
@@ -287,8 +291,8 @@ def _suggestion(candidates: _Candidates, name: str, shown: Question, *, step: bo
 
 
 def _isolability(
-    plant: DescriptorSystem, shown: Sequence[Question], questions: Questions
-) -> tuple[np.ndarray, np.ndarray, list[Question]]:
+    plant: DescriptorSystem, shown: Sequence[FaultColumnsQuestion], questions: Questions
+) -> tuple[np.ndarray, np.ndarray, list[FaultColumnsQuestion]]:
     weak, strong = np.zeros((2, plant.nf, plant.nf), dtype=bool)
     asked = {(i, j): questions.of((j,), i) for i in range(plant.nf) for j in others(plant, i)}
     for place, pair in {**asked, **{(i, i): own for i, own in enumerate(shown)}}.items():
@@ -296,7 +300,7 @@ def _isolability(
     return read_only(weak, bool), read_only(strong, bool), list(asked.values())
 
 
-def _warnings(plant: DescriptorSystem, asked: Sequence[Question]) -> tuple[str, ...]:
+def _warnings(plant: DescriptorSystem, asked: Sequence[FaultColumnsQuestion]) -> tuple[str, ...]:
     texts = []
     if not structure_of(plant).regular:
         texts.append(

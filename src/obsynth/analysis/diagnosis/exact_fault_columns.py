@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 
-from obsynth.analysis.diagnosis.fault_columns import Question, Removal, reduced_values
+from obsynth.analysis.diagnosis.fault_columns import FaultColumnsQuestion, Removal, reduced_values
 from obsynth.analysis.diagnosis.residual_orders import exact_residual_order
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.plants.descriptor import DescriptorSystem
@@ -41,7 +41,7 @@ MOST_EXACT_UNKNOWNS = 70
 
 
 @dataclass(frozen=True, eq=False)
-class ExactQuestion(Question):
+class ExactQuestion(FaultColumnsQuestion):
     """The same over the rational numbers: no tolerance, so no gap.
 
     ``reduced``: on the plant without its unknown inputs; otherwise by the fault polynomial alone, and orders are those
@@ -150,7 +150,9 @@ def decided_exactly(plant: DescriptorSystem) -> bool:
     return plant.nx + plant.nd + plant.nf <= MOST_EXACT_UNKNOWNS and not any(map(holds_computed, matrices))
 
 
-def question(plant: DescriptorSystem, removed: Sequence[int], number: int, exactly: bool | None = None) -> Question:
+def question(
+    plant: DescriptorSystem, removed: Sequence[int], number: int, exactly: bool | None = None
+) -> FaultColumnsQuestion:
     """Return a question about a fault; exact (unless it is said) where the plant is decided exactly."""
     return Questions(plant, decided_exactly(plant) if exactly is None else exactly).of(removed, number)
 
@@ -163,9 +165,9 @@ class Questions:
     exactly: bool
     _removals: dict[tuple[int, ...], Removal] = field(default_factory=dict, repr=False)
     _pencils: dict[tuple[int, ...], ExactPencil] = field(default_factory=dict, repr=False)
-    _asked: dict[tuple[tuple[int, ...], int], Question] = field(default_factory=dict, repr=False)
+    _asked: dict[tuple[tuple[int, ...], int], FaultColumnsQuestion] = field(default_factory=dict, repr=False)
 
-    def of(self, removed: Sequence[int], number: int) -> Question:
+    def of(self, removed: Sequence[int], number: int) -> FaultColumnsQuestion:
         """Return the question about a fault, with others removed."""
         gone = tuple(sorted(removed))
         if (gone, number) not in self._asked:
@@ -173,7 +175,7 @@ class Questions:
                 self._removals[gone] = Removal(self.source, gone, self._pencils)
             removal, small = self._removals[gone], self.source.nx + self.source.ny <= MOST_REDUCED
             exact = ExactQuestion(removal, number, small) if self.exactly else None
-            self._asked[gone, number] = exact or Question(removal, number)
+            self._asked[gone, number] = exact or FaultColumnsQuestion(removal, number)
         return self._asked[gone, number]
 
 

@@ -109,7 +109,7 @@ class Removal:
 
 
 @dataclass(frozen=True, eq=False)
-class Question:
+class FaultColumnsQuestion:
     """A fault of a plant, with the faults ``removed`` and every unknown input out of sight, in floating point."""
 
     removal: Removal

@@ -82,7 +82,7 @@ class Output:
 
 
 @dataclass(frozen=True)
-class Signals:
+class FmuSignals:
     """Everything that an FMU shows, in the order of its values."""
 
     inputs: tuple[str, ...]
@@ -98,7 +98,7 @@ class Signals:
         return -1 if signal is None else list(self.points).index(signal)
 
 
-def signals_of_linear(found: Realisation, alarms: Alarms) -> Signals:
+def signals_of_linear(found: Realisation, alarms: Alarms) -> FmuSignals:
     """Return the signals of a linear observer; fault estimates and residuals may be watched."""
     plant, observer = found.design.plant, found.observer
     biases = getattr(plant, "sensor_faults", ())
@@ -121,7 +121,7 @@ def signals_of_linear(found: Realisation, alarms: Alarms) -> Signals:
     signals = (*found.inputs, *observer.state_names, *observer.fault_names)
     points = {name: float(stated.get(name, 0.0)) for name in dict.fromkeys(signals)}
     inputs = _apart(observer.input_names, observer.output_names)
-    return Signals(inputs, found.inputs, tuple(outputs), points, alarms, units, observer.dt)
+    return FmuSignals(inputs, found.inputs, tuple(outputs), points, alarms, units, observer.dt)
 
 
 def _learned_outputs(alarms: Alarms) -> list[Output]:
@@ -136,7 +136,7 @@ def _learned_outputs(alarms: Alarms) -> list[Output]:
     ]
 
 
-def signals_of_dae(design: ObserverDesign, alarms: Alarms) -> Signals:
+def signals_of_dae(design: ObserverDesign, alarms: Alarms) -> FmuSignals:
     """Return the signals of the observer of a nonlinear plant; parameters, innovations and their square may be
     watched."""
     model, observer = design.nonlinear
@@ -152,7 +152,7 @@ def signals_of_dae(design: ObserverDesign, alarms: Alarms) -> Signals:
     outputs += [Output(f"r[{name}]", None, units.get(name, ""), f"innovation of {name}") for name in model.output_names]
     outputs.append(Output("nis", None, "", "square of the innovations in units of their covariance"))
     outputs += _learned_outputs(alarms)
-    return Signals(
+    return FmuSignals(
         _apart(model.input_names, model.output_names),
         (*model.input_names, *model.output_names),
         tuple(outputs),
@@ -192,7 +192,7 @@ def _variable(
     return is_number, attributes | ({"initial": initial} if initial else {}), shown | ({"unit": unit} if unit else {})
 
 
-def _variables(signals: Signals) -> Iterator[_Variable]:
+def _variables(signals: FmuSignals) -> Iterator[_Variable]:
     """Yield the variables in the order of their value references, which are 0, 1, 2, ..."""
     yield _variable("time", "independent", "continuous", "time", unit="s")
     for name, signal in zip(signals.inputs, signals.input_signals, strict=True):
@@ -225,7 +225,7 @@ def _variables(signals: Signals) -> Iterator[_Variable]:
 
 
 def model_description(
-    signals: Signals, version: str, sources: list[str], *, identifier: str, token: str, name: str, told: str
+    signals: FmuSignals, version: str, sources: list[str], *, identifier: str, token: str, name: str, told: str
 ) -> bytes:
     """Return ``modelDescription.xml`` of a version of FMI; ``told``: what the model is, in a sentence."""
     (token_name, number, lists, abilities), step = _VERSIONS[version], repr(signals.dt)
@@ -332,7 +332,7 @@ def _contents(
     warm_up: float | None,
     learned: LearnedThresholds | None,
     outliers: str | None,
-) -> tuple[Signals, tuple[str, str], str]:
+) -> tuple[FmuSignals, tuple[str, str], str]:
     """Return the signals, source and header, and the digest of the gain set."""
     header = f"{_PREFIX}.h"
     if isinstance(design.observer, DAEObserver):
@@ -351,7 +351,7 @@ def _contents(
     return signals_of_linear(found, alarms), (source, declared), found.digest
 
 
-def _layout(design: ObserverDesign, signals: Signals, token: str) -> str:
+def _layout(design: ObserverDesign, signals: FmuSignals, token: str) -> str:
     """Return ``layout.h``: sizes, start values, and how one sample is taken."""
     # Of each number, by value reference.
     starts = [shown.get("start", "0.0") for is_number, _, shown in _variables(signals) if is_number]
@@ -398,7 +398,7 @@ def _layout(design: ObserverDesign, signals: Signals, token: str) -> str:
     )
 
 
-def _taking_linear(design: ObserverDesign, signals: Signals) -> list[str]:
+def _taking_linear(design: ObserverDesign, signals: FmuSignals) -> list[str]:
     """Return the body that hands one sample to the linear observer; empty groups are no arguments there."""
     kinds = [output.name.partition("[")[0] for output in signals.outputs]
     known = len(signals.inputs) - len(design.plant.output_names)
@@ -415,7 +415,7 @@ def _taking_linear(design: ObserverDesign, signals: Signals) -> list[str]:
     ]
 
 
-def _taking_learned(signals: Signals, place: int) -> list[str]:
+def _taking_learned(signals: FmuSignals, place: int) -> list[str]:
     """Return the lines that show what a learned monitor says, if there is one."""
     if signals.alarms.learned is None:
         return []
@@ -423,7 +423,7 @@ def _taking_learned(signals: Signals, place: int) -> list[str]:
     return [f"    out[{place + i}] = memory->monitor.{text};" for i, text in enumerate(said)]
 
 
-def _taking_dae(design: ObserverDesign, signals: Signals) -> list[str]:
+def _taking_dae(design: ObserverDesign, signals: FmuSignals) -> list[str]:
     model, _ = design.nonlinear
     parts = (
         ("states", model.nx),

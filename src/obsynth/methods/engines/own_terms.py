@@ -31,7 +31,7 @@ from obsynth.methods.method import Synthesis
 from obsynth.methods.pd_observer.given_gains import synthesis_from_gains as pd_from_gains
 from obsynth.methods.pd_observer.limits import default_delta
 from obsynth.methods.pd_observer.method import PdObserver
-from obsynth.methods.refusals import require_all_told
+from obsynth.methods.refusals import require_all_conditions
 from obsynth.methods.ui_pi_observer.assembly import synthesis_from_gains as ui_pi_from_gains
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
 from obsynth.numerics.arrays import FloatArray
@@ -147,7 +147,7 @@ def ui_pi_by_inequality(plant: DescriptorSystem, asked: UiPiObserver, *, progres
     progress("checking the existence conditions")
     model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
     known = existence(plant, model)
-    require_all_told(known.conditions)
+    require_all_conditions(known.conditions)
     where = _region_of_poles(asked, plant.dt)
     found = sharepasand(
         plant, fault_model=asked.fault_model, region=where, E_sharp=asked.E_sharp, C_sharp=asked.C_sharp, G=asked.G

@@ -28,7 +28,7 @@ FAR_FROM_NORMAL = 1e3
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class OutputRows:
     """``C z + D v`` with v = [u; y], and what these rows are of the plant's equations, T0 ``(rows, nx)``.
 
     C may have fewer columns than there are states: the first ones.  The dynamics of a filter are rows as well, those of
@@ -43,14 +43,14 @@ class Rows:
         """Return C for so many states."""
         return np.hstack([self.C, np.zeros((len(self.C), order - self.C.shape[1]))])
 
-    def plus(self, other: Rows) -> Rows:
+    def plus(self, other: OutputRows) -> OutputRows:
         """Return the sum."""
         order = max(self.C.shape[1], other.C.shape[1])
-        return Rows(self.of_order(order) + other.of_order(order), self.D + other.D, self.T0 + other.T0)
+        return OutputRows(self.of_order(order) + other.of_order(order), self.D + other.D, self.T0 + other.T0)
 
-    def times(self, matrix: FloatArray) -> Rows:
+    def times(self, matrix: FloatArray) -> OutputRows:
         """Return combinations of the rows; where only rounding is left, there is nothing."""
-        return Rows(
+        return OutputRows(
             product_but_rounding(matrix, self.C),
             product_but_rounding(matrix, self.D),
             product_but_rounding(matrix, self.T0),
@@ -61,9 +61,9 @@ class Rows:
 class FilterPart:
     """A filter for some faults: its dynamics, rows that estimate them, and residuals; ``delay`` in samples."""
 
-    dynamics: Rows
-    estimates: Rows
-    residuals: Rows
+    dynamics: OutputRows
+    estimates: OutputRows
+    residuals: OutputRows
     faults: tuple[int, ...]
     delay: int
 
@@ -74,14 +74,14 @@ def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, dela
     gain = replace(gain, K=_told(gain.K, sizes), lag=tuple(_told(part, sizes) for part in gain.lag))
     shown = _told(shown, sizes)
     parts = (model.A, -model.C), (model.B, model.L), (model.T, model.T0)
-    dynamics = Rows(*(product_but_rounding(gain.K, fed_back, own) for own, fed_back in parts))
-    innovation = Rows(-model.C, model.L, model.T0)
+    dynamics = OutputRows(*(product_but_rounding(gain.K, fed_back, own) for own, fed_back in parts))
+    innovation = OutputRows(-model.C, model.L, model.T0)
     count, nx = len(model.estimate), model.T.shape[1]
-    row = Rows(model.estimate, np.zeros((count, model.L.shape[1])), np.zeros((count, nx)))
+    row = OutputRows(model.estimate, np.zeros((count, model.L.shape[1])), np.zeros((count, nx)))
     coordinates = _plain_coordinates(dynamics.C)
     if coordinates is not None:
         dynamics = _rounded_once(model, gain, coordinates)
-        innovation, row = (Rows(r.C @ coordinates, r.D, r.T0) for r in (innovation, row))
+        innovation, row = (OutputRows(r.C @ coordinates, r.D, r.T0) for r in (innovation, row))
     corrections = [innovation.times(model.estimate @ part) for part in gain.lag]
     if corrections:
         row = row.plus(corrections[0])
@@ -116,26 +116,26 @@ def _plain_coordinates(a: FloatArray) -> FloatArray | None:
     return np.asarray(turn * balanced_matrix(triangular)[1])
 
 
-def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray) -> Rows:
+def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray) -> OutputRows:
     """Return the dynamics in other coordinates; with digits to spare, for the small rows of entries that cancel."""
     with flint.ctx.workprec(EXPONENTIAL_BITS):
         k, there = arb_matrix(gain.K), arb_matrix(coordinates)
         back = there.inv()
         parts = ((model.A, -model.C), (model.B, model.L), (model.T, model.T0))
         a, b, t = (back * (arb_matrix(own) + k * arb_matrix(fed_back)) for own, fed_back in parts)
-        return Rows(*(as_ball(part).midpoint for part in (a * there, b, t)))
+        return OutputRows(*(as_ball(part).midpoint for part in (a * there, b, t)))
 
 
-def _registered(dynamics: Rows, row: Rows) -> tuple[Rows, Rows]:
+def _registered(dynamics: OutputRows, row: OutputRows) -> tuple[OutputRows, OutputRows]:
     """Return the dynamics with states that hold the last value of ``row``, and the rows that read them."""
     order, count = len(dynamics.C), len(row.C)
-    more = Rows(
+    more = OutputRows(
         np.block([[dynamics.C, np.zeros((order, count))], [row.of_order(order), np.zeros((count, count))]]),
         np.vstack([dynamics.D, row.D]),
         np.vstack([dynamics.T0, row.T0]),
     )
     read = np.hstack([np.zeros((count, order)), np.eye(count)])
-    return more, Rows(read, np.zeros_like(row.D), np.zeros_like(row.T0))
+    return more, OutputRows(read, np.zeros_like(row.D), np.zeros_like(row.T0))
 
 
 def assembled(
@@ -173,11 +173,11 @@ def assembled(
     return observer, _stacked([part.dynamics.T0 for part in parts], nx), t0
 
 
-def _side_by_side(found: Sequence[Rows], orders: Sequence[int], inputs: int, nx: int) -> Rows:
+def _side_by_side(found: Sequence[OutputRows], orders: Sequence[int], inputs: int, nx: int) -> OutputRows:
     """Return the rows of several filters, each reading its own states."""
     own = [rows.of_order(order) for rows, order in zip(found, orders, strict=True)]
     c = block_diag(*own) if own else np.zeros((0, 0))
-    return Rows(c, _stacked([rows.D for rows in found], inputs), _stacked([rows.T0 for rows in found], nx))
+    return OutputRows(c, _stacked([rows.D for rows in found], inputs), _stacked([rows.T0 for rows in found], nx))
 
 
 def _stacked(matrices: Sequence[FloatArray], width: int) -> FloatArray:

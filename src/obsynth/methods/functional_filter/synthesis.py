@@ -28,7 +28,7 @@ from obsynth.methods.functional_filter.method import FunctionalFilter
 from obsynth.methods.functional_filter.rates import MOST_LONGER, default_rates, settling_time
 from obsynth.methods.functional_filter.tracking import estimate_deviations, tracking_map
 from obsynth.methods.method import Synthesis
-from obsynth.methods.refusals import require_above_rounding, require_all_told
+from obsynth.methods.refusals import require_above_rounding, require_all_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.eigenstructure import checked_poles, place
 from obsynth.numerics.ranks import rounding_rank
@@ -47,7 +47,7 @@ def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Ca
     _require_samples(plant, asked)
     model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
     progress("checking the existence conditions")
-    require_all_told(asked.existence(plant))
+    require_all_conditions(asked.existence(plant))
     noisy, notes = _with_noise(plant, asked)
     progress("decoupling the unknown inputs")
     models = _models(noisy, model, asked)

@@ -14,7 +14,7 @@ import numpy as np
 
 from obsynth.methods.guaranteed_test.checks import checks
 from obsynth.methods.guaranteed_test.existence import samples_decided_on
-from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.guaranteed_test.options import TestOptions
 from obsynth.methods.guaranteed_test.problem import problem_of, window_as_designed
 from obsynth.methods.guaranteed_test.proofs import Repaired, proved_ray, proved_threshold, repaired_multipliers
 from obsynth.methods.guaranteed_test.windows import courses_of
@@ -192,7 +192,7 @@ def hidden_by(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any], 
     return {} if point is None else courses_of(window, point)
 
 
-def _smallest_groups(design: ObserverDesign, asked: Asked) -> Iterator[Check]:
+def _smallest_groups(design: ObserverDesign, asked: TestOptions) -> Iterator[Check]:
     plant = design.linear[0]
     for fault, group in enumerate(groups_of(design)):
         if len(group) == 1:
@@ -218,7 +218,7 @@ def pairs_of(plant: DescriptorSystem) -> tuple[tuple[int, int], ...]:
     return tuple((one, other) for one in range(plant.nf) for other in range(plant.nf) if one != other)
 
 
-def _pairs(design: ObserverDesign, asked: Asked) -> Iterator[Check]:
+def _pairs(design: ObserverDesign, asked: TestOptions) -> Iterator[Check]:
     """Yield the row on the table pair by pair; of two faults it is that of the tests themselves."""
     plant, shipped = design.linear[0], design.certificate.matrices
     pairs, wrong = pairs_of(plant), []

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import ObsynthError
-from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.guaranteed_test.options import TestOptions
 from obsynth.methods.guaranteed_test.problem import (
-    Problem,
-    Programmes,
+    WindowProblem,
+    WindowProgrammes,
     delay_in_samples,
     observer_of,
     observer_of_rows,
@@ -51,14 +51,14 @@ SAME_SUM = 1e-12
 PRODUCT_ROUNDINGS = 4.0
 
 
-def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Asked]) -> Iterator[Check]:
+def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], TestOptions]) -> Iterator[Check]:
     """Yield a row for each claim; ``read`` returns options that are checked."""
     constant, problem, programmes, reason = isinstance(design.plant, DescriptorSystem), None, None, ""
     try:
         plant: Any = design.linear[0] if constant else design.plant
         asked = read(design.options)
         problem = problem_as_designed(plant, asked)
-        programmes = Programmes.of(problem, int(asked.samples))
+        programmes = WindowProgrammes.of(problem, int(asked.samples))
     except (ObsynthError, TypeError, ValueError, AttributeError, ArithmeticError, LookupError) as error:
         reason = str(error) or type(error).__name__
     yield upper_bound_check(
@@ -126,7 +126,7 @@ def _by_programme(design: ObserverDesign, *, constant: bool) -> dict[str, FloatA
 
 
 def _what_does_not_fit(
-    design: ObserverDesign, shipped: Mapping[str, FloatArray], programmes: Programmes, *, constant: bool
+    design: ObserverDesign, shipped: Mapping[str, FloatArray], programmes: WindowProgrammes, *, constant: bool
 ) -> list[str]:
     """Return the names of matrices that are missing, or are not of the shape and sign of what they stand for."""
     count, windows, plant = len(programmes.windows), programmes.windows, programmes.windows[0].model.plant
@@ -192,7 +192,7 @@ def _judged(
 def _of_the_tests(
     design: ObserverDesign,
     shipped: Mapping[str, FloatArray],
-    programmes: Programmes,
+    programmes: WindowProgrammes,
     tests: Mapping[int, Repaired],
     *,
     constant: bool,
@@ -253,8 +253,8 @@ def _of_the_tests(
 def _of_what_runs(
     design: ObserverDesign,
     shipped: Mapping[str, FloatArray],
-    problem: Problem,
-    programmes: Programmes,
+    problem: WindowProblem,
+    programmes: WindowProgrammes,
     tests: Mapping[int, Repaired],
 ) -> Iterator[Check]:
     windows, rooms = programmes.windows, {}
@@ -349,8 +349,8 @@ def _proved_witness(
 def _of_the_least(
     design: ObserverDesign,
     shipped: Mapping[str, FloatArray],
-    problem: Problem,
-    programmes: Programmes,
+    problem: WindowProblem,
+    programmes: WindowProgrammes,
     used: list[int],
     *,
     constant: bool,

@@ -10,8 +10,8 @@ import numpy as np
 from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.condensed import Condensed
-from obsynth.methods.guaranteed_test.options import Asked
-from obsynth.methods.guaranteed_test.problem import Problem, missing_bounds, problem_of, samples_given
+from obsynth.methods.guaranteed_test.options import TestOptions
+from obsynth.methods.guaranteed_test.problem import WindowProblem, missing_bounds, problem_of, samples_given
 from obsynth.methods.guaranteed_test.proofs import proved_ray, repaired_multipliers
 from obsynth.methods.guaranteed_test.windows import Window, fault_names
 from obsynth.numerics.arrays import FloatArray
@@ -33,7 +33,7 @@ MOST_NAMED_STATES = 8
 
 
 def conditions(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Asked, *, with_windows: bool = True
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: TestOptions, *, with_windows: bool = True
 ) -> tuple[Condition, ...]:
     """Return the conditions in order; ``with_windows``: also whether a window tells the fault, if the others hold."""
     first: tuple[Condition, ...] = ()
@@ -75,7 +75,7 @@ def conditions(
     return (*first, *(told(problem_of(plant, own), own)[0] for own in each))
 
 
-def told(problem: Problem, asked: Asked) -> tuple[Condition, int]:
+def told(problem: WindowProblem, asked: TestOptions) -> tuple[Condition, int]:
     """Return the condition that some window tells the fault, and the lag with which it does."""
     lags = [problem.question.lag]
     if problem.question.course == "any" and asked.lag is None:
@@ -89,7 +89,7 @@ def told(problem: Problem, asked: Asked) -> tuple[Condition, int]:
     return told_condition(window, False, _why(problem, asked, window)), lags[-1]
 
 
-def _decisive(problem: Problem, asked: Asked, lag: int) -> Iterator[Window]:
+def _decisive(problem: WindowProblem, asked: TestOptions, lag: int) -> Iterator[Window]:
     """Yield the windows of which one has a test where there is any."""
     if isinstance(problem.plant, TimeVaryingDescriptorSystem):
         samples = _samples_by_row(problem, asked)
@@ -109,13 +109,13 @@ def _decisive(problem: Problem, asked: Asked, lag: int) -> Iterator[Window]:
     yield from (problem.window(samples, lag=lag) for samples in (*(tried for tried in doubled if tried < most), most))
 
 
-def _samples_by_row(problem: Problem, asked: Asked) -> int:
+def _samples_by_row(problem: WindowProblem, asked: TestOptions) -> int:
     """Return the samples on which it is decided where each row has a window of its own."""
     given = samples_given(asked)
     return problem.ladder()[-1] if given == "auto" else int(given)
 
 
-def samples_decided_on(problem: Problem, asked: Asked, lag: int) -> int:
+def samples_decided_on(problem: WindowProblem, asked: TestOptions, lag: int) -> int:
     """Return the samples on which it is decided."""
     enough = problem.enough(lag)
     if asked.samples != "auto":
@@ -164,7 +164,7 @@ def told_condition(window: Window, holds: bool, detail: str) -> Condition:
     )
 
 
-def _why(problem: Problem, asked: Asked, window: Window) -> str:
+def _why(problem: WindowProblem, asked: TestOptions, window: Window) -> str:
     """Return in words what hides the fault."""
     fault, varies = problem.fault, isinstance(problem.plant, TimeVaryingDescriptorSystem)
     found = proved_ray(window)

@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import SpecError
-from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.guaranteed_test.options import TestOptions
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -28,7 +28,7 @@ NOMINAL_BANK = (
 
 
 @dataclass(frozen=True)
-class GuaranteedTestMethod(Asked, Method):
+class GuaranteedTestMethod(TestOptions, Method):
     r"""Design the test of a fault on the last samples that has the least threshold without false alarms.
 
     The residual is a weighted sum of the last outputs and known inputs.  While disturbances and noise keep their bounds

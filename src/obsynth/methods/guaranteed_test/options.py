@@ -11,7 +11,7 @@ from obsynth.numerics.arguments import FewSamples, Positive, WrittenAs
 
 
 @dataclass(frozen=True)
-class Asked:
+class TestOptions:
     """Options as asked for."""
 
     fault: Annotated[Any, WrittenAs("text")] = None

@@ -12,9 +12,16 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.guaranteed_test.options import TestOptions
 from obsynth.methods.guaranteed_test.tolerant import side_by_side
-from obsynth.methods.guaranteed_test.windows import Bounds, Question, Window, disturbance_names, fault_names, window_of
+from obsynth.methods.guaranteed_test.windows import (
+    Bounds,
+    TestProblem,
+    Window,
+    disturbance_names,
+    fault_names,
+    window_of,
+)
 from obsynth.numerics.arguments import is_finite_number, real_number
 from obsynth.numerics.arrays import LARGEST, FloatArray, require_no_overflow
 from obsynth.numerics.ranks import decide_rank
@@ -36,7 +43,7 @@ COURSES: Mapping[str, str] = {
 }
 
 #: Samples that are tried for ``samples="auto"``; for a step, those after its healthy past.
-LADDER = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
+CANDIDATE_LENGTHS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 
 #: The ladder ends where a window has more states than this.
 MOST_STATES = 2500
@@ -57,7 +64,7 @@ REFUSED: Mapping[str, str] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class WindowProblem:
     """A plant with its bounds and what is asked, but for the number of samples, the lag and the row.
 
     Of a plant that changes with k, ``E_{k+1} x(k+1) = A_k x(k) + B_k u(k) + Phi_k f(k) + mu(k)`` and
@@ -66,7 +73,7 @@ class Problem:
 
     plant: DescriptorSystem | TimeVaryingDescriptorSystem
     bounds: Bounds
-    question: Question  # of one sample more than its course needs
+    question: TestProblem  # of one sample more than its course needs
 
     def window(self, samples: int, *, lag: int | None = None, row: int = 0) -> Window:
         """Return the stacked equations of so many samples, of which the last is that of k = ``row``."""
@@ -97,7 +104,7 @@ class Problem:
         """Return the numbers of samples to try; of a large plant fewer."""
         most = max(MOST_STATES // max(self.plant.nx, 1), self.shortest)
         most = most if self.horizon is None else min(most, self.horizon)
-        asked = [self.question.before + rung for rung in LADDER]
+        asked = [self.question.before + rung for rung in CANDIDATE_LENGTHS]
         return tuple(rung for rung in asked if self.shortest <= rung <= most) or (self.shortest,)
 
     def rows(self, samples: int) -> range:
@@ -138,7 +145,7 @@ def _continues(before: FloatArray, a: FloatArray, after: FloatArray) -> bool:
     return decide_rank(np.vstack([before, without @ a])).rank == decide_rank(before).rank + len(without)
 
 
-def question_of(asked: Asked, plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> Question:
+def question_of(asked: TestOptions, plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> TestProblem:
     """Return what is looked for, of one sample more than its course needs."""
     names, before = fault_names(plant), asked.before if asked.course == "step" else 0
     fault, rates = fault_of(names, asked.fault), np.zeros(0)
@@ -147,7 +154,7 @@ def question_of(asked: Asked, plant: DescriptorSystem | TimeVaryingDescriptorSys
     index = None
     if isinstance(plant, DescriptorSystem) and not decide_rank(plant.E).full:
         index = ExactPencil.written(plant.E, plant.A).index
-    return Question(
+    return TestProblem(
         fault,
         asked.course,
         before + 1,
@@ -163,7 +170,7 @@ def question_of(asked: Asked, plant: DescriptorSystem | TimeVaryingDescriptorSys
     )
 
 
-def problem_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Asked) -> Problem:
+def problem_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: TestOptions) -> WindowProblem:
     """Return what is asked of a plant; raise `SpecError` for what it cannot be asked, unknown signals, missing bounds
     and courses that do not fit."""
     if isinstance(plant, TimeVaryingDescriptorSystem):
@@ -180,16 +187,16 @@ def problem_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Ask
                 path="plant.horizon",
             )
     question = question_of(asked, plant)
-    return Problem(plant, bounds_of(plant, asked), question)
+    return WindowProblem(plant, bounds_of(plant, asked), question)
 
 
-def samples_given(asked: Asked) -> Any:
+def samples_given(asked: TestOptions) -> Any:
     """Return the number of samples, or ``auto``."""
     return asked.before + asked.after if asked.after is not None else asked.samples
 
 
 @dataclass(frozen=True, eq=False)
-class Programmes:
+class WindowProgrammes:
     """The different windows of all rows, the first row of each, and which window each row has ``(rows,)``."""
 
     windows: tuple[Window, ...]
@@ -197,7 +204,7 @@ class Programmes:
     of_row: np.ndarray
 
     @classmethod
-    def of(cls, problem: Problem, samples: int) -> Programmes:
+    def of(cls, problem: WindowProblem, samples: int) -> WindowProgrammes:
         """Return them; those with the same numbers are one."""
         numbers: dict[bytes, int] = {}
         windows: list[Window] = []
@@ -219,13 +226,13 @@ class Programmes:
         return cls(tuple(windows), tuple(first), np.array(of_row, dtype=np.int64))
 
 
-def problem_as_designed(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Asked) -> Problem:
+def problem_as_designed(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: TestOptions) -> WindowProblem:
     """Return the problem of options as a design ships them: with the lag."""
     problem = problem_of(plant, asked)
     return replace(problem, question=replace(problem.question, lag=asked.lag or 0))
 
 
-def window_as_designed(plant: DescriptorSystem, asked: Asked) -> Window:
+def window_as_designed(plant: DescriptorSystem, asked: TestOptions) -> Window:
     """Return the stacked equations of options as a design ships them: with the number of samples and the lag."""
     return problem_as_designed(plant, asked).window(int(asked.samples))
 
@@ -263,7 +270,7 @@ def free_faults(names: tuple[str, ...], given: Any, fault: int) -> tuple[int, ..
     return tuple(sorted({names.index(name) for name in listed}))
 
 
-def missing_bounds(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Asked) -> Iterator[str]:
+def missing_bounds(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: TestOptions) -> Iterator[str]:
     """Yield a sentence for each bound that is missing."""
     known, names = asked.disturbance_bounds, disturbance_names(plant)
     if isinstance(plant, TimeVaryingDescriptorSystem):
@@ -296,7 +303,7 @@ def missing_bounds(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked:
         )
 
 
-def bounds_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Asked) -> Bounds:
+def bounds_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: TestOptions) -> Bounds:
     """Return the bounds that are given; raise `SpecError` where some are missing."""
     lacking = list(missing_bounds(plant, asked))
     if lacking:
@@ -422,7 +429,7 @@ def observer_of(window: Window, multipliers: FloatArray, beside: LinearObserver 
 
 
 def observer_of_rows(
-    problem: Problem, programmes: Programmes, told: np.ndarray, multipliers: list[FloatArray]
+    problem: WindowProblem, programmes: WindowProgrammes, told: np.ndarray, multipliers: list[FloatArray]
 ) -> WindowObserver:
     """Return the weights of all rows; ``told``: which programmes have a test."""
     plant, question = problem.plant, programmes.windows[0].question

@@ -10,7 +10,12 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.methods.functions import design_function
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
-from obsynth.methods.guaranteed_test.problem import Programmes, free_faults, problem_as_designed, window_as_designed
+from obsynth.methods.guaranteed_test.problem import (
+    WindowProgrammes,
+    free_faults,
+    problem_as_designed,
+    window_as_designed,
+)
 from obsynth.methods.guaranteed_test.tolerant import rows_before
 from obsynth.methods.guaranteed_test.windows import courses_of
 from obsynth.numerics.arguments import arguments_checked, real_array, whole_number
@@ -188,7 +193,7 @@ class GuaranteedTest(ObserverDesign):
                 return {}
             problem = problem_as_designed(self._varying_plant, GuaranteedTestMethod.of(self.options))
             place = int(np.flatnonzero(leasts == self.least)[0])
-            window = Programmes.of(problem, self.samples).windows[place]
+            window = WindowProgrammes.of(problem, self.samples).windows[place]
             return courses_of(window, shipped["witness"][place][: len(window.bar)])
         point = self.certificate.matrices.get("witness")
         if point is None:

@@ -12,13 +12,13 @@ from obsynth.analysis.existence.condition import require_all
 from obsynth.errors import ObsynthError, PreconditionError, SolverError
 from obsynth.methods.designing import design
 from obsynth.methods.guaranteed_test.existence import conditions, told
-from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.guaranteed_test.options import TestOptions
 from obsynth.methods.guaranteed_test.problem import (
     COURSES,
     MOST_STATES,
     WITHIN,
-    Problem,
-    Programmes,
+    WindowProblem,
+    WindowProgrammes,
     delay_in_samples,
     observer_of,
     observer_of_rows,
@@ -41,7 +41,7 @@ from obsynth.methods.guaranteed_test.tolerant import (
     thresholds_over_record,
     with_tolerances,
 )
-from obsynth.methods.guaranteed_test.windows import Question, Window, disturbance_names
+from obsynth.methods.guaranteed_test.windows import TestProblem, Window, disturbance_names
 from obsynth.methods.method import Synthesis
 from obsynth.methods.tracking import tracking_of
 from obsynth.numerics.arrays import FloatArray
@@ -77,7 +77,7 @@ SHORT_SECONDS, MINUTES = 5.0, 120.0
 
 def synthesise(
     plant: DescriptorSystem | TimeVaryingDescriptorSystem,
-    asked: Asked,
+    asked: TestOptions,
     *,
     progress: Callable[[str], None],
     scenario: Scenario | None = None,
@@ -99,7 +99,7 @@ def synthesise(
     most = problem.ladder()[-1] if given == "auto" else int(given)
     progress(f"solving linear programmes of up to {most} samples, which take {in_time(plant.nx, most)}")
     samples, table, known = chosen_samples(problem, asked, beside)
-    programmes = Programmes.of(problem, samples)
+    programmes = WindowProgrammes.of(problem, samples)
     several = f", one for each of {len(programmes.windows)} different windows" if len(programmes.windows) > 1 else ""
     progress(f"proving the threshold on {samples} samples{several}")
     shipped = []
@@ -116,7 +116,7 @@ def synthesise(
 
 
 def _observer_beside(
-    asked: Asked, scenario: Scenario, plant: DescriptorSystem, progress: Callable[[str], None]
+    asked: TestOptions, scenario: Scenario, plant: DescriptorSystem, progress: Callable[[str], None]
 ) -> Beside:
     """Return the observer of the state, and what it says of a scenario without its faults."""
     if asked.state_bounds or asked.initial_bounds:
@@ -156,7 +156,7 @@ def _observer_beside(
 
 
 def chosen_samples(
-    problem: Problem, asked: Asked, beside: Beside | None
+    problem: WindowProblem, asked: TestOptions, beside: Beside | None
 ) -> tuple[int, FloatArray, Mapping[int, Optimum]]:
     """Return the number of samples, the table of those tried with their thresholds ``(tried, 2)``, and the optima by
     row; where each row has a window of its own some rows are tried, and the worst one counts.
@@ -239,9 +239,9 @@ def proved_test(window: Window, found: Optimum) -> Shipped:
 
 
 def _synthesis(
-    problem: Problem,
-    asked: Asked,
-    programmes: Programmes,
+    problem: WindowProblem,
+    asked: TestOptions,
+    programmes: WindowProgrammes,
     shipped: list[Shipped | None],
     table: FloatArray,
     beside: Beside | None,
@@ -262,7 +262,7 @@ def _synthesis(
     }
     if np.isfinite(leasts[used]).any():
         claims["least"] = float(np.nanmax(leasts[used]))
-    options: dict[str, Any] = {option.name: getattr(asked, option.name) for option in fields(Asked)} | {
+    options: dict[str, Any] = {option.name: getattr(asked, option.name) for option in fields(TestOptions)} | {
         "samples": question.samples,
         "lag": question.lag if question.course in ("any", "ramp", "rate") else None,
         "fault": problem.fault,
@@ -286,7 +286,9 @@ def _synthesis(
     return Synthesis(options, {"h": on_y, "g": on_u}, observer, certificate, notes=notes)
 
 
-def _by_programme(problem: Problem, programmes: Programmes, shipped: list[Shipped | None]) -> dict[str, FloatArray]:
+def _by_programme(
+    problem: WindowProblem, programmes: WindowProgrammes, shipped: list[Shipped | None]
+) -> dict[str, FloatArray]:
     """Return what is proved of each different window, a row for each, and which of them each row of a record has."""
     windows, empty = programmes.windows, Repaired(np.zeros(1), np.zeros(1))
     tests = [empty if one is None else one.test for one in shipped]
@@ -320,7 +322,9 @@ def padded(rows: Sequence[FloatArray], width: int = 1) -> FloatArray:
     return np.array([np.pad(row, (0, width - len(row))) for row in rows])
 
 
-def _notes(problem: Problem, asked: Asked, window: Window, claims: Mapping[str, float], table: FloatArray) -> list[str]:
+def _notes(
+    problem: WindowProblem, asked: TestOptions, window: Window, claims: Mapping[str, float], table: FloatArray
+) -> list[str]:
     question, threshold, least = window.question, claims["threshold"], claims.get("least")
     words, mean = [], claims.get("mean_threshold")
     if threshold == 0.0:
@@ -373,7 +377,7 @@ def _notes(problem: Problem, asked: Asked, window: Window, claims: Mapping[str, 
 
 
 def _notes_of_rows(
-    problem: Problem, claims: Mapping[str, float], matrices: Mapping[str, FloatArray], question: Question
+    problem: WindowProblem, claims: Mapping[str, float], matrices: Mapping[str, FloatArray], question: TestProblem
 ) -> Iterator[str]:
     thresholds, of_row = matrices["thresholds"], matrices["programmes"].astype(np.int64)
     without = int(np.sum(of_row < 0))

@@ -67,7 +67,7 @@ class Bounds:
 
 
 @dataclass(frozen=True, eq=False)
-class Question:
+class TestProblem:
     """What is asked of a window: the fault, its course, the samples, and what else may happen."""
 
     fault: int
@@ -126,7 +126,7 @@ def disturbance_names(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> 
     )
 
 
-def _constant_model(plant: DescriptorSystem, bounds: Bounds, question: Question) -> Model:
+def _constant_model(plant: DescriptorSystem, bounds: Bounds, question: TestProblem) -> Model:
     """Return the same matrices at each sample."""
     regular = decide_rank(plant.E).full
     count = question.samples - 1 if regular else question.samples + question.closing
@@ -194,7 +194,7 @@ class Window:
 
     model: Model
     bounds: Bounds
-    question: Question
+    question: TestProblem
     rows: int
     labels: tuple[tuple[Any, ...], ...]
     bar: FloatArray
@@ -404,7 +404,7 @@ def courses_of(window: Window, point: FloatArray) -> dict[str, FloatArray]:
 
 
 def window_of(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem, bounds: Bounds, question: Question, start: int = 1
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, bounds: Bounds, question: TestProblem, start: int = 1
 ) -> Window:
     """Return the stacked equations of a question; ``start``: k of the first sample, where matrices change with it."""
     if isinstance(plant, DescriptorSystem):
@@ -461,7 +461,7 @@ def window_of(
     )
 
 
-def _disturbances(bounds: Bounds, question: Question, builder: Builder, acting: Any, span: range, rows: int) -> int:
+def _disturbances(bounds: Bounds, question: TestProblem, builder: Builder, acting: Any, span: range, rows: int) -> int:
     """Enter the disturbances; return the number of rows."""
     one = np.ones((1, 1))
     for i in np.flatnonzero(bounds.disturbance > 0.0).tolist():
@@ -481,7 +481,7 @@ def _disturbances(bounds: Bounds, question: Question, builder: Builder, acting: 
     return rows
 
 
-def _course(question: Question, builder: Builder, acting: Any, span: range) -> None:
+def _course(question: TestProblem, builder: Builder, acting: Any, span: range) -> None:
     """Enter the fault that is looked for."""
     which = np.array([question.fault])
     target = question.samples - 1 - question.lag

@@ -22,7 +22,7 @@ from obsynth.errors import PreconditionError, SolverError
 from obsynth.methods.engines.kalman_problem import NOISE_PRICE, KalmanProblem, compromise
 from obsynth.methods.engines.region import Region, region_gain
 from obsynth.methods.method import Synthesis
-from obsynth.methods.refusals import require_all_told
+from obsynth.methods.refusals import require_all_conditions
 from obsynth.methods.ui_pi_observer.assembly import assembled
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
 from obsynth.methods.ui_pi_observer.placement_problem import PlacementProblem, kalman_problem, placement_problem
@@ -96,7 +96,7 @@ def synthesise(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callab
     weights = asked.checked_noise(plant.output_names)
     progress("checking the existence conditions")
     found = existence(plant, model)
-    require_all_told(found.conditions)
+    require_all_conditions(found.conditions)
     working = found.plant
     progress("decoupling the unknown inputs")
     problem = placement_problem(working, model, found.fixed_modes, joint=asked.joint, given=asked.given_decoupling())

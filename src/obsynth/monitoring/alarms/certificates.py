@@ -23,7 +23,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import restored
 from obsynth.results.gain_sets import loaded
 from obsynth.results.verification_report import VerificationReport
-from obsynth.verification.assumptions import Log, file_digest
+from obsynth.verification.assumptions import LogReference, file_digest
 
 
 @arguments_checked
@@ -82,7 +82,7 @@ def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
     u = np.asarray(data["u"], dtype=np.float64).reshape(-1, plant.nu)
     y = np.asarray(data["y"], dtype=np.float64).reshape(-1, plant.ny)
     by_test = "multipliers" in data
-    log = None if data["log"] is None else Log.from_dict(data["log"])
+    log = None if data["log"] is None else LogReference.from_dict(data["log"])
     yield gain_set_row(design, body["gain_set"]["sha256"])
     yield _log_row(log, log_file, design, u, y, last=data["row"] if by_test else len(y))
     if by_test:
@@ -130,7 +130,7 @@ def gain_set_row(design: ObserverDesign, digest: str, name: str = "gain set") ->
 
 
 def _log_row(
-    log: Log | None, file: Path | None, design: ObserverDesign, u: FloatArray, y: FloatArray, last: int
+    log: LogReference | None, file: Path | None, design: ObserverDesign, u: FloatArray, y: FloatArray, last: int
 ) -> Check:
     """Return the row on the log: compared where it is given, else assumed; ``last``: its row that y ends with."""
     if file is None:
@@ -172,7 +172,7 @@ def _checked_by_test(
     data: Mapping[str, Any],
     u: FloatArray,
     y: FloatArray,
-    log: Log | None,
+    log: LogReference | None,
 ) -> Iterator[Check]:
     """Yield the rows on a certificate of a guaranteed test."""
     row = data["row"]

@@ -28,7 +28,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import MOST_LISTED, shown
 from obsynth.results.certificate_files import SHOWN_DIGITS
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.assumptions import Log
+from obsynth.verification.assumptions import LogReference
 
 
 def rows_of_test(test: GuaranteedTest) -> int:
@@ -78,7 +78,9 @@ def margin_of(window: Window, values: list[Fraction], y: FloatArray, u: FloatArr
     return down(total / allowed - 1)
 
 
-def statement_of(test: GuaranteedTest, group: tuple[str, ...], row: int, log: Log | None, gain_set: str) -> str:
+def statement_of(
+    test: GuaranteedTest, group: tuple[str, ...], row: int, log: LogReference | None, gain_set: str
+) -> str:
     """Return what a proof says, with everything it rests on."""
     window = Programmes.of(test).window
     plant, question = window.plant, window.question

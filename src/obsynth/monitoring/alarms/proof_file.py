@@ -25,7 +25,7 @@ from obsynth.plants.signal_names import index_of
 from obsynth.results.certificate_files import SHOWN_DIGITS, sealed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import design_as_dict, plain
-from obsynth.verification.assumptions import Assumptions, Log
+from obsynth.verification.assumptions import Assumptions, LogReference
 
 ALARM_VERSION = 2
 
@@ -104,7 +104,7 @@ def proved_alarm(
     noise_bound: float | None = None,
     initial_set: Mapping[str, Any] | None = None,
     state_bounds: Mapping[str, Any] | None = None,
-    log: Log | None = None,
+    log: LogReference | None = None,
     unverified: bool = False,
 ) -> AlarmProof:
     """Return the proof for the last sample of a record ``u (steps, nu)``, ``y (steps, ny)`` of deviations.
@@ -174,7 +174,7 @@ def _failing(design: ObserverDesign, *, unverified: bool) -> str | None:
 
 
 def _proved_by_test(
-    design: ObserverDesign, u: FloatArray, y: FloatArray, log: Log | None, *, unverified: bool
+    design: ObserverDesign, u: FloatArray, y: FloatArray, log: LogReference | None, *, unverified: bool
 ) -> AlarmProof:
     """Return the proof of a guaranteed test: a fraction for each equation of its window."""
     whole, row = GuaranteedTest.of(design), len(y)
@@ -195,7 +195,7 @@ def _proved_by_test(
     return AlarmProof(True, row, rows, numbers["margin"], text, "", {**plain(certificate), "gain_set": gain_set})
 
 
-def statement(assumed: Assumptions, window: int, row: int, origin: str, log: Log | None, gain_set: str) -> str:
+def statement(assumed: Assumptions, window: int, row: int, origin: str, log: LogReference | None, gain_set: str) -> str:
     """Return what a proof says, with everything it rests on."""
     uncertain = assumed.plant.uncertainty
     linear = (

@@ -41,7 +41,7 @@ REPLAY, STATED_BOUNDS = "replay from the start", "stated"
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class WindowRows:
     """Sparse rows ``sum value * variable (= or <=) right`` of variables in ``scales``, powers of two; the last is t."""
 
     scales: FloatArray
@@ -66,8 +66,8 @@ class Rows:
 class Programme:
     """The programme: equations, inequalities, bounds of all variables; the last variable is t."""
 
-    equal: Rows
-    below: Rows
+    equal: WindowRows
+    below: WindowRows
     lower: FloatArray
     upper: FloatArray
 
@@ -150,7 +150,7 @@ class _Builder:
         self.t = self.products + steps * len(self.pairs)
         self.size = np.maximum(np.abs(data.low), np.abs(data.high))
         scales = self._scales(bounds)
-        self.equal, self.below = Rows(scales), Rows(scales)
+        self.equal, self.below = WindowRows(scales), WindowRows(scales)
         self.bd = np.hstack([plant.Bd.center, plant.plant.Bw])
         self.dd = np.hstack([plant.Dd.center, plant.plant.Dw])
         moving = np.abs(plant.E.center) + plant.E.spread + plant.E.radius

@@ -21,7 +21,7 @@ from obsynth.numerics.arguments import arguments_checked, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.assumptions import Log
+from obsynth.verification.assumptions import LogReference
 
 
 @arguments_checked
@@ -112,7 +112,7 @@ def prove_alarm(
     if own is not None and window not in (WINDOW, own):
         raise SpecError(f"window is {window}: the window of this test has {own} samples.", path="window")
     values, nu = rows_of(design, data, row, columns, scales, own), design.linear[0].nu
-    log = Log.of(Path(data), columns, scales) if isinstance(data, (str, Path)) else None
+    log = LogReference.of(Path(data), columns, scales) if isinstance(data, (str, Path)) else None
     return proved_alarm(
         design,
         values[:, :nu],

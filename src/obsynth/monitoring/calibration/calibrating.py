@@ -14,11 +14,11 @@ from obsynth.monitoring.calibration.diagnostics import STANDS_OUT, standing_out,
 from obsynth.monitoring.calibration.innovations_fit import InnovationsFit, chosen_timing, innovations_fit
 from obsynth.monitoring.calibration.integration_error import IntegrationError, integration_error
 from obsynth.monitoring.calibration.linear_plant import LinearPlant
-from obsynth.monitoring.calibration.logs import Log, LogData, read_log, told_rows
+from obsynth.monitoring.calibration.logs import LogData, RecordedLog, read_log, told_rows
 from obsynth.monitoring.calibration.noise_proposals import proposed_states
 from obsynth.monitoring.calibration.noise_states import NoiseStates, PlantWithNoise, asked_states
 from obsynth.monitoring.calibration.plants import CalibrationPlant, NonlinearPlant
-from obsynth.monitoring.calibration.problem import Problem, calibration_problem, require_variation
+from obsynth.monitoring.calibration.problem import CalibrationProblem, calibration_problem, require_variation
 from obsynth.monitoring.calibration.reporting import reported
 from obsynth.monitoring.calibration.result import Calibration
 from obsynth.monitoring.calibration.simulation_error import (
@@ -214,7 +214,7 @@ def calibrate(
     plant = NonlinearPlant(model) if isinstance(model, DAEModel) else LinearPlant(model, whole)
     asked = asked_states(sensor_noise, offset, walks, model.output_names)
 
-    def problem_with(states: NoiseStates, log: Log) -> Problem:
+    def problem_with(states: NoiseStates, log: RecordedLog) -> CalibrationProblem:
         extended = PlantWithNoise(plant, states, log) if states else plant
         own = noisy
         if isinstance(extended, PlantWithNoise):
@@ -276,7 +276,7 @@ class _Found:
     """A problem as it was fitted at last, with its fits, what backward Euler errs, and what each delay of the inputs
     loses in nats, where it was searched for."""
 
-    problem: Problem
+    problem: CalibrationProblem
     fits: list[Fit]
     fit: InnovationsFit | None
     error: IntegrationError | None
@@ -288,7 +288,7 @@ class _Fitting:
     """How a problem is fitted: simulations first, steps that are exact enough, timing, then the innovations."""
 
     plant: CalibrationPlant
-    problem_with: Callable[[NoiseStates, Log], Problem]
+    problem_with: Callable[[NoiseStates, RecordedLog], CalibrationProblem]
     starts: int
     seed: int
     level: float
@@ -297,7 +297,7 @@ class _Fitting:
     widen_start: bool
     innovations: bool
 
-    def fitted(self, problem: Problem, *, search: bool) -> _Found:
+    def fitted(self, problem: CalibrationProblem, *, search: bool) -> _Found:
         """Return the fit of a problem; the delay of the inputs is searched for where asked."""
         fits = simulation_fits(problem, self.starts, self.seed, self.note)
         if self.widen_start and (seen := with_seen_start(problem, fits[0])) is not problem:
@@ -329,7 +329,7 @@ class _Fitting:
         return _Found(problem, fits, fit, error, losses)
 
     def first_fit(
-        self, asked: NoiseStates, log: Log, *, search: bool, may_take_offsets: bool
+        self, asked: NoiseStates, log: RecordedLog, *, search: bool, may_take_offsets: bool
     ) -> tuple[_Found, NoiseStates, list[str]]:
         """Return the fit with the states that were asked for; and with those, and a sentence for each, the offsets of
         sensors that it takes where without them the model explains nothing."""
@@ -399,8 +399,12 @@ class _Fitting:
 
 
 def _innovations(
-    problem: Problem, fits: list[Fit], level: float, note: Callable[[str], object], error: IntegrationError | None
-) -> tuple[Problem, InnovationsFit | None, IntegrationError | None]:
+    problem: CalibrationProblem,
+    fits: list[Fit],
+    level: float,
+    note: Callable[[str], object],
+    error: IntegrationError | None,
+) -> tuple[CalibrationProblem, InnovationsFit | None, IntegrationError | None]:
     """Return the fit, with the steps that it needs: errors of single steps that are small may move constants still."""
     chosen = error is not None and not error.matters
     exact = problem.integrated("radau", problem.substeps) if chosen else None

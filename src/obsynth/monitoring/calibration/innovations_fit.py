@@ -18,7 +18,7 @@ from obsynth.monitoring.calibration.maximum import (
     without_collapse,
 )
 from obsynth.monitoring.calibration.noise_states import PlantWithNoise
-from obsynth.monitoring.calibration.problem import Problem
+from obsynth.monitoring.calibration.problem import CalibrationProblem
 from obsynth.monitoring.calibration.simulation_error import UNKNOWN_START, BoolArray, Fit, simulation_fits
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.noise import DEFAULT_WHITE_SHARE
@@ -71,8 +71,8 @@ class InnovationsFit:
 
 
 def chosen_timing(
-    problem: Problem, fits: list[Fit], seed: int, note: Callable[[str], object], *, any_start: bool = False
-) -> tuple[Problem, list[Fit], Mapping[int, float]]:
+    problem: CalibrationProblem, fits: list[Fit], seed: int, note: Callable[[str], object], *, any_start: bool = False
+) -> tuple[CalibrationProblem, list[Fit], Mapping[int, float]]:
     """Return the problem with the inputs as the likelihood wants them, and what each delay loses in nats; a start that
     nobody stated must not decide."""
     compared = problem.with_start(UNKNOWN_START**2 * problem.P0) if any_start else problem
@@ -127,7 +127,7 @@ def guarded_maximum(
     return maximum, found
 
 
-def moved_by(exact: Problem, start: Fit, maximum: Maximum, avoided: FloatArray, said: Information) -> float:
+def moved_by(exact: CalibrationProblem, start: Fit, maximum: Maximum, avoided: FloatArray, said: Information) -> float:
     """Return by how much constants move with exact steps: the most, in their deviations."""
     objective = Objective(exact, start)
     objective.avoided[:] = avoided
@@ -139,7 +139,12 @@ def moved_by(exact: Problem, start: Fit, maximum: Maximum, avoided: FloatArray, 
 
 
 def innovations_fit(
-    problem: Problem, fits: list[Fit], level: float, note: Callable[[str], object], *, exact: Problem | None = None
+    problem: CalibrationProblem,
+    fits: list[Fit],
+    level: float,
+    note: Callable[[str], object],
+    *,
+    exact: CalibrationProblem | None = None,
 ) -> tuple[InnovationsFit | None, float]:
     """Return the fit of the innovations, from fits of the simulation. With an ``exact`` problem also by how much its
     constants would move; there is no fit where that matters."""
@@ -192,7 +197,7 @@ def _at_end(objective: Objective, maximum: Maximum, said: Information) -> tuple[
     return x, np.sqrt(np.diag(P) + np.einsum("ij,jk,ik->i", moved, said.covariance, moved))
 
 
-def _beside(problem: Problem) -> list[int]:
+def _beside(problem: CalibrationProblem) -> list[int]:
     """Return places of variances, of equations and then of sensors, that stand beside a plant's own."""
     if not isinstance(problem.plant, PlantWithNoise):
         return []

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.monitoring.calibration.problem import Problem
+from obsynth.monitoring.calibration.problem import CalibrationProblem
 from obsynth.monitoring.calibration.step_graphs import SampleGraphs, compiled
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import FloatArray
@@ -29,7 +29,7 @@ class Likelihood:
     """Negative log likelihood of a problem's record, or of other outputs ``y (n, ny)`` with NaN for what is missing, as
     a function of ``v = [t, log q, log r]``."""
 
-    def __init__(self, problem: Problem, y: FloatArray | None = None) -> None:
+    def __init__(self, problem: CalibrationProblem, y: FloatArray | None = None) -> None:
         graphs, noisy = problem.graphs, problem.noisy_equations
         self.ny, self.size = graphs.ny, graphs.nt + len(noisy) + graphs.ny
         y, self._nx = problem.y if y is None else y, graphs.nx

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.monitoring.calibration.logs import Log, refused
+from obsynth.monitoring.calibration.logs import RecordedLog, refused
 from obsynth.monitoring.calibration.plants import (
     EXACT_STEP,
     SIZED_SAMPLES,
@@ -85,7 +85,7 @@ class LinearPlant(CalibrationPlant):
 
     has_levels = False
 
-    def __init__(self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, log: Log) -> None:
+    def __init__(self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, log: RecordedLog) -> None:
         uncertainty = getattr(plant, "uncertainty", None)
         constants = {} if uncertainty is None else uncertainty.box.constants
         if isinstance(plant, TimeVaryingDescriptorSystem):
@@ -132,7 +132,7 @@ class LinearPlant(CalibrationPlant):
         # A linear plant says nothing of the size of its states: the outputs do, so that units change no answer.
         self.state_scales = self.state_deviations = self._sizes(log, first)
 
-    def _algebraic(self, log: Log) -> list[int]:
+    def _algebraic(self, log: RecordedLog) -> list[int]:
         """Return the rows of E that are zero for every k of the log, of a discrete plant."""
         if self.continuous:
             return []
@@ -146,7 +146,7 @@ class LinearPlant(CalibrationPlant):
         E = ca.SX(matrix.symbolic(known, None))
         return [i for i in range(self.nx) if all(E[i, j].is_zero() for j in range(self.nx))]
 
-    def signals(self, log: Log) -> FloatArray:
+    def signals(self, log: RecordedLog) -> FloatArray:
         """Return inputs before and at each row, its k, and the matrices without a formula ``(n, ns)``."""
         u = log.u - self.input_point
         k = log.rows[0] + np.arange(log.samples, dtype=np.float64)
@@ -240,7 +240,7 @@ class LinearPlant(CalibrationPlant):
             y = y + self._product(at("D", True), s[self.nu : 2 * self.nu])
         return outputs_function(x, s, t, y)
 
-    def _sizes(self, log: Log, signals: FloatArray) -> FloatArray:
+    def _sizes(self, log: RecordedLog, signals: FloatArray) -> FloatArray:
         """Return how large each initial state can be ``(nx,)``: so that alone it makes outputs as large as they are."""
         stages, equations = self.step((), next(iter(BUTCHER)) if self.continuous else EXACT_STEP)
         X, x, s = ca.SX.sym("X", self.nx * stages), ca.SX.sym("x", self.nx), ca.SX.sym("s", signals.shape[1])

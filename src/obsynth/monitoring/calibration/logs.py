@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-LogData: TypeAlias = "str | Path | pd.DataFrame | Mapping[str, Any] | Log"
+LogData: TypeAlias = "str | Path | pd.DataFrame | Mapping[str, Any] | RecordedLog"
 
 #: Stamps further off the grid than this share of a step are refused, and further than the second are told.
 LARGEST_JITTER = 0.2
@@ -62,7 +62,7 @@ def refused(code: str, message: str, *, signals: Sequence[str] = ()) -> Precondi
 
 
 @dataclass(frozen=True, eq=False)
-class Log:
+class RecordedLog:
     """Inputs and outputs on a regular grid."""
 
     time: FloatArray  # ``(n,)`` seconds
@@ -109,7 +109,7 @@ class Log:
             "dt": self.dt,
         }
 
-    def shifted(self, rows: int) -> Log:
+    def shifted(self, rows: int) -> RecordedLog:
         """Return the log with its inputs later by whole rows: what row k says acts from row k on for ``rows = 1``."""
         if abs(rows) >= len(self.u):
             raise SpecError(
@@ -119,7 +119,7 @@ class Log:
         held = None if self.held is None else self.held[places]
         return replace(self, u=read_only(self.u[places]), held=held, input_delay=self.input_delay + rows)
 
-    def without(self, wrong: NDArray[np.bool_]) -> Log:
+    def without(self, wrong: NDArray[np.bool_]) -> RecordedLog:
         """Return the log without single outputs ``(n, ny)`` that are no measurements, with a note for each sensor."""
         notes = list(self.notes)
         for i, name in enumerate(self.output_names):
@@ -131,7 +131,7 @@ class Log:
                 )
         return replace(self, y=read_only(np.where(wrong, np.nan, self.y)), notes=tuple(notes))
 
-    def unstuck(self) -> Log:
+    def unstuck(self) -> RecordedLog:
         """Return the log without what sensors repeated while they were stuck, which no noise of theirs moved."""
         stuck = [stuck_rows(column) for column in self.y.T]
         if not any(stuck):
@@ -154,11 +154,11 @@ def read_log(
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
     dt: float | None = None,
-) -> Log:
+) -> RecordedLog:
     """Return the rows of a log as inputs and outputs on a grid. A log is a CSV or Parquet file, a data frame, or a
     mapping from names to columns; ``columns`` says which column a signal (or ``time``) is in where the names differ,
     ``scales`` what its values are multiplied by."""
-    if isinstance(log, Log):
+    if isinstance(log, RecordedLog):
         if (log.input_names, log.output_names) != (tuple(input_names), tuple(output_names)):
             raise SpecError("The log is of another plant: its signals differ.", path="log")
         first, last = parsed_rows(rows, log.samples)
@@ -243,7 +243,7 @@ def _on_grid(
     outputs: tuple[str, ...],
     rows: tuple[int, int],
     source: str,
-) -> Log:
+) -> RecordedLog:
     """Return the log on its grid; missing rows become rows without outputs whose inputs are those before.
     Rows whose stamps do not rise are left out, and inputs that are missing are held."""
     notes = []
@@ -280,7 +280,7 @@ def _on_grid(
         wide = np.full((len(whole), y.shape[1]), np.nan)
         wide[places] = y
         y, time = wide, time[0] + step * whole
-    return Log(read_only(time), read_only(u), read_only(y), step, inputs, outputs, rows, source, tuple(notes),
+    return RecordedLog(read_only(time), read_only(u), read_only(y), step, inputs, outputs, rows, source, tuple(notes),
                held=missing)  # fmt: skip
 
 

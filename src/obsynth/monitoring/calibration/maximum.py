@@ -9,7 +9,7 @@ import numpy as np
 
 from obsynth.monitoring.calibration.likelihood import IMPOSSIBLE, Likelihood
 from obsynth.monitoring.calibration.logs import refused
-from obsynth.monitoring.calibration.problem import Problem
+from obsynth.monitoring.calibration.problem import CalibrationProblem
 from obsynth.monitoring.calibration.simulation_error import BoolArray, Fit
 from obsynth.numerics.arrays import FloatArray
 
@@ -70,7 +70,7 @@ class Objective:
     """Negative log of likelihood and prior, and its gradient, of free variables ``z``. ``z`` holds the constants in
     widths of their bounds, then the logarithms of the variances that are not known."""
 
-    def __init__(self, problem: Problem, fit: Fit) -> None:
+    def __init__(self, problem: CalibrationProblem, fit: Fit) -> None:
         p, g = problem, problem.graphs
         self.problem = p
         self.likelihood = Likelihood(p)
@@ -157,7 +157,7 @@ class Maximum:
     likeliest: FloatArray
 
 
-def _process_noise(problem: Problem, fit: Fit) -> FloatArray:
+def _process_noise(problem: CalibrationProblem, fit: Fit) -> FloatArray:
     """Return logarithms of first guesses, from what a unit added to an equation does to the states in a sample."""
     g, p = problem.graphs, problem
     stages = g.solve(p.x0, p.u[0], fit.t)[0]

@@ -22,7 +22,7 @@ from obsynth.monitoring.calibration.likelihood import IMPOSSIBLE, Likelihood
 from obsynth.monitoring.calibration.maximum import Objective
 from obsynth.monitoring.calibration.noise_states import NoiseStates, PlantWithNoise, correlation_name
 from obsynth.monitoring.calibration.plants import NonlinearPlant
-from obsynth.monitoring.calibration.problem import Problem
+from obsynth.monitoring.calibration.problem import CalibrationProblem
 from obsynth.monitoring.calibration.reporting import COLOURED_SHARE, FIRST_KEPT
 from obsynth.monitoring.calibration.simulation_error import Fit
 from obsynth.numerics.arrays import FloatArray
@@ -59,11 +59,11 @@ LONGEST_RUN, RETURNED = 5, 3
 
 
 def proposed_states(
-    problem: Problem,
+    problem: CalibrationProblem,
     fit: InnovationsFit,
     asked: NoiseStates,
     kinds: Sequence[str],
-    problem_with: Callable[[NoiseStates], Problem],
+    problem_with: Callable[[NoiseStates], CalibrationProblem],
     note: Callable[[str], object],
 ) -> tuple[NoiseStates, list[str]]:
     """Return the states asked for with those that the innovations ask for, and a sentence for each of these."""
@@ -96,7 +96,7 @@ def proposed_states(
     return states, told
 
 
-def hidden_faults(problem: Problem, fit: InnovationsFit, states: NoiseStates) -> tuple[str, ...]:
+def hidden_faults(problem: CalibrationProblem, fit: InnovationsFit, states: NoiseStates) -> tuple[str, ...]:
     """Return the faults of a nonlinear plant that the outputs determine at nominal constant inputs, but not beside the
     offsets of sensors."""
     inner = problem.plant.inner if isinstance(problem.plant, PlantWithNoise) else problem.plant
@@ -113,7 +113,7 @@ def hidden_faults(problem: Problem, fit: InnovationsFit, states: NoiseStates) ->
     return tuple(name for name in model.parameter_names if name in found[1] and name not in found[0])
 
 
-def _asking(problem: Problem, fit: InnovationsFit) -> set[tuple[str, str]]:
+def _asking(problem: CalibrationProblem, fit: InnovationsFit) -> set[tuple[str, str]]:
     """Return kinds and names that innovations ask for: coloured noise of a sensor where those of one are not white or
     an equation has process noise, which may stand for it; offsets that explain more of them than constants can; unknown
     inputs."""
@@ -143,7 +143,7 @@ def _asking(problem: Problem, fit: InnovationsFit) -> set[tuple[str, str]]:
     return found
 
 
-def whitened_run(problem: Problem, v: FloatArray, y: FloatArray) -> FloatArray:
+def whitened_run(problem: CalibrationProblem, v: FloatArray, y: FloatArray) -> FloatArray:
     """Return whitened innovations ``(n, ny)`` of other measurements, NaN where nothing was measured."""
     return Likelihood(problem, y).innovations(v)[0]
 
@@ -161,7 +161,7 @@ def _candidates(
             yield "walk", name, replace(states, loads=(*states.loads, name))
 
 
-def _like(problem: Problem, new: Problem) -> Problem:
+def _like(problem: CalibrationProblem, new: CalibrationProblem) -> CalibrationProblem:
     """Return a problem with the steps, the inputs and the start of another one, as far as it goes."""
     if (new.integration, new.substeps) != (problem.integration, problem.substeps):
         new = new.integrated(problem.integration, problem.substeps)
@@ -179,7 +179,7 @@ class _Known:
         self.t, self.variances, self.kept, self.R = t, variances, kept, R
 
     @classmethod
-    def of(cls, problem: Problem, fit: InnovationsFit) -> _Known:
+    def of(cls, problem: CalibrationProblem, fit: InnovationsFit) -> _Known:
         """Return what a fit found; ``kept``: how much of an innovation of each sensor its next one keeps."""
         columns = zip(problem.output_names, fit.whitened.T, strict=True)
         kept = {name: whiteness(column).first for name, column in columns}
@@ -188,7 +188,7 @@ class _Known:
         spread = np.nanmean(fit.innovations**2, axis=0)
         return cls(dict(zip(problem.unknown, fit.t.tolist(), strict=True)), variances, kept, spread)
 
-    def best(self, problem: Problem) -> tuple[float, _Known]:
+    def best(self, problem: CalibrationProblem) -> tuple[float, _Known]:
         """Return the least negative log likelihood with another model, and what it found."""
         plant = problem.plant
         nominal = {name: float(value) for name, value in zip(problem.unknown, problem.nominal, strict=True)}

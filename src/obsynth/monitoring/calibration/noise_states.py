@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.monitoring.calibration.linear_plant import FIRST_CORRELATION, LEAST_CORRELATION, LONGEST_SHARE
-from obsynth.monitoring.calibration.logs import Log, roughness
+from obsynth.monitoring.calibration.logs import RecordedLog, roughness
 from obsynth.monitoring.calibration.plants import SIZED_SAMPLES, CalibrationPlant, outputs_function
 from obsynth.monitoring.calibration.step_graphs import sample_graphs
 from obsynth.numerics import lazy_casadi as ca
@@ -67,7 +67,7 @@ class PlantWithNoise(CalibrationPlant):
     Coloured noise goes over a sample as the plant's own integration makes it, so that a design finds the same numbers.
     """
 
-    def __init__(self, inner: CalibrationPlant, states: NoiseStates, log: Log) -> None:
+    def __init__(self, inner: CalibrationPlant, states: NoiseStates, log: RecordedLog) -> None:
         self.inner, self.states, self._outputs = inner, states, log.output_names
         for name in states.loads:
             index_of(name, list(inner.values), what="walks")
@@ -104,11 +104,11 @@ class PlantWithNoise(CalibrationPlant):
         fixed = {offset_state(name) for name in self.states.offsets}
         return tuple(name for name in self.added if name not in fixed)
 
-    def signals(self, log: Log) -> FloatArray:
+    def signals(self, log: RecordedLog) -> FloatArray:
         """Return what steps and outputs take of each row ``(n, ns)``."""
         return self.inner.signals(log)
 
-    def _sizes(self, log: Log) -> FloatArray:
+    def _sizes(self, log: RecordedLog) -> FloatArray:
         """Return how large the further states may be: as sensors move, or as loads that make them move so."""
         rough = roughness(log.y)
         moved = np.nan_to_num(np.nanstd(log.y, axis=0))
@@ -118,7 +118,7 @@ class PlantWithNoise(CalibrationPlant):
         found = [large[name] for name in self.coloured] + [offsets[name] for name in self.states.offsets]
         return np.array([*found, *self._load_sizes(log, moved)])
 
-    def _load_sizes(self, log: Log, moved: FloatArray) -> list[float]:
+    def _load_sizes(self, log: RecordedLog, moved: FloatArray) -> list[float]:
         found = []
         for name in self.states.loads:
             graphs = sample_graphs(self.inner, (name,), log.dt, integration=self.inner.integration("auto"), substeps=1)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.monitoring.calibration.logs import Log
+from obsynth.monitoring.calibration.logs import RecordedLog
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae import DAEModel, symbols_of
@@ -52,7 +52,7 @@ class CalibrationPlant(ABC):
         return self.own_integration if asked == "auto" or self.own_integration == EXACT_STEP else asked
 
     @abstractmethod
-    def signals(self, log: Log) -> FloatArray:
+    def signals(self, log: RecordedLog) -> FloatArray:
         """Return what steps and outputs take of each row ``(n, ns)``."""
 
     @abstractmethod
@@ -79,7 +79,7 @@ class NonlinearPlant(CalibrationPlant):
         self.nominal_signals = np.array(model.nominal_input)
         self._promoted: dict[tuple[str, ...], DAEModel] = {}
 
-    def signals(self, log: Log) -> FloatArray:
+    def signals(self, log: RecordedLog) -> FloatArray:
         """Return the inputs ``(n, nu)``."""
         return log.u
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.monitoring.calibration.logs import EVEN, Log, bad_log, quantum, refused, repeats
+from obsynth.monitoring.calibration.logs import EVEN, RecordedLog, bad_log, quantum, refused, repeats
 from obsynth.monitoring.calibration.plants import CalibrationPlant
 from obsynth.monitoring.calibration.step_graphs import SampleGraphs, sample_graphs
 from obsynth.numerics.arguments import is_number, real_number, require_mapping, require_shape, whole_number
@@ -26,12 +26,12 @@ LEAST_NOISE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class CalibrationProblem:
     """A plant with its log; arrays by unknown ``(nt,)``, by sensor ``(ny,)``, by noisy equation. ``u (n, ns)``: the
     signals that the plant takes of each row."""
 
     plant: CalibrationPlant
-    log: Log
+    log: RecordedLog
     u: FloatArray
     unknown: tuple[str, ...]
     nominal: FloatArray
@@ -76,29 +76,29 @@ class Problem:
         """Numbers of the noisy equations."""
         return [self.plant.equation_names.index(name) for name in self.noisy]
 
-    def integrated(self, integration: str, substeps: int) -> Problem:
+    def integrated(self, integration: str, substeps: int) -> CalibrationProblem:
         """Return the same problem with other steps."""
         graphs = sample_graphs(
             self.plant, self.unknown, self.log.dt, integration=integration, substeps=substeps, samples=self.log.samples
         )
-        return Problem(**{**vars(self), "graphs": graphs, "integration": integration, "substeps": substeps})
+        return CalibrationProblem(**{**vars(self), "graphs": graphs, "integration": integration, "substeps": substeps})
 
-    def with_start(self, P0: FloatArray, *notes: str) -> Problem:
+    def with_start(self, P0: FloatArray, *notes: str) -> CalibrationProblem:
         """Return the same problem with another covariance of the initial state, and what is said of that."""
-        return Problem(**{**vars(self), "P0": P0, "notes": notes})
+        return CalibrationProblem(**{**vars(self), "P0": P0, "notes": notes})
 
-    def with_notes(self, *notes: str) -> Problem:
+    def with_notes(self, *notes: str) -> CalibrationProblem:
         """Return the same problem with more that is said of it."""
-        return Problem(**{**vars(self), "notes": (*self.notes, *notes)})
+        return CalibrationProblem(**{**vars(self), "notes": (*self.notes, *notes)})
 
-    def with_log(self, log: Log) -> Problem:
+    def with_log(self, log: RecordedLog) -> CalibrationProblem:
         """Return the same problem with another log of the same signals."""
-        return Problem(**{**vars(self), "log": log, "u": self.plant.signals(log)})
+        return CalibrationProblem(**{**vars(self), "log": log, "u": self.plant.signals(log)})
 
 
 def calibration_problem(
     plant: CalibrationPlant,
-    log: Log,
+    log: RecordedLog,
     *,
     unknown: Mapping[str, Sequence[float]],
     priors: Mapping[str, Sequence[float]] | None,
@@ -109,7 +109,7 @@ def calibration_problem(
     initial_covariance: Any,
     integration: str,
     substeps: int,
-) -> Problem:
+) -> CalibrationProblem:
     """Return the problem, or say what is wrong with what is asked."""
     substeps = whole_number(substeps, "substeps")
     if not log.samples > 1:
@@ -132,7 +132,7 @@ def calibration_problem(
     _require_enough(log, len(names), int(np.isnan(known_Q).sum() + np.isnan(known_R).sum()))
     x0 = named_vector(initial_state, plant.state_names, plant.nominal_state, "initial_state")
     graphs = sample_graphs(plant, names, log.dt, integration=integration, substeps=substeps, samples=log.samples)
-    return Problem(
+    return CalibrationProblem(
         plant,
         log,
         plant.signals(log),
@@ -162,7 +162,7 @@ def _floors(y: FloatArray, quanta: FloatArray) -> FloatArray:
     return np.maximum(np.where(held, quanta**2 / EVEN, 0.0), (LEAST_NOISE * np.where(largest > 0.0, largest, 1.0)) ** 2)
 
 
-def _require_enough(log: Log, constants: int, variances: int) -> None:
+def _require_enough(log: RecordedLog, constants: int, variances: int) -> None:
     """Refuse a question without unknowns, or with more of them than the log can determine."""
     if not constants and not variances:
         raise SpecError(
@@ -247,7 +247,7 @@ def _covariance(plant: CalibrationPlant, value: Any) -> FloatArray:
     return matrix
 
 
-def require_variation(problem: Problem) -> None:
+def require_variation(problem: CalibrationProblem) -> None:
     """Refuse a log in which nothing moves and nothing is put in: it determines no constant."""
     if not np.nanstd(problem.y, axis=0).any() and not np.std(problem.u, axis=0).any():
         raise refused(

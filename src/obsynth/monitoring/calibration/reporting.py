@@ -23,9 +23,9 @@ from obsynth.monitoring.calibration.diagnostics import (
 from obsynth.monitoring.calibration.innovations_fit import InnovationsFit
 from obsynth.monitoring.calibration.integration_error import IntegrationError
 from obsynth.monitoring.calibration.intervals import Side, covariance_of, quantile
-from obsynth.monitoring.calibration.logs import EVEN, Log, told_rows
+from obsynth.monitoring.calibration.logs import EVEN, RecordedLog, told_rows
 from obsynth.monitoring.calibration.noise_states import PlantWithNoise, correlation_name
-from obsynth.monitoring.calibration.problem import Problem
+from obsynth.monitoring.calibration.problem import CalibrationProblem
 from obsynth.monitoring.calibration.result import Calibration
 from obsynth.monitoring.calibration.simulation_error import Fit, SimulationError, unexplained
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -54,7 +54,7 @@ FIRST_KEPT, COLOURED_SHARE = (0.3, 0.98), 0.7
 
 
 def reported(
-    problem: Problem,
+    problem: CalibrationProblem,
     start: Fit,
     fit: InnovationsFit | None,
     *,
@@ -146,7 +146,7 @@ def _box(names: Sequence[str], found: InnovationsFit, level: float, digest: str,
 
 
 def _noise_model(
-    problem: Problem, found: InnovationsFit, Q: dict[str, float], R: dict[str, float]
+    problem: CalibrationProblem, found: InnovationsFit, Q: dict[str, float], R: dict[str, float]
 ) -> tuple[dict[str, dict[str, float]], dict[str, float], dict[str, float]]:
     """Return coloured noise, deviations of offsets, and walks, in the terms of `with_noise`."""
     if not isinstance(problem.plant, PlantWithNoise) or not Q:
@@ -165,7 +165,7 @@ def _noise_model(
     return sensors, offsets, {name: step * Q[name] ** 0.5 for name in states.loads}
 
 
-def _found_offsets(problem: Problem, found: InnovationsFit) -> dict[str, tuple[float, float]]:
+def _found_offsets(problem: CalibrationProblem, found: InnovationsFit) -> dict[str, tuple[float, float]]:
     """Return the offset of each sensor after the last row, and its deviation."""
     if not isinstance(problem.plant, PlantWithNoise) or found.at_end is None:
         return {}
@@ -174,7 +174,7 @@ def _found_offsets(problem: Problem, found: InnovationsFit) -> dict[str, tuple[f
     return {name: (value, deviation) for name, (value, deviation) in pairs.items()}
 
 
-def _of_simulation(problem: Problem, start: Fit, level: float) -> InnovationsFit:
+def _of_simulation(problem: CalibrationProblem, start: Fit, level: float) -> InnovationsFit:
     """Return what the fit of a simulation says, in the form of a fit of innovations; its boxes are Wald's."""
     error = SimulationError(problem)
     nt, scale = error.nt, error.scale
@@ -211,7 +211,7 @@ def _of_simulation(problem: Problem, start: Fit, level: float) -> InnovationsFit
 
 
 def _fitted(
-    problem: Problem,
+    problem: CalibrationProblem,
     box: CalibratedBox,
     fit: InnovationsFit,
     at_end: tuple[str, ...],
@@ -254,7 +254,7 @@ def _fitted(
     ]
 
 
-def _outlier_sizes(log: Log, deviations: FloatArray) -> dict[str, float]:
+def _outlier_sizes(log: RecordedLog, deviations: FloatArray) -> dict[str, float]:
     """Return how far off an outlier of each output is at least, for innovations of ``deviations (ny,)``.
 
     One more outlier is nearer than all of n with the probability 1 / (n + 1): the size stands that share of the way, on
@@ -268,7 +268,7 @@ def _outlier_sizes(log: Log, deviations: FloatArray) -> dict[str, float]:
     return found
 
 
-def _misfits(problem: Problem, start: Fit, whitened: FloatArray, R: dict[str, float]) -> list[str]:
+def _misfits(problem: CalibrationProblem, start: Fit, whitened: FloatArray, R: dict[str, float]) -> list[str]:
     """Return sentences about sensors that the model does not follow, their mean, and single samples that stand out."""
     found = []
     for name in unexplained(problem, start.deviations):
@@ -317,7 +317,7 @@ def _checked(nis: Consistency, colours: dict[str, Whiteness], row: int | None, s
 
 
 def _told(
-    problem: Problem, R: dict[str, float], losses: Mapping[int, float], error: IntegrationError | None
+    problem: CalibrationProblem, R: dict[str, float], losses: Mapping[int, float], error: IntegrationError | None
 ) -> list[str]:
     found, delay = list[str](), problem.log.input_delay
     for name, step in zip(problem.output_names, problem.quanta, strict=True):

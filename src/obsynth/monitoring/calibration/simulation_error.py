@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from obsynth.monitoring.calibration.likelihood import LARGEST_STEP_RESIDUAL
 from obsynth.monitoring.calibration.logs import refused, roughness
-from obsynth.monitoring.calibration.problem import Problem
+from obsynth.monitoring.calibration.problem import CalibrationProblem
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.plants.dae_functions import Compiled
@@ -71,7 +71,7 @@ class Fit:
 class SimulationError:
     """Weighted differences between simulation and log, prior terms included, as a function of ``[t, x0]`` scaled."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: CalibrationProblem) -> None:
         self.problem, graphs = problem, problem.graphs
         self.spread = np.sqrt(np.maximum(np.diag(problem.P0), SMALLEST))
         self.scale = np.concatenate([problem.widths, self.spread])
@@ -150,7 +150,12 @@ class SimulationError:
 
 
 def simulation_fits(
-    problem: Problem, starts: int, seed: int, note: Callable[[str], object], *, start: FloatArray | None = None
+    problem: CalibrationProblem,
+    starts: int,
+    seed: int,
+    note: Callable[[str], object],
+    *,
+    start: FloatArray | None = None,
 ) -> list[Fit]:
     """Return fits from given or nominal constants and random ones within their bounds, the best first."""
     error, rng = SimulationError(problem), np.random.default_rng(seed)
@@ -176,7 +181,7 @@ def simulation_fits(
     return fits
 
 
-def with_seen_start(problem: Problem, fit: Fit, *, first: FloatArray | None = None) -> Problem:
+def with_seen_start(problem: CalibrationProblem, fit: Fit, *, first: FloatArray | None = None) -> CalibrationProblem:
     """Return the problem with a wider covariance of the initial state, where the log begins elsewhere. A start that
     nobody stated would else look like a fault in the first rows. It is seen in the fit, or in the ``first`` whitened
     innovations ``(rows, ny)``: then a fit that hardly knows it says where it is."""
@@ -197,20 +202,20 @@ def with_seen_start(problem: Problem, fit: Fit, *, first: FloatArray | None = No
     return problem.with_start(np.diag(np.where(far, away, deviations) ** 2), note)
 
 
-def unexplained(problem: Problem, left: FloatArray) -> list[str]:
+def unexplained(problem: CalibrationProblem, left: FloatArray) -> list[str]:
     """Return sensors that move, and of whose motion the best fit leaves nearly all ``left (ny,)``."""
     share, moves = _shares(problem, left)
     return [name for name, bad in zip(problem.output_names, moves & (share > UNEXPLAINED), strict=True) if bad]
 
 
-def _shares(problem: Problem, left: FloatArray) -> tuple[FloatArray, BoolArray]:
+def _shares(problem: CalibrationProblem, left: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return what a fit leaves of each sensor, as a share of its deviation, and whether it moves."""
     deviations = np.nanstd(problem.y, axis=0)
     moves = deviations > MOVING_SIGNAL * np.maximum(roughness(problem.y), np.sqrt(problem.floors))
     return left / np.maximum(deviations, SMALLEST), moves
 
 
-def _judged(problem: Problem, simulated: FloatArray) -> BoolArray:
+def _judged(problem: CalibrationProblem, simulated: FloatArray) -> BoolArray:
     """Return of which sensors a simulation without noise must say something ``(ny,)``: those that inputs move, and only
     where no input is unknown."""
     if problem.plant.unknown_inputs:
@@ -219,7 +224,7 @@ def _judged(problem: Problem, simulated: FloatArray) -> BoolArray:
     return np.asarray(moved | problem.plant.has_levels)
 
 
-def _require_explained(problem: Problem, left: FloatArray, judged: BoolArray) -> None:
+def _require_explained(problem: CalibrationProblem, left: FloatArray, judged: BoolArray) -> None:
     """Refuse a model whose best fit leaves as much as there was: its units, scales or sample time are wrong."""
     deviations = np.nanstd(problem.y, axis=0)
     share, moves = _shares(problem, left)
@@ -237,7 +242,7 @@ def _require_explained(problem: Problem, left: FloatArray, judged: BoolArray) ->
         )
 
 
-def _require_levels(problem: Problem, fit: Fit, simulated: FloatArray, judged: BoolArray) -> None:
+def _require_levels(problem: CalibrationProblem, fit: Fit, simulated: FloatArray, judged: BoolArray) -> None:
     """Refuse a single sensor in other units: the best fit leaves nearly all of it, on another level altogether."""
     names = problem.output_names
     # Deviations from an operating point have no level, but a size; a free offset stands for any level.
@@ -257,7 +262,7 @@ def _require_levels(problem: Problem, fit: Fit, simulated: FloatArray, judged: B
         )
 
 
-def _moved_by_noise(problem: Problem, deviations: FloatArray) -> bool:
+def _moved_by_noise(problem: CalibrationProblem, deviations: FloatArray) -> bool:
     """Whether no input moves, and outputs move by no more than the plant's size: noise may be all that moves it."""
     if np.std(problem.log.u, axis=0).any():
         return False
@@ -266,7 +271,7 @@ def _moved_by_noise(problem: Problem, deviations: FloatArray) -> bool:
     return bool((deviations <= OUTSIZED * sizes).all())
 
 
-def _simulated(problem: Problem) -> Any:
+def _simulated(problem: CalibrationProblem) -> Any:
     """Return the function from ``[t, x0]`` to rows: outputs, their derivatives by t and x0, and the residual."""
     g, n = problem.graphs, len(problem.y)
     nx, ny, nt, size = g.nx, g.ny, g.nt, g.nt + g.nx

@@ -21,10 +21,10 @@ from obsynth.monitoring.calibration.diagnostics import (
 )
 from obsynth.monitoring.calibration.explanations import Explanation, explanations, whitened
 from obsynth.monitoring.calibration.integration_error import IntegrationError, integration_error
-from obsynth.monitoring.calibration.logs import Log, LogData, quantum, read_log
+from obsynth.monitoring.calibration.logs import LogData, RecordedLog, quantum, read_log
 from obsynth.monitoring.calibration.maximum import Objective, greatest_likelihood
 from obsynth.monitoring.calibration.plants import NonlinearPlant
-from obsynth.monitoring.calibration.problem import Problem
+from obsynth.monitoring.calibration.problem import CalibrationProblem
 from obsynth.monitoring.calibration.simulation_error import Fit
 from obsynth.monitoring.calibration.step_graphs import sample_graphs
 from obsynth.monitoring.calibration.told_variances import (
@@ -90,7 +90,7 @@ class RecordedInnovations:
         return float(whole[np.isfinite(whole)].sum())
 
 
-def recorded_innovations(design: ObserverDesign, log: Log) -> RecordedInnovations:
+def recorded_innovations(design: ObserverDesign, log: RecordedLog) -> RecordedInnovations:
     """Run a design over a log."""
     observer = design.observer
     if isinstance(observer, (DAEObserver, RecursiveObserver)) and observer.sensors is not None:
@@ -104,7 +104,7 @@ def recorded_innovations(design: ObserverDesign, log: Log) -> RecordedInnovation
     raise TypeError(f"{type(observer).__name__} has no innovations with a covariance")
 
 
-def _integration_error(observer: object, log: Log, record: RecordedInnovations) -> IntegrationError | None:
+def _integration_error(observer: object, log: RecordedLog, record: RecordedInnovations) -> IntegrationError | None:
     """Return the error of backward Euler along a log, where an observer takes such steps."""
     if not (isinstance(observer, DAEObserver) and observer.integration == "backward-euler"):
         return None
@@ -119,7 +119,7 @@ def _integration_error(observer: object, log: Log, record: RecordedInnovations) 
     )
 
 
-def _over(observer: DAEObserver, log: Log) -> Estimates:
+def _over(observer: DAEObserver, log: RecordedLog) -> Estimates:
     """Return the estimates over a log; inputs that are missing are those that runs take in their place."""
     u = log.measured_inputs
     if not np.isnan(u).any():
@@ -131,7 +131,7 @@ def _over(observer: DAEObserver, log: Log) -> Estimates:
     return rows.estimates()
 
 
-def _recursive(observer: RecursiveObserver, log: Log, point: Mapping[str, float]) -> RecordedInnovations:
+def _recursive(observer: RecursiveObserver, log: RecordedLog, point: Mapping[str, float]) -> RecordedInnovations:
     """Predict each sample from those before it: a step without measurements, beside the one with them."""
     plant = observer.plant
     y = log.y - np.array([point.get(name, 0.0) for name in plant.output_names])
@@ -156,7 +156,7 @@ def _recorded(found: Estimates, innovations: FloatArray, deviations: FloatArray)
     )
 
 
-def noise_ratios(observer: DAEObserver, log: Log) -> tuple[Mapping[str, float], float, FloatArray]:
+def noise_ratios(observer: DAEObserver, log: RecordedLog) -> tuple[Mapping[str, float], float, FloatArray]:
     """Return what a log says of the variances of a design, parameters at their start, or as they walk: likeliest over
     designed variance for each that it contradicts, the nats that the likeliest ones gain, and the walk of the
     parameters ``(nq, nq)`` that goes with them, at most the one that is stated."""
@@ -179,7 +179,7 @@ def noise_ratios(observer: DAEObserver, log: Log) -> tuple[Mapping[str, float], 
     plant = NonlinearPlant(made)
     graphs = sample_graphs(plant, (), log.dt, integration=observer.integration, substeps=1, samples=log.samples)
     quanta = np.array([quantum(column) for column in log.y.T])
-    problem = Problem(
+    problem = CalibrationProblem(
         plant,
         log,
         log.u,
@@ -337,7 +337,7 @@ def _usable_log(
     rows: str | slice | Sequence[int] | None,
     columns: Mapping[str, str] | None,
     scales: Mapping[str, float] | None,
-) -> Log:
+) -> RecordedLog:
     """Return the log of a design whose innovations it can contradict, without samples that are clearly wrong."""
     if not states_innovations(design):
         raise SpecError(
@@ -361,7 +361,7 @@ def _usable_log(
 
 def _contradicted(
     design: ObserverDesign,
-    log: Log,
+    log: RecordedLog,
     record: RecordedInnovations,
     sensors: Mapping[str, SensorValidation],
     whole: Consistency,
@@ -395,7 +395,7 @@ def _contradicted(
 
 
 def _as_far_as_it_walks(
-    design: ObserverDesign, log: Log, record: RecordedInnovations, note: Callable[[str], object]
+    design: ObserverDesign, log: RecordedLog, record: RecordedInnovations, note: Callable[[str], object]
 ) -> tuple[ObserverDesign, RecordedInnovations, list[str]]:
     """Return the design with as much of the walk of its parameters as the log shows, its run, and what is said of
     that; ``record`` is the run with all of it."""
@@ -482,7 +482,7 @@ def _with_variances(observer: DAEObserver, ratios: Mapping[str, float], walk: Fl
 
 
 def _explanations(
-    design: ObserverDesign, log: Log, record: RecordedInnovations, note: Callable[[str], object]
+    design: ObserverDesign, log: RecordedLog, record: RecordedInnovations, note: Callable[[str], object]
 ) -> tuple[Explanation, ...]:
     """Return what explains innovations that are not white, other than the variances."""
     observer, constants = design.observer, dict[str, float]()

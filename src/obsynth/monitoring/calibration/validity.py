@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.monitoring.calibration.logs import EVEN, Log, LogData, quantum, read_log
+from obsynth.monitoring.calibration.logs import EVEN, LogData, RecordedLog, quantum, read_log
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.records import named_vector
@@ -211,7 +211,7 @@ def _deviation(column: FloatArray, name: str, given: Mapping[str, float] | None)
     return found
 
 
-def _linear_outputs(linear: DescriptorSystem, log: Log, start: FloatArray) -> FloatArray:
+def _linear_outputs(linear: DescriptorSystem, log: RecordedLog, start: FloatArray) -> FloatArray:
     """Return outputs ``(n, ny)`` in deviations from the operating point, by the Radau method of the nonlinear plant."""
     E, A, a, n = linear.E, linear.A, BUTCHER["radau"], linear.nx
     inputs = dict(zip(log.input_names, log.u.T, strict=True)) | {DRIFT: np.ones(log.samples)}

@@ -18,10 +18,10 @@ from obsynth.monitoring.calibration.diagnostics import (
 )
 from obsynth.monitoring.calibration.innovations_fit import InnovationsFit
 from obsynth.monitoring.calibration.noise_proposals import LONGEST_RUN, RETURNED, whitened_run
-from obsynth.monitoring.calibration.problem import Problem
+from obsynth.monitoring.calibration.problem import CalibrationProblem
 
 
-def wrong_runs(problem: Problem, fit: InnovationsFit) -> BoolArray:
+def wrong_runs(problem: CalibrationProblem, fit: InnovationsFit) -> BoolArray:
     """Return which measurements ``(n, ny)`` stand out with others of the same sensor beside them, are not seen by
     another sensor, and leave the next samples where these are predicted without them."""
     found = np.zeros(problem.y.shape, dtype=bool)
@@ -51,7 +51,9 @@ def _groups(far: BoolArray) -> list[tuple[int, int]]:
     return [(first, last) for first, last in found if 0 < last - first <= LONGEST_RUN]
 
 
-def _end(problem: Problem, fit: InnovationsFit, usual: float, output: int, first: int, last: int) -> int | None:
+def _end(
+    problem: CalibrationProblem, fit: InnovationsFit, usual: float, output: int, first: int, last: int
+) -> int | None:
     """Return the first row to which samples must be hidden so that those after it are where they are predicted; `None`
     where there is none."""
     for end in range(first, min(last, first + LONGEST_RUN - 1) + 1):

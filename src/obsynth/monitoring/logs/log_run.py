@@ -18,7 +18,7 @@ from obsynth.monitoring.alarms.events import NO_DECISION, AlarmEvent, AlarmLog
 from obsynth.monitoring.logs.linear_observer import log_observer
 from obsynth.monitoring.logs.log_observer import DECIDING, GAP, RECOVERING, STALE, Clock, Row
 from obsynth.monitoring.logs.recovered_states import FIRST_SECONDS, MOST_FIRST_ROWS, RecoveredStates
-from obsynth.monitoring.logs.signals import TIME_HEADER, Signals
+from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.stuck_sensors import RepeatedValues
 from obsynth.monitoring.thresholds.learned import LearnedRule, as_learned
@@ -57,7 +57,7 @@ _TIME_PARTS = frozenset({"last", "longest"})
 class OperatingPointCheck:
     """Gathers the first second of data, to tell whether they begin near the operating point."""
 
-    def __init__(self, signals: Signals) -> None:
+    def __init__(self, signals: LogSignals) -> None:
         self._signals = signals
         self._begin: float | None = None
         self.status = ""  # of the first row
@@ -157,7 +157,7 @@ class LogRun:
         if monitor is not None and isinstance(monitor.rule, LearnedRule):
             design = design.replace(observer=as_learned(design.observer, monitor.rule.learned))
         self.observer = observer = log_observer(design, gap=gap, warm_up=warm_up, outliers=outliers)
-        self.clock, self.signals = Clock(observer.dt, gap), Signals.of(observer, columns, scales)
+        self.clock, self.signals = Clock(observer.dt, gap), LogSignals.of(observer, columns, scales)
         self.stamps, self.monitor = stamps, monitor
         #: What rows wait in for those after them, if they do.
         self.later: Any = None

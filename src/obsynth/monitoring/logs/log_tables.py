@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
-from obsynth.monitoring.logs.signals import TIME_HEADER, Signals, column_of
+from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals, column_of
 from obsynth.monitoring.logs.sources import (
     CHUNK_ROWS,
     NEEDED_PACKAGES,
@@ -44,7 +44,7 @@ def log_table(
     first = time if has_stamps else next(iter(there), None)
     if first is None:
         return {}, header, ()
-    signals = Signals(tuple(there), (first, *there), np.ones(len(there)), np.zeros(len(there)), {})
+    signals = LogSignals(tuple(there), (first, *there), np.ones(len(there)), np.zeros(len(there)), {})
     stamps = Stamps()
     stamps.are_missing = not has_stamps
     rows = np.concatenate(list(chunks(data, signals, stamps, CHUNK_ROWS)))

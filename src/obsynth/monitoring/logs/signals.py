@@ -38,7 +38,7 @@ _TIME_NAMES = ("timestamp", "datetime", "zeit", "uhrzeit", "time", "date")
 
 
 @dataclass(frozen=True, eq=False)
-class Signals:
+class LogSignals:
     """Which column holds which measured signal, and how its values become deviations."""
 
     names: tuple[str, ...]  # signals: known inputs, then outputs
@@ -53,7 +53,7 @@ class Signals:
     @classmethod
     def of(
         cls, observer: LogObserver, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None
-    ) -> Signals:
+    ) -> LogSignals:
         """Return the signals that a running design reads."""
         names = observer.input_names + observer.output_names
         renamed, factors = dict(columns or {}), dict(scales or {})

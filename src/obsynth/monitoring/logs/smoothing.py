@@ -21,8 +21,14 @@ from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import deviations_in
 from obsynth.observers.running import changed
-from obsynth.observers.smoothing import checked_lag, links_of, parameters_of, smoothed_estimates, smoothed_record
-from obsynth.observers.smoothing_chain import Chain, Smoothed
+from obsynth.observers.smoothing import (
+    checked_lag,
+    linearisation_of,
+    parameters_of,
+    smoothed_estimates,
+    smoothed_record,
+)
+from obsynth.observers.smoothing_chain import Smoothed, SmootherHistory
 from obsynth.results.design import ObserverDesign
 
 
@@ -37,7 +43,7 @@ class LaterRows:
                 path="smooth",
             )
         self.logged, self.lag = observer, checked_lag(lag)
-        self.chain = observer.chain = Chain(links_of(observer.observer))
+        self.chain = observer.chain = SmootherHistory(linearisation_of(observer.observer))
         #: With the sample of the chain that each is.
         self.waiting = list[tuple[Row, int]]()
 

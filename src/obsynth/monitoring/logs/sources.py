@@ -18,7 +18,7 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, reason
 from obsynth.monitoring.logs.signals import (
     TIME_HEADER,
-    Signals,
+    LogSignals,
     column_of,
     date_place,
     is_bad,
@@ -67,7 +67,7 @@ LARGEST_SHIFT = 0.5
 _BEGINNINGS = {".parquet": b"PAR1", ".tdms": b"TDSm", ".mf4": b"MDF ", ".mdf": b"MDF ", ".dat": b"MDF "}
 
 
-def chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
+def chunks(data: Data, signals: LogSignals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
     """Yield ``(rows, 1 + nu + ny)``: time and signals, in order; NaN where a sample is missing.  Inputs are those that
     act in a row as the design takes it."""
     found = _chunks(data, signals, stamps, rows)
@@ -81,7 +81,7 @@ def chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator[
     stamps.require_numbers()
 
 
-def _delayed(found: Iterator[FloatArray], signals: Signals, stamps: Stamps) -> Iterator[FloatArray]:
+def _delayed(found: Iterator[FloatArray], signals: LogSignals, stamps: Stamps) -> Iterator[FloatArray]:
     """Yield rows with the inputs of so many rows before; the first ones hold their own."""
     inputs = slice(1, 1 + signals.inputs)
     for chunk in found:
@@ -93,7 +93,7 @@ def _delayed(found: Iterator[FloatArray], signals: Signals, stamps: Stamps) -> I
         yield chunk
 
 
-def _advanced(found: Iterator[FloatArray], signals: Signals) -> Iterator[FloatArray]:
+def _advanced(found: Iterator[FloatArray], signals: LogSignals) -> Iterator[FloatArray]:
     """Yield rows with the inputs of so many rows after, for which they wait; the last ones hold the last."""
     inputs, wait = slice(1, 1 + signals.inputs), -signals.delay
     kept: FloatArray | None = None
@@ -112,7 +112,7 @@ def _advanced(found: Iterator[FloatArray], signals: Signals) -> Iterator[FloatAr
         yield kept
 
 
-def _chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
+def _chunks(data: Data, signals: LogSignals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
     if isinstance(data, str | Path):
         path = Path(data)
         check_suffix(path, (*TEXT_SUFFIXES, *NEEDED_PACKAGES))
@@ -141,7 +141,7 @@ def _chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator
                 yield whole[start : start + rows]
 
 
-def samples(data: Data, signals: Signals) -> Iterator[tuple[float, FloatArray]]:
+def samples(data: Data, signals: LogSignals) -> Iterator[tuple[float, FloatArray]]:
     """Yield time and deviations ``(nu + ny,)`` of each row."""
     for chunk in chunks(data, signals, Stamps(), CHUNK_ROWS):
         yield from zip(chunk[:, 0].tolist(), signals.deviations(chunk), strict=True)
@@ -219,7 +219,7 @@ def _unreadable(path: Path, package: str, error: Exception) -> SpecError:
     )
 
 
-def _parquet(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[pd.DataFrame]:
+def _parquet(path: Path, signals: LogSignals, stamps: Stamps, rows: int) -> Iterator[pd.DataFrame]:
     import pyarrow.parquet
 
     time = signals.columns[0]
@@ -281,7 +281,7 @@ def _only(path: Path, name: str, channels: Sequence[tuple[str, str, Any]]) -> An
     return found[0][1] if found else None
 
 
-def _tdms(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[pd.DataFrame]:
+def _tdms(path: Path, signals: LogSignals, stamps: Stamps, rows: int) -> Iterator[pd.DataFrame]:
     """Yield the channels of a TDMS file; where no channel is the time, that of the waveforms is."""
     from nptdms import TdmsFile
 
@@ -346,7 +346,7 @@ def _wave_times(path: Path, waves: dict[str, Any]) -> FloatArray:
     return times
 
 
-def _mdf(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[pd.DataFrame]:
+def _mdf(path: Path, signals: LogSignals, stamps: Stamps, rows: int) -> Iterator[pd.DataFrame]:
     """Yield the channels of an MDF file on the raster of the first signal, with the stamps of the time channel."""
     with _mdf_file(path) as file:
         known = _mdf_channels(file)
@@ -449,7 +449,7 @@ def _cells_of(samples: Any) -> Any:
     return np.asarray(samples, dtype=object if samples.dtype.kind == "U" else np.float64)
 
 
-def _frames(found: dict[str, Any], others: dict[str, Any], signals: Signals, rows: int) -> Iterator[pd.DataFrame]:
+def _frames(found: dict[str, Any], others: dict[str, Any], signals: LogSignals, rows: int) -> Iterator[pd.DataFrame]:
     """Yield columns in chunks; names that are not there are told with all that are."""
     import pandas as pd
 
@@ -463,7 +463,7 @@ def _frames(found: dict[str, Any], others: dict[str, Any], signals: Signals, row
 #: What yields the rows of a file, and what names all of its columns, of which some are wanted, the time first.
 READERS: dict[
     str,
-    tuple[Callable[[Path, Signals, Stamps, int], Iterator[Any]], Callable[[Path, Sequence[str]], list[str]]],
+    tuple[Callable[[Path, LogSignals, Stamps, int], Iterator[Any]], Callable[[Path, Sequence[str]], list[str]]],
 ] = {
     ".parquet": (_parquet, _parquet_names),
     ".tdms": (_tdms, _tdms_names),
@@ -473,7 +473,7 @@ READERS: dict[
 }
 
 
-def _with_time(frame: pd.DataFrame, signals: Signals) -> pd.DataFrame:
+def _with_time(frame: pd.DataFrame, signals: LogSignals) -> pd.DataFrame:
     """Return a frame whose index of dates, of time differences, or called as the time, is a column."""
     import pandas as pd
 
@@ -485,7 +485,7 @@ def _with_time(frame: pd.DataFrame, signals: Signals) -> pd.DataFrame:
     return frame.assign(**{time: frame.index}).reset_index(drop=True)
 
 
-def _converted(frames: Iterator[pd.DataFrame], signals: Signals, stamps: Stamps) -> Iterator[FloatArray]:
+def _converted(frames: Iterator[pd.DataFrame], signals: LogSignals, stamps: Stamps) -> Iterator[FloatArray]:
     done = 0
     for frame in frames:
         header = tuple(str(name) for name in frame.columns)

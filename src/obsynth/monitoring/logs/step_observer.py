@@ -14,7 +14,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import as_run
-from obsynth.observers.smoothing_chain import Chain
+from obsynth.observers.smoothing_chain import SmootherHistory
 from obsynth.results.design import ObserverDesign
 
 
@@ -52,7 +52,7 @@ class SteppingLogObserver(LogObserver):
                 "estimates alone.",
             )
         #: Of a smoother: the samples since the observer last started.
-        self.chain: Chain | None = None
+        self.chain: SmootherHistory | None = None
         self.state: Any = self.observer.init()
         self.u: FloatArray | None = None
         # Deviations of the faults at the last row, and before samples were missing: zero where nothing is left of that.
@@ -66,7 +66,7 @@ class SteppingLogObserver(LogObserver):
         """Start the observer again."""
         self.state = self.observer.init()
         if self.chain is not None:
-            self.chain = Chain(self.chain.links)
+            self.chain = SmootherHistory(self.chain.links)
 
     @property
     def gates(self) -> bool:

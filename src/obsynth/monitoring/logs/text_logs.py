@@ -15,7 +15,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.files.tables import unquoted
-from obsynth.monitoring.logs.signals import Signals, column_of, date_place, is_bad, status_places, with_date
+from obsynth.monitoring.logs.signals import LogSignals, column_of, date_place, is_bad, status_places, with_date
 from obsynth.monitoring.logs.stamps import MISSING_TEXTS, Stamps
 from obsynth.numerics.arguments import number_in_text
 from obsynth.numerics.arrays import FloatArray
@@ -119,7 +119,7 @@ def no_text(path: Path, error: UnicodeDecodeError) -> SpecError:
     return SpecError(f"{path} is no {name} text (byte {error.start}). {SAVE_AS_TEXT}", path=str(path))
 
 
-def text_chunks(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
+def text_chunks(path: Path, signals: LogSignals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
     """Yield ``(rows, 1 + nu + ny)`` of a file."""
     with path.open(encoding=encoding_of(path), errors=WINDOWS_TEXT, newline="") as stream:
         if not stream.readline():
@@ -133,7 +133,7 @@ def text_chunks(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iter
             raise
 
 
-def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[FloatArray]:
+def stream_rows(stream: TextIO, signals: LogSignals, stamps: Stamps) -> Iterator[FloatArray]:
     """Yield one row at a time, ``(1, 1 + nu + ny)``, as soon as its line is there."""
     header, comma, table = opened_text(stream, signals.columns)
     if not header:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.monitoring.thresholds.adaptive_screening import Screening
-from obsynth.monitoring.thresholds.monitor import Judged, LinearSample, Rule, Sample
+from obsynth.monitoring.thresholds.monitor import LinearSample, Rule, RuleOutput, Sample
 from obsynth.monitoring.thresholds.rules import FITTING_SHARE, NormRule, NormState, norm_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.simulation.benches import Runs
@@ -134,11 +134,11 @@ class AdaptiveRule(Rule):
             nominal = self.nominal.restart(nominal)
         return self._begun(nominal, self._later)._replace(first=False, last=state.last, waiting=state.waiting)
 
-    def step(self, state: AdaptiveRuleState, sample: Sample) -> tuple[AdaptiveRuleState, Judged]:
+    def step(self, state: AdaptiveRuleState, sample: Sample) -> tuple[AdaptiveRuleState, RuleOutput]:
         """Return the state, statistic and threshold: those of the residual's norm, or of the row passed most."""
         said, dt = sample.said, self.plan.sample_time
         if not isinstance(said, LinearSample):
-            return self.restart(state), Judged(math.nan, math.nan, None, (math.nan,) * len(self.columns))
+            return self.restart(state), RuleOutput(math.nan, math.nan, None, (math.nan,) * len(self.columns))
         last, state = state.last, state._replace(last=sample.time)
         if dt is not None and last is not None and abs(sample.time - last - dt) > FITTING_SHARE * dt:
             # What the observer did over another interval is an error of its own, which must decay first.
@@ -164,15 +164,15 @@ class AdaptiveRule(Rule):
         nf = len(plan.fault_names)
         cells = self._cells(values[:nf], found, error)
         if state.waiting or not sample.deciding:
-            return state, Judged(math.nan, math.nan if state.waiting else threshold, None, cells)
+            return state, RuleOutput(math.nan, math.nan if state.waiting else threshold, None, cells)
         ratios = np.abs(values) / found.total
         worst = int(np.argmax(ratios)) if len(ratios) else 0
         if statistic <= threshold and len(ratios) and ratios[worst] > 1.0:
             # The row is passed although the norm is not: it decides, in the scale of the norm's threshold.
             value = threshold * float(ratios[worst])
-            return state, Judged(value, threshold, worst if worst < nf else None, cells)
+            return state, RuleOutput(value, threshold, worst if worst < nf else None, cells)
         passed = int(np.argmax(ratios[:nf])) if nf and ratios[:nf].max() > 1.0 else None
-        return state, Judged(statistic, threshold, passed, cells)
+        return state, RuleOutput(statistic, threshold, passed, cells)
 
     def _cells(self, faults: FloatArray, found: Thresholds, error: Thresholds) -> tuple[float, ...]:
         nf = len(faults)

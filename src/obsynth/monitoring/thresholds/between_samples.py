@@ -41,7 +41,7 @@ FINITE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class BetweenSamples:
+class IntersampleErrorSystem:
     """A design on samples: ``s+ = M s``, ``r = c s``, ``s = [x; eps]`` with the part of x that decays."""
 
     plant: DescriptorSystem
@@ -66,7 +66,7 @@ class BetweenSamples:
         *,
         rows: slice,
         endless: bool = True,
-    ) -> BetweenSamples:
+    ) -> IntersampleErrorSystem:
         """Return the design at samples ``dt`` apart, for ``tracking V (nz, nx)``; raise `SpecError` without a bound.
         Without ``endless`` a record of known length is bounded whether or not anything decays."""
         try:
@@ -89,7 +89,7 @@ class BetweenSamples:
         terms = np.abs(az) @ np.abs(t) + (np.abs(g0) + 2.0 * np.abs(g1)) @ np.abs(smooth.C) + np.abs(t)
         into = exact(g1) @ c - exact(t)
 
-        def split(kept: FloatArray, *, decays: bool) -> BetweenSamples:
+        def split(kept: FloatArray, *, decays: bool) -> IntersampleErrorSystem:
             found = _split(phi, k, j, into, kept, az, observer.Cz[rows], endless=decays)
             return cls(smooth, dt, *found[:4], g1, earlier.midpoint, observer.Dy[rows], rows, found[4])
 
@@ -109,7 +109,7 @@ class BetweenSamples:
         tracking: FloatArray,
         *,
         rows: slice,
-    ) -> BetweenSamples:
+    ) -> IntersampleErrorSystem:
         """Return a design for a sampled plant, with states of ``written``: ``eps+ = Az eps - T q + By Dd d``."""
         smooth = eliminate_algebraic_states(written).plant
         n, nz, exact = smooth.nx, observer.order, Ball.exact

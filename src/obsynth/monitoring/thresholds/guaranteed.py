@@ -17,7 +17,7 @@ from obsynth.methods.guaranteed_test.regions import while_inside
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.tolerant import noisy_as_bounded, rows_before
 from obsynth.monitoring.thresholds.adaptive_monitor import over_box
-from obsynth.monitoring.thresholds.monitor import Judged, LinearSample, Monitor, Rule, Sample
+from obsynth.monitoring.thresholds.monitor import LinearSample, Monitor, Rule, RuleOutput, Sample
 from obsynth.monitoring.thresholds.rules import NormRule
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
@@ -205,7 +205,7 @@ class GuaranteedRule(Rule):
         width = self._rounding.shape[1]
         return GuaranteedState(0, np.zeros(width), np.zeros((0, width)))
 
-    def step(self, state: GuaranteedState, sample: Sample) -> tuple[GuaranteedState, Judged]:
+    def step(self, state: GuaranteedState, sample: Sample) -> tuple[GuaranteedState, RuleOutput]:
         """Return statistic and threshold; NaN while the window is not full, and nothing else is known of it."""
         said: Any = sample.said
         cells = (np.nan,) * len(self.columns)
@@ -223,16 +223,16 @@ class GuaranteedRule(Rule):
             found = [programme.least_test(*self._window(state, k)) for k, programme in enumerate(self._programmes)]
             values, thresholds = (np.array(part) for part in zip(*found, strict=True))
         else:
-            return state, Judged(np.nan, float(thresholds[0]), None, cells)
+            return state, RuleOutput(np.nan, float(thresholds[0]), None, cells)
         if self._exact:
             values, thresholds, cells = self._intervals(state, values, thresholds)
         known_tests = np.isfinite(values) & np.isfinite(thresholds)
         if not known_tests.any():
-            return state, Judged(np.nan, float(thresholds[0]), None, cells)
+            return state, RuleOutput(np.nan, float(thresholds[0]), None, cells)
         sizes = np.where(known_tests, np.abs(values), 0.0)
         share = np.divide(sizes, thresholds, out=np.where(sizes > 0.0, np.inf, 0.0), where=thresholds > 0.0)
         which = int(np.argmax(np.where(known_tests, share, -1.0)))
-        return state, Judged(float(sizes[which]), float(thresholds[which]), which, cells)
+        return state, RuleOutput(float(sizes[which]), float(thresholds[which]), which, cells)
 
     def _kept(self, state: GuaranteedState, rows: FloatArray) -> GuaranteedState:
         return state._replace(recent=np.vstack([state.recent, rows])[-self._length :])
@@ -296,16 +296,16 @@ class VaryingRule(Rule):
         """Return the state before the first sample."""
         return VaryingState(0, np.zeros(self._rounding.shape[1]))
 
-    def step(self, state: VaryingState, sample: Sample) -> tuple[VaryingState, Judged]:
+    def step(self, state: VaryingState, sample: Sample) -> tuple[VaryingState, RuleOutput]:
         """Return statistic and threshold; NaN where the row has no verdict."""
         said: Any = sample.said
         known = np.concatenate([said.inputs, said.outputs])
         after = VaryingState(state.k + 1, np.fmax(state.largest, np.abs(known)))
         which = self._observer.programme_at(state.k)
         if which < 0:
-            return after, Judged(np.nan, np.nan)
+            return after, RuleOutput(np.nan, np.nan)
         threshold = float(self._limits[which] + self._rounding[which] @ after.largest)
-        return after, Judged(float(abs(said.faults_and_residuals[0])), threshold, 0)
+        return after, RuleOutput(float(abs(said.faults_and_residuals[0])), threshold, 0)
 
     def restart(self, state: VaryingState, skipped: int = 0) -> VaryingState:
         """Count the rows that are missing: those of the window before them have no verdict."""

@@ -31,7 +31,7 @@ from obsynth.monitoring.thresholds.learned_levels import (
     learned_levels,
     rows_needed,
 )
-from obsynth.monitoring.thresholds.monitor import Evidence, Judged, LinearSample, Monitor, Rule, Sample
+from obsynth.monitoring.thresholds.monitor import Evidence, LinearSample, Monitor, Rule, RuleOutput, Sample
 from obsynth.monitoring.thresholds.parameter_scores import (
     Scores,
     before_any,
@@ -713,7 +713,7 @@ class LearnedRule(Rule):
             return found
         return found._replace(before=before_any(len(self._walk)), scores=np.zeros((max(AGES), 2 * len(self._walk))))
 
-    def step(self, state: LearnedState, sample: Sample) -> tuple[LearnedState, Judged]:
+    def step(self, state: LearnedState, sample: Sample) -> tuple[LearnedState, RuleOutput]:
         """Return the largest statistic in units of its level, one as threshold, and the fault whose step it is."""
         missing = 0 if state.last is None else round((sample.time - state.last) / self.learned.dt) - 1
         for _ in range(min(max(missing, 0), max(AGES))):
@@ -731,12 +731,12 @@ class LearnedRule(Rule):
             state = state._replace(waiting=self._model.order + 1)
         state = state._replace(waiting=max(state.waiting - 1, 0))
         if found is None or not (whole or (varying and (counts or np.isfinite(found[self._places]).all()))):
-            return self._added(state, None), Judged(math.nan, math.nan)
+            return self._added(state, None), RuleOutput(math.nan, math.nan)
         seen = found[self._places]
         kept = seen if shown is None else np.where(np.isfinite(seen), seen, shown)
         state = self._added(state, kept, most, shown)
         if not counts:
-            return state, Judged(math.nan, math.nan)
+            return state, RuleOutput(math.nan, math.nan)
         # Products of numbers that overflow have passed any level.
         with np.errstate(all="ignore"):
             ratios = ((self._templates @ state.white.ravel()) ** 2).reshape(-1, len(AGES)).max(axis=1)
@@ -748,7 +748,7 @@ class LearnedRule(Rule):
             values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares]) / self.learned.levels
         values = np.where(np.isnan(values), np.inf, values)
         which = self._fault(found, ratios) if self._walk is None else most_likely_change(changes)
-        return state, Judged(float(values.max()), 1.0, which)
+        return state, RuleOutput(float(values.max()), 1.0, which)
 
     def _scored(self, state: LearnedState, said: Any, missing: int) -> LearnedState:
         """Return the state with what a sample says of the faults."""

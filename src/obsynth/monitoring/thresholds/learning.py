@@ -179,7 +179,7 @@ def learn_thresholds(
 
 def _sized(
     design: ObserverDesign, started: Callable[[FloatArray | None], LogRun], log: FloatArray
-) -> tuple[_Said, FloatArray | None]:
+) -> tuple[_ObserverOutput, FloatArray | None]:
     """Return what a design says of rows without faults, and how far off outliers are by these rows ``(ny,)``; `None`
     where that is what the design says."""
     run = started(None)
@@ -238,7 +238,7 @@ def learned_sizes(wrong: Sequence[FloatArray], usual: FloatArray, stated: FloatA
     return found
 
 
-class _Said(NamedTuple):
+class _ObserverOutput(NamedTuple):
     """What a design says of a log."""
 
     numbers: NDArray[np.int64]  # ``(n,)``: of rows, from 0
@@ -249,7 +249,7 @@ class _Said(NamedTuple):
     refused: list[FloatArray]  # ``(4, ny)`` each: what a gate remembers after each row; empty without a gate
 
 
-def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _Said:
+def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _ObserverOutput:
     """Return what a design says of rows ``(n, 1 + nu + ny)``."""
     nothing = np.full(len(watched_names(design)), np.nan)
     residuals = [i for i, name in enumerate(run.observer.columns) if name.startswith("r[")]
@@ -283,7 +283,7 @@ def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _Said:
             del found[-1 - len(last.missed) : -1 - max(AGES)]
     numbers, times, rows, squares, scores = zip(*found, strict=True) if found else ((),) * 5
     both = [np.array([getattr(one, part.name) for one in scores]) for part in fields(Scores)]
-    return _Said(
+    return _ObserverOutput(
         np.array(numbers),
         np.array(times),
         np.array(rows),
@@ -300,8 +300,8 @@ def _rows(run: LogRun, log: FloatArray, together: int) -> Iterator[Row]:
 
 
 def _without_pairs(
-    design: ObserverDesign, started: Callable[[], LogRun], log: FloatArray, said: _Said, every: float
-) -> tuple[_Said, WrongPairs]:
+    design: ObserverDesign, started: Callable[[], LogRun], log: FloatArray, said: _ObserverOutput, every: float
+) -> tuple[_ObserverOutput, WrongPairs]:
     """Return what a design says of rows without pairs of wrong samples, and what there was of these."""
     from scipy.special import pdtrc
 
@@ -313,7 +313,7 @@ def _without_pairs(
     if not pairs:
         return said, NO_PAIRS
 
-    def again(chosen: Sequence[Pair]) -> _Said:
+    def again(chosen: Sequence[Pair]) -> _ObserverOutput:
         return _said(design, started(), np.hstack([log[:, :before], without(y, chosen)]))
 
     hidden = again(pairs)

@@ -138,7 +138,7 @@ class Sample(NamedTuple):
     bridged: bool = False  # whether the plant's model stood in for all that was missing since the warm-up
 
 
-class Judged(NamedTuple):
+class RuleOutput(NamedTuple):
     """What a rule says of a row: the fault by its number, `NOT_DISTINGUISHED`, or `None` where the rule does not look
     for it; and cells for columns of its own."""
 
@@ -148,7 +148,7 @@ class Judged(NamedTuple):
     cells: tuple[float, ...] = ()
 
 
-class Seen(NamedTuple):
+class MonitorOutput(NamedTuple):
     """What a monitor says of one row: NaN where nothing is decided; without an alarm no fault is named."""
 
     statistic: float
@@ -184,7 +184,7 @@ class Rule(ABC):
         """Return the state before the first sample."""
 
     @abstractmethod
-    def step(self, state: RuleState, sample: Sample) -> tuple[RuleState, Judged]:
+    def step(self, state: RuleState, sample: Sample) -> tuple[RuleState, RuleOutput]:
         """Return the state after a sample, and statistic and threshold at it."""
 
     @abstractmethod
@@ -297,7 +297,7 @@ class Monitor:
         """Return the state before the first sample."""
         return MonitorState(False, self.rule.init())
 
-    def step(self, state: MonitorState, sample: Sample) -> tuple[MonitorState, Seen]:
+    def step(self, state: MonitorState, sample: Sample) -> tuple[MonitorState, MonitorOutput]:
         """Take one row of estimates; return the state after it, and what the monitor sees.
 
         Parameters
@@ -315,12 +315,12 @@ class Monitor:
         after = MonitorState(sample.deciding, inner)
         # A statistic that has overflowed has passed any threshold.
         if math.isnan(statistic) or not math.isfinite(threshold):
-            return after, Seen(math.nan, math.nan, False, "", more)
+            return after, MonitorOutput(math.nan, math.nan, False, "", more)
         if statistic <= threshold + self.floor:
-            return after, Seen(statistic, threshold, False, "", more)
+            return after, MonitorOutput(statistic, threshold, False, "", more)
         if which is None and self.fault_names and np.isfinite(sample.faults).all():
             which = int(np.argmax(np.abs(sample.faults) / self.fault_scales))
-        return after, Seen(statistic, threshold, True, self._named(which), more)
+        return after, MonitorOutput(statistic, threshold, True, self._named(which), more)
 
     def _named(self, which: int | None) -> str:
         """Return the fault of a number, or the group of faults one of which is there for certain."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
 from obsynth.methods.registry import error_model
-from obsynth.monitoring.thresholds.between_samples import BetweenSamples
+from obsynth.monitoring.thresholds.between_samples import IntersampleErrorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.norms import output_covariance
@@ -62,7 +62,7 @@ class ResidualModel:
     steady: tuple[bool, ...]  # nothing but what is random, all the time
     errors: ErrorModel  # with the noise of the scenario
     continuous: ContinuousDesign | None = None
-    sampled: BetweenSamples | None = None  # of a plant on samples, where the continuous one behind it is known
+    sampled: IntersampleErrorSystem | None = None  # of a plant on samples, where the continuous one behind it is known
 
     @property
     def initial_error(self) -> float:
@@ -121,9 +121,9 @@ class ContinuousDesign:
         return self.errors.observer
 
     @cached_property
-    def between(self) -> BetweenSamples:
+    def between(self) -> IntersampleErrorSystem:
         """The design on samples; raises `SpecError` where what is watched has no bound."""
-        return BetweenSamples.of(
+        return IntersampleErrorSystem.of(
             self.plant, self.observer, self.errors.own, self.dt, rows=self.rows, endless=self.endless
         )
 
@@ -211,7 +211,7 @@ def residual_model(
         direct_w, faults_w = continuous.direct(rows), continuous.direct(observer.fault_rows)
     between = None
     if plant.is_discrete and plant.nd and design.source is not None and design.source.sample_time is not None:
-        between = BetweenSamples.of_sampled(design.source.plant, plant, observer, errors.own, rows=rows)
+        between = IntersampleErrorSystem.of_sampled(design.source.plant, plant, observer, errors.own, rows=rows)
     return ResidualModel(
         a,
         -shown,

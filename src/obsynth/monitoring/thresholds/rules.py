@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.between_samples import InputResponse
 from obsynth.monitoring.thresholds.gap_growth import GapGrowth, GapState
-from obsynth.monitoring.thresholds.monitor import Judged, Monitor, Rule, Sample
+from obsynth.monitoring.thresholds.monitor import Monitor, Rule, RuleOutput, Sample
 from obsynth.monitoring.thresholds.stated_noise import UnlimitedHorizonBound
 from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray
@@ -37,7 +37,7 @@ SAME_INTERVAL = 1e-6
 COUNT_ROUNDING = 1e-9
 
 #: What a rule says where nothing is decided.
-NOT_DECIDED = Judged(math.nan, math.nan)
+NOT_DECIDED = RuleOutput(math.nan, math.nan)
 
 
 PARAMETER_KINDS = ("chi-square", "cusum", "nis")
@@ -123,7 +123,7 @@ class NormRule(Rule):
         """Return the statistic of records: without a window every sample stands for itself."""
         return norm_of(residuals) if self._window == 1 else super().statistics(residuals)
 
-    def step(self, state: NormState, sample: Sample) -> tuple[NormState, Judged]:
+    def step(self, state: NormState, sample: Sample) -> tuple[NormState, RuleOutput]:
         """Return the state after a sample, statistic and threshold."""
         said: Any = sample.said
         late = 0.0 if state.last is None else (sample.time - state.last - self._dt) / self._dt
@@ -150,9 +150,9 @@ class NormRule(Rule):
             gap, grown = self.gaps.after(state.gap, sample) if sample.bridged else (self.gaps.start(), 0.0)
             state, threshold = state._replace(gap=gap), threshold + grown
         if not sample.deciding:
-            return state, Judged(math.nan, threshold)
+            return state, RuleOutput(math.nan, threshold)
         state, value = self.fold(state, sample.residuals if self._watched is None else said.rows[self._watched])
-        return state, Judged(value, threshold)
+        return state, RuleOutput(value, threshold)
 
     def _with_inputs(self, driven: InputResponse, state: NormState, said: Any) -> NormState:
         """Return the state with the known inputs of a row, and what they add to the norm; in a gap they are held."""
@@ -181,7 +181,7 @@ def norm_of(values: FloatArray) -> Any:
     return math.hypot(*values) if values.ndim == 1 else np.linalg.norm(values, axis=-1)
 
 
-class WindowState(NamedTuple):
+class WindowRuleState(NamedTuple):
     """The state of `WhitenedRule`; of many runs rows and sums have an axis before their last."""
 
     window: tuple[FloatArray, ...]  # latest residuals ``(..., nr)``, oldest first
@@ -212,11 +212,11 @@ class WhitenedRule(Rule):
         self.whitener, self._mean, self._change, self._window = whitener, mean, change, window
         self._probability, self._dt, self._white, self.table = false_alarms, dt, white, table
 
-    def init(self) -> WindowState:
+    def init(self) -> WindowRuleState:
         """Return the state before the first sample."""
-        return WindowState((np.zeros_like(self._mean),) * self._window, np.zeros(2 * len(self.whitener)))
+        return WindowRuleState((np.zeros_like(self._mean),) * self._window, np.zeros(2 * len(self.whitener)))
 
-    def fold(self, state: WindowState, residuals: FloatArray) -> tuple[WindowState, Any]:
+    def fold(self, state: WindowRuleState, residuals: FloatArray) -> tuple[WindowRuleState, Any]:
         """Return the state and the statistic ``(...)`` after residuals ``(..., nr)``."""
         centred = residuals - self._mean
         shape, count = centred.shape, state.filled + 1
@@ -233,7 +233,7 @@ class WhitenedRule(Rule):
             levels = _finite(two_sided_sums(state.levels, white, one, self._change * one))
         return state._replace(levels=levels), levels.max(axis=-1)
 
-    def step(self, state: WindowState, sample: Sample) -> tuple[WindowState, Judged]:
+    def step(self, state: WindowRuleState, sample: Sample) -> tuple[WindowRuleState, RuleOutput]:
         """Return the state after a sample, statistic and threshold. Stamps that jitter are those of the regular samples
         that they are nearest to."""
         if state.last is not None:
@@ -248,12 +248,12 @@ class WhitenedRule(Rule):
         state = state._replace(looks=state.looks + 1)
         probability, degrees = self._probability * share_of_look(state.looks), len(self.whitener)
         if self._change is None:
-            return state, Judged(float(value), chi_square_limit(degrees, probability))
+            return state, RuleOutput(float(value), chi_square_limit(degrees, probability))
         # Sums of what is not white are counted one by one: as many end here as there were looks.
         ending = 1 if self._white else state.looks
-        return state, Judged(float(value), math.log(2 * degrees * ending / probability))
+        return state, RuleOutput(float(value), math.log(2 * degrees * ending / probability))
 
-    def restart(self, state: WindowState, skipped: int = 0) -> WindowState:
+    def restart(self, state: WindowRuleState, skipped: int = 0) -> WindowRuleState:
         """Clear window and sums; the decisions that were taken stay counted."""
         return self.init()._replace(looks=state.looks)
 
@@ -268,7 +268,7 @@ def _finite(values: FloatArray) -> FloatArray:
     return np.nan_to_num(values, nan=largest, posinf=largest, neginf=-largest)
 
 
-class ParameterState(NamedTuple):
+class ParameterRuleState(NamedTuple):
     """The state of `ParameterRule`."""
 
     levels: FloatArray  # ``(2 nq,)``: cumulative sums
@@ -285,11 +285,11 @@ class ParameterRule(Rule):
     def __init__(self, kind: str, nominal: FloatArray, change: FloatArray, false_alarms: float) -> None:
         self._kind, self._nominal, self._change, self._probability = kind, nominal, change, false_alarms
 
-    def init(self) -> ParameterState:
+    def init(self) -> ParameterRuleState:
         """Return the state before the first sample."""
-        return ParameterState(np.zeros(2 * len(self._nominal)))
+        return ParameterRuleState(np.zeros(2 * len(self._nominal)))
 
-    def step(self, state: ParameterState, sample: Sample) -> tuple[ParameterState, Judged]:
+    def step(self, state: ParameterRuleState, sample: Sample) -> tuple[ParameterRuleState, RuleOutput]:
         """Return the state after a sample, statistic, threshold, and the number of the parameter if it is known."""
         if not sample.deciding:
             return state, NOT_DECIDED
@@ -300,12 +300,12 @@ class ParameterRule(Rule):
             along, information = found.score - found.information @ self._nominal, np.diag(found.information)
             levels = two_sided_sums(state.levels, along, information, self._change)
             which = int(np.argmax(levels)) % len(self._nominal)
-            return looked._replace(levels=levels), Judged(float(levels.max()), math.log(len(levels) / share), which)
+            return looked._replace(levels=levels), RuleOutput(float(levels.max()), math.log(len(levels) / share), which)
         if self._kind == "chi-square":
             away = found.theta - self._nominal
             weights = np.linalg.pinv(found.parameter_covariance, hermitian=True)
             value, limit = float(away @ weights @ away), chi_square_limit(len(away), share)
-            return looked, Judged(value, limit, alone(weights @ away, np.diag(weights)))
+            return looked, RuleOutput(value, limit, alone(weights @ away, np.diag(weights)))
         gap = found.whitened
         if found.regressor.size:
             gap = gap - found.regressor @ self._nominal
@@ -313,9 +313,9 @@ class ParameterRule(Rule):
         if not sum(degrees):
             return state._replace(squares=squares, degrees=degrees), NOT_DECIDED
         looked = looked._replace(squares=squares, degrees=degrees)
-        return looked, Judged(sum(squares), chi_square_limit(sum(degrees), share))
+        return looked, RuleOutput(sum(squares), chi_square_limit(sum(degrees), share))
 
-    def restart(self, state: ParameterState, skipped: int = 0) -> ParameterState:
+    def restart(self, state: ParameterRuleState, skipped: int = 0) -> ParameterRuleState:
         """Clear the sums; the covariance of the filter accounts for missing rows."""
         return self.init()._replace(looks=state.looks)
 
