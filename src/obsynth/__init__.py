@@ -139,37 +139,11 @@ register(
 )
 
 
-#: Functions that `design_from_gains` has replaced, by method.
-_FROM_GAINS = {
-    "fault_estimation_filter_from_gains": "fault-estimation-filter",
-    "pd_observer_from_gains": "pd-observer",
-    "ui_pi_observer_from_gains": "ui-pi-observer",
-}
-
-
-def _replaced(name: str) -> Any:
-    """Return a function of old with a warning that names the new one."""
-    from warnings import warn
-
-    method = _FROM_GAINS[name]
-    warn(f"{name} is now design_from_gains(plant, {method!r}, ...).", DeprecationWarning, stacklevel=3)
-    from obsynth.methods.designing import design_from_gains
-
-    return lambda plant, **gains: design_from_gains(plant, method, **gains)
-
-
 def __getattr__(name: str) -> Any:
-    if name in _FROM_GAINS:
-        return _replaced(name)
     if name in _PUBLIC_HOMES:
         return getattr(import_module(_PUBLIC_HOMES[name]), name)
     if name in _PUBLIC_PACKAGES:
         return import_module(f"obsynth.{name}")
-    if name[:1].isupper() and name in (types := import_module("obsynth.types")).__all__:
-        from warnings import warn
-
-        warn(f"obsynth.{name} is now obsynth.types.{name}.", DeprecationWarning, stacklevel=2)
-        return getattr(types, name)
     raise AttributeError(f"module 'obsynth' has no attribute {name!r}")
 
 

@@ -172,7 +172,7 @@ def test_the_sentence_tells_bounds_start_constants_and_log(tmp_path) -> None:
     content["certificate"]["y"]["data"][3] += 1e-9
     report = obsynth.verify_alarm(resigned(content, tmp_path / "bad.json"), data=log)
     assert "log" in {check.name for check in report.failures}
-    content["schema_version"] = 1
+    content["schema_version"] = 2
     (tmp_path / "old.json").write_text(json.dumps(content))
     with pytest.raises(obsynth.SpecError, match="prove the alarm again"):
         obsynth.verify_alarm(tmp_path / "old.json")

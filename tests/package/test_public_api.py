@@ -132,22 +132,10 @@ def test_all_names_resolve_and_are_listed():
         _ = obsynth.nonsense
 
 
-def test_functions_of_old_say_what_has_replaced_them():
-    plant = obsynth.DescriptorSystem(None, [[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0)
-    gains = {letter: obsynth.fault_estimation_filter(plant).gains[letter] for letter in "TNLW"}
-    with pytest.warns(DeprecationWarning, match=r"design_from_gains\(plant, 'fault-estimation-filter'"):
-        old = obsynth.fault_estimation_filter_from_gains
-    new = obsynth.design_from_gains(plant, "fault-estimation-filter", **gains)
-    assert old(plant, **gains).observer.as_dict().keys() == new.observer.as_dict().keys()
-    assert old(plant, **gains).report.passed == new.report.passed
-    assert "fault_estimation_filter_from_gains" not in obsynth.__all__
-
-
 def test_types_are_in_a_module_of_their_own_and_names_are_few():
     assert len(obsynth.__all__) <= 100
     assert not set(obsynth.__all__) & set(obsynth.types.__all__)
     assert set(dir(obsynth.types)) == set(obsynth.types.__all__)
-    with pytest.warns(DeprecationWarning, match=r"obsynth\.Simulation is now obsynth\.types\.Simulation"):
-        assert obsynth.Simulation is obsynth.types.Simulation
+    assert not hasattr(obsynth, "Simulation")
     with pytest.raises(AttributeError, match=r"'obsynth\.types' has no attribute 'nonsense'"):
         _ = obsynth.types.nonsense

@@ -30,8 +30,8 @@ def smib() -> obsynth.ObserverDesign:
 def test_another_schema_is_refused(smib: obsynth.ObserverDesign, tmp_path: Path):
     path = smib.save(tmp_path / "a.json")
     document = json.loads(path.read_text(encoding="utf-8"))
-    path.write_text(json.dumps({**document, "schema_version": 1}), encoding="utf-8")
-    with pytest.raises(obsynth.SpecError, match="schema version 1; this obsynth reads 2"):
+    path.write_text(json.dumps({**document, "schema_version": 2}), encoding="utf-8")
+    with pytest.raises(obsynth.SpecError, match="schema version 2; this obsynth reads 1"):
         obsynth.load(path)
 
 

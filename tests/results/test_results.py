@@ -383,7 +383,6 @@ class TestAtomicWriting:
         before = json.dumps(design_as_dict(design))
         design.save(tmp_path / "a.json")
         assert json.dumps(design_as_dict(design)) == before
-        assert design_module.GAIN_SET_VERSION == 2
 
 
 PROGRAM = """
@@ -431,11 +430,6 @@ class TestReport:
         assert report["b"].name == "b"
         with pytest.raises(KeyError, match="there are: a, b"):
             report["c"]
-
-    def test_a_former_name_of_a_check_answers_with_a_warning(self):
-        report = VerificationReport.of([self.row("state error alone")])
-        with pytest.warns(DeprecationWarning, match="is now 'state error alone'"):
-            assert report["state part"].name == "state error alone"
 
     def test_as_dict_and_back(self, design):
         assert VerificationReport.from_dict(VerificationReport.of([self.row()]).as_dict()).checks == (self.row(),)

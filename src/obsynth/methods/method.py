@@ -99,8 +99,6 @@ class Method(ABC):
     over_scenario: ClassVar[bool] = False
     #: Values of required options, for questions that do not depend on them.
     placeholders: ClassVar[Mapping[str, Any]] = {}
-    #: Options of old, and what to take instead.
-    gone: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
         kinds = field_types(type(self))
@@ -114,9 +112,6 @@ class Method(ABC):
     def of(cls, given: Mapping[str, Any]) -> Self:
         """Return the method with these options; raise `SpecError` for unknown names, wrong types and broken rules."""
         unknown = sorted(set(given) - set(field_types(cls)))
-        for name in unknown:
-            if name in cls.gone:
-                raise SpecError(f"{cls.id} has no option {name!r} any more: {cls.gone[name]}", path=OPTIONS_PATH)
         if unknown:
             listed = ", ".join(sorted(field_types(cls)))
             raise SpecError(

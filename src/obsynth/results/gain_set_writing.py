@@ -31,7 +31,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.recovery import StateRecovery
 
-GAIN_SET_VERSION = 2
+GAIN_SET_VERSION = 1
 
 GAIN_SET_KIND = "obsynth gain set"
 

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from obsynth.numerics.arguments import require_kind
 from obsynth.results.checks import Check, all_hold
-
-#: Checks by the names that they had once; asked for by these, they answer with a DeprecationWarning.
-FORMER_NAMES = {"state part": "state error alone", "P part alone": "proportional part alone"}
 
 
 @dataclass(frozen=True)
@@ -51,9 +47,6 @@ class VerificationReport:
         for check in self.checks:
             if check.name == name:
                 return check
-        if name in FORMER_NAMES:
-            warnings.warn(f"The check {name!r} is now {FORMER_NAMES[name]!r}.", DeprecationWarning, stacklevel=2)
-            return self[FORMER_NAMES[name]]
         raise KeyError(f"no check named {name!r}; there are: {', '.join(c.name for c in self.checks)}")
 
     def __repr__(self) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from obsynth.errors import SpecError, a_kind
 from obsynth.files.inputs import read_json, read_text
-from obsynth.methods.registry import AUTO, REGISTRY, method_class
+from obsynth.methods.registry import AUTO, REGISTRY
 from obsynth.numerics.arguments import is_whole
 from obsynth.plants.signal_names import suggestion
 
@@ -196,11 +196,7 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
         install = f" If it is that of a plug-in, install the package that provides {identifier}."
         problems.add("method.id", f"unknown method {identifier!r}; the known methods are: {known}.{close or install}")
     elif isinstance(identifier, str) and identifier != AUTO and isinstance(raw_options, dict):
-        gone = method_class(identifier).gone
-        for name in (name for name in raw_options if name in gone):
-            problems.add(f"method.options.{name}", f"there is no such option any more: {gone[name]}")
-        kept = {name: value for name, value in raw_options.items() if name not in gone}
-        options = _validated(options_schema(identifier), kept, problems, prefix="method.options")
+        options = _validated(options_schema(identifier), raw_options, problems, prefix="method.options")
     problems.raise_if_any()
     if checked is None or options is None:
         raise SpecError(f"{source} is not a valid spec.", path=str(source))

@@ -151,10 +151,6 @@ class FaultEstimationFilter(Method):
     }
     witnesses: ClassVar[frozenset[str]] = LEAST_GAIN_WITNESSES | {"P_factor", "tracking"}
     averaged: ClassVar[bool] = True
-    gone: ClassVar[Mapping[str, str]] = {
-        "model_error": "the least thresholds over tolerances are those of the method guaranteed-test with a scenario; "
-        "for this one, what tolerances do can be stated as noise of the plant (Bw)."
-    }
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults"})
 
     gamma: Positive | None = None

@@ -148,10 +148,6 @@ class PdObserver(Method):
     witnesses: ClassVar[frozenset[str]] = frozenset({"P1", "P3", "P_rate", "P_noise", "P1_low", "P1_high"})
     imposed: ClassVar[frozenset[str]] = frozenset({"decay"})
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults"})
-    gone: ClassVar[Mapping[str, str]] = {
-        "delta_scan": "a scan is a sweep: obsynth sweep --system SPEC --set 'delta=[0.1, 1]', or obsynth.sweep(plant, "
-        "{'delta': [0.1, 1]}, method='pd-observer')."
-    }
 
     theorem: Literal[1, 2] = 1
     delta: Positive | None = None

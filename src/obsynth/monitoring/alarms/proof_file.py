@@ -27,7 +27,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import design_as_dict, plain
 from obsynth.verification.assumptions import Assumptions, LogReference
 
-ALARM_VERSION = 2
+ALARM_VERSION = 1
 
 ALARM_KIND = "obsynth alarm certificate"
 

@@ -46,7 +46,7 @@ FAR_FROM_POINT = 0.2
 
 RUN_STATE_KIND = "obsynth run state"
 
-RUN_STATE_VERSION = 12
+RUN_STATE_VERSION = 1
 
 STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"', suffix=".json")
 

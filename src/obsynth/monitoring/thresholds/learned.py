@@ -59,7 +59,7 @@ TOLD_LEVEL_FACTOR = 2.0
 
 LEARNED_KIND = "obsynth learned thresholds"
 
-LEARNED_VERSION = 10
+LEARNED_VERSION = 1
 
 LEARNED = FileKind(
     "learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"', suffix=".json"
