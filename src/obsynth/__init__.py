@@ -1,5 +1,7 @@
 """obsynth: designs, proves and runs observers and fault-estimation filters for descriptor systems.
 
+The papers' inequalities
+    conditions: each as a cvxpy problem, in the letters of its paper, to read, change and solve.
 Plants
     DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel; from other tools: from_andes, from_casadi, from_control,
     from_fmu, from_matlab, from_modelica, from_pandas, from_scipy, from_sympy; from a spec: load_spec; changed by
@@ -103,7 +105,7 @@ _PUBLIC_HOMES = {name: f"obsynth.{module}" for module, names in _PUBLIC_NAMES.it
 #: Modules whose names are used through them, such as ``obsynth.plotting.plot_data``.
 _PUBLIC_PACKAGES = ("conditions", "plotting", "types")
 
-__all__ = sorted(_PUBLIC_HOMES)
+__all__ = sorted([*_PUBLIC_HOMES, "conditions"])
 
 
 def _conditions_of_design(design: Any) -> Any:
@@ -148,4 +150,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*__all__, *_PUBLIC_PACKAGES, "__version__"])
+    return sorted({*__all__, *_PUBLIC_PACKAGES, "__version__"})

@@ -127,3 +127,30 @@ def test_report_shows_the_design_on_the_scenario_of_a_spec(folder, capsys):
     assert main(["report", "--gains", gains, "--out", "other.html", "--system", str(other)]) == 2
     assert "tm GENCLS 1" in capsys.readouterr().err
     assert not Path("other.html").exists()
+
+
+def test_the_block_how_to_reproduce_this_runs(tmp_path, monkeypatch, capsys):
+    """Every setting of the command is in it: run in the same folder, it writes the same page again."""
+    import re
+    import runpy
+    import shlex
+    from html import unescape
+
+    docs = Path(__file__).parents[2] / "docs/examples/thermal"
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(docs / "make_log.py"), run_name="__main__")
+    assert main(["design", "--system", str(docs / "spec.yaml"), "--quiet"]) == 0
+    words = ["report", "--gains", "oven.gains.json", "--data", "oven.csv", "--time-column", "Timestamp"]
+    assert main([*words, "--threshold", "fhat[heater fault]=1", "--out", "a page.html"]) == 0
+    page = Path("a page.html").read_text(encoding="utf-8")
+    commands = unescape(re.search(r"<pre>(obsynth verify.*?)</pre>", page, re.DOTALL).group(1)).splitlines()
+    assert len(commands) == 2
+    for command in commands:
+        program, *arguments = shlex.split(command)
+        assert program == "obsynth"
+        assert main(arguments) == 0
+    again = Path("a page.html").read_text(encoding="utf-8")
+    # Only the time at which it was written may differ.
+    without_time = [re.sub(r'<p class="soft">\d{4}-\d\d-\d\d [^;]*;', "", text) for text in (page, again)]
+    assert without_time[0] == without_time[1]
+    assert "ALARM from 2026-05-01T09:30:30+02:00 on. Probable fault: heater fault." in page

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from obsynth.observers.decisions import ParameterMonitor
-from obsynth.results.layout import headed_table, number, print_section
+from obsynth.results.layout import duration, headed_table, number, print_section
 
 if TYPE_CHECKING:
     from obsynth.monitoring.thresholds.monitor import Monitor
@@ -166,7 +166,7 @@ def simulation_report(
         if linear and (end := summary[f"{kind[:-1]}_warm_up"]) is None:
             told = "the initial-condition response has not settled: errors of the whole record"
         elif linear:
-            told = f"errors after the warm-up, which ended at {end:g} s"
+            told = f"errors from {duration(end)} on, when the start no longer shows"
         print_section(console, f"{title} ({told})", table)
     for note in summary["notes"]:
         console.print(Text(note))

@@ -153,11 +153,27 @@ def print_summary(found: Summary, *, console: Console) -> None:
 def _facts(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterator[tuple[str, str]]:
     known = method_class(design.method) if design.method in REGISTRY else None
     yield "method", design.method + (f": {known.summary}" if known else "")
+    yield from _engine(design)
     yield "plant", _plant(design.plant)
     yield from _promise(design)
     yield "dynamics", _dynamics(design)
     yield from _speed(design, steps)
     yield "assumes", "; ".join(_assumptions(design))
+
+
+#: The inequality of each method that an engine of Riccati equations does without.
+_INEQUALITIES = {"fault-estimation-filter": "(45)", "pd-observer": "the theorem"}
+
+
+def _engine(design: ObserverDesign) -> Iterator[tuple[str, str]]:
+    """Yield how the gains were computed, where a method has several ways, and how to have the other one."""
+    engine, inequality = design.solver.get("engine"), _INEQUALITIES.get(design.method)
+    if engine == "riccati" and inequality:
+        yield "engine", f"Riccati equations; {inequality} verified with its P (by Clarabel: engine lmi)"
+    elif engine == "lmi":
+        runs = design.solver.get("runs", ())
+        names = dict.fromkeys(str(run["solver"]) for run in runs if "settings" in run and "solver" in run)
+        yield "engine", f"matrix inequality{f', solved by {listed(list(names))}' if names else ''}"
 
 
 def _plant(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> str:

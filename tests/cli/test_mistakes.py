@@ -1,0 +1,93 @@
+"""What a user gets wrong is told with what may be meant, and where."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import obsynth
+from obsynth.cli.examples import EXAMPLES
+from obsynth.cli.main import VERBS, main, obsynth_parser
+
+ROOT = Path(__file__).parents[2]
+THERMAL = ROOT / "docs/examples/thermal/spec.yaml"
+WANG = ROOT / "designs/wang2015/spec.yaml"
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["desing"], "there is no command 'desing'. Did you mean design?"),
+        (["clibrate", "--system", "x"], "Did you mean calibrate or validate?"),
+        (["xyzzy"], "there is no command 'xyzzy'. obsynth --help lists them all."),
+        (["design", "--sytem", "spec.yaml"], "There is no option --sytem. Did you mean --system?"),
+        (["check", "--system", "spec.yaml", "--verbos1"], "Did you mean --verbose?"),
+    ],
+)
+def test_words_that_are_misspelt(words: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(words)
+    assert left.value.code == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_mistake_of_yaml_is_shown_with_its_line_and_a_caret(tmp_path, capsys) -> None:
+    text = THERMAL.read_text(encoding="utf-8")
+    (tmp_path / "spec.yaml").write_text(text.replace("  state_names", "   state_names"), encoding="utf-8")
+    assert main(["check", "--system", str(tmp_path / "spec.yaml")]) == 2
+    *_, shown, caret = capsys.readouterr().err.rstrip().splitlines()
+    number = next(i for i, line in enumerate(text.splitlines(), 1) if "state_names" in line)
+    assert shown == f"  {number} |    state_names: [heater, air, wall, surface]"
+    assert shown[caret.index("^") :].startswith("state_names")
+
+
+def test_a_spec_given_for_a_gain_set_says_what_to_run(capsys) -> None:
+    assert main(["run", "--gains", str(THERMAL), "--data", "log.csv"]) == 2
+    assert f"is a spec, not a file that obsynth wrote. Run `obsynth design --system {THERMAL}` first." in (
+        capsys.readouterr().err
+    )
+
+
+def test_own_constraints_are_judged_before_a_solver_is_asked() -> None:
+    plant = obsynth.load_spec(WANG).plant
+    with pytest.raises(obsynth.SpecError, match=r"Your constraint 1 is not convex: P @ Y <= 2\.0"):
+        obsynth.fault_estimation_filter(plant, constraints=lambda v: [v["P"] @ v["Y"] <= 2.0])
+    with pytest.raises(obsynth.SpecError, match=r"no variable 'L': there are P, Y, gamma_squared, and the data T, N,"):
+        obsynth.fault_estimation_filter(plant, constraints=lambda v: [v["L"] <= 2.0])
+
+
+def test_own_constraints_get_the_data_of_the_paper() -> None:
+    import cvxpy as cp
+
+    plant = obsynth.load_spec(WANG).plant
+    design = obsynth.fault_estimation_filter(plant, constraints=lambda v: [cp.norm(v["Y"] @ v["C1"]) <= 30.0])
+    assert design.report.passed
+
+
+def test_a_method_of_a_plug_in_that_is_missing(tmp_path, capsys) -> None:
+    (tmp_path / "spec.yaml").write_text(THERMAL.read_text(encoding="utf-8").replace("ui-pi-observer", "hinf-pi"))
+    assert main(["design", "--system", str(tmp_path / "spec.yaml"), "--quiet"]) == 2
+    assert "install the package that provides hinf-pi" in capsys.readouterr().err
+
+
+def test_every_command_has_an_example_that_its_parser_takes() -> None:
+    import shlex
+
+    assert set(EXAMPLES) == set(VERBS)
+    for name, example in EXAMPLES.items():
+        program, verb, *words = shlex.split(example)
+        assert (program, verb) == ("obsynth", name)
+        parser = obsynth_parser([name])
+        options, rest = parser.parse_known_args([verb, *words])
+        assert options.verb == name
+        # What is left are settings, which are read apart.
+        assert all(word.startswith("--") or "=" in word or rest[i - 1].startswith("--") for i, word in enumerate(rest))
+
+
+@pytest.mark.parametrize("name", sorted(EXAMPLES))
+def test_help_begins_with_the_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main([name, "--help"])
+    text = capsys.readouterr().out
+    assert text.index("example:") < text.index("options:")

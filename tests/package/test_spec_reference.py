@@ -1,0 +1,56 @@
+"""The reference of a spec's keys explains every key of the schema, and its examples are YAML."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+from obsynth.specs import schema, schema_plants, schema_sections, schema_values
+
+DOCS = Path(__file__).parents[2] / "docs"
+PARTS = (schema_values, schema_plants, schema_sections, schema)
+
+
+@pytest.fixture(scope="module")
+def spec_keys() -> Iterator[object]:
+    sys.path.insert(0, str(DOCS / "_ext"))
+    try:
+        import spec_keys
+
+        yield spec_keys
+    finally:
+        sys.path.remove(str(DOCS / "_ext"))
+
+
+def sections() -> dict[str, type]:
+    """Return the sections of the schema that have keys of their own, by name."""
+    kinds = (kind for part in PARTS for kind in vars(part).values() if isinstance(kind, type))
+    return {kind.__name__: kind for kind in kinds if issubclass(kind, schema_values.Section) and kind.model_fields}
+
+
+#: Sections with one key, which stand in the types of others.
+WITHIN_OTHERS = {"NamesFile", "OutputPick", "StatePick"}
+
+
+def test_every_key_of_the_schema_is_explained(spec_keys) -> None:
+    known = sections()
+    assert set(known) - WITHIN_OTHERS == set(spec_keys.KEYS) - {"Constant"}
+    for name in set(known) - WITHIN_OTHERS:
+        assert set(spec_keys.KEYS[name]) == set(known[name].model_fields), name
+
+
+def test_every_section_stands_on_the_page(spec_keys) -> None:
+    shown = [name for _, name, _ in (*spec_keys.SECTIONS, *spec_keys.OPTION_SECTIONS)]
+    assert sorted(shown) == sorted(spec_keys.KEYS)
+
+
+def test_examples_are_yaml_and_meanings_are_sentences(spec_keys) -> None:
+    for section, keys in spec_keys.KEYS.items():
+        for key, (unit, meaning, example) in keys.items():
+            YAML(typ="safe", pure=True).load(f"{key}: {example}")
+            assert meaning.endswith("."), (section, key)
+            assert not unit.endswith("."), (section, key)
