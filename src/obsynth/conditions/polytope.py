@@ -1,0 +1,393 @@
+r"""Observers of polytopic plants by matrix inequalities at the vertices: gain, mean square, decay.
+
+``e+ = (A - L C) e + (B - L D) w``, ``z = Cz e + Dz w`` with the matrices in the hull of vertices
+(`obsynth.verification.error_polytope`); ``Y_i = P L_i``.  With one P every change of the weights is covered:
+
+.. math::
+    \begin{bmatrix} P & 0 & (P A_i - Y_i C)^T & C_{z,i}^T \\ * & \gamma^2 I & (P B_i - Y_i D)^T & D_{z,i}^T \\
+    * & * & P & 0 \\ * & * & * & I \end{bmatrix} > 0 \tag{V1}
+
+    \begin{bmatrix} P - C_z^T C_z & (P A_i - Y_i C)^T \\ * & P \end{bmatrix} > 0, \quad
+    \mathrm{tr}\, B_{cl}^T P B_{cl} + |D_z|^2 < J \tag{V2}
+
+With P at each vertex and a slack G (V3) the pair (i, j) is a vertex now and at the next sample: ``P_i`` in the first
+place, ``G_i + G_i' - P_j`` in the third, and ``G_i'`` instead of P in products, ``L_i = G_i^-T F_i``; where the weight
+changes by at most ``steps`` in a sample, the pairs are the corners of a hexagon, and one G serves all.  In continuous
+time
+
+.. math::
+    \begin{bmatrix} \mathrm{He}(P A_i - Y_i C) + C_z^T C_z & P B_i - Y_i D + C_z^T D_z \\ * & D_z^T D_z - \gamma^2 I
+    \end{bmatrix} < 0 \tag{V4}
+
+with ``[[P1, 0], [P2, P3]]`` for P where the last errors are algebraic.
+
+References: Boyd, El Ghaoui, Feron, Balakrishnan 1994; Daafouz, Bernussou, Syst. Control Lett. 43 (2001); de Oliveira,
+Bernussou, Geromel, Syst. Control Lett. 37 (1999).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.conditions.atoms import MARGIN
+from obsynth.conditions.problem import Conditions, Values
+from obsynth.errors import SpecError
+from obsynth.methods.conic import lazy_cvxpy as cp
+from obsynth.methods.conic import lmi
+from obsynth.numerics.arguments import FloatArray, arguments_checked, chosen, real_number, shown
+from obsynth.proofs.vertex_inequalities import Pair, Witness
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_polytope import ErrorPolytope
+
+#: What homogeneous problems (decay alone) are normalised by: the trace of P is at most the order times this.
+TRACE = 1.0
+#: The largest slack that is sought: more says nothing, and lets the scale of P run away.
+MOST_ROOM = 1.0
+
+
+@arguments_checked
+def polytope(
+    errors: ErrorPolytope,
+    *,
+    goal: str = "gain",
+    level: float | None = None,
+    decay: float | None = None,
+    lyapunov: str = "common",
+    steps: float | None = None,
+    gain: str = "scheduled",
+    gains: Sequence[FloatArray] | None = None,
+    gain_limit: float | None = None,
+    margin: float = MARGIN,
+) -> Conditions:
+    """Return the inequalities at the vertices of an error system, in P and Y.
+
+    Parameters
+    ----------
+    errors : ErrorPolytope
+        The vertices.
+    goal : {"gain", "power", "decay"}, optional
+        The least l2 gain from w to z, the least mean square of z for unit white w, or the largest slack of ``decay``.
+    level : float, optional
+        A given gain (or root mean square): the largest slack at that level is sought instead, which is what makes a
+        proof pass.
+    decay : float, optional
+        Errors decay at least like ``decay ** k`` (discrete time, below 1) or ``exp(-decay t)`` (continuous, 1/s).
+    lyapunov : {"common", "vertex"}, optional
+        One P, or one at each vertex (discrete time).
+    steps : float, optional
+        Largest change of the weight of the second of two vertices within a sample; any by default.
+    gain : {"scheduled", "constant"}, optional
+        One L at each vertex, or one for all.
+    gains : sequence of array_like, optional
+        Given gains, which are analysed.
+    gain_limit : float, optional
+        Largest Frobenius norm of each Y.
+    margin : float, optional
+        What the inequalities keep to the boundary of the cone.
+
+    Returns
+    -------
+    Conditions
+        Variables ``P`` (or ``P[1]``, ...), ``G``, ``Y[1]``, ... and ``gamma_squared`` or ``mean_square``, or ``room``
+        where the level is given; gains ``L[1]``, ..., and ``P[1]``, ``G[1]``, ... that `witness_of` reads.
+
+    Raises
+    ------
+    SpecError
+        An option is out of range, or a scheduled gain beside an output that changes.
+
+    Examples
+    --------
+    >>> scalar = ErrorPolytope([[[a]] for a in (0.5, 0.9, 1.2)], [[1.0]], B=[[1.0, 0.0]], D=[[0.0, 1.0]], dt=1.0)
+    >>> found = polytope(scalar)
+    >>> found.solve("CLARABEL", {})
+    >>> round(float(found.variables["gamma_squared"].value) ** 0.5, 5)
+    1.56205
+    """
+    chosen(goal, "goal", ("gain", "power", "decay"))
+    chosen(lyapunov, "lyapunov", ("common", "vertex"))
+    chosen(gain, "gain", ("scheduled", "constant"))
+    _require_fitting(errors, goal, level, decay, lyapunov, steps, gain, gains)
+    forms = _Forms.of(errors, lyapunov=lyapunov, steps=steps, gain=gain, gains=gains)
+    room = cp.Variable(name="room") if level is not None or goal == "decay" else None
+    kept = margin if room is None else room
+    variables = forms.variables()
+    value: Any = None
+    if goal != "decay":
+        name = "gamma_squared" if goal == "gain" else "mean_square"
+        value = level**2 if level is not None else cp.Variable(nonneg=True, name=name)
+        if level is None:
+            variables[name] = value
+    constraints: dict[str, Any] = {}
+    for place, now, then in forms.places():
+        constraints |= forms.at(place, now, then, goal, value, decay, kept)
+    constraints |= {f"P{name}": lmi.at_least(P, kept) for name, P in forms.positive()}
+    if room is not None:
+        variables["room"] = room
+        constraints["room"] = room <= MOST_ROOM
+    if goal == "decay":
+        constraints["trace"] = sum(cp.trace(P) for _, P in forms.positive()) <= TRACE * errors.order
+    if gain_limit is not None and gains is None:
+        constraints |= {f"limit{name}": cp.norm(Y, "fro") <= gain_limit for name, Y in forms.unknown_gains()}
+    objective = cp.Maximize(room) if room is not None else cp.Minimize(value)
+
+    def unsupported(_: dict[str, FloatArray], name: str) -> ObserverDesign:
+        raise SpecError(f"The error system of {name!r} has no plant: design by a method.", path="errors")
+
+    return Conditions(
+        "vertex inequalities (V1) to (V4)",
+        cp.Problem(objective, list(constraints.values())),
+        variables,
+        {},
+        {f"A[{i + 1}]": A for i, A in enumerate(errors.A)},
+        constraints,
+        tuple,
+        forms.gains,
+        unsupported,
+    )
+
+
+def witness_of(errors: ErrorPolytope, conditions: Conditions, *, steps: float | None = None) -> tuple[Witness, list[FloatArray]]:
+    """Return the Lyapunov matrices and the gains of the variables' present values."""
+    found = conditions.gains()
+    several = "P[2]" in found
+    P = [found[f"P[{i + 1}]"] for i in range(errors.count)] if several else [found["P"]]
+    names = [f"G[{i + 1}]" for i in range(errors.count)] if "G[2]" in found else ["G"] if "G" in found else []
+    gains = [found[f"L[{i + 1}]"] for i in range(errors.count)] if "L[2]" in found else [found["L[1]"]]
+    slack = [found[name] for name in names] or None
+    pairs = pairs_of(errors.count, steps) if steps is not None else None
+    multiplier = float(found["t"].item()) if "t" in found else 0.0
+    return Witness(P, slack, pairs, multiplier, errors.differential), gains
+
+
+def pairs_of(count: int, steps: float | None) -> list[Pair]:
+    """Return the corners of the set of weights now and at the next sample.
+
+    Parameters
+    ----------
+    count : int
+        Number of vertices.
+    steps : float or None
+        Largest change of the weight of the second of two vertices; any for ``None``.
+    """
+    units = np.eye(count)
+    if steps is None:
+        return [(now, then) for now in units for then in units]
+    if count != 2:
+        raise SpecError(
+            f"steps are for two vertices (one parameter that enters linearly), there are {count}: leave the rates out.",
+            path="steps",
+        )
+    reach = min(float(steps), 1.0)
+
+    def weights(share: float) -> FloatArray:
+        return np.array([1.0 - share, share])
+
+    corners = [(0.0, 0.0), (0.0, reach), (1.0 - reach, 1.0), (1.0, 1.0), (1.0, 1.0 - reach), (reach, 0.0)]
+    return [(weights(now), weights(then)) for now, then in dict.fromkeys(corners)]
+
+
+def _require_fitting(
+    errors: ErrorPolytope, goal: str, level: Any, decay: Any, lyapunov: str, steps: Any, gain: str, gains: Any
+) -> None:
+    if level is not None:
+        real_number(level, "level", "a positive number", above=0.0)
+    if goal == "decay" and decay is None:
+        raise SpecError("goal 'decay' needs the rate: give decay.", path="decay")
+    if decay is not None and not (decay >= 0.0 and (errors.dt <= 0.0 or decay <= 1.0)):
+        raise SpecError(
+            f"decay is {shown(decay)}: give a factor from 0 to 1 a sample in discrete time, or a rate of 0 or more.",
+            path="decay",
+        )
+    if (lyapunov == "vertex" or steps is not None or errors.ball) and errors.dt <= 0.0:
+        raise SpecError(
+            "P at each vertex, steps and a remainder are for discrete time: take lyapunov='common' here.",
+            path="lyapunov",
+        )
+    if steps is not None and not 0.0 < steps:
+        raise SpecError(f"steps is {shown(steps)}: give a positive number.", path="steps")
+    if errors.ball and goal == "power":
+        raise SpecError("A remainder beside A has no bound on the mean square: take goal='gain'.", path="goal")
+    if gains is None and gain == "scheduled" and not errors.constant_output:
+        raise SpecError(
+            "A gain that changes with the scheduling needs the same C and D at all vertices: the product L(mu) C(mu) "
+            "has no vertices. Take gain='constant'.",
+            path="gain",
+        )
+    if gains is not None:
+        errors.closed(gains)
+
+
+@dataclass(frozen=True, eq=False)
+class _Forms:
+    """The variables of the inequalities, and the products that are linear in them."""
+
+    errors: ErrorPolytope
+    P: list[Any]  # one at each vertex, or the same everywhere
+    G: list[Any]
+    Y: list[Any]
+    slack: bool
+    pairs: list[Pair] | None
+    given: Sequence[FloatArray] | None
+    t: Any
+
+    @classmethod
+    def of(cls, errors: ErrorPolytope, *, lyapunov: str, steps: float | None, gain: str, gains: Any) -> _Forms:
+        """Return new variables."""
+        n, m, count, k = errors.order, errors.outputs, errors.count, errors.differential
+        several, moving = lyapunov == "vertex", lyapunov == "vertex" or steps is not None
+        t = cp.Variable(nonneg=True, name="t") if errors.ball else None
+        dae = k is not None and k < n
+        if dae:
+            P, G = _descriptor_variables(n, k)
+            Ps, Gs = [P] * count, [G] * count
+        else:
+            Ps = [cp.Variable((n, n), symmetric=True, name=f"P[{i + 1}]") for i in range(count)] if several else []
+            Ps = Ps or [cp.Variable((n, n), symmetric=True, name="P")] * count
+            one = steps is not None or gain == "constant"
+            slack = [cp.Variable((n, n), name="G")] * count if one else []
+            slack = slack or [cp.Variable((n, n), name=f"G[{i + 1}]") for i in range(count)]
+            Gs = slack if moving else Ps
+        if gains is not None:
+            Y = [G.T @ np.asarray(L) for G, L in zip(Gs, list(gains) * (count if len(gains) == 1 else 1), strict=True)]
+        else:
+
+            def unknown(name: str) -> Any:
+                above = cp.Variable((k if dae else n, m), name=name)
+                return cp.vstack([above, np.zeros((n - k, m))]) if dae else above
+
+            Y = [unknown("Y")] * count if gain == "constant" else [unknown(f"Y[{i + 1}]") for i in range(count)]
+        pairs = pairs_of(count, steps) if moving else None
+        return cls(errors, Ps, Gs, Y, moving or dae, pairs, gains, t)
+
+    def variables(self) -> dict[str, Any]:
+        """Return the variables by name."""
+        found = {}
+        for matrix in (*self.P, *(self.G if self.slack else ()), *(self.Y if self.given is None else ())):
+            found |= {part.name(): part for part in matrix.variables()}
+        return found | ({"t": self.t} if self.t is not None else {})
+
+    def unknown_gains(self) -> list[tuple[str, Any]]:
+        """Return the gains that are sought, with the ends of their names."""
+        distinct = list(dict.fromkeys(self.Y))
+        return [(f"[{i + 1}]", Y) for i, Y in enumerate(distinct)]
+
+    def positive(self) -> list[tuple[str, Any]]:
+        """Return the matrices that must be positive definite, with the ends of their names."""
+        k = self.errors.differential
+        distinct = list(dict.fromkeys(self.P))
+        if k is not None and k < self.errors.order:
+            return [("", distinct[0][:k, :k])]
+        return [(f"[{i + 1}]" if len(distinct) > 1 else "", P) for i, P in enumerate(distinct)]
+
+    def places(self) -> list[tuple[str, FloatArray, FloatArray]]:
+        """Return name and weights, now and at the next sample, of every inequality."""
+        if self.pairs is None:
+            return [(f"[{i + 1}]", unit, unit) for i, unit in enumerate(np.eye(self.errors.count))]
+        return [(f"[{i + 1}]", now, then) for i, (now, then) in enumerate(self.pairs)]
+
+    def at(
+        self, place: str, now: FloatArray, then: FloatArray, goal: str, value: Any, decay: float | None, kept: Any
+    ) -> dict[str, Any]:
+        """Return the inequalities at weights, by name."""
+        errors = self.errors
+        G = _mean(self.G, now)
+        GA = _mean([g.T @ a - y @ c for g, a, y, c in zip(self.G, errors.A, self.Y, errors.C, strict=True)], now)
+        GB = _mean([g.T @ b - y @ d for g, b, y, d in zip(self.G, errors.B, self.Y, errors.D, strict=True)], now)
+        Z, Dz = _mean(list(errors.Cz), now), _mean(list(errors.Dz), now)
+        if errors.dt > 0.0:
+            low = G + G.T - _mean(self.P, then) if self.slack else _mean(self.P, then)
+            return self._discrete(place, _mean(self.P, now), low, G, GA, GB, Z, Dz, goal, value, decay, kept)
+        return self._continuous(place, _mean(self.P, now), GA, GB, Z, Dz, goal, value, decay, kept)
+
+    def _discrete(
+        self, place: str, P: Any, low: Any, G: Any, GA: Any, GB: Any, Z: Any, Dz: Any,
+        goal: str, value: Any, decay: float | None, kept: Any,
+    ) -> dict[str, Any]:  # fmt: skip
+        n, p, q = P.shape[0], Dz.shape[1], Dz.shape[0]
+        rest = self.errors.ball**2 * self.t * np.eye(n) if self.t is not None else 0.0
+        found = {}
+        if goal == "gain":
+            lower = [
+                [P - rest],
+                [np.zeros((p, n)), value * np.eye(p)],
+                [GA, GB, low],
+                [Z, Dz, np.zeros((q, n)), np.eye(q)],
+            ]
+            found[f"(V1){place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, G, 2)), kept)
+        if goal == "power":
+            W = cp.Variable((p, p), symmetric=True)
+            found[f"(V2){place}"] = lmi.at_least(lmi.symmetric_blocks([[P - Z.T @ Z], [GA, low]]), kept)
+            found[f"(V2) trace{place}"] = cp.trace(W) + float(np.sum(Dz**2)) + kept <= value
+            found[f"(V2) noise{place}"] = lmi.at_least(lmi.symmetric_blocks([[W], [GB, low]]), 0.0)
+        if decay is not None:
+            lower = [[decay**2 * P - rest], [GA, low]]
+            found[f"decay{place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, G, 1)), kept)
+        return found
+
+    def _with_ball(self, lower: list[list[Any]], G: Any, next_error: int) -> list[list[Any]]:
+        if self.t is None:
+            return lower
+        n = self.errors.order
+        across = [G if i == next_error else np.zeros((n, row[-1].shape[0])) for i, row in enumerate(lower)]
+        return [*lower, [*across, self.t * np.eye(n)]]
+
+    def _continuous(
+        self, place: str, P: Any, GA: Any, GB: Any, Z: Any, Dz: Any, goal: str, value: Any, decay: float | None, kept: Any
+    ) -> dict[str, Any]:
+        p = Dz.shape[1]
+        found = {}
+        if goal == "gain":
+            lower = [[-2.0 * GA - Z.T @ Z], [-(GB + Z.T @ Dz).T, value * np.eye(p) - Dz.T @ Dz]]
+            found[f"(V4){place}"] = lmi.at_least(lmi.symmetric_blocks(lower), kept)
+        if goal == "power":
+            W = cp.Variable((p, p), symmetric=True)
+            found[f"(V4) power{place}"] = lmi.at_least(-2.0 * GA - Z.T @ Z, kept)
+            found[f"(V4) trace{place}"] = cp.trace(W) + float(np.sum(Dz**2)) + kept <= value
+            k = self.errors.differential or P.shape[0]
+            found[f"(V4) noise{place}"] = lmi.at_least(lmi.symmetric_blocks([[W], [GB[:k], P[:k, :k]]]), 0.0)
+        if decay is not None:
+            found[f"decay{place}"] = lmi.at_least(-2.0 * GA - 2.0 * decay * P, kept)
+        return found
+
+    def gains(self, values: Values) -> dict[str, FloatArray]:
+        """Return gains and Lyapunov matrices of the values of the variables."""
+        found: dict[str, FloatArray] = {}
+        distinct = list(dict.fromkeys(self.P))
+        for i, P in enumerate(distinct):
+            matrix = np.asarray(P.value)
+            found[f"P[{i + 1}]" if len(distinct) > 1 else "P"] = 0.5 * (matrix + matrix.T)
+        slack = list(dict.fromkeys(self.G)) if self.slack else []
+        for i, G in enumerate(slack):
+            found[f"G[{i + 1}]" if len(slack) > 1 else "G"] = np.asarray(G.value)
+        if self.given is not None:
+            return found | {f"L[{i + 1}]": np.asarray(L) for i, L in enumerate(self.given)} | self._multiplier(values)
+        known: dict[Any, FloatArray] = {}
+        for G, Y in zip(self.G, self.Y, strict=True):
+            if (G, Y) not in known:
+                matrix = np.asarray(G.value)
+                known[G, Y] = np.linalg.solve(matrix.T if self.slack else 0.5 * (matrix + matrix.T), np.asarray(Y.value))
+                found[f"L[{len(known)}]"] = known[G, Y]
+        return found | self._multiplier(values)
+
+    def _multiplier(self, values: Values) -> dict[str, FloatArray]:
+        return {"t": np.atleast_2d(values["t"])} if self.t is not None else {}
+
+
+def _descriptor_variables(n: int, k: int) -> tuple[Any, Any]:
+    """Return ``diag(P1, 0)`` and ``[[P1, 0], [P2, P3]]``, P1 ``(k, k)`` symmetric."""
+    P1 = cp.Variable((k, k), symmetric=True, name="P1")
+    P2, P3 = cp.Variable((n - k, k), name="P2"), cp.Variable((n - k, n - k), name="P3")
+    above = [P1, np.zeros((k, n - k))]
+    return cp.bmat([above, [np.zeros((n - k, k)), np.zeros((n - k, n - k))]]), cp.bmat([above, [P2, P3]])
+
+
+def _mean(parts: Sequence[Any], weights: FloatArray) -> Any:
+    used = np.flatnonzero(weights)
+    if len(used) == 1 and weights[used[0]] == 1.0:
+        return parts[int(used[0])]
+    return sum(float(weights[i]) * parts[int(i)] for i in used)

@@ -1,0 +1,382 @@
+r"""Polytopic (linear parameter-varying) descriptor systems: plants whose matrices change with measured parameters.
+
+.. math::
+    E x^+ = A(\mu) x + B(\mu) u + B_d(\mu) d + B_f(\mu) f + B_w(\mu) w, \qquad
+    y = C(\mu) x + D(\mu) u + D_d(\mu) d + D_f(\mu) f + D_w(\mu) w
+
+where every matrix is the mean, with weights :math:`\mu(\rho)` of the simplex, of those at the vertices, and the
+scheduling parameters :math:`\rho` are measured at the same sample as y.  E is the same at all vertices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import PreconditionError, SpecError, a_kind
+from obsynth.numerics.arguments import FloatArray, is_finite_number, shown
+from obsynth.numerics.expressions import parse_expression
+from obsynth.plants.constants import expressions_in
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.scheduling import LinearForm, Scheduling, linear_form, parameters_of
+
+#: Matrices that may change over a region.
+SCHEDULED_MATRICES = ("A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
+#: What the vertices of one plant have in common.
+_SHARED = ("dt", "state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
+
+
+class PolytopicSystem:
+    r"""A linear descriptor system whose matrices change with measured scheduling parameters.
+
+    Parameters
+    ----------
+    vertices : sequence of DescriptorSystem, optional
+        Two or more, with the same E, sample time and names of signals.  The weights of the vertices are then the
+        scheduling parameters, named ``weight1, weight2, ...``, unless ``scheduling`` says otherwise.
+    plant : mapping, optional
+        Instead: the arguments of `DescriptorSystem`, where entries of all matrices but E may be expressions of the
+        scheduling parameters, such as ``"-k / m"``.
+    scheduling : mapping, optional
+        For ``plant``: ``{name: {"range": [low, high], "rate": ..., "column": ..., "unit": ...}}`` or
+        ``{name: [low, high]}``; ``rate`` is the largest change in a second, and ``column`` the column of a log that
+        holds the parameter where it has another name.  For two ``vertices``: one parameter with its range, of which
+        the first vertex is at the low end.
+    constants : mapping of str to float, optional
+        Values of other names in the expressions.
+
+    Raises
+    ------
+    SpecError
+        Vertices that differ in E, sample time or names; an empty range; a rate that is not positive; an expression
+        with an unknown name; E with an expression; more than 12 functions of the parameters in the matrices.
+    PreconditionError
+        An expression is not bounded over the region, or may jump there.
+
+    Notes
+    -----
+    An entry may depend on the parameters as it likes.  Each function of them that does not enter linearly, such as
+    ``v ** 2`` beside ``v``, is a direction of its own, between proved bounds: the polytope then holds more plants than
+    there are, and what is proved for it is proved for these.  Entries are rounded to double precision once.
+
+    References
+    ----------
+    .. [Hamdi2012] H. Hamdi, M. Rodrigues, C. Mechmeche, D. Theilliol, N. BenHadj Braiek, Fault detection and isolation
+       in linear parameter-varying descriptor systems via proportional integral observer, Int. J. Adapt. Control Signal
+       Process. 26 (3), 2012.
+
+    Examples
+    --------
+    >>> spring = PolytopicSystem(
+    ...     plant={"A": [[0, 1], ["-k", -1]], "C": [[1, 0]], "Bd": [[0], [1]], "state_names": ["x", "v"]},
+    ...     scheduling={"k": [1.0, 6.0]},
+    ... )
+    >>> spring
+    <PolytopicSystem: 2 vertices over k in [1, 6]; nx 2, ny 1, nu 0, nf 0, nd 1, continuous>
+    >>> spring.at({"k": 2.0}).A.tolist()
+    [[0.0, 1.0], [-2.0, -1.0]]
+    """
+
+    vertices: tuple[DescriptorSystem, ...]
+    scheduling: Scheduling
+
+    def __init__(
+        self,
+        vertices: Sequence[DescriptorSystem] | None = None,
+        *,
+        plant: Mapping[str, Any] | None = None,
+        scheduling: Mapping[str, Any] | None = None,
+        constants: Mapping[str, float] | None = None,
+    ) -> None:
+        if (vertices is None) == (plant is None):
+            raise SpecError("Give vertices, or plant with expressions and scheduling.", path="vertices")
+        given: dict[str, Any]
+        if vertices is not None:
+            if constants:
+                raise SpecError("constants are for plant, whose entries may be expressions.", path="constants")
+            found, held = _from_vertices(vertices, scheduling)
+            given = {"vertices": [vertex.as_dict() for vertex in found], "scheduling": _plain(scheduling)}
+        else:
+            numbers = _constants(constants)
+            found, held = _from_expressions(plant or {}, scheduling, numbers)
+            given = {"plant": _plain(plant), "scheduling": _plain(scheduling), "constants": numbers}
+        for name, value in (("vertices", found), ("scheduling", held), ("_given", given)):
+            object.__setattr__(self, name, value)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"a PolytopicSystem cannot be changed: {name}")
+
+    def __getattr__(self, name: str) -> Any:
+        # What the vertices share is the plant's own: names, sample time, E, and the matrices that do not change.
+        if name.startswith("_") or "vertices" not in vars(self):
+            raise AttributeError(name)
+        first = self.vertices[0]
+        if name in _SHARED or name in ("E", "units", "scales", "operating_point"):
+            return getattr(first, name)
+        if name in ("nx", "nu", "ny", "nf", "nd", "nw", "is_discrete"):
+            return getattr(first, name)
+        raise AttributeError(f"a PolytopicSystem has no {name!r}; its vertices may have.")
+
+    @property
+    def count(self) -> int:
+        """Number of vertices."""
+        return len(self.vertices)
+
+    def is_constant(self, *names: str) -> bool:
+        """Whether matrices of these names are the same at all vertices.
+
+        Parameters
+        ----------
+        *names : str
+            Such as ``"C"``.
+        """
+        first = self.vertices[0]
+        return all(
+            np.array_equal(getattr(vertex, name), getattr(first, name)) for vertex in self.vertices for name in names
+        )
+
+    def weights(self, parameters: Mapping[str, float] | Sequence[float]) -> FloatArray:
+        """Return the weights of the vertices ``(N,)`` at scheduling parameters.
+
+        Parameters
+        ----------
+        parameters : mapping or sequence
+            Values by name, or in order; inside the region.
+
+        Raises
+        ------
+        SpecError
+            A parameter is missing, unknown or outside the region.
+        """
+        values = self.scheduling.values(parameters)
+        if not self.scheduling.is_inside(values):
+            told = ", ".join(f"{name} = {value:.6g}" for name, value in zip(self.scheduling.names, values, strict=True))
+            raise SpecError(f"{told} is outside the region: {self.scheduling.sentence()}.", path="scheduling")
+        return self.scheduling.weights(values)
+
+    def at(self, parameters: Mapping[str, float] | Sequence[float]) -> DescriptorSystem:
+        """Return the plant at scheduling parameters that stay where they are.
+
+        Parameters
+        ----------
+        parameters : mapping or sequence
+            Values by name, or in order; inside the region.
+
+        Raises
+        ------
+        SpecError
+            A parameter is missing, unknown or outside the region.
+        """
+        return self.mean(self.weights(parameters))
+
+    def mean(self, weights: FloatArray) -> DescriptorSystem:
+        """Return the plant at weights of the vertices.
+
+        Parameters
+        ----------
+        weights : FloatArray
+            ``(N,)``, of the simplex.
+        """
+        changed = {}
+        for name in SCHEDULED_MATRICES:
+            if not self.is_constant(name):
+                changed[name] = sum(w * getattr(v, name) for w, v in zip(weights, self.vertices, strict=True))
+        return self.vertices[0].replace(exact=None, **changed) if changed else self.vertices[0]
+
+    @cached_property
+    def center(self) -> DescriptorSystem:
+        """The mean of the vertices."""
+        return self.mean(np.full(self.count, 1.0 / self.count))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what it was made of, as the constructor takes it."""
+        return dict(self._given)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> PolytopicSystem:
+        """Return the plant that `as_dict` described.
+
+        Parameters
+        ----------
+        data : mapping
+            With ``vertices``, or ``plant``, and ``scheduling``.
+        """
+        found = dict(data)
+        if found.get("vertices") is not None:
+            found["vertices"] = [DescriptorSystem(**vertex) for vertex in found["vertices"]]
+        return cls(**found)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self).from_dict, (self.as_dict(),)
+
+    def __repr__(self) -> str:
+        """Return sizes and region in one line."""
+        time = f"dt {self.dt:g}" if self.dt else "continuous"
+        sizes = ", ".join(f"{name} {getattr(self, name)}" for name in ("nx", "ny", "nu", "nf", "nd"))
+        return f"<PolytopicSystem: {self.count} vertices over {self.scheduling.sentence()}; {sizes}, {time}>"
+
+
+def _from_vertices(
+    vertices: Sequence[DescriptorSystem], scheduling: Mapping[str, Any] | None
+) -> tuple[tuple[DescriptorSystem, ...], Scheduling]:
+    """Return checked vertices, and their weights as scheduling parameters."""
+    if isinstance(vertices, DescriptorSystem) or not isinstance(vertices, Sequence) or not vertices:
+        raise SpecError(f"vertices are {a_kind(vertices)}: give a list of DescriptorSystem.", path="vertices")
+    for place, vertex in enumerate(vertices):
+        if not isinstance(vertex, DescriptorSystem):
+            raise SpecError(f"Vertex {place + 1} is {a_kind(vertex)}: give a DescriptorSystem.", path="vertices")
+    found = tuple(vertex.dense() for vertex in vertices)
+    first = found[0]
+    for place, vertex in enumerate(found[1:], start=2):
+        if vertex.uncertainty is not None or first.uncertainty is not None:
+            raise SpecError(
+                "A vertex has constants with tolerances, which no proof over a region takes in yet: leave them out "
+                "(plant.replace(uncertainty=None)).",
+                path="vertices",
+            )
+        for name in _SHARED:
+            if getattr(vertex, name) != getattr(first, name):
+                raise SpecError(f"Vertex {place} has another {name} than vertex 1.", path=f"vertices.{name}")
+        for name in SCHEDULED_MATRICES:
+            if getattr(vertex, name).shape != getattr(first, name).shape:
+                raise SpecError(f"{name} of vertex {place} has another shape than that of vertex 1.", path="vertices")
+        if not np.array_equal(vertex.E, first.E):
+            raise PreconditionError(
+                f"E of vertex {place} is not that of vertex 1: with a matrix E(mu) beside the next state a proof at "
+                "the vertices says nothing of what is between them. Solve the equations that have the parameter "
+                "beside a derivative for that derivative.",
+                condition="constant E",
+            )
+    if scheduling is None:
+        count = len(found)
+        names = tuple(f"weight{i + 1}" for i in range(count))
+        return found, Scheduling(names, np.zeros(count), np.ones(count), (None,) * count, ())
+    asked = parameters_of(scheduling)
+    if len(found) != 2 or len(asked) != 1:
+        raise SpecError(
+            "scheduling beside vertices is one parameter of two vertices; the parameters of more are their weights "
+            "(leave scheduling out), or give plant with expressions.",
+            path="scheduling",
+        )
+    return found, _scheduling(asked, tuple(asked))
+
+
+def _scheduling(asked: Mapping[str, Mapping[str, Any]], functions: Sequence[str]) -> Scheduling:
+    return Scheduling(
+        tuple(asked),
+        np.array([entry["range"][0] for entry in asked.values()]),
+        np.array([entry["range"][1] for entry in asked.values()]),
+        tuple(entry.get("rate") for entry in asked.values()),
+        tuple(functions),
+        {name: str(entry["column"]) for name, entry in asked.items() if entry.get("column")},
+        {name: str(entry["unit"]) for name, entry in asked.items() if entry.get("unit")},
+    )
+
+
+def _constants(given: Mapping[str, float] | None) -> dict[str, float]:
+    found = dict(given or {})
+    for name, value in found.items():
+        if not is_finite_number(value):
+            raise SpecError(f"The constant {name!r} is {shown(value)}: give a finite number.", path=f"constants.{name}")
+    return {str(name): float(value) for name, value in found.items()}
+
+
+def _from_expressions(
+    given: Mapping[str, Any], scheduling: Mapping[str, Any] | None, constants: Mapping[str, float]
+) -> tuple[tuple[DescriptorSystem, ...], Scheduling]:
+    """Return the vertices of a plant whose entries are expressions, and its scheduling."""
+    if not isinstance(given, Mapping):
+        raise SpecError(f"plant is {a_kind(given)}: give the arguments of DescriptorSystem by name.", path="plant")
+    asked = parameters_of(scheduling)
+    both = sorted(set(asked) & set(constants))
+    if both:
+        raise SpecError(f"{both[0]!r} is both a scheduling parameter and a constant.", path=f"scheduling.{both[0]}")
+    arguments, forms = dict(given), dict[str, list[tuple[int, int, LinearForm]]]()
+    if expressions_in(arguments.get("E"))[1]:
+        raise PreconditionError(
+            "E has an expression: with a matrix E(mu) beside the next state a proof at the vertices says nothing of "
+            "what is between them. Solve the equations that have the parameter beside a derivative for that "
+            "derivative.",
+            condition="constant E",
+        )
+    for name in SCHEDULED_MATRICES:
+        arguments[name], entries = expressions_in(arguments.get(name))
+        forms[name] = [
+            (row, column, _form(text, f"{name}[{row + 1},{column + 1}]", constants, tuple(asked)))
+            for row, column, text in entries
+        ]
+    functions = list(asked)
+    for form in (form for entries in forms.values() for _, _, form in entries):
+        functions += [text for text in form.parts if text not in functions]
+    used = {text for entries in forms.values() for _, _, form in entries for text in form.parts}
+    needed = {name for text in used for name in parse_expression(text).names}
+    idle = [name for name in asked if name not in needed]
+    if idle:
+        raise SpecError(
+            f"No entry depends on {idle[0]!r}: leave it out of scheduling, or write it into an entry of the matrices.",
+            path=f"scheduling.{idle[0]}",
+        )
+    held = _scheduling(asked, [text for text in functions if text in used])
+    base = _descriptor({key: value for key, value in arguments.items() if value is not None})
+    return tuple(_vertex(base, forms, dict(zip(held.functions, row, strict=True))) for row in held.corners), held
+
+
+def _descriptor(arguments: dict[str, Any]) -> DescriptorSystem:
+    if "A" not in arguments:
+        raise SpecError("plant has no matrix A.", path="plant.A")
+    try:
+        return DescriptorSystem(arguments.pop("E", None), arguments.pop("A"), **arguments).dense()
+    except TypeError as error:
+        raise SpecError(f"plant: {error}.", path="plant") from error
+
+
+def _form(text: str, place: str, constants: Mapping[str, float], names: tuple[str, ...]) -> LinearForm:
+    expression = parse_expression(text)
+    unknown = sorted(expression.names - set(names) - set(constants))
+    if unknown:
+        raise SpecError(
+            f"{place} is {text!r}: {unknown[0]!r} is no scheduling parameter and no constant. Give its value in "
+            "constants, or its range in scheduling.",
+            path=f"plant.{place}",
+        )
+    try:
+        return linear_form(expression, constants, names)
+    except SpecError as error:
+        raise SpecError(f"{place} is {text!r}: {error}", path=f"plant.{place}") from None
+    except (ValueError, ArithmeticError) as error:
+        raise SpecError(f"{place} is {text!r}, which has no finite value: {error}.", path=f"plant.{place}") from error
+
+
+def _vertex(
+    base: DescriptorSystem, forms: Mapping[str, list[tuple[int, int, LinearForm]]], values: Mapping[str, float]
+) -> DescriptorSystem:
+    """Return the plant at values of the functions, every entry rounded once."""
+    from fractions import Fraction
+
+    changed = {}
+    for name, entries in forms.items():
+        if not entries:
+            continue
+        matrix = np.array(getattr(base, name))
+        for row, column, form in entries:
+            total = form.constant + sum((f * Fraction(values[text]) for text, f in form.parts.items()), Fraction(0))
+            matrix[row, column] = float(total)
+        changed[name] = matrix
+    return base.replace(**changed) if changed else base
+
+
+def _plain(value: Any) -> Any:
+    """Return nested lists, numbers and texts of what a plant was made of."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(part) for key, part in value.items()}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if hasattr(value, "toarray"):
+        return value.toarray().tolist()
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,0 +1,180 @@
+r"""The error system of an observer whose plant is known to lie in a polytope: the one form of designs over a region.
+
+.. math::
+    e^+ = (A(\mu) - L(\mu) C(\mu)) e + (B(\mu) - L(\mu) D(\mu)) w, \qquad z = C_z(\mu) e + D_z(\mu) w
+
+with :math:`\mu` in the simplex, changing as it likes (or within stated steps), and in continuous time, where there
+are algebraic errors too, :math:`E e'` on the left.  A gain that changes with :math:`\mu` needs constant C and D: the
+product :math:`L(\mu) C(\mu)` would be of second degree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import FloatArray, as_matrix, read_only, require_shape
+from obsynth.proofs.balls import Enclosed
+from obsynth.proofs.vertex_inequalities import Vertex
+
+Matrices = Sequence[FloatArray] | FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorPolytope:
+    """Vertices of an error system.
+
+    Parameters
+    ----------
+    A : sequence of array_like
+        ``(n, n)`` at each vertex.
+    C : array_like or sequence of array_like
+        ``(m, n)``, one for all vertices or one for each; so are the others.
+    B, D : array_like or sequence of array_like, optional
+        ``(n, p)`` and ``(m, p)``: disturbances and noise; none by default.
+    Cz, Dz : array_like or sequence of array_like, optional
+        ``(q, n)`` and ``(q, p)``: the errors that count; all of e by default.
+    dt : float
+        Seconds between samples; 0 for continuous time.
+    differential : int, optional
+        How many of the errors, the first ones, are differential; all by default.
+    ball : float, optional
+        Largest spectral norm of a remainder beside A (discrete time).
+
+    Raises
+    ------
+    SpecError
+        Shapes do not fit together.
+
+    Examples
+    --------
+    >>> scalar = ErrorPolytope([[[0.5]], [[0.9]]], [[1.0]], B=[[1.0, 0.0]], D=[[0.0, 1.0]], dt=1.0)
+    >>> scalar.count, scalar.order, scalar.constant_output
+    (2, 1, True)
+    """
+
+    A: Sequence[FloatArray]
+    C: Matrices
+    B: Matrices | None = None
+    D: Matrices | None = None
+    Cz: Matrices | None = None
+    Dz: Matrices | None = None
+    dt: float = 1.0
+    differential: int | None = None
+    ball: float = 0.0
+
+    def __post_init__(self) -> None:
+        A = tuple(as_matrix(matrix, "A") for matrix in self.A)
+        if not A:
+            raise SpecError("There is no vertex: give A at one or more.", path="A")
+        n, count = len(A[0]), len(A)
+        C = _each(self.C, "C", count)
+        m = C[0].shape[0]
+        Cz = _each(self.Cz, "Cz", count) if self.Cz is not None else (np.eye(n),) * count
+        B = _each(self.B, "B", count) if self.B is not None else (np.zeros((n, 0)),) * count
+        p, q = B[0].shape[1], len(Cz[0])
+        D = _each(self.D, "D", count) if self.D is not None else (np.zeros((m, p)),) * count
+        Dz = _each(self.Dz, "Dz", count) if self.Dz is not None else (np.zeros((q, p)),) * count
+        shapes = {"A": (n, n), "C": (m, n), "B": (n, p), "D": (m, p), "Cz": (q, n), "Dz": (q, p)}
+        given = {"A": A, "C": C, "B": B, "D": D, "Cz": Cz, "Dz": Dz}
+        for name, matrices in given.items():
+            for matrix in matrices:
+                require_shape(matrix.shape, shapes[name], name)
+        if self.differential is not None and (not 0 < self.differential <= n or self.dt > 0.0):
+            raise SpecError(
+                f"differential is {self.differential}: give 1 to {n}, in continuous time.", path="differential"
+            )
+        if not (np.isfinite(self.ball) and self.ball >= 0.0) or (self.ball and self.dt <= 0.0):
+            raise SpecError("ball must be a finite number, 0 or more, in discrete time.", path="ball")
+        for name, matrices in given.items():
+            object.__setattr__(self, name, tuple(read_only(matrix) for matrix in matrices))
+
+    @property
+    def count(self) -> int:
+        """Number of vertices."""
+        return len(self.A)
+
+    @property
+    def order(self) -> int:
+        """Number of errors."""
+        return len(self.A[0])
+
+    @property
+    def outputs(self) -> int:
+        """Number of measurements."""
+        return int(self.C[0].shape[0])
+
+    @property
+    def inputs(self) -> int:
+        """Number of disturbances and noises."""
+        return int(self.B[0].shape[1])
+
+    @property
+    def constant_output(self) -> bool:
+        """Whether C and D are the same at all vertices."""
+        return all(
+            np.array_equal(c, self.C[0]) and np.array_equal(d, self.D[0]) for c, d in zip(self.C, self.D, strict=True)
+        )
+
+    def closed(self, gains: Sequence[FloatArray]) -> list[Vertex]:
+        """Return how the closed error system is formed at each vertex.
+
+        Parameters
+        ----------
+        gains : sequence of FloatArray
+            ``(n, m)``: one for all vertices, or one for each where C and D are constant.
+
+        Raises
+        ------
+        SpecError
+            A gain for each vertex beside an output that changes, or gains of another shape.
+        """
+        if len(gains) not in (1, self.count):
+            raise SpecError(f"There are {len(gains)} gains: give one, or one for each of {self.count} vertices.")
+        for gain in gains:
+            require_shape(np.shape(gain), (self.order, self.outputs), "gain")
+        if len(gains) > 1 and not self.constant_output:
+            raise SpecError(
+                "A gain that changes with the scheduling needs the same C and D at all vertices: the product "
+                "L(mu) C(mu) has no vertices. Give one gain for all.",
+                path="gains",
+            )
+        return [self._vertex(i, np.asarray(gains[i if len(gains) > 1 else 0])) for i in range(self.count)]
+
+    def _vertex(self, i: int, gain: FloatArray) -> Vertex:
+        def vertex(kind: type[Enclosed]) -> tuple[Enclosed, Enclosed, Enclosed, Enclosed]:
+            exact = kind.exact
+            shipped = exact(gain)
+            return (
+                exact(self.A[i]) - shipped @ exact(self.C[i]),
+                exact(self.B[i]) - shipped @ exact(self.D[i]),
+                exact(self.Cz[i]),
+                exact(self.Dz[i]),
+            )
+
+        return vertex
+
+    def at(self, weights: FloatArray, gains: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
+        """Return the closed M, B, Cz and Dz at weights, in floating point."""
+        each = list(gains) * (self.count if len(gains) == 1 else 1)
+        mean: Callable[[Sequence[FloatArray]], FloatArray] = lambda X: sum(  # noqa: E731
+            (w * x for w, x in zip(weights, X, strict=True)), 0.0 * X[0]
+        )
+        A = mean([a - g @ c for a, g, c in zip(self.A, each, self.C, strict=True)])
+        B = mean([b - g @ d for b, g, d in zip(self.B, each, self.D, strict=True)])
+        return A, B, mean(self.Cz), mean(self.Dz)
+
+
+def _each(given: Matrices, name: str, count: int) -> tuple[FloatArray, ...]:
+    """Return a matrix at each vertex."""
+    several = not isinstance(given, np.ndarray) and len(given) and np.ndim(given[0]) == 2
+    several = several or (isinstance(given, np.ndarray) and given.ndim == 3)
+    if not several:
+        return (as_matrix(given, name),) * count
+    found = tuple(as_matrix(matrix, name) for matrix in given)
+    if len(found) != count:
+        raise SpecError(f"{name} is given at {len(found)} vertices, A at {count}.", path=name)
+    return found
