@@ -75,6 +75,7 @@ _PUBLIC_NAMES = {
     "plants.importing.fmu": "from_fmu",
     "plants.importing.model_files": "from_matlab from_modelica",
     "plants.importing.python_objects": "from_control from_pandas from_scipy from_sympy",
+    "plants.polytopic": "PolytopicSystem",
     "plants.time_varying": "TimeVaryingDescriptorSystem",
     "plants.transformations.elimination": "eliminate_algebraic_states",
     "plants.transformations.linearisation": "linearise",

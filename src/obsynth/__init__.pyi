@@ -61,6 +61,7 @@ from obsynth.plants.importing.python_objects import from_control as from_control
 from obsynth.plants.importing.python_objects import from_pandas as from_pandas
 from obsynth.plants.importing.python_objects import from_scipy as from_scipy
 from obsynth.plants.importing.python_objects import from_sympy as from_sympy
+from obsynth.plants.polytopic import PolytopicSystem as PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem as TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states as eliminate_algebraic_states
 from obsynth.plants.transformations.linearisation import linearise as linearise

@@ -22,6 +22,7 @@ _TYPE_NAMES = {
     "observers.estimates": "Estimates",
     "observers.parameter_alarms": "Alarm Decision",
     "observers.running": "RunningObserver",
+    "observers.scheduled.observer": "ScheduledObserver",
     "observers.window.observer": "WindowObserver",
     "plants.calibrated_box": "CalibratedBox",
     "plants.constants": "Constant ConstantsBox",

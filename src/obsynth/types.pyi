@@ -19,6 +19,7 @@ from obsynth.observers.parameter_alarms import Alarm as Alarm
 from obsynth.observers.parameter_alarms import Decision as Decision
 from obsynth.observers.recursive.steady_filter import SteadyState as SteadyState
 from obsynth.observers.running import RunningObserver as RunningObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver as ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver as WindowObserver
 from obsynth.plants.calibrated_box import CalibratedBox as CalibratedBox
 from obsynth.plants.constants import Constant as Constant

@@ -33,13 +33,14 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.conditions import lazy_cvxpy as cp
+from obsynth.conditions import lmi
 from obsynth.conditions.atoms import MARGIN
 from obsynth.conditions.problem import Conditions, Values
 from obsynth.errors import SpecError
-from obsynth.methods.conic import lazy_cvxpy as cp
-from obsynth.methods.conic import lmi
-from obsynth.numerics.arguments import FloatArray, arguments_checked, chosen, real_number, shown
-from obsynth.proofs.vertex_inequalities import Pair, Witness
+from obsynth.numerics.arguments import arguments_checked, chosen, real_number, shown
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.vertex_inequalities import Pair, Witness, pairs_of
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_polytope import ErrorPolytope
 
@@ -75,7 +76,7 @@ def polytope(
         A given gain (or root mean square): the largest slack at that level is sought instead, which is what makes a
         proof pass.
     decay : float, optional
-        Errors decay at least like ``decay ** k`` (discrete time, below 1) or ``exp(-decay t)`` (continuous, 1/s).
+        Errors decay at least like ``decay ** k`` (discrete time) or ``exp(-decay t)`` (continuous, 1/s).
     lyapunov : {"common", "vertex"}, optional
         One P, or one at each vertex (discrete time).
     steps : float, optional
@@ -151,7 +152,9 @@ def polytope(
     )
 
 
-def witness_of(errors: ErrorPolytope, conditions: Conditions, *, steps: float | None = None) -> tuple[Witness, list[FloatArray]]:
+def witness_of(
+    errors: ErrorPolytope, conditions: Conditions, *, steps: float | None = None
+) -> tuple[Witness, list[FloatArray]]:
     """Return the Lyapunov matrices and the gains of the variables' present values."""
     found = conditions.gains()
     several = "P[2]" in found
@@ -164,33 +167,6 @@ def witness_of(errors: ErrorPolytope, conditions: Conditions, *, steps: float | 
     return Witness(P, slack, pairs, multiplier, errors.differential), gains
 
 
-def pairs_of(count: int, steps: float | None) -> list[Pair]:
-    """Return the corners of the set of weights now and at the next sample.
-
-    Parameters
-    ----------
-    count : int
-        Number of vertices.
-    steps : float or None
-        Largest change of the weight of the second of two vertices; any for ``None``.
-    """
-    units = np.eye(count)
-    if steps is None:
-        return [(now, then) for now in units for then in units]
-    if count != 2:
-        raise SpecError(
-            f"steps are for two vertices (one parameter that enters linearly), there are {count}: leave the rates out.",
-            path="steps",
-        )
-    reach = min(float(steps), 1.0)
-
-    def weights(share: float) -> FloatArray:
-        return np.array([1.0 - share, share])
-
-    corners = [(0.0, 0.0), (0.0, reach), (1.0 - reach, 1.0), (1.0, 1.0), (1.0, 1.0 - reach), (reach, 0.0)]
-    return [(weights(now), weights(then)) for now, then in dict.fromkeys(corners)]
-
-
 def _require_fitting(
     errors: ErrorPolytope, goal: str, level: Any, decay: Any, lyapunov: str, steps: Any, gain: str, gains: Any
 ) -> None:
@@ -198,9 +174,9 @@ def _require_fitting(
         real_number(level, "level", "a positive number", above=0.0)
     if goal == "decay" and decay is None:
         raise SpecError("goal 'decay' needs the rate: give decay.", path="decay")
-    if decay is not None and not (decay >= 0.0 and (errors.dt <= 0.0 or decay <= 1.0)):
+    if decay is not None and not decay >= 0.0:
         raise SpecError(
-            f"decay is {shown(decay)}: give a factor from 0 to 1 a sample in discrete time, or a rate of 0 or more.",
+            f"decay is {shown(decay)}: give a factor a sample in discrete time, or a rate, 0 or more.",
             path="decay",
         )
     if (lyapunov == "vertex" or steps is not None or errors.ball) and errors.dt <= 0.0:
@@ -208,7 +184,7 @@ def _require_fitting(
             "P at each vertex, steps and a remainder are for discrete time: take lyapunov='common' here.",
             path="lyapunov",
         )
-    if steps is not None and not 0.0 < steps:
+    if steps is not None and not steps > 0.0:
         raise SpecError(f"steps is {shown(steps)}: give a positive number.", path="steps")
     if errors.ball and goal == "power":
         raise SpecError("A remainder beside A has no bound on the mean square: take goal='gain'.", path="goal")
@@ -241,9 +217,9 @@ class _Forms:
         n, m, count, k = errors.order, errors.outputs, errors.count, errors.differential
         several, moving = lyapunov == "vertex", lyapunov == "vertex" or steps is not None
         t = cp.Variable(nonneg=True, name="t") if errors.ball else None
-        dae = k is not None and k < n
-        if dae:
-            P, G = _descriptor_variables(n, k)
+        below = 0 if k is None else n - k
+        if below:
+            P, G = _descriptor_variables(n, n - below)
             Ps, Gs = [P] * count, [G] * count
         else:
             Ps = [cp.Variable((n, n), symmetric=True, name=f"P[{i + 1}]") for i in range(count)] if several else []
@@ -257,16 +233,16 @@ class _Forms:
         else:
 
             def unknown(name: str) -> Any:
-                above = cp.Variable((k if dae else n, m), name=name)
-                return cp.vstack([above, np.zeros((n - k, m))]) if dae else above
+                above = cp.Variable((n - below, m), name=name)
+                return cp.vstack([above, np.zeros((below, m))]) if below else above
 
             Y = [unknown("Y")] * count if gain == "constant" else [unknown(f"Y[{i + 1}]") for i in range(count)]
         pairs = pairs_of(count, steps) if moving else None
-        return cls(errors, Ps, Gs, Y, moving or dae, pairs, gains, t)
+        return cls(errors, Ps, Gs, Y, moving or bool(below), pairs, gains, t)
 
     def variables(self) -> dict[str, Any]:
         """Return the variables by name."""
-        found = {}
+        found: dict[str, Any] = {}
         for matrix in (*self.P, *(self.G if self.slack else ()), *(self.Y if self.given is None else ())):
             found |= {part.name(): part for part in matrix.variables()}
         return found | ({"t": self.t} if self.t is not None else {})
@@ -337,7 +313,17 @@ class _Forms:
         return [*lower, [*across, self.t * np.eye(n)]]
 
     def _continuous(
-        self, place: str, P: Any, GA: Any, GB: Any, Z: Any, Dz: Any, goal: str, value: Any, decay: float | None, kept: Any
+        self,
+        place: str,
+        P: Any,
+        GA: Any,
+        GB: Any,
+        Z: Any,
+        Dz: Any,
+        goal: str,
+        value: Any,
+        decay: float | None,
+        kept: Any,
     ) -> dict[str, Any]:
         p = Dz.shape[1]
         found = {}
@@ -370,7 +356,9 @@ class _Forms:
         for G, Y in zip(self.G, self.Y, strict=True):
             if (G, Y) not in known:
                 matrix = np.asarray(G.value)
-                known[G, Y] = np.linalg.solve(matrix.T if self.slack else 0.5 * (matrix + matrix.T), np.asarray(Y.value))
+                known[G, Y] = np.linalg.solve(
+                    matrix.T if self.slack else 0.5 * (matrix + matrix.T), np.asarray(Y.value)
+                )
                 found[f"L[{len(known)}]"] = known[G, Y]
         return found | self._multiplier(values)
 

@@ -32,6 +32,7 @@ from obsynth.conditions import lazy_cvxpy as cp
 from obsynth.conditions.atoms import MARGIN
 from obsynth.conditions.gamma_lower_bound import proved_lower_bound
 from obsynth.conditions.problem import Conditions, Values, design_of, require_data
+from obsynth.conditions.wang_over_region import wang_over_region
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, chosen, real_number, require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix, require_no_overflow
@@ -40,6 +41,7 @@ from obsynth.numerics.injection_problem import GainProblem, normalise, null_basi
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.recovery import Transformation, linear_plant
 
 #: What a design claims above the true norm of its filter, tried in turn until the proof goes through.
@@ -48,7 +50,7 @@ CLAIMED_ABOVE_NORM = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 
 @arguments_checked
 def wang2015(
-    plant: DescriptorSystem | Transformation,
+    plant: DescriptorSystem | PolytopicSystem | Transformation,
     *,
     gamma: float | None = None,
     S: ArrayLike | None = None,
@@ -62,8 +64,9 @@ def wang2015(
 
     Parameters
     ----------
-    plant : DescriptorSystem or Transformation
-        Discrete time: ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)`` (the paper's F), ``Bd (nx, nd)`` (its D).
+    plant : DescriptorSystem, PolytopicSystem or Transformation
+        Discrete time; of a PolytopicSystem (45) stands at every vertex, ``"(45)[1]"``, ..., with one P and ``Y[1]``,
+        ...: ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)`` (the paper's F), ``Bd (nx, nd)`` (its D).
     gamma : float, optional, dimensionless
         A given level: is (45) feasible?  It is then the parameter ``gamma_squared``, for a bisection.  By default
         gamma squared is a variable, and minimised.
@@ -116,6 +119,10 @@ def wang2015(
     >>> paper.problem.status, sorted(paper.variables)
     ('optimal', ['P', 'Y', 'gamma_squared'])
     """
+    if isinstance(plant, PolytopicSystem):
+        if any(value is not None for value in (S, T, N, W)) or coordinates != "plant":
+            raise SpecError("Over a region there are gamma and margin: leave S, T, N, W and coordinates out.", path="W")
+        return wang_over_region(plant, gamma=gamma, margin=margin)
     own = linear_plant(plant).dense()
     held, _ = examine_fault_filter(own)
     require_data(held, solvers=("fault zeros",))

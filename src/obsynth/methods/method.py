@@ -27,10 +27,11 @@ from obsynth.verification.error_system import ErrorModel
 if TYPE_CHECKING:
     from obsynth.observers.nonlinear.observer import DAEObserver
     from obsynth.observers.recursive.observer import RecursiveObserver
+    from obsynth.observers.scheduled.observer import ScheduledObserver
     from obsynth.observers.window.observer import WindowObserver
 
 
-PlantKind: TypeAlias = Literal["time-invariant", "time-varying", "nonlinear"]
+PlantKind: TypeAlias = Literal["time-invariant", "time-varying", "nonlinear", "polytopic"]
 
 #: What the choice by default (`auto`) takes a method for.
 Purpose: TypeAlias = Literal[
@@ -56,7 +57,7 @@ class Synthesis:
 
     options: Mapping[str, Any]
     gains: Mapping[str, FloatArray]
-    observer: LinearObserver | RecursiveObserver | DAEObserver | WindowObserver
+    observer: LinearObserver | RecursiveObserver | DAEObserver | WindowObserver | ScheduledObserver
     certificate: Certificate
     solver: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()

@@ -12,6 +12,7 @@ from obsynth.methods.installed import OWN, REGISTRY, not_loadable
 from obsynth.methods.method import Method, PlantKind
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
@@ -19,12 +20,13 @@ from obsynth.verification.error_system import ErrorModel
 #: What a spec and `obsynth.design` call the choice between all methods that exist.
 AUTO = "auto"
 
-Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
+Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel | PolytopicSystem
 
 _PLANT_KINDS: Mapping[PlantKind, tuple[type, str]] = {
     "time-invariant": (DescriptorSystem, "a linear plant with constant matrices"),
     "time-varying": (TimeVaryingDescriptorSystem, "a linear plant whose matrices change with k"),
     "nonlinear": (DAEModel, "a nonlinear DAEModel"),
+    "polytopic": (PolytopicSystem, "a polytopic plant (PolytopicSystem)"),
 }
 
 
@@ -79,7 +81,8 @@ def kind_of(plant: Any) -> PlantKind:
         if isinstance(plant, plant_type):
             return kind
     raise SpecError(
-        f"The plant is {a_kind(plant)}: give an obsynth.DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel.",
+        f"The plant is {a_kind(plant)}: give an obsynth.DescriptorSystem, TimeVaryingDescriptorSystem, "
+        "PolytopicSystem or DAEModel.",
         path="plant",
     )
 

@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError, a_kind
-from obsynth.numerics.arguments import FloatArray, is_finite_number, shown
+from obsynth.numerics.arguments import is_finite_number, shown
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import parse_expression
-from obsynth.plants.constants import expressions_in
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.scheduling import LinearForm, Scheduling, linear_form, parameters_of
+from obsynth.plants.uncertainty import expressions_in
 
 #: Matrices that may change over a region.
 SCHEDULED_MATRICES = ("A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
@@ -36,8 +37,9 @@ class PolytopicSystem:
     Parameters
     ----------
     vertices : sequence of DescriptorSystem, optional
-        Two or more, with the same E, sample time and names of signals.  The weights of the vertices are then the
-        scheduling parameters, named ``weight1, weight2, ...``, unless ``scheduling`` says otherwise.
+        One or more (or their `as_dict`), with the same E, sample time and names of signals.  The weights of the
+        vertices are then the scheduling parameters, named ``weight1, weight2, ...``, unless ``scheduling`` says
+        otherwise.
     plant : mapping, optional
         Instead: the arguments of `DescriptorSystem`, where entries of all matrices but E may be expressions of the
         scheduling parameters, such as ``"-k / m"``.
@@ -205,10 +207,7 @@ class PolytopicSystem:
         data : mapping
             With ``vertices``, or ``plant``, and ``scheduling``.
         """
-        found = dict(data)
-        if found.get("vertices") is not None:
-            found["vertices"] = [DescriptorSystem(**vertex) for vertex in found["vertices"]]
-        return cls(**found)
+        return cls(**data)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self).from_dict, (self.as_dict(),)
@@ -224,6 +223,8 @@ def _from_vertices(
     vertices: Sequence[DescriptorSystem], scheduling: Mapping[str, Any] | None
 ) -> tuple[tuple[DescriptorSystem, ...], Scheduling]:
     """Return checked vertices, and their weights as scheduling parameters."""
+    if isinstance(vertices, Sequence):
+        vertices = [DescriptorSystem(**vertex) if isinstance(vertex, Mapping) else vertex for vertex in vertices]
     if isinstance(vertices, DescriptorSystem) or not isinstance(vertices, Sequence) or not vertices:
         raise SpecError(f"vertices are {a_kind(vertices)}: give a list of DescriptorSystem.", path="vertices")
     for place, vertex in enumerate(vertices):
@@ -355,7 +356,6 @@ def _vertex(
     base: DescriptorSystem, forms: Mapping[str, list[tuple[int, int, LinearForm]]], values: Mapping[str, float]
 ) -> DescriptorSystem:
     """Return the plant at values of the functions, every entry rounded once."""
-    from fractions import Fraction
 
     changed = {}
     for name, entries in forms.items():

@@ -12,13 +12,14 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arguments import FloatArray, freeze, is_finite_number, read_only, shown
+from obsynth.numerics.arguments import is_finite_number, shown
+from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.numerics.expressions import Expression, parse_expression
 from obsynth.proofs.intervals import range_over
 
@@ -251,9 +252,7 @@ def _require_rate(name: str, rate: Any) -> None:
 def parameters_of(given: Any) -> dict[str, dict[str, Any]]:
     """Return scheduling parameters as ``{name: {range, rate, column, unit}}``; raise `SpecError` for anything else."""
     if not isinstance(given, Mapping) or not given:
-        raise SpecError(
-            "scheduling must name one or more parameters, such as {v: {range: [1, 3]}}.", path="scheduling"
-        )
+        raise SpecError("scheduling must name one or more parameters, such as {v: {range: [1, 3]}}.", path="scheduling")
     found = {}
     for name, entry in given.items():
         path = f"scheduling.{name}"
@@ -356,9 +355,9 @@ def _bracketed(text: str) -> str:
     return text if is_call or text.replace(".", "").isdigit() else f"({text})"
 
 
-_NAMES = "sin cos tan sinh cosh tanh exp log log10 sqrt abs sign floor ceil".split()
+_NAMES = ["sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "log10", "sqrt", "abs", "sign", "floor", "ceil"]
 _TEXTS: dict[Callable[..., Any], Callable[..., str]] = {
-    **{getattr(np, name): (lambda name: lambda x: f"{name}({x})")(name) for name in _NAMES},
+    **{getattr(np, name): partial("{}({})".format, name) for name in _NAMES},
     np.arcsin: lambda x: f"asin({x})",
     np.arccos: lambda x: f"acos({x})",
     np.arctan: lambda x: f"atan({x})",

@@ -19,7 +19,7 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.expressions import Expression, step_function
-from obsynth.proofs.affine import FUNCTION_ROUNDINGS
+from obsynth.proofs.affine_numbers import FUNCTION_ROUNDINGS
 
 #: To which share of its width a range is sought.
 RANGE_SHARE = 1e-3
@@ -94,7 +94,9 @@ class Interval:
         if exponent.is_point and exponent.low.is_integer():
             return self._whole_power(int(exponent.low))
         if not self.low > 0.0:
-            raise _unbounded(f"the base of a power lies between {self.low:.4g} and {self.high:.4g}: it must be positive")
+            raise _unbounded(
+                f"the base of a power lies between {self.low:.4g} and {self.high:.4g}: it must be positive"
+            )
         if exponent.is_point:
             ends = self.low**exponent.low, self.high**exponent.low
             return Interval.outward(min(ends), max(ends), FUNCTION_ROUNDINGS)
@@ -177,7 +179,12 @@ def interval_of(expression: Expression, box: Mapping[str, tuple[float, float]]) 
 
 
 def _least(
-    expression: Expression, names: list[str], start: tuple[tuple[float, float], ...], sign: float, best: float, width: float
+    expression: Expression,
+    names: list[str],
+    start: tuple[tuple[float, float], ...],
+    sign: float,
+    best: float,
+    width: float,
 ) -> tuple[int, float, float]:
     """Return how many boxes were tried, a lower bound of ``sign`` times the expression, and a value that it takes."""
 
@@ -236,7 +243,8 @@ def _waves(function: Callable[[float], float], first_peak: float) -> Callable[[I
     """Return a function of period 2 pi that is 1 at ``first_peak`` and -1 half a turn later."""
 
     def taken(x: Interval) -> Interval:
-        found = Interval.outward(*sorted((function(x.low), function(x.high))), FUNCTION_ROUNDINGS)
+        ends = function(x.low), function(x.high)
+        found = Interval.outward(min(ends), max(ends), FUNCTION_ROUNDINGS)
         low, high = found.low, found.high
         # A little early: a peak that may lie within is taken to lie within.
         slack = FUNCTION_ROUNDINGS * np.finfo(np.float64).eps * (1.0 + max(abs(x.low), abs(x.high)))

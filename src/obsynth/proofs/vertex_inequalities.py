@@ -31,8 +31,11 @@ from typing import Protocol
 
 import numpy as np
 
-from obsynth.numerics.arguments import FloatArray
-from obsynth.proofs.balls import Ball, DefinitenessProof, Enclosed, block, prove_positive_definite, unproved
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.balls import Ball
+from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
+from obsynth.proofs.extended_balls import Enclosed, block
 
 #: Weights at the vertices now and at the next sample.
 Pair = tuple[FloatArray, FloatArray]
@@ -133,6 +136,33 @@ class VertexProof:
         return cls(bool(proofs), margin, len(proofs), "" if proofs else "there is no vertex")
 
 
+def pairs_of(count: int, steps: float | None) -> list[Pair]:
+    """Return the corners of the set of weights now and at the next sample.
+
+    Parameters
+    ----------
+    count : int
+        Number of vertices.
+    steps : float or None
+        Largest change of the weight of the second of two vertices; any for ``None``.
+    """
+    units = np.eye(count)
+    if steps is None:
+        return [(now, then) for now in units for then in units]
+    if count != 2:
+        raise SpecError(
+            f"steps are for two vertices (one parameter that enters linearly), there are {count}: leave the rates out.",
+            path="steps",
+        )
+    reach = min(float(steps), 1.0)
+
+    def weights(share: float) -> FloatArray:
+        return np.array([1.0 - share, share])
+
+    corners = [(0.0, 0.0), (0.0, reach), (1.0 - reach, 1.0), (1.0, 1.0), (1.0, 1.0 - reach), (reach, 0.0)]
+    return [(weights(now), weights(then)) for now, then in dict.fromkeys(corners)]
+
+
 def prove_gain(
     vertices: Sequence[Vertex], witness: Witness, gain: float, *, discrete: bool, ball: float = 0.0
 ) -> VertexProof:
@@ -148,7 +178,7 @@ def prove_decay(
 
 
 def prove_mean_square(vertices: Sequence[Vertex], witness: Witness, level: float, *, discrete: bool) -> VertexProof:
-    """Try to prove that the mean of ``|z|^2`` is below ``level`` squared for unit white w independent of the weights."""
+    """Try to prove that the mean of ``|z|^2`` is below ``level ** 2`` for unit white w, independent of the weights."""
     return _proved(vertices, witness, discrete=discrete, ball=0.0, power=level)
 
 
@@ -220,9 +250,7 @@ class _Forms:
     witness: Witness
     ball: float
 
-    def discrete(
-        self, gain: float | None, decay: float | None, power: float | None
-    ) -> Iterator[tuple[str, _Formula]]:
+    def discrete(self, gain: float | None, decay: float | None, power: float | None) -> Iterator[tuple[str, _Formula]]:
         """Yield place and formula of every matrix in discrete time."""
         for now, then in self.witness.pairs_of(len(self.vertices)):
             place = _place(now, then)
@@ -337,10 +365,13 @@ class _Forms:
         n = self.witness.order
         # e at the next sample is the third of four blocks, or the second of two.
         place = len(sizes) // 2
-        column = [slack.T if i == place else _zero(kind, size, n) for i, size in enumerate(sizes)]
+        column: list[Enclosed] = [slack.T if i == place else _zero(kind, size, n) for i, size in enumerate(sizes)]
         corner = kind.exact(np.eye(n)).scaled(self.witness.multiplier)
-        whole = [[*row, part] for row, part in zip(rows, column, strict=True)]
-        return block([*whole, [*(part.T for part in column), corner]])
+        whole: list[list[Enclosed]] = []
+        for row, part in zip(rows, column, strict=True):
+            whole.append([*row, part])
+        whole.append([*(part.T for part in column), corner])
+        return block(whole)
 
 
 def _mean(parts: Sequence[Enclosed], weights: FloatArray) -> Enclosed:

@@ -22,9 +22,11 @@ from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, set
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.recovery import StateRecovery
 from obsynth.report.plots.frequency import FaultGains, fault_gains
@@ -80,7 +82,9 @@ def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
         return [("bounds", f"none: {error}")]
 
 
-def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> Iterator[tuple[str, str]]:
+def plant_facts(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem | DAEModel,
+) -> Iterator[tuple[str, str]]:
     """Yield label and value of what is known about a plant."""
     if isinstance(plant, DAEModel):
         yield "equations", f"{plant.nx}: {name_list(plant.equation_names)}"
@@ -90,6 +94,10 @@ def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
         varying = [name for name, matrix in plant.matrices.items() if not matrix.is_constant]
         yield "change with k", name_list(varying) if varying else "nothing"
         yield "equations", str(plant.ne)
+    elif isinstance(plant, PolytopicSystem):
+        yield "time", f"discrete, {plant.dt:g} s between samples" if plant.is_discrete else "continuous"
+        yield "region", f"{plant.scheduling.sentence()}; {plant.count} vertices"
+        yield "directions", name_list(plant.scheduling.functions or plant.scheduling.names)
     else:
         yield "time", f"discrete, {plant.dt:g} s between samples" if plant.is_discrete else "continuous"
     for label, attribute in _NAMES_OF_SIGNALS.items():
@@ -200,7 +208,7 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
         unit = units.get(name, "")
         return missing if value is None else f"{number(value)} {'' if unit == '1' else unit}".strip()
 
-    if isinstance(observer, WindowObserver):
+    if isinstance(observer, (WindowObserver, ScheduledObserver)):
         delayed = zip(observer.fault_names, observer.fault_delays, strict=True)
         return ("fault", "delay", "delay in s"), [(name, str(k), number(k * observer.dt)) for name, k in delayed]
     if gains is None or not isinstance(plant, DescriptorSystem):

@@ -20,9 +20,11 @@ from obsynth.methods.fault_figures import FaultFigures
 from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.derived import SETTLED_TO, transient
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.signal_names import listed
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import (
@@ -176,8 +178,12 @@ def _engine(design: ObserverDesign) -> Iterator[tuple[str, str]]:
         yield "engine", f"matrix inequality{f', solved by {listed(list(names))}' if names else ''}"
 
 
-def _plant(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> str:
+def _plant(plant: DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem | DAEModel) -> str:
     counts = [(len(plant.state_names), "state"), (len(plant.output_names), "output")]
+    if isinstance(plant, PolytopicSystem):
+        time = f"{plant.dt:g} s between samples" if plant.is_discrete else "continuous in time"
+        counts += [(plant.nf, "fault"), (plant.nd, "unknown input"), (plant.count, "vertex")]
+        return f"{time}; {_counted(counts).replace('vertexs', 'vertices')}; region {plant.scheduling.sentence()}"
     if isinstance(plant, DescriptorSystem):
         time = f"{plant.dt:g} s between samples" if plant.is_discrete else "continuous in time"
         return f"{time}; {_counted([*counts, (plant.nf, 'fault'), (plant.nd, 'unknown input')])}"
@@ -219,6 +225,11 @@ def _dynamics(design: ObserverDesign) -> str:
             return f"the initial-condition response does not decay; observer of order {design.observer.order}"
         settling = f"{100.0 * SETTLED_TO:g} % settling time {number(float(f'{seconds:.2g}'))} s"
         return f"{settling}; observer of order {design.observer.order}"
+    if isinstance(design.observer, ScheduledObserver):
+        decay = design.certificate.claims.get("region_decay", math.nan)
+        return (
+            f"errors shrink to {number(100.0 * decay)} % a sample at least; observer of order {design.observer.order}"
+        )
     factor = design.certificate.claims.get("contraction", math.nan)
     order = f"observer of order {design.observer.order}"
     if not math.isfinite(factor):
@@ -254,6 +265,8 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
         yield "the model is exact; only --monitor pointwise accounts for tolerances" if some else "the model is exact"
     elif isinstance(design.observer, WindowObserver):
         yield "a model with the stated bounds"
+    elif isinstance(design.plant, PolytopicSystem):
+        yield "the model is exact, with the scheduling parameters measured and in their region"
     else:
         chosen = next(filter(None, map(_IDENTITY_NOTE.match, design.notes)), None)
         names = "" if chosen is None else " = ".join(chosen.group(1).split(" and "))

@@ -14,10 +14,12 @@ from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.sensor_timing import LONGEST_DELAY
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.signal_names import listed
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.recovery import StateRecovery
@@ -69,13 +71,13 @@ class ObserverDesign:
         Name of the design, from the spec or the caller.
     method : str
         Identifier of the method.
-    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem, PolytopicSystem or DAEModel
         The plant the observer is for (after the transformations a spec asks for).
     options : mapping
         Options as resolved, plain data.
     gains : mapping of str to FloatArray
         Gains with the paper's letters, for readers; what is shipped is `observer`.
-    observer : LinearObserver, RecursiveObserver or DAEObserver
+    observer : LinearObserver, RecursiveObserver, ScheduledObserver or DAEObserver
         What is shipped.
     certificate : Certificate
         Enough to recheck every claim without a solver.
@@ -97,10 +99,10 @@ class ObserverDesign:
 
     name: str
     method: str
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem | DAEModel
     options: Mapping[str, Any]
     gains: Mapping[str, FloatArray]
-    observer: LinearObserver | RecursiveObserver | DAEObserver | WindowObserver
+    observer: LinearObserver | RecursiveObserver | DAEObserver | WindowObserver | ScheduledObserver
     certificate: Certificate
     solver: Mapping[str, Any]
     notes: tuple[str, ...] = ()
@@ -138,6 +140,17 @@ class ObserverDesign:
             The design is a linear time-invariant one.
         """
         return self._parts(TimeVaryingDescriptorSystem, RecursiveObserver, "recursive observer")
+
+    @property
+    def scheduled(self) -> tuple[PolytopicSystem, ScheduledObserver]:
+        """Plant and observer of a design over a region.
+
+        Raises
+        ------
+        SpecError
+            The design is for one point.
+        """
+        return self._parts(PolytopicSystem, ScheduledObserver, "scheduled observer")
 
     @property
     def nonlinear(self) -> tuple[DAEModel, DAEObserver]:

@@ -25,9 +25,11 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.recovery import StateRecovery
 
@@ -45,7 +47,7 @@ GAIN_SET = FileKind(
 )
 
 #: Tags of kinds of designs; linear time-invariant ones have none.
-DESIGN_KINDS = (None, "recursive", "dae", "window")
+DESIGN_KINDS = (None, "recursive", "dae", "window", "scheduled")
 
 #: From so many numbers on, which are more than a megabyte as text, the arrays of a gain set are a binary member.
 MANY_NUMBERS = 50_000
@@ -133,6 +135,7 @@ def types_of(kind: str | None) -> tuple[Any, Any]:
         "recursive": (TimeVaryingDescriptorSystem, RecursiveObserver),
         "window": (TimeVaryingDescriptorSystem, WindowObserver),
         "dae": (DAEModel, DAEObserver),
+        "scheduled": (PolytopicSystem, ScheduledObserver),
     }
     return others.get(kind, (DescriptorSystem, LinearObserver))
 

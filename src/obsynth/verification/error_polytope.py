@@ -12,15 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import FloatArray, as_matrix, read_only, require_shape
-from obsynth.proofs.balls import Enclosed
+from obsynth.numerics.arguments import require_shape
+from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.proofs.extended_balls import Enclosed
 from obsynth.proofs.vertex_inequalities import Vertex
-
-Matrices = Sequence[FloatArray] | FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +56,13 @@ class ErrorPolytope:
     (2, 1, True)
     """
 
-    A: Sequence[FloatArray]
-    C: Matrices
-    B: Matrices | None = None
-    D: Matrices | None = None
-    Cz: Matrices | None = None
-    Dz: Matrices | None = None
+    # Each a tuple of one matrix for each vertex, whatever was given.
+    A: Any
+    C: Any
+    B: Any = None
+    D: Any = None
+    Cz: Any = None
+    Dz: Any = None
     dt: float = 1.0
     differential: int | None = None
     ball: float = 0.0
@@ -168,7 +169,7 @@ class ErrorPolytope:
         return A, B, mean(self.Cz), mean(self.Dz)
 
 
-def _each(given: Matrices, name: str, count: int) -> tuple[FloatArray, ...]:
+def _each(given: Any, name: str, count: int) -> tuple[FloatArray, ...]:
     """Return a matrix at each vertex."""
     several = not isinstance(given, np.ndarray) and len(given) and np.ndim(given[0]) == 2
     several = several or (isinstance(given, np.ndarray) and given.ndim == 3)

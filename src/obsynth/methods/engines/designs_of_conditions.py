@@ -9,12 +9,14 @@ import numpy as np
 
 from obsynth.conditions.wang import CLAIMED_ABOVE_NORM, error_norm
 from obsynth.errors import VerificationError
-from obsynth.methods.designing import design_from_gains
+from obsynth.methods.designing import design_from_gains, draft_of
 from obsynth.methods.functions import descriptor_kalman
+from obsynth.methods.verifying import verify
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.injection_problem import GainProblem
 from obsynth.observers.recursive.steady_filter import steady_state_filter
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.recovery import Transformation, linear_plant
 from obsynth.results.design import ObserverDesign
@@ -24,13 +26,14 @@ from obsynth.results.design import ObserverDesign
 SAME_GAIN = 1e-3
 
 
-def design_of(source: str, plant: DescriptorSystem | Transformation, *given: Any) -> ObserverDesign:
+def design_of(source: str, plant: Any, *given: Any) -> ObserverDesign:
     """Return the design of gains that conditions of this source have; ``given`` ends with the gains and a name."""
     makers: dict[str, Callable[..., ObserverDesign]] = {
         "wang2015": _wang2015,
         "filasova": _filasova,
         "sharepasand": _sharepasand,
         "kalman": _kalman,
+        "wang over region": _wang_over_region,
     }
     return makers[source](plant, *given)
 
@@ -51,6 +54,15 @@ def _wang2015(
         if found.report.passed:
             break
     return found
+
+
+def _wang_over_region(plant: PolytopicSystem, gains: dict[str, FloatArray], name: str) -> ObserverDesign:
+    """Return the scheduled filter of gains, with the least gain over the region that can be proved for them."""
+    from obsynth.methods.fault_estimation_filter.over_region import synthesis_of_gains
+
+    made = synthesis_of_gains(plant, [gains[f"R[{i + 1}]"] for i in range(plant.count)])
+    draft = draft_of(plant, "fault-estimation-filter", made, name=name)
+    return draft.replace(report=verify(draft))
 
 
 def _filasova(

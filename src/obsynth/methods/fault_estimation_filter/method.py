@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -22,9 +22,12 @@ from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Syn
 from obsynth.numerics.arguments import FewSamples, OpenUnitInterval, Positive, WrittenAs, checked_value, shown
 from obsynth.numerics.arrays import require_no_overflow
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.least_gain_proof import LEAST_GAIN_WITNESSES
+from obsynth.verification.over_region import DECAY_ROW, WITNESSES
 
 #: The least relative distance to the optimum at which a proof can be expected: less leaves no room for one.
 LEAST_MARGIN = 1e-2
@@ -39,9 +42,11 @@ class FaultEstimationFilter(Method):
 
     Parameters
     ----------
-    plant : DescriptorSystem or Transformation
+    plant : DescriptorSystem, PolytopicSystem or Transformation
         Discrete time (``dt > 0``), ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; feedthrough
-        ``D, Df, Dd`` and noise ``Bw, Dw`` allowed.
+        ``D, Df, Dd`` and noise ``Bw, Dw`` allowed.  Over the region of a PolytopicSystem a scheduled filter is
+        designed, with one certificate for every course of the parameters: outputs constant, faults of constant
+        directions that are seen after one sample; options gamma, gamma_margin, decay, solver and solver_options.
     gamma : float, optional, dimensionless
         Required bound on the l2 gain d -> fault error.  ``None`` ships ``1 + gamma_margin`` times the least one; where
         the plant states noise, not less than the gain of the Kalman filter that takes d as unit white noise.
@@ -136,7 +141,7 @@ class FaultEstimationFilter(Method):
     """
 
     id: ClassVar[str] = "fault-estimation-filter"
-    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant",)
+    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant", "polytopic")
     time: ClassVar[str] = "discrete"
     summary: ClassVar[str] = "fault estimates with a bounded gain from the disturbances"
     source: ClassVar[str] = "Wang, Rodrigues, Theilliol, Shen 2015"
@@ -147,9 +152,10 @@ class FaultEstimationFilter(Method):
         ),
         "gamma_bracket_low": ClaimMeaning("", "lower end of the bisection's bracket", "claimed gains"),
         "gamma_bracket_high": ClaimMeaning("", "upper end of the bisection's bracket", "claimed gains"),
+        "region_decay": ClaimMeaning("", "factor by which errors decay in a sample, over the region", DECAY_ROW),
         "state_lag": ClaimMeaning("samples", "samples by which the state estimate lags", "unbiased: state"),
     }
-    witnesses: ClassVar[frozenset[str]] = LEAST_GAIN_WITNESSES | {"P_factor", "tracking"}
+    witnesses: ClassVar[frozenset[str]] = LEAST_GAIN_WITNESSES | {"P_factor", "tracking", *WITNESSES}
     averaged: ClassVar[bool] = True
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults"})
 
@@ -189,11 +195,32 @@ class FaultEstimationFilter(Method):
         """Whether (45) is asked for with something else in it."""
         return bool(own_terms(self)) or self.region is not None or self.decay is not None
 
-    def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
+    def existence(self, plant: DescriptorSystem | PolytopicSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, decided exactly or in floating point; the list ends at the first failure."""
+        if isinstance(plant, PolytopicSystem):
+            from obsynth.analysis.existence.over_region import conditions_over_region
+
+            return conditions_over_region(plant, exactly=exactly)
         from obsynth.analysis.existence.wang2015 import fault_filter_conditions
 
         return fault_filter_conditions(plant, exactly=exactly)
+
+    def synthesise(self, plant: Any, *, progress: Callable[[str], None]) -> Synthesis:
+        """Return gains, observer and certificate, not yet verified."""
+        if isinstance(plant, PolytopicSystem):
+            from obsynth.methods.fault_estimation_filter.over_region import synthesise_over_region
+
+            return synthesise_over_region(plant, self, progress=progress)
+        return super().synthesise(plant, progress=progress)
+
+    @classmethod
+    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+        """Yield a row for each claim, from the plant and the shipped realisation alone."""
+        if isinstance(design.plant, PolytopicSystem):
+            from obsynth.methods.fault_estimation_filter.checks_over_region import checks_over_region
+
+            return checks_over_region(design)
+        return super().checks(design, printed_digits)
 
     @classmethod
     def from_gains(  # type: ignore[override]
@@ -214,6 +241,8 @@ class FaultEstimationFilter(Method):
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel | None:
         """Return the plant with its past states, which the filter follows; ``None`` without a tracking map."""
+        if isinstance(design.plant, PolytopicSystem):
+            return None  # one for each vertex: its checks have them
         (plant, observer), tracking = design.linear, design.certificate.matrices.get("tracking")
         if tracking is None:
             return None

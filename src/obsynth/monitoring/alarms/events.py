@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from obsynth.monitoring.logs.log_observer import GAP, OUT_OF_ORDER, PARTIAL, RECOVERING, REPEATED_STAMP, WARM_UP
+from obsynth.monitoring.logs.log_observer import GAP, OUT, OUT_OF_ORDER, PARTIAL, RECOVERING, REPEATED_STAMP, WARM_UP
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.observers.estimates import BAND_WIDTH
 
@@ -35,6 +35,7 @@ NO_ALARM = "No alarm"
 #: Why a row cannot alarm, by its status.
 REASONS = {
     WARM_UP: "the observer was still settling (shorten with --warm-up)",
+    OUT: "a scheduling parameter was outside its region, or had been so until recently",
     RECOVERING: "the observer was still settling after a gap (shorten with --warm-up)",
     GAP: "samples are missing, or left out as outliers",
     REPEATED_STAMP: "the time stamp repeats the one before",

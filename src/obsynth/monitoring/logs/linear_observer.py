@@ -11,6 +11,7 @@ import numpy as np
 
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.monitoring.logs.log_observer import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, LogObserver, Row
+from obsynth.monitoring.logs.scheduled_observer import ScheduledLogObserver
 from obsynth.monitoring.logs.step_observer import SteppingLogObserver
 from obsynth.monitoring.logs.window_observer import WindowLogObserver
 from obsynth.monitoring.thresholds.monitor import LinearSample
@@ -19,6 +20,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.linear.derived import noise_variances, transient
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.taken_inputs import no_inputs, over_samples, taken_inputs
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -507,4 +509,8 @@ def log_observer(
         if outliers not in (None, "none"):
             raise SpecError("outliers is for recursive and nonlinear designs: leave it out.", path="outliers")
         return WindowLogObserver(design, design.observer, warm_up=warm_up)
+    if isinstance(design.observer, ScheduledObserver):
+        if outliers not in (None, "none"):
+            raise SpecError("outliers is for recursive and nonlinear designs: leave it out.", path="outliers")
+        return ScheduledLogObserver(design, warm_up=warm_up)
     return SteppingLogObserver(design, warm_up=warm_up, outliers=outliers)

@@ -18,6 +18,9 @@ from obsynth.plants.descriptor import DescriptorSystem
 #: What a row of estimates is.
 OK, WARM_UP, PARTIAL, GAP, RECOVERING = "ok", "warm-up", "partial", "gap", "recovering"
 
+#: A row in which a scheduling parameter is outside its region, or was so recently that nothing is claimed yet.
+OUT = "out"
+
 #: Rows whose stamps do not rise: they are left out, and say nothing.
 REPEATED_STAMP, OUT_OF_ORDER = "repeated stamp", "out of order"
 
@@ -61,7 +64,7 @@ MOST_COUNTED_SAMPLES = 2.0**53
 class Row(NamedTuple):
     """A row of a log, and the estimates at it."""
 
-    status: str  # ``ok``, ``warm-up``, ``partial``, ``gap`` or ``recovering``
+    status: str  # ``ok``, ``warm-up``, ``partial``, ``gap``, ``recovering`` or ``out``
     values: FloatArray  # one for each column of the observer; deviations, NaN where nothing is known
     skipped: int = 0  # how many rows were missing before this one that nothing stands for
     evidence: Evidence | LinearSample | None = None  # what was learnt from this row, for decisions

@@ -1,0 +1,187 @@
+r"""When a fault-estimation filter exists over the whole region of a polytopic plant, with exact decoupling.
+
+Wang et al. 2015 at a plant of which A, B, Bd change, with a constant ``T E + N C = I``: if the faults keep their
+directions, ``Bf(mu) = Bf0 Delta(mu)`` with Delta nonsingular on the hull, and reach the outputs after one sample
+(``Upsilon = C T Bf0`` of full column rank), then ``L(mu) = T A(mu) Psi Upsilon^+ + R(mu) U2'``, ``Psi = T Bf0``, makes
+``(T A - L C) Psi = 0`` at every point, and what is left is a problem at the vertices.  *Proof:*
+``Psi Delta (Upsilon Delta)^+ = Psi Upsilon^+``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from obsynth.analysis.existence.condition import Condition
+from obsynth.analysis.existence.restricted_equivalent import prepare, with_sensor_faults_as_states
+from obsynth.analysis.existence.wang2015 import fault_filter_conditions
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import decide_rank
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.proofs.vertex_inequalities import prove_nonsingular
+
+#: What is kept of ``1 / |Delta^-1|`` in its proof, largest share first.
+EFFECTIVENESS_SHARES = (1.0 - 1e-9, 0.99, 0.5, 0.1)
+_SOURCE = "over the region: Wang 2015 with constant T, N"
+#: Matrices that a scheduled gain needs to be the same at all vertices.
+CONSTANT_MATRICES = ("C", "D", "Df", "Dd", "Dw")
+
+
+@dataclass(frozen=True, eq=False)
+class FilterOverRegion:
+    """The parts of a filter that do not change: with the plant's sensor faults as states.
+
+    ``T (n, n)``, ``N (n, ny)``, ``Bf0 (nx, nf)``, ``Psi (n, nf)``, ``Upsilon (ny, nf)``; ``Delta`` ``(nf, nf)`` at each
+    vertex; ``reach``: a proved bound on ``|Delta^-1|`` over the hull; ``vertices``: the plant's, with Bf0 as Bf.
+    """
+
+    T: FloatArray
+    N: FloatArray
+    Bf0: FloatArray
+    Psi: FloatArray
+    Upsilon: FloatArray
+    Delta: tuple[FloatArray, ...]
+    reach: float
+    vertices: tuple[DescriptorSystem, ...]
+    work: tuple[DescriptorSystem, ...]
+
+
+def conditions_over_region(plant: PolytopicSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
+    """Return the existence conditions over a region; the list ends at the first failure."""
+    return tuple(_in_order(plant, exactly, []))
+
+
+def examine_over_region(plant: PolytopicSystem) -> tuple[tuple[Condition, ...], FilterOverRegion | None]:
+    """Return the existence conditions over a region, and the constant parts of the filter where they hold."""
+    made: list[FilterOverRegion] = []
+    found = tuple(_in_order(plant, True, made))
+    return found, made[0] if made else None
+
+
+def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion]) -> Iterator[Condition]:
+    changing = [name for name in CONSTANT_MATRICES if not plant.is_constant(name)]
+    yield Condition(
+        "constant outputs",
+        "C, D, Df, Dd and Dw are the same at all vertices: the product L(mu) C(mu) has no vertices",
+        not changing,
+        float(len(changing)),
+        0.0,
+        _SOURCE,
+        f"changing: {', '.join(changing)}" if changing else "",
+    )
+    if changing:
+        return
+    for place, vertex in enumerate(plant.vertices):
+        for condition in fault_filter_conditions(vertex, exactly=exactly):
+            if not condition.holds:
+                where = plant.scheduling.vertex_name(place)
+                yield replace(condition, name=f"{condition.name} at {where}")
+                return
+    yield Condition(
+        "filter at every vertex",
+        "at every vertex the filter of the plant with constant matrices exists",
+        True,
+        float(plant.count),
+        float(plant.count),
+        "Wang 2015, Theorem 2",
+    )
+    directions = _directions(plant)
+    yield _direction_condition(plant, directions)
+    if directions is None:
+        return
+    Bf0, Delta = directions
+    reach = _reach(Delta)
+    yield Condition(
+        "effectiveness",
+        "Delta(mu) of Bf(mu) = Bf0 Delta(mu) is nonsingular on the whole region: a fault does not lose its effect",
+        reach is not None,
+        np.inf if reach is None else reach,
+        np.inf,
+        _SOURCE,
+        "" if reach is not None else "between the vertices some fault may have no effect",
+    )
+    if reach is None:
+        return
+    found = _constant_parts(plant, Bf0, Delta, reach)
+    late = [name for name, index in zip(plant.fault_names, found[1], strict=True) if index != 1]
+    yield Condition(
+        "one sample to the outputs",
+        "every fault reaches the outputs after one sample: C T Bf0 has full column rank",
+        not late,
+        float(len(late)),
+        0.0,
+        _SOURCE,
+        f"later: {', '.join(late)}; a filter for these over a region is not known here" if late else "",
+        signals=tuple(late),
+    )
+    if not late:
+        made.append(found[0])
+
+
+def _directions(plant: PolytopicSystem) -> tuple[FloatArray, tuple[FloatArray, ...]] | None:
+    """Return Bf0 and Delta at each vertex, or ``None`` where the faults turn."""
+    each = [np.vstack([vertex.Bf, vertex.Df]) for vertex in plant.vertices]
+    nf = plant.nf
+    if all(np.array_equal(matrix, each[0]) for matrix in each):
+        return plant.vertices[0].Bf, (np.eye(nf),) * plant.count
+    middle = sum(each[1:], start=each[0]) / len(each)
+    turning = decide_rank(np.hstack([middle, *each]), expected=nf).rank > nf
+    if turning or not decide_rank(middle, expected=nf).full:
+        return None
+    # A column that keeps its direction has one number; others are mixed by least squares.
+    Delta = tuple(_cleaned(np.asarray(np.linalg.lstsq(middle, matrix, rcond=None)[0])) for matrix in each)
+    return plant.center.Bf, Delta
+
+
+def _cleaned(matrix: FloatArray) -> FloatArray:
+    """Return a matrix without what is rounding beside its largest entry."""
+    size = float(np.max(np.abs(matrix), initial=0.0))
+    return np.where(np.abs(matrix) > len(matrix) * 16.0 * np.finfo(np.float64).eps * size, matrix, 0.0)
+
+
+def _direction_condition(plant: PolytopicSystem, found: object) -> Condition:
+    return Condition(
+        "directions of the faults",
+        "Bf(mu) = Bf0 Delta(mu): the faults keep the space of their directions over the region",
+        found is not None,
+        float(plant.nf),
+        float(plant.nf),
+        _SOURCE,
+        ""
+        if found is not None
+        else "a fault turns with the scheduling; a filter with exact decoupling for that is not known here",
+        signals=() if found is not None else plant.fault_names,
+    )
+
+
+def _reach(Delta: tuple[FloatArray, ...]) -> float | None:
+    """Return a proved bound on ``|Delta^-1|`` over the hull; ``None`` without a proof."""
+    count = len(Delta[0])
+    if not count or all(np.array_equal(matrix, np.eye(count)) for matrix in Delta):
+        return 1.0
+    least = min(float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0]) for matrix in Delta)
+    for share in EFFECTIVENESS_SHARES:
+        room = share * least
+        if room > 0.0 and prove_nonsingular(Delta, np.eye(count), room).proved:
+            return float(np.nextafter(1.0 / room, np.inf))
+    return None
+
+
+def _constant_parts(
+    plant: PolytopicSystem, Bf0: FloatArray, Delta: tuple[FloatArray, ...], reach: float
+) -> tuple[FilterOverRegion, list[int]]:
+    vertices = tuple(vertex.replace(Bf=Bf0, exact=None) for vertex in plant.vertices)
+    prepared = prepare(plant.center.replace(Bf=Bf0, exact=None), exactly=False)
+    states = prepared.scaling.states[:, None]
+    T = states * prepared.T * prepared.scaling.equations
+    N = states * prepared.N * prepared.scaling.outputs
+    work = tuple(with_sensor_faults_as_states(vertex) for vertex in vertices)
+    Psi = T @ work[0].Bf
+    Upsilon = work[0].C @ Psi
+    full = decide_rank(Upsilon, expected=plant.nf).full
+    indexes = [int(index or 0) for index in prepared.detectability.indexes]
+    indexes = indexes if full or any(index != 1 for index in indexes) else [0] * plant.nf
+    return FilterOverRegion(T, N, Bf0, Psi, Upsilon, Delta, reach, vertices, work), indexes

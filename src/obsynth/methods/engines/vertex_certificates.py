@@ -1,0 +1,337 @@
+"""Gains and Lyapunov matrices of a polytope of error systems that can be proved: first the least level, then a proof.
+
+The P of the least level proves nothing: its inequality is singular.  A second problem fixes a level a little above and
+maximises the slack; what counts is not the solver's status but whether `obsynth.proofs.vertex_inequalities` proves it.
+Both are solved in units (powers of two, exact) in which states and levels are near one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.conditions.lmi import USABLE_STATUSES
+from obsynth.conditions.polytope import polytope, witness_of
+from obsynth.errors import SolverError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.norms import state_units
+from obsynth.proofs.vertex_inequalities import VertexProof, Witness, prove_decay, prove_gain, prove_mean_square
+from obsynth.verification.error_polytope import ErrorPolytope
+
+#: How far above the least level a proof is sought, in turn; 200 of 200 random certificates passed at the first.
+ROOMS = (5e-4, 2e-3, 1e-2, 5e-2)
+#: A level in other units than these is solved again in units of its own.
+LEVEL_UNITS = (2.0**-4, 2.0**4)
+#: Solutions in units of the level found before: a level 1e-10 off is near one after the second.
+MOST_RESCALINGS = 4
+#: Steps by which a decay that is not proved is made slower, towards none.
+DECAY_SHARES = (1e-6, 1e-3, 1e-2, 1e-1, 0.3, 0.6, 0.8, 0.9, 0.95, 0.99, 0.999)
+#: Trials of a bisection for the best decay, and where it ends.
+MOST_BISECTIONS = 40
+BISECTION_SHARE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class VertexCertificate:
+    """Gains that are proved.
+
+    Parameters
+    ----------
+    gains : list of FloatArray
+        One for each vertex, or one for all.
+    witness : Witness
+        Lyapunov matrices.
+    level : float
+        What is proved: an l2 gain or root mean square.
+    least : float
+        The least level of the first problem, not proved.
+    decay : float
+        The decay that the same P proves.
+    proof : VertexProof
+        Of the level.
+    runs : tuple of mapping
+        Records of the solver.
+    """
+
+    gains: list[FloatArray]
+    witness: Witness
+    level: float
+    least: float
+    decay: float
+    proof: VertexProof
+    runs: tuple[Mapping[str, Any], ...]
+
+
+def certified(
+    errors: ErrorPolytope,
+    *,
+    goal: str = "gain",
+    level: float | None = None,
+    margin: float = 0.0,
+    decay: float | None = None,
+    lyapunov: str = "common",
+    steps: float | None = None,
+    gain: str = "scheduled",
+    gains: Sequence[FloatArray] | None = None,
+    solver: str = "CLARABEL",
+    settings: Mapping[str, Any] | None = None,
+) -> VertexCertificate:
+    """Return gains with a certificate that is proved at every vertex.
+
+    Parameters
+    ----------
+    errors : ErrorPolytope
+        The vertices; with inputs w.
+    goal : {"gain", "power"}, optional
+        What is made small.
+    level : float, optional
+        A level that is required; by default ``1 + margin`` times the least one.
+    margin : float, optional
+        Relative distance to the least level.
+    decay, lyapunov, steps, gain, gains : optional
+        As for `obsynth.conditions.polytope`.
+    solver : str, optional
+        Any of ``cvxpy.installed_solvers()`` that does semidefinite programmes.
+    settings : mapping, optional
+        Its settings.
+
+    Raises
+    ------
+    SolverError
+        No certificate was found.  That proves nothing: there may be one.
+    """
+    options: dict[str, Any] = {"goal": goal, "decay": decay, "lyapunov": lyapunov, "steps": steps, "gain": gain}
+    units = _Units.of(errors)
+    runs: list[dict[str, Any]] = []
+    prover = prove_gain if goal == "gain" else prove_mean_square
+    more = {"ball": errors.ball} if goal == "gain" else {}
+    least, z_unit = _least(units, options, gains, solver, settings, runs)
+    wanted = [level] if level is not None else [(1.0 + max(room, margin)) * least for room in ROOMS]
+    for target in dict.fromkeys(wanted):
+        moved = units.moved(z_unit)
+        found = polytope(moved, level=target / z_unit, gains=units.gains_in(gains), **options)
+        if not _solve(found, solver, settings, runs):
+            continue
+        inner, own = witness_of(moved, found, steps=steps)
+        made = [units.gain_out(L) for L in own] if gains is None else [np.asarray(L, dtype=np.float64) for L in gains]
+        witness = units.witness_out(inner, z_unit)
+        proof = prover(errors.closed(made), witness, target, discrete=errors.dt > 0.0, **more)
+        if proof.proved:
+            rate = proved_decay(errors, made, witness, wanted=decay)
+            return VertexCertificate(made, witness, target, least, rate, proof, tuple(runs))
+    if level is not None and level < least:
+        raise SolverError(
+            f"No observer with one certificate over the region was found at {level:.6g}: the least level found for "
+            f"the inequalities at the vertices is {least:.6g}. Give more than that, a smaller region, or (where the "
+            "parameter is slow) its rate."
+        )
+    raise SolverError(
+        "A gain was found, but no certificate at the vertices could be proved. That is no proof that there is none: "
+        "give a smaller region, or a larger margin.",
+    )
+
+
+def best_decay(
+    errors: ErrorPolytope,
+    *,
+    gains: Sequence[FloatArray] | None = None,
+    limit: float = 1e3,
+    slowest: float = 1.0,
+    **options: Any,
+) -> tuple[float, Witness, list[FloatArray]]:
+    """Return the fastest decay that is proved, its certificate and gains, by bisection.
+
+    Parameters
+    ----------
+    errors : ErrorPolytope
+        The vertices.
+    gains : sequence of FloatArray, optional
+        Given gains.
+    limit : float, optional
+        In continuous time the fastest rate that is tried, and the largest gain: rates alone run away.
+
+    slowest : float, optional
+        In discrete time the slowest decay (above 1: growth) that is tried.
+    **options
+        ``lyapunov``, ``steps`` and ``gain`` as for `obsynth.conditions.polytope`.
+
+    Raises
+    ------
+    SolverError
+        No decay at all is proved.
+    """
+    discrete = errors.dt > 0.0
+    units = _Units.of(errors)
+    moved = units.moved(1.0)
+    low, high = (0.0, slowest) if discrete else (0.0, limit)
+    best: tuple[float, Witness, list[FloatArray]] | None = None
+    trial = high if discrete else low
+    for _ in range(MOST_BISECTIONS):
+        found = polytope(
+            moved,
+            goal="decay",
+            decay=trial,
+            gains=units.gains_in(gains),
+            gain_limit=None if gains else limit,
+            **options,
+        )
+        good = _solve(found, "CLARABEL", None, [])
+        if good:
+            inner, own = witness_of(moved, found, steps=options.get("steps"))
+            made = [units.gain_out(L) for L in own] if gains is None else list(gains)
+            witness = units.witness_out(inner, 1.0)
+            good = prove_decay(errors.closed(made), witness, trial, discrete=discrete, ball=errors.ball).proved
+            best = (trial, witness, made) if good else best
+        if good == discrete:
+            high = trial
+        else:
+            low = trial
+        if best is None and trial in ((slowest,) if discrete else (0.0,)):
+            break
+        trial = 0.5 * (low + high)
+        if high - low <= BISECTION_SHARE * max(high, BISECTION_SHARE):
+            break
+    if best is None:
+        raise SolverError(
+            "No certificate of stability at the vertices was found. That is no proof that there is none: give a "
+            "smaller region, or (where the parameter is slow) its rate."
+        )
+    return best
+
+
+def proved_decay(
+    errors: ErrorPolytope, gains: Sequence[FloatArray], witness: Witness, *, wanted: float | None = None
+) -> float:
+    """Return a decay that a given certificate proves: ``wanted`` where it does, else near the fastest it can."""
+    vertices, discrete = errors.closed(gains), errors.dt > 0.0
+    fastest = _decay_of(errors, gains, witness)
+    tries = [] if wanted is None else [wanted]
+    if discrete:
+        tries += [fastest + share * (1.0 - fastest) for share in DECAY_SHARES]
+    else:
+        tries += [fastest * (1.0 - share) for share in DECAY_SHARES]
+    for rate in tries:
+        if prove_decay(vertices, witness, rate, discrete=discrete, ball=errors.ball).proved:
+            return rate
+    return 1.0 if discrete else 0.0
+
+
+def _decay_of(errors: ErrorPolytope, gains: Sequence[FloatArray], witness: Witness) -> float:
+    """Return the decay that one P allows, in floating point; a guess for others."""
+    P = witness.P[0]
+    if len(witness.P) > 1 or witness.G is not None or errors.ball:
+        return 0.0
+    factor = np.linalg.cholesky(P)
+    rates = []
+    for weights in np.eye(errors.count):
+        M = errors.at(weights, gains)[0]
+        turned = np.linalg.solve(factor, M.T @ factor).T
+        norm = np.linalg.norm(turned, 2) if errors.dt > 0.0 else np.linalg.eigvalsh(0.5 * (turned + turned.T))[-1]
+        rates.append(float(norm))
+    return min(max(rates), 1.0) if errors.dt > 0.0 else max(-max(rates), 0.0)
+
+
+def _least(
+    units: _Units, options: Mapping[str, Any], gains: Any, solver: str, settings: Any, runs: list[dict[str, Any]]
+) -> tuple[float, float]:
+    """Return the least level, and the unit of z in which it is near one."""
+    plain = units.moved(1.0)
+    sizes = [
+        np.linalg.norm(z) * np.linalg.norm(b) + np.linalg.norm(d)
+        for z, b, d in zip(plain.Cz, plain.B, plain.Dz, strict=True)
+    ]
+    unit = float(np.exp2(np.round(np.log2(max(sizes))))) if max(sizes) > 0.0 else 1.0
+    for _ in range(MOST_RESCALINGS):
+        moved = units.moved(unit)
+        found = polytope(moved, gains=units.gains_in(gains), **options)
+        if not _solve(found, solver, settings, runs):
+            raise SolverError(
+                "No common Lyapunov matrix was found for the vertices: the solver ended with "
+                f"{runs[-1]['status']!r}. That is no proof that there is none. Give a smaller region, a slower decay, "
+                "or (where the parameter is slow) its rate.",
+                record=runs[-1],
+            )
+        squared = found.variables["gamma_squared" if options["goal"] == "gain" else "mean_square"].value
+        least = float(np.sqrt(max(float(squared), 0.0)))
+        if least == 0.0 or LEVEL_UNITS[0] <= least <= LEVEL_UNITS[1]:
+            return max(least, float(np.finfo(np.float64).eps)) * unit, unit
+        level = least * unit
+        unit *= float(np.exp2(np.round(np.log2(least))))
+    return level, unit
+
+
+def _solve(found: Any, solver: str, settings: Mapping[str, Any] | None, runs: list[dict[str, Any]]) -> bool:
+    """Solve, and return whether there are numbers to look at."""
+    record = {"what": found.source, "solver": str(solver), "settings": dict(settings or {})}
+    try:
+        found.solve(solver, settings or {})
+    except SolverError:
+        runs.append({**record, "status": "crashed"})
+        return False
+    status = str(found.problem.status)
+    runs.append({**record, "status": status})
+    if status not in USABLE_STATUSES:
+        return False
+    return all(
+        variable.value is not None and np.isfinite(variable.value).all() for variable in found.problem.variables()
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Units:
+    """Powers of two for states and measurements, in which the vertices are balanced."""
+
+    errors: ErrorPolytope
+    states: FloatArray
+    outputs: FloatArray
+
+    @classmethod
+    def of(cls, errors: ErrorPolytope) -> _Units:
+        """Return units that suit all vertices."""
+        n, m = errors.order, errors.outputs
+        if errors.ball or (errors.differential is not None and errors.differential < n):
+            # A remainder is a norm in the given units; algebraic equations have rows of their own.
+            return cls(errors, np.ones(n), np.ones(m))
+        largest = [
+            np.max([np.abs(matrix) for matrix in each], axis=0) for each in (errors.A, errors.B, errors.C, errors.Cz)
+        ]
+        a, b, c, z = largest
+        states = state_units(a, b, np.vstack([c, z]))
+        # All states in a unit in which the inputs are near one: P is then as large as the level, whatever that is.
+        driven = float(np.linalg.norm(b / states[:, None]))
+        states = states * float(np.exp2(np.round(np.log2(driven)))) if driven > 0.0 else states
+        sizes = np.linalg.norm(c * states, axis=1)
+        outputs = np.exp2(np.round(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
+        return cls(errors, states, outputs)
+
+    def moved(self, level: float) -> ErrorPolytope:
+        """Return the vertices in these units, z in units of ``level``."""
+        s, o = self.states, self.outputs[:, None]
+        return replace(
+            self.errors,
+            A=[a * s / s[:, None] for a in self.errors.A],
+            B=[b / s[:, None] for b in self.errors.B],
+            C=[c * s / o for c in self.errors.C],
+            D=[d / o for d in self.errors.D],
+            Cz=[z * s / level for z in self.errors.Cz],
+            Dz=[z / level for z in self.errors.Dz],
+        )
+
+    def gains_in(self, gains: Sequence[FloatArray] | None) -> list[FloatArray] | None:
+        """Return gains in these units."""
+        return None if gains is None else [np.asarray(L) * self.outputs / self.states[:, None] for L in gains]
+
+    def gain_out(self, L: FloatArray) -> FloatArray:
+        """Return a gain in the units of the plant."""
+        return L * self.states[:, None] / self.outputs
+
+    def witness_out(self, witness: Witness, level: float) -> Witness:
+        """Return Lyapunov matrices in the units of the plant: P of ``e = S e'``, z in units of ``level``, becomes
+        ``level ** 2 S^-1 P' S^-1``."""
+        s = self.states / level
+        P = [matrix / s / s[:, None] for matrix in witness.P]
+        G = None if witness.G is None else [matrix / s / s[:, None] for matrix in witness.G]
+        return replace(witness, P=P, G=G, multiplier=witness.multiplier * level**2)

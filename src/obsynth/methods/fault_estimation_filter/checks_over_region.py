@@ -1,0 +1,184 @@
+"""Checks of a fault-estimation filter over a region, from the polytopic plant and the shipped realisation alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from obsynth.analysis.existence.over_region import EFFECTIVENESS_SHARES, conditions_over_region
+from obsynth.errors import PreconditionError
+from obsynth.methods.fault_estimation_filter.whole_transfer import fault_rows
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import Scaling, balance_by_least_squares
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.proofs.vertex_inequalities import VertexProof, pairs_of, prove_nonsingular
+from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.claims import claimed
+from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.over_region import (
+    DECOUPLING_ROW,
+    WITNESSES,
+    courses,
+    decay_row,
+    fault_error_vertices,
+    gain_row,
+    rows_to_forget,
+    same_scheduling_row,
+    switching_row,
+    tracking_rows,
+    witness_of_certificate,
+    worst_of_vertices,
+)
+from obsynth.verification.plant import condition_rows
+
+_IDENTITIES = {
+    "dynamics": ("unbiased: dynamics", "Az T E + By C = T A", "Wang 2015, eqs. (7), (26)"),
+    "inputs": ("unbiased: inputs", "Bu + By D = T B", "Wang 2015, eq. (23)"),
+    "state estimate": ("unbiased: state", "the state estimate equals the state when the error is zero", "(7)"),
+    "fault estimate": ("unbiased: fault", "the state has no effect on the fault estimate", "Wang 2015, eq. (25)"),
+    "residual": ("unbiased: residual", "the state has no effect on the residual", "Wang 2015, eq. (25)"),
+    "input feedthrough": ("unbiased: feedthrough", "the input has no direct effect on any estimate", "our extension"),
+}
+#: The row that says what an effectiveness that changes does to the gain.
+EFFECTIVENESS_ROW = "effectiveness of the faults"
+#: What a product of three numbers and a quotient may be rounded by.
+_ROOM = 4.0 * float(np.finfo(np.float64).eps)
+
+
+def checks_over_region(design: ObserverDesign) -> Iterator[Check]:
+    """Yield every check of a filter over a region; see `obsynth.verify`."""
+    plant, observer = design.plant, design.observer
+    fitting = isinstance(plant, PolytopicSystem) and isinstance(observer, ScheduledObserver)
+    if not (isinstance(plant, PolytopicSystem) and isinstance(observer, ScheduledObserver)):
+        yield fitting_check("a scheduled observer for a polytopic plant", fits=fitting)
+        return
+    yield from condition_rows(conditions_over_region(plant))
+    tracking = design.certificate.matrices.get("tracking")
+    fits = tracking is not None and _fits(plant, observer, tracking)
+    yield fitting_check("observer, certificate and plant have matching signals and shapes", fits=fits)
+    if tracking is None or not fits:
+        return
+    same = same_scheduling_row(plant, observer)
+    yield same
+    if not same.passed:
+        return
+    observers = [observer.at_vertex(place) for place in range(plant.count)]
+    models = [ErrorModel(vertex, own, tracking) for vertex, own in zip(plant.vertices, observers, strict=True)]
+    yield from tracking_rows(models, plant.scheduling, _IDENTITIES)
+    yield from _fault_rows(plant, observer, observers, tracking, models)
+    yield from _proved_rows(design, plant, observer, tracking)
+
+
+def _fits(plant: PolytopicSystem, observer: ScheduledObserver, tracking: FloatArray) -> bool:
+    return (
+        observer.count == plant.count
+        and observer.dt == plant.dt
+        and observer.input_names[: observer.inputs] == plant.input_names
+        and observer.output_names == plant.output_names
+        and observer.state_names == plant.state_names
+        and observer.fault_names == observer.residual_names == plant.fault_names
+        and observer.state_delays == (0,) * plant.nx
+        and observer.fault_delays == (1,) * plant.nf
+        and tracking.shape == (observer.order, plant.nx)
+    )
+
+
+def _fault_rows(
+    plant: PolytopicSystem,
+    observer: ScheduledObserver,
+    observers: list[LinearObserver],
+    tracking: FloatArray,
+    models: list[ErrorModel],
+) -> Iterator[Check]:
+    """Yield the rows on the transfer from the faults, that at the vertex where they miss most."""
+    reports = []
+    for vertex, own, errors in zip(plant.vertices, observers, models, strict=True):
+        rows = fault_rows(vertex, own, tracking, errors, _scaling(vertex), {})
+        # The residual is the effect of a fault, which is the fault itself where that does not change.
+        reports.append([row for row in rows if observer.effectiveness_is_one or row.name != "fault in the residual"])
+    for row in worst_of_vertices(reports, plant.scheduling):
+        if row.name == "fault decoupled after its delay":
+            claim = (
+                "(T A - L C) T Bf = 0 at every vertex, and Bf keeps its directions: at every point, for every course "
+                "of the parameters, a fault has no effect on the error after a sample"
+            )
+            yield Check(
+                DECOUPLING_ROW, claim, row.value, row.bound, row.margin, row.passed, row.source, row.kind, row.detail
+            )
+        else:
+            yield row
+
+
+def _scaling(plant: DescriptorSystem) -> Scaling | None:
+    try:
+        return balance_by_least_squares(plant.E, plant.A, inputs=[plant.Bf], outputs=[plant.C])
+    except PreconditionError:
+        return None
+
+
+def _proved_rows(
+    design: ObserverDesign, plant: PolytopicSystem, observer: ScheduledObserver, tracking: FloatArray
+) -> Iterator[Check]:
+    claims, matrices = design.certificate.claims, design.certificate.matrices
+    steps = plant.scheduling.step_of(plant.dt) if WITNESSES[1] in matrices else None
+    words = courses(plant.scheduling, steps)
+    witness = witness_of_certificate(matrices, None if steps is None else pairs_of(plant.count, steps))
+    undivided = [observer.before_division(place) for place in range(plant.count)]
+    vertices = fault_error_vertices(plant.vertices, undivided, tracking)
+    reach = 1.0
+    if not observer.effectiveness_is_one:
+        row, reach = _effectiveness(plant, observer)
+        yield row
+    if plant.nd:
+        gamma = claimed(claims, "gamma")
+        level = gamma / reach * (1.0 - _ROOM)
+        yield gain_row(vertices, witness, level, gamma, discrete=True, words=words)
+        if steps is None:
+            yield switching_row(vertices, level)
+        if "gamma_min" in claims:
+            yield information(
+                "least gain",
+                "the least gain that the inequalities at the vertices allow, as the solver found it",
+                claimed(claims, "gamma_min"),
+                source="certificate",
+                status="assumed",
+            )
+    decay = claimed(claims, "region_decay")
+    yield decay_row(vertices, witness, decay, discrete=True, words=words)
+    yield upper_bound_check(
+        "rows without a claim",
+        "after a row outside the region nothing is claimed until a hundredth of its error is left",
+        float(rows_to_forget(decay)),
+        float(observer.forgetting),
+        source="decay over the region",
+    )
+
+
+def _effectiveness(plant: PolytopicSystem, observer: ScheduledObserver) -> tuple[Check, float]:
+    """Return the row that the effectiveness is nonsingular over the region, and a bound on its inverse."""
+    each = list(observer.effectiveness)
+    least = min(float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0]) for matrix in each)
+    room, proof = 0.0, VertexProof(False, -np.inf, 0, "it is singular at a vertex, or next to it")
+    for share in EFFECTIVENESS_SHARES:
+        room = share * least
+        if room <= 0.0:
+            break
+        proof = prove_nonsingular(each, np.eye(plant.nf), room)
+        if proof.proved:
+            break
+    reach = float(np.nextafter(1.0 / room, np.inf)) if proof.proved else np.inf
+    row = upper_bound_check(
+        EFFECTIVENESS_ROW,
+        "the effect of the faults does not vanish over the region: the norm of its inverse is at most this",
+        reach,
+        reach if proof.proved else -np.inf,
+        source="Delta + Delta' definite at every vertex, proved in balls",
+        kind="proved",
+        detail="" if proof.proved else f"not proved: {proof.reason}",
+    )
+    return row, reach

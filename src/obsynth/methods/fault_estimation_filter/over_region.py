@@ -1,0 +1,205 @@
+"""The fault-estimation filter over the region of a polytopic plant: gains at the vertices, one certificate for all.
+
+Wang 2015, (45), with the vertices of A1 and T D: P and Y of `obsynth.conditions.polytope`, L of (60) at each vertex.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.existence.condition import require_all
+from obsynth.analysis.existence.detectability_indexes import FaultDetectability
+from obsynth.analysis.existence.over_region import FilterOverRegion, examine_over_region
+from obsynth.conditions.lmi import chosen_solver
+from obsynth.conditions.wang_over_region import errors_over_region
+from obsynth.errors import SpecError
+from obsynth.methods.engines.vertex_certificates import VertexCertificate, certified
+from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
+from obsynth.methods.fault_estimation_filter.realisation import realise_filter
+from obsynth.methods.method import Synthesis
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import decide_rank
+from obsynth.observers.scheduled.observer import ScheduledObserver
+from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.results.design import Certificate
+from obsynth.verification.error_polytope import ErrorPolytope
+from obsynth.verification.over_region import WITNESSES, rows_to_forget
+
+#: Options of the filter of a constant plant that the one over a region does not have.
+NOT_OVER_REGION = (
+    "S", "constraints", "free_residual_weight", "mean", "objective", "prove_least", "region", "residual_weight_limit",
+)  # fmt: skip
+
+
+def synthesise_over_region(
+    plant: PolytopicSystem, asked: FaultEstimationFilter, *, progress: Callable[[str], None]
+) -> Synthesis:
+    """Return a scheduled filter with its certificate; see `obsynth.fault_estimation_filter`."""
+    _require_options(asked)
+    progress("checking the existence conditions over the region")
+    conditions, parts = examine_over_region(plant)
+    require_all(conditions)
+    if parts is None:  # every condition holds, so there are parts
+        raise SpecError("The plant has no filter over its region.", path="plant")
+    W = np.asarray(np.linalg.pinv(parts.Upsilon))
+    errors, _, _ = errors_over_region(parts, W)
+    steps = plant.scheduling.step_of(plant.dt)
+    steps = steps if steps is not None and steps < 1.0 else None
+    progress("solving the inequalities at the vertices")
+    found = _certified(errors, asked, parts, steps)
+    progress("building the realisation and its certificate")
+    return _synthesis(plant, asked, parts, W, found, steps)
+
+
+def synthesis_of_gains(plant: PolytopicSystem, R: Sequence[FloatArray]) -> Synthesis:
+    """Return the filter of gains R ``(n, ny - nf)``, one for each vertex, with a certificate that is found for them."""
+    conditions, parts = examine_over_region(plant)
+    require_all(conditions)
+    if parts is None:  # every condition holds, so there are parts
+        raise SpecError("The plant has no filter over its region.", path="plant")
+    W = np.asarray(np.linalg.pinv(parts.Upsilon))
+    errors, _, _ = errors_over_region(parts, W)
+    asked = FaultEstimationFilter()
+    return _synthesis(plant, asked, parts, W, _certified(errors, asked, parts, None, gains=R, margin=0.0), None)
+
+
+def _synthesis(
+    plant: PolytopicSystem,
+    asked: FaultEstimationFilter,
+    parts: FilterOverRegion,
+    W: FloatArray,
+    found: VertexCertificate,
+    steps: float | None,
+) -> Synthesis:
+    errors, L0, U2 = errors_over_region(parts, W)
+    gains: dict[str, FloatArray] = {"T": parts.T, "N": parts.N, "W": W, "Psi": parts.Psi, "Upsilon": parts.Upsilon}
+    R = found.gains * (errors.count if len(found.gains) == 1 else 1)
+    L = [first + r @ U2.T for first, r in zip(L0, R, strict=True)]
+    gains |= {f"L[{i + 1}]": matrix for i, matrix in enumerate(L)}
+    observer, tracking = _realised(plant, parts, gains, L, found.decay)
+    matrices = {"tracking": tracking, WITNESSES[0]: np.array(found.witness.P)}
+    if found.witness.G is not None:
+        matrices[WITNESSES[1]] = np.array(found.witness.G)
+    claims = {"region_decay": found.decay, "state_lag": 0.0}
+    if plant.nd:
+        claims |= {"gamma": _above(found.level * parts.reach), "gamma_min": found.least * parts.reach}
+    return Synthesis(
+        options=asked.as_plain(),
+        gains=gains,
+        observer=observer,
+        certificate=Certificate(matrices, claims),
+        solver={"engine": "lmi", "runs": list(found.runs)},
+        notes=_notes(plant, parts, found, steps),
+    )
+
+
+def _require_options(asked: FaultEstimationFilter) -> None:
+    plain = FaultEstimationFilter()
+    given = [name for name in NOT_OVER_REGION if getattr(asked, name) is not getattr(plain, name)]
+    given += ["gamma_search"] if asked.gamma_search != plain.gamma_search else []
+    given += ["engine"] if asked.engine == "riccati" else []
+    if given:
+        raise SpecError(
+            f"A filter over a region has no {', '.join(given)}: leave it out. It takes gamma, gamma_margin, decay, "
+            "solver and solver_options.",
+            path=f"method.options.{given[0]}",
+        )
+    chosen_solver(asked.solver, asked.solver_options)
+
+
+def _certified(
+    errors: ErrorPolytope,
+    asked: FaultEstimationFilter,
+    parts: FilterOverRegion,
+    steps: float | None,
+    *,
+    gains: Sequence[FloatArray] | None = None,
+    margin: float | None = None,
+) -> VertexCertificate:
+    """Return the gains R and their certificate; without disturbances every state has one of its own."""
+    work, count = errors, errors.inputs
+    if not count:
+        # A certificate of stability alone: every error is driven, so that gains stay small.
+        n = errors.order
+        work = ErrorPolytope(
+            errors.A, list(errors.C), B=np.eye(n), D=np.zeros((errors.outputs, n)), Cz=np.eye(n), dt=errors.dt
+        )
+    lyapunov = "common" if steps is None else "vertex"
+    level = asked.gamma / parts.reach if asked.gamma is not None and count else None
+    return certified(
+        work,
+        level=level,
+        margin=asked.gamma_margin if margin is None else margin,
+        decay=None if asked.decay is None else float(np.exp(-asked.decay * errors.dt)),
+        lyapunov=lyapunov,
+        steps=steps,
+        gains=gains,
+        solver=asked.solver,
+        settings=asked.solver_options,
+    )
+
+
+def _realised(
+    plant: PolytopicSystem, parts: FilterOverRegion, gains: dict[str, FloatArray], L: list[FloatArray], decay: float
+) -> tuple[ScheduledObserver, FloatArray]:
+    """Return the observer and its tracking map: the realisation of the constant filter at each vertex."""
+    nf = plant.nf
+    once = FaultDetectability((1,) * nf, parts.Psi, parts.Upsilon, decide_rank(parts.Upsilon, expected=nf), 1.0)
+    made = []
+    for vertex, work, gain in zip(parts.vertices, parts.work, L, strict=True):
+        made.append(realise_filter(vertex, work, {**gains, "L": gain}, once))
+    first, tracking, _ = made[0]
+    read = tuple(plant.scheduling.columns.get(name, name) for name in plant.scheduling.names)
+    each: dict[str, Any] = {
+        name: np.array([getattr(observer, name) for observer, _, _ in made]) for name in ("Az", "Bu", "By")
+    }
+    observer = ScheduledObserver(
+        **each,
+        Cz=first.Cz,
+        Du=first.Du,
+        Dy=first.Dy,
+        effectiveness=np.array(parts.Delta).reshape(plant.count, nf, nf),
+        scheduling=plant.scheduling,
+        forgetting=rows_to_forget(decay),
+        dt=plant.dt,
+        input_names=(*plant.input_names, *read),
+        output_names=plant.output_names,
+        state_names=plant.state_names,
+        fault_names=plant.fault_names,
+        residual_names=plant.fault_names,
+        state_delays=first.state_delays,
+        fault_delays=first.fault_delays,
+    )
+    return observer, tracking
+
+
+def _above(value: float) -> float:
+    """Return a number that no rounding of a product and its quotient brings below ``value``."""
+    return value * (1.0 + 8.0 * float(np.finfo(np.float64).eps))
+
+
+def _notes(
+    plant: PolytopicSystem, parts: FilterOverRegion, found: VertexCertificate, steps: float | None
+) -> tuple[str, ...]:
+    notes = [
+        f"One certificate at {plant.count} vertices, for the region {plant.scheduling.sentence()}. A row with a "
+        "parameter outside or missing is out: the parameter is moved into its range, and nothing is claimed for "
+        f"{rows_to_forget(found.decay)} rows from the last such row on."
+    ]
+    rated = [
+        name for name, rate in zip(plant.scheduling.names, plant.scheduling.rates, strict=True) if rate is not None
+    ]
+    if rated and steps is None:
+        notes.append(
+            f"The rate of {', '.join(rated)} is not used: the certificate is for every course. One with a rate is "
+            "sought for one parameter that enters linearly and cannot cross its range within a sample."
+        )
+    if parts.reach != 1.0:
+        notes.append(
+            f"The effect of the faults changes with the scheduling: the estimates are divided by it, and gamma is the "
+            f"gain of that effect times a proved bound on its inverse, {parts.reach:.6g}."
+        )
+    return tuple(notes)

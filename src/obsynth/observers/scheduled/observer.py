@@ -1,0 +1,322 @@
+r"""Scheduled observers: linear ones whose matrices are means, with weights from measured parameters, of vertices.
+
+.. math::
+    z^+ = A_z(\mu_k) z + B_u(\mu_k) u + B_y(\mu_k) y, \qquad
+    [\hat x; \varphi; r] = C_z z + D_u u + D_y y, \qquad \hat f = \Delta(\mu_{k-1})^{-1} \varphi
+
+with the weights of the sample itself, but for the effectiveness :math:`\Delta` of the faults: an estimate that lags by
+a sample belongs to the parameters of the sample before.  Scheduling parameters are read after the known inputs.  A
+missing one keeps its last value, one outside its range is moved to the nearest end; from then on, until the error has
+decayed again, a row is marked: nothing is claimed there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind, shown
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.records import NAME_FIELDS, checked_sample, require_names, whole_record
+from obsynth.observers.running import Observer
+from obsynth.plants.scheduling import Scheduling
+
+#: What a step of a parameter may exceed its rate by, from rounding of logs.
+RATE_TOLERANCE = 1e-6
+#: The matrices that have a value at each vertex; of the others there is one.
+SCHEDULED = ("Az", "Bu", "By")
+FIXED = ("Cz", "Du", "Dy")
+
+
+class ScheduledState(NamedTuple):
+    """The state of a scheduled observer."""
+
+    z: FloatArray  # ``(nz,)``, before the next sample
+    weights: FloatArray  # ``(N,)``, of the sample before
+    parameters: FloatArray  # ``(p,)``, of the sample before, within their ranges; NaN before the first
+    unclaimed: int  # rows for which nothing is claimed yet
+
+
+@dataclass(frozen=True, eq=False)
+class ScheduledObserver(Observer[ScheduledState, FloatArray]):
+    """An observer in discrete time whose matrices change with measured parameters.
+
+    Parameters
+    ----------
+    Az, Bu, By : FloatArray
+        ``(N, nz, nz)``, ``(N, nz, nu)``, ``(N, nz, ny)``: at each vertex.
+    Cz, Du, Dy : FloatArray
+        ``(nx + nf + nr, nz)``, ``(nx + nf + nr, nu)``, ``(nx + nf + nr, ny)``: states, faults, residuals.
+    effectiveness : FloatArray
+        ``(N, nf, nf)``: what the fault rows are divided by, with the weights of the sample before.
+    scheduling : Scheduling
+        Parameters, ranges, and the weights that follow from them.
+    forgetting : int
+        Rows for which nothing is claimed after a parameter was missing or outside its range.
+    dt : float
+        Seconds between samples.
+    input_names : tuple of str
+        Known inputs, then scheduling parameters (the columns that hold them).
+    output_names, state_names, fault_names, residual_names : tuple of str
+        The signals of ``y`` and of the rows, in order.
+    state_delays, fault_delays : tuple of int
+        Samples by which each estimate lags.
+
+    Raises
+    ------
+    SpecError
+        Shapes do not fit together.
+    """
+
+    Az: FloatArray
+    Bu: FloatArray
+    By: FloatArray
+    Cz: FloatArray
+    Du: FloatArray
+    Dy: FloatArray
+    effectiveness: FloatArray
+    scheduling: Scheduling
+    forgetting: int
+    dt: float
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    state_names: tuple[str, ...]
+    fault_names: tuple[str, ...]
+    residual_names: tuple[str, ...]
+    state_delays: tuple[int, ...]
+    fault_delays: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        require_kind(self.scheduling, Scheduling, "scheduling", "a Scheduling")
+        for name in NAME_FIELDS:
+            require_names(getattr(self, name), name)
+        count, ny = self.scheduling.count, len(self.output_names)
+        nu = len(self.input_names) - len(self.scheduling.names)
+        nf = len(self.fault_names)
+        rows = len(self.state_names) + nf + len(self.residual_names)
+        nz = np.shape(self.Az)[-1] if np.ndim(self.Az) == 3 else -1
+        shapes = {
+            "Az": (count, nz, nz), "Bu": (count, nz, nu), "By": (count, nz, ny), "Cz": (rows, nz), "Du": (rows, nu),
+            "Dy": (rows, ny), "effectiveness": (count, nf, nf),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            matrix = np.asarray(getattr(self, name), dtype=np.float64)
+            if matrix.shape != shape or not np.isfinite(matrix).all():
+                raise SpecError(f"{name} of the observer is {matrix.shape}, finite {shape} is needed.", path=name)
+            object.__setattr__(self, name, read_only(matrix))
+        if not (is_finite_number(self.dt) and self.dt > 0.0):
+            raise SpecError(f"dt of a scheduled observer is {shown(self.dt)}: give positive seconds.", path="dt")
+        if not is_whole(self.forgetting) or self.forgetting < 0:
+            raise SpecError("forgetting must be a whole number of rows, 0 or more.", path="forgetting")
+        for names, delays in ((self.state_names, self.state_delays), (self.fault_names, self.fault_delays)):
+            if len(names) != len(delays) or not all(is_whole(delay) and delay >= 0 for delay in delays):
+                raise SpecError("The observer needs one delay >= 0, in samples, for each signal.", path="delays")
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Return the observer that its `as_dict` described.
+
+        Parameters
+        ----------
+        data : mapping
+            Every field by name; lists stand for tuples.
+        """
+        require_kind(data, Mapping, "data", "what as_dict() returns")
+        return super().from_dict({**data, "scheduling": Scheduling.from_dict(data["scheduling"])})
+
+    @property
+    def order(self) -> int:
+        """Number of observer states ``nz``."""
+        return int(self.Az.shape[1])
+
+    @property
+    def count(self) -> int:
+        """Number of vertices."""
+        return len(self.Az)
+
+    @property
+    def inputs(self) -> int:
+        """Number of known inputs, without the scheduling parameters."""
+        return len(self.input_names) - len(self.scheduling.names)
+
+    @property
+    def row_names(self) -> tuple[str, ...]:
+        """Names of the rows: ``xhat[...]``, ``fhat[...]``, ``r[...]``."""
+        kinds = (("xhat", self.state_names), ("fhat", self.fault_names), ("r", self.residual_names))
+        return tuple(f"{kind}[{name}]" for kind, names in kinds for name in names)
+
+    @property
+    def fault_rows(self) -> slice:
+        """Rows that hold the fault estimates."""
+        return slice(len(self.state_names), len(self.state_names) + len(self.fault_names))
+
+    @cached_property
+    def effectiveness_is_one(self) -> bool:
+        """Whether fault rows are divided by nothing."""
+        return not self.fault_names or not bool((self.effectiveness != np.eye(len(self.fault_names))).any())
+
+    def at_vertex(self, place: int) -> LinearObserver:
+        """Return the linear observer that it is while the weight of one vertex is one.
+
+        Parameters
+        ----------
+        place : int
+            Number of the vertex, from 0.
+        """
+        Cz, Du, Dy = (np.array(getattr(self, name)) for name in FIXED)
+        if not self.effectiveness_is_one:
+            for matrix in (Cz, Du, Dy):
+                matrix[self.fault_rows] = np.linalg.solve(self.effectiveness[place], matrix[self.fault_rows])
+        return self._linear(place, Cz, Du, Dy)
+
+    def before_division(self, place: int) -> LinearObserver:
+        """Return the linear observer at a vertex whose fault rows are not divided by the effectiveness.
+
+        Parameters
+        ----------
+        place : int
+            Number of the vertex, from 0.
+        """
+        return self._linear(place, self.Cz, self.Du, self.Dy)
+
+    def _linear(self, place: int, Cz: FloatArray, Du: FloatArray, Dy: FloatArray) -> LinearObserver:
+        return LinearObserver(
+            self.Az[place], self.Bu[place], self.By[place], Cz, Du, Dy, self.dt, self.input_names[: self.inputs],
+            self.output_names, self.state_names, self.fault_names, self.residual_names, self.state_delays,
+            self.fault_delays,
+        )  # fmt: skip
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return every field, as the constructor takes it."""
+        known = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**known, "scheduling": self.scheduling.as_dict()}
+
+    def init(self) -> ScheduledState:
+        """Return the state before the first sample."""
+        unknown = np.full(len(self.scheduling.names), np.nan)
+        return ScheduledState(np.zeros(self.order), self.scheduling.weights(self._middle), unknown, 0)
+
+    @cached_property
+    def _middle(self) -> FloatArray:
+        """The middle of the region: where parameters are taken to be before the first one is known."""
+        return 0.5 * (self.scheduling.low + self.scheduling.high)
+
+    @cached_property
+    def _steps(self) -> FloatArray:
+        """How far parameters may move within a sample; infinite where no rate is stated."""
+        rates = [np.inf if rate is None else rate for rate in self.scheduling.rates]
+        return np.array(rates) * self.dt * (1.0 + RATE_TOLERANCE)
+
+    def advance(self, state: ScheduledState, y: FloatArray, u: FloatArray) -> tuple[ScheduledState, FloatArray]:
+        """Return the next state and the row ``[xhat, fhat, r]``, without checking the sample.
+
+        Parameters
+        ----------
+        state : ScheduledState
+            Before the sample.
+        y, u : FloatArray
+            ``(ny,)`` and ``(nu + p,)``: known inputs, then parameters, of which NaN is a missing one.
+        """
+        inputs, given = u[: self.inputs], u[self.inputs :]
+        before = np.where(np.isnan(state.parameters), self._middle, state.parameters)
+        parameters = np.where(np.isnan(given), before, self.scheduling.nearest(given))
+        weights = self.scheduling.weights(parameters)
+        row = self.Cz @ state.z + self.Du @ inputs + self.Dy @ y
+        if not self.effectiveness_is_one:
+            effect = np.tensordot(state.weights, self.effectiveness, 1)
+            row[self.fault_rows] = np.linalg.solve(effect, row[self.fault_rows])
+        after = np.zeros(self.order)
+        for weight, Az, Bu, By in zip(weights, self.Az, self.Bu, self.By, strict=True):
+            if weight:
+                after += weight * (Az @ state.z + Bu @ inputs + By @ y)
+        # Before the first sample nothing moved: that comparison with NaN is false.
+        slow = not bool((np.abs(given - state.parameters) > self._steps).any())
+        inside = slow and self.scheduling.is_inside(given)
+        unclaimed = max(state.unclaimed - 1, 0) if inside else self.forgetting
+        return ScheduledState(after, weights, parameters, unclaimed), row
+
+    def step(self, state: ScheduledState, y: ArrayLike, u: ArrayLike = ()) -> tuple[ScheduledState, Estimates]:
+        """Return the state after a sample, and the estimates at it.
+
+        Parameters
+        ----------
+        state : ScheduledState
+            Before the sample; it is not changed.
+        y : array_like
+            Outputs ``(ny,)``.
+        u : array_like
+            Known inputs, then scheduling parameters, ``(nu + p,)``; NaN marks a missing parameter.
+
+        Raises
+        ------
+        SpecError
+            A sample has the wrong length, or something but a parameter is not finite.
+        """
+        require_kind(state, ScheduledState, "state", "what init() or the step before returned")
+        outputs = checked_sample(y, len(self.output_names), "y")
+        known = np.asarray(u, dtype=np.float64).ravel()
+        if known.shape != (len(self.input_names),):
+            raise SpecError(f"u needs {len(self.input_names)} numbers: {', '.join(self.input_names)}.", path="u")
+        checked_sample(known[: self.inputs], self.inputs, "u")
+        after, row = self.advance(state, outputs, known)
+        return after, self.split(row[None, :])
+
+    def run(self, y: ArrayLike, u: ArrayLike) -> Estimates:
+        """Run over a whole record.
+
+        Parameters
+        ----------
+        y : array_like
+            Outputs ``(samples, ny)``.
+        u : array_like
+            Known inputs, then scheduling parameters, ``(samples, nu + p)``.
+
+        Raises
+        ------
+        SpecError
+            Shapes do not fit, or a number is not finite.
+        """
+        rows, _ = self.record(y, u)
+        return self.split(rows)
+
+    def record(self, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Return the rows of a record ``(samples, nx + nf + nr)``, and at which of them something is claimed.
+
+        Parameters
+        ----------
+        y, u : array_like
+            As for `run`; NaN marks a missing parameter.
+        """
+        known = np.asarray(u, dtype=np.float64)
+        filled = np.where(np.isnan(known), 0.0, known) if known.ndim == 2 else known
+        if known.ndim == 2 and known.shape[1] == len(self.input_names):
+            filled[:, : self.inputs] = known[:, : self.inputs]
+        outputs, _ = whole_record(y, filled, len(self.output_names), len(self.input_names))
+        state = self.init()
+        rows, claimed = np.empty((len(outputs), len(self.Cz))), np.empty(len(outputs), dtype=bool)
+        for k, (y_k, u_k) in enumerate(zip(outputs, known, strict=True)):
+            state, rows[k] = self.advance(state, y_k, u_k)
+            claimed[k] = not state.unclaimed
+        return rows, claimed
+
+    def split(self, rows: FloatArray) -> Estimates:
+        """Return the estimates in rows ``(..., samples, nx + nf + nr)``.
+
+        Parameters
+        ----------
+        rows : FloatArray
+            What `advance` returned, one below the other.
+        """
+        states, faults = len(self.state_names), self.fault_rows
+        return Estimates(
+            read_only(rows[..., :states]), read_only(rows[..., faults]), read_only(rows[..., faults.stop :]),
+            self.state_names, self.fault_names, self.residual_names, self.state_delays, self.fault_delays,
+        )  # fmt: skip
