@@ -1,7 +1,7 @@
 """The papers' conditions as problems of cvxpy, to read, to change and to solve; and the inequalities they are made of.
 
 ``wang2015``, ``filasova_theorem1``, ``filasova_theorem2``, ``sharepasand`` and ``kalman`` return `Conditions`;
-``polytope`` returns those of an `ErrorPolytope`, whose matrices lie in the hull of vertices;
+``vertex_inequalities`` returns those of an `ErrorPolytope`, whose matrices lie in the hull of vertices;
 ``bounded_real``, ``h2``, ``region`` and ``admissible`` return constraints; ``disk``, ``half_plane`` and ``sector`` are
 regions for the eigenvalues.
 """
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from obsynth.conditions.atoms import admissible, bounded_real, h2, region
     from obsynth.conditions.filasova import filasova_theorem1, filasova_theorem2
     from obsynth.conditions.kalman_gain import kalman
-    from obsynth.conditions.polytope import polytope
+    from obsynth.conditions.polytope import vertex_inequalities
     from obsynth.conditions.problem import Conditions
     from obsynth.conditions.share_pasand import sharepasand
     from obsynth.conditions.wang import wang2015
@@ -32,10 +32,10 @@ __all__ = [
     "h2",
     "half_plane",
     "kalman",
-    "polytope",
     "region",
     "sector",
     "sharepasand",
+    "vertex_inequalities",
     "wang2015",
 ]
 
@@ -46,7 +46,7 @@ _HOMES = {
         "conditions.atoms": "admissible bounded_real h2 region",
         "conditions.filasova": "filasova_theorem1 filasova_theorem2",
         "conditions.kalman_gain": "kalman",
-        "conditions.polytope": "polytope",
+        "conditions.polytope": "vertex_inequalities",
         "conditions.problem": "Conditions",
         "conditions.share_pasand": "sharepasand",
         "conditions.wang": "wang2015",

@@ -51,7 +51,7 @@ MOST_ROOM = 1.0
 
 
 @arguments_checked
-def polytope(
+def vertex_inequalities(
     errors: ErrorPolytope,
     *,
     goal: str = "gain",
@@ -104,7 +104,7 @@ def polytope(
     Examples
     --------
     >>> scalar = ErrorPolytope([[[a]] for a in (0.5, 0.9, 1.2)], [[1.0]], B=[[1.0, 0.0]], D=[[0.0, 1.0]], dt=1.0)
-    >>> found = polytope(scalar)
+    >>> found = vertex_inequalities(scalar)
     >>> found.solve("CLARABEL", {})
     >>> round(float(found.variables["gamma_squared"].value) ** 0.5, 5)
     1.56205

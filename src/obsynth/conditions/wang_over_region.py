@@ -14,7 +14,7 @@ import numpy as np
 
 from obsynth.analysis.existence.condition import require_all
 from obsynth.analysis.existence.over_region import FilterOverRegion, examine_over_region
-from obsynth.conditions.polytope import polytope
+from obsynth.conditions.polytope import vertex_inequalities
 from obsynth.conditions.problem import Conditions, Values
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
@@ -32,7 +32,7 @@ def wang_over_region(plant: PolytopicSystem, *, gamma: float | None = None, marg
         raise SpecError("The plant has no filter over its region.", path="plant")
     W = np.asarray(np.linalg.pinv(parts.Upsilon))
     errors, L0, U2 = errors_over_region(parts, W)
-    found = polytope(errors, level=gamma, margin=margin)
+    found = vertex_inequalities(errors, level=gamma, margin=margin)
 
     def gains(values: Values) -> dict[str, FloatArray]:
         own = found._gains(values)

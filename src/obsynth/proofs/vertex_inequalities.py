@@ -209,6 +209,8 @@ def _proved(
     power: float | None = None,
 ) -> VertexProof:
     problem = witness.problem(len(vertices))
+    if not problem and any(vertex(Ball)[0].shape != (witness.order, witness.order) for vertex in vertices):
+        problem = "the certificate is of another order than the errors"
     if not problem and not all(value is None or value >= 0.0 for value in (gain, power)):
         problem = "the number that is claimed is negative"
     if not problem and not discrete:
@@ -365,13 +367,15 @@ class _Forms:
         n = self.witness.order
         # e at the next sample is the third of four blocks, or the second of two.
         place = len(sizes) // 2
-        column: list[Enclosed] = [slack.T if i == place else _zero(kind, size, n) for i, size in enumerate(sizes)]
         corner = kind.exact(np.eye(n)).scaled(self.witness.multiplier)
-        whole: list[list[Enclosed]] = []
-        for row, part in zip(rows, column, strict=True):
-            whole.append([*row, part])
-        whole.append([*(part.T for part in column), corner])
-        return block(whole)
+        last: list[Enclosed] = []
+        for row, size in zip(rows, sizes, strict=True):
+            part = slack if row is rows[place] else _zero(kind, n, size)
+            row.append(part.T)
+            last.append(part)
+        last.append(corner)
+        rows.append(last)
+        return block(rows)
 
 
 def _mean(parts: Sequence[Enclosed], weights: FloatArray) -> Enclosed:

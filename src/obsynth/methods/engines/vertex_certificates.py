@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.conditions.lmi import USABLE_STATUSES
-from obsynth.conditions.polytope import polytope, witness_of
+from obsynth.conditions.polytope import vertex_inequalities, witness_of
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import state_units
@@ -92,7 +92,7 @@ def certified(
     margin : float, optional
         Relative distance to the least level.
     decay, lyapunov, steps, gain, gains : optional
-        As for `obsynth.conditions.polytope`.
+        As for `obsynth.conditions.vertex_inequalities`.
     solver : str, optional
         Any of ``cvxpy.installed_solvers()`` that does semidefinite programmes.
     settings : mapping, optional
@@ -112,7 +112,7 @@ def certified(
     wanted = [level] if level is not None else [(1.0 + max(room, margin)) * least for room in ROOMS]
     for target in dict.fromkeys(wanted):
         moved = units.moved(z_unit)
-        found = polytope(moved, level=target / z_unit, gains=units.gains_in(gains), **options)
+        found = vertex_inequalities(moved, level=target / z_unit, gains=units.gains_in(gains), **options)
         if not _solve(found, solver, settings, runs):
             continue
         inner, own = witness_of(moved, found, steps=steps)
@@ -156,7 +156,7 @@ def best_decay(
     slowest : float, optional
         In discrete time the slowest decay (above 1: growth) that is tried.
     **options
-        ``lyapunov``, ``steps`` and ``gain`` as for `obsynth.conditions.polytope`.
+        ``lyapunov``, ``steps`` and ``gain`` as for `obsynth.conditions.vertex_inequalities`.
 
     Raises
     ------
@@ -170,7 +170,7 @@ def best_decay(
     best: tuple[float, Witness, list[FloatArray]] | None = None
     trial = high if discrete else low
     for _ in range(MOST_BISECTIONS):
-        found = polytope(
+        found = vertex_inequalities(
             moved,
             goal="decay",
             decay=trial,
@@ -246,7 +246,7 @@ def _least(
     unit = float(np.exp2(np.round(np.log2(max(sizes))))) if max(sizes) > 0.0 else 1.0
     for _ in range(MOST_RESCALINGS):
         moved = units.moved(unit)
-        found = polytope(moved, gains=units.gains_in(gains), **options)
+        found = vertex_inequalities(moved, gains=units.gains_in(gains), **options)
         if not _solve(found, solver, settings, runs):
             raise SolverError(
                 "No common Lyapunov matrix was found for the vertices: the solver ended with "

@@ -20,7 +20,7 @@ from obsynth.results.design import ObserverDesign
 class ScheduledLogObserver(LogObserver):
     """A scheduled observer on a log."""
 
-    saved: ClassVar = {"observer": "state", "last": "last", "begun": "begun"}
+    saved: ClassVar = {"observer": "state", "held": "held", "begun": "begun"}
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None) -> None:
         plant, observer = design.scheduled
@@ -29,7 +29,7 @@ class ScheduledLogObserver(LogObserver):
         self.input_names, self.output_names = observer.input_names, observer.output_names
         self.point, self.scales, self.input_delay = plant.operating_point, plant.scales, design.input_delay
         self.state = observer.init()
-        self.last, self.begun = np.zeros(len(self.input_names) + len(self.output_names)), False
+        self.held, self.begun = np.zeros(len(self.input_names) + len(self.output_names)), False
 
     def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
         """Take one row."""
@@ -43,9 +43,9 @@ class ScheduledLogObserver(LogObserver):
         if missing or not self.begun:
             self.state, self.begun = self.observer.init(), True
             self.settled_at, self.phase = self._after(time, self.warm_up), WARM_UP
-        taken = np.where(known, values, self.last)
+        taken = np.where(known, values, self.held)
         taken[parameters] = np.where(known[parameters], values[parameters], np.nan)
-        self.last = np.where(needed, taken, 0.0)
+        self.held = np.where(needed, taken, 0.0)
         with np.errstate(over="ignore", invalid="ignore"):
             self.state, row = self.observer.advance(self.state, taken[nu:], taken[:nu])
         if not whole:

@@ -1,0 +1,103 @@
+"""Polytopic plants: vertices, weights, points, and what is refused."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+
+from obsynth import DescriptorSystem, PolytopicSystem, PreconditionError, SpecError
+from obsynth.plants.scheduling import MOST_FUNCTIONS
+
+
+def _pendulum() -> PolytopicSystem:
+    return PolytopicSystem(
+        plant={"A": [[0, "1 / m"], ["-k - 0.5 * v ** 2", "-2 * v"]], "C": [[1, 0]], "Bd": [[0], ["1 + sin(v)"]]},
+        scheduling={"k": [1, 6], "v": {"range": [-1, 2], "rate": 0.1, "unit": "m/s", "column": "speed"}},
+        constants={"m": 2.0},
+    )
+
+
+def test_a_point_is_the_plant_of_its_expressions() -> None:
+    plant = _pendulum()
+    assert plant.count == 16
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        k, v = rng.uniform(1, 6), rng.uniform(-1, 2)
+        found = plant.at({"k": k, "v": v})
+        assert pytest.approx(np.array([[0, 0.5], [-k - 0.5 * v**2, -2 * v]]), abs=1e-14) == found.A
+        assert found.Bd == pytest.approx(np.array([[0], [1 + np.sin(v)]]), abs=1e-14)
+        weights = plant.weights([k, v])
+        assert weights.min() >= 0.0
+        assert weights.sum() == pytest.approx(1.0, abs=1e-15)
+
+
+def test_functions_of_parameters_are_enclosed_and_shared() -> None:
+    functions = _pendulum().scheduling
+    assert functions.functions == ("k", "v", "v ** 2", "sin(v)")
+    bounds = dict(zip(functions.functions, functions.bounds.tolist(), strict=True))
+    assert bounds["v ** 2"][0] <= 0.0
+    assert bounds["v ** 2"][1] == pytest.approx(4.0, rel=1e-3)
+    assert bounds["sin(v)"][0] == pytest.approx(-np.sin(1.0))
+    assert bounds["sin(v)"][1] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_what_is_saved_is_the_plant_again() -> None:
+    plant = _pendulum()
+    for again in (pickle.loads(pickle.dumps(plant)), PolytopicSystem(**plant.as_dict())):
+        assert repr(again) == repr(plant)
+        assert all(np.array_equal(one.A, other.A) for one, other in zip(again.vertices, plant.vertices, strict=True))
+    with pytest.raises(AttributeError, match="cannot be changed"):
+        plant.vertices = ()  # type: ignore[misc]
+
+
+def test_vertices_alone_are_scheduled_by_their_weights() -> None:
+    one = DescriptorSystem(A=[[0.5]], C=[[1]], dt=1.0)
+    plant = PolytopicSystem([one, one.replace(A=[[0.9]]), one.replace(A=[[0.1]])])
+    assert plant.at([0.2, 0.3, 0.5]).A[0, 0] == pytest.approx(0.42)
+    with pytest.raises(SpecError, match="outside the region"):
+        plant.at([0.2, 0.3, 0.1])
+    two = PolytopicSystem([one, one.replace(A=[[0.9]])], scheduling={"v": [10, 20]})
+    assert two.at({"v": 15}).A[0, 0] == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize(
+    ("plant", "scheduling", "error", "told"),
+    [
+        ({"A": [["k"]]}, {"k": [1, 1]}, SpecError, "A parameter that does not change is a constant"),
+        ({"A": [["k"]]}, {"k": [2, 1]}, SpecError, "lower one first"),
+        ({"A": [["k"]]}, {"k": [1, np.nan]}, SpecError, "both finite"),
+        ({"A": [["k"]]}, {"k": {"range": [1, 2], "rate": 0}}, SpecError, "rate of 'k' is 0"),
+        ({"A": [["k"]]}, {"k": {"range": [1, 2], "measured": False}}, SpecError, "is not measured"),
+        ({"A": [["floor(k)"]]}, {"k": [1, 3]}, PreconditionError, "floor jumps"),
+        ({"A": [["where(k < 1, 1, 2)"]]}, {"k": [0, 3]}, SpecError, "chooses between formulas"),
+        ({"A": [["1 / k"]]}, {"k": [-1, 2]}, PreconditionError, "can be zero"),
+        ({"A": [["sqrt(k)"]]}, {"k": [-1, 2]}, PreconditionError, "argument of sqrt"),
+        ({"A": [["k"]], "E": [["k"]]}, {"k": [1, 2]}, PreconditionError, "Solve the equations"),
+        ({"A": [["k + j"]]}, {"k": [1, 2]}, SpecError, "'j' is no scheduling parameter"),
+        ({"A": [[1.0]]}, {"k": [1, 2]}, SpecError, "No entry depends on 'k'"),
+        ({"A": [["k"]]}, {}, SpecError, "must name one or more"),
+        ({"C": [["k"]]}, {"k": [1, 2]}, SpecError, "no matrix A"),
+    ],
+)
+def test_what_is_no_plant_over_a_region_is_refused_by_name(
+    plant: dict[str, object], scheduling: dict[str, object], error: type[Exception], told: str
+) -> None:
+    with pytest.raises(error, match=told):
+        PolytopicSystem(plant=plant, scheduling=scheduling)
+
+
+def test_too_many_functions_are_refused() -> None:
+    names = [f"p{i}" for i in range(MOST_FUNCTIONS + 1)]
+    with pytest.raises(SpecError, match="at most 12"):
+        PolytopicSystem(plant={"A": [[" + ".join(f"{i + 1} * {name}" for i, name in enumerate(names))] ]} ,
+                        scheduling={name: [0, 1] for name in names})  # fmt: skip
+
+
+def test_vertices_must_have_one_e() -> None:
+    one = DescriptorSystem(A=[[0.5]], C=[[1]], dt=1.0)
+    with pytest.raises(PreconditionError, match="E of vertex 2"):
+        PolytopicSystem([one, one.replace(E=[[2.0]])])
+    with pytest.raises(SpecError, match="another dt"):
+        PolytopicSystem([one, one.replace(dt=2.0)])

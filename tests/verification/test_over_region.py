@@ -1,0 +1,265 @@
+"""Filters over a region: exact decoupling, proved gains, corrupted designs, files, logs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from tests.support.polytopic_plants import WANG_A, WANG_BD, WANG_BF, WANG_LEAST, record, wang
+
+import obsynth
+from obsynth import ObserverDesign, PolytopicSystem, PreconditionError, SpecError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.results.design import Certificate
+
+
+@pytest.fixture(scope="module")
+def design() -> ObserverDesign:
+    return obsynth.fault_estimation_filter(wang())
+
+
+@pytest.fixture(scope="module")
+def scaled() -> ObserverDesign:
+    """Return a design whose first fault changes its effect."""
+    return obsynth.fault_estimation_filter(wang(effectiveness=True))
+
+
+def _wild(plant: PolytopicSystem, samples: int, seed: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
+    rng = np.random.default_rng(seed)
+    parameters = rng.uniform(-1.0, 1.0, (samples, len(plant.scheduling.names)))
+    return parameters, rng.standard_normal((samples, plant.nu)), 10.0 * rng.standard_normal((samples, plant.nf))
+
+
+def test_one_vertex_is_the_filter_of_the_paper() -> None:
+    point = wang().center.replace(A=WANG_A)
+    one = obsynth.fault_estimation_filter(PolytopicSystem([point]), gamma_margin=0.01)
+    assert one.certificate.claims["gamma_min"] == pytest.approx(WANG_LEAST, rel=1e-6)
+    paper = obsynth.fault_estimation_filter(point, gamma_margin=0.01)
+    assert one.certificate.claims["gamma"] == pytest.approx(paper.certificate.claims["gamma"], rel=1e-6)
+
+
+def test_conditions_of_the_paper_at_four_vertices() -> None:
+    found = obsynth.conditions.wang2015(wang())
+    assert [name for name in found.constraints if name.startswith("(45)")] == [f"(45)[{i}]" for i in (1, 2, 3, 4)]
+    found.solve("CLARABEL", {})
+    assert float(found.variables["gamma_squared"].value) ** 0.5 == pytest.approx(1.4970662, rel=1e-6)
+    made = found.design()
+    assert made.report.passed
+    assert made.certificate.claims["gamma"] == pytest.approx(1.4970662, rel=1e-3)
+    assert found.existence.passed
+
+
+@pytest.mark.parametrize("name", ["design", "scaled"])
+def test_faults_are_decoupled_for_wild_courses(name: str, request: pytest.FixtureRequest) -> None:
+    made: ObserverDesign = request.getfixturevalue(name)
+    plant, observer = made.scheduled
+    parameters, u, f = _wild(plant, 200)
+    found = observer.run(record(plant, parameters, u, f), np.hstack([u, parameters]))
+    left = observer.forgetting
+    assert np.abs(found.faults[left + 1 :] - f[left:-1]).max() < 1e-11
+    by_step, state = [], observer.init()
+    y = record(plant, parameters, u, f)
+    for k in range(20):
+        state, estimates = observer.step(state, y[k], np.r_[u[k], parameters[k]])
+        by_step.append(estimates.faults[0])
+    assert np.array(by_step) == pytest.approx(found.faults[:20], abs=1e-14)
+
+
+@pytest.mark.parametrize("name", ["design", "scaled"])
+def test_disturbances_pass_by_less_than_is_proved(name: str, request: pytest.FixtureRequest) -> None:
+    made: ObserverDesign = request.getfixturevalue(name)
+    plant, observer = made.scheduled
+    gamma = made.certificate.claims["gamma"]
+    for seed in range(5):
+        parameters, u, f = _wild(plant, 300, seed)
+        d = np.random.default_rng(seed).standard_normal((300, 1))
+        # Worst for slow filters: steps as well as noise.
+        d = np.cumsum(d, axis=0) / 10.0 if seed % 2 else d
+        both = [observer.run(record(plant, parameters, u, f, each), np.hstack([u, parameters])).faults
+                for each in (d, 0.0 * d)]  # fmt: skip
+        assert np.linalg.norm(both[0] - both[1]) <= gamma * np.linalg.norm(d)
+    row = made.report["worst switching found"]
+    assert 0.8 * gamma / (2.0 if name == "scaled" else 1.0) < row.value <= gamma
+
+
+def test_errors_decay_as_is_proved(design: ObserverDesign) -> None:
+    plant, observer = design.scheduled
+    rate, P = design.certificate.claims["region_decay"], design.certificate.matrices["P_region"][0]
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        e = rng.standard_normal(observer.order)
+        for _ in range(30):
+            weights = (
+                rng.dirichlet(np.ones(plant.count)) if rng.random() < 0.5 else np.eye(plant.count)[rng.integers(4)]
+            )
+            after = np.tensordot(weights, observer.Az, 1) @ e
+            assert np.sqrt(after @ P @ after) <= rate * np.sqrt(e @ P @ e) * (1 + 1e-12)
+            e = after
+
+
+def test_a_rate_buys_a_smaller_gain() -> None:
+    slow = obsynth.fault_estimation_filter(wang(0.1, rate=0.02), gamma_margin=0.01)
+    assert "G_region" in slow.certificate.matrices
+    assert "at most 0.02 in a second" in slow.report["LMI"].claim
+    any_course = obsynth.fault_estimation_filter(
+        PolytopicSystem(list(slow.scheduled[0].vertices), scheduling={"a": [-1.0, 1.0]}), gamma_margin=0.01
+    )
+    assert slow.certificate.claims["gamma_min"] <= any_course.certificate.claims["gamma_min"] * (1 + 1e-6)
+    # With a faster parameter the certificate is none.
+    faster = slow.replace(plant=wang(0.1, rate=0.9))
+    assert obsynth.verify(faster)["LMI"].passed is False or obsynth.verify(faster)["scheduling"].passed is False
+
+
+def _matrices(design: ObserverDesign, **changed: Any) -> ObserverDesign:
+    known = design.certificate
+    return design.replace(certificate=Certificate({**known.matrices, **changed}, known.claims))
+
+
+def _claims(design: ObserverDesign, **changed: float) -> ObserverDesign:
+    known = design.certificate
+    return design.replace(certificate=Certificate(known.matrices, {**known.claims, **changed}))
+
+
+def _observer(design: ObserverDesign, **changed: Any) -> ObserverDesign:
+    from dataclasses import replace
+
+    return design.replace(observer=replace(design.observer, **changed))
+
+
+def _nudged(design: ObserverDesign, name: str, size: float) -> ObserverDesign:
+    matrix = np.array(getattr(design.observer, name))
+    matrix[(1,) + (0,) * (matrix.ndim - 1)] += size
+    return _observer(design, **{name: matrix})
+
+
+_P = "P_region"
+_CORRUPTIONS: dict[str, tuple[Callable[[ObserverDesign], ObserverDesign], str]] = {
+    "wider region": (lambda d: d.replace(plant=wang(0.06)), "unbiased: dynamics"),
+    "smaller number": (lambda d: _claims(d, gamma=0.9 * d.certificate.claims["gamma"]), "LMI"),
+    "no number": (lambda d: _claims(d, gamma=float("nan")), "LMI"),
+    "faster decay": (
+        lambda d: _claims(d, region_decay=0.8 * d.certificate.claims["region_decay"]),
+        "decay over the region",
+    ),
+    "growth": (lambda d: _claims(d, region_decay=1.0), "decay over the region"),
+    "asymmetric P": (lambda d: _matrices(d, P_region=d.certificate.matrices[_P] + np.eye(4, k=1) * 1e-9), "LMI"),
+    "negative P": (lambda d: _matrices(d, P_region=-d.certificate.matrices[_P]), "LMI"),
+    "P of other order": (lambda d: _matrices(d, P_region=np.eye(3)[None]), "LMI"),
+    "P that is flat": (lambda d: _matrices(d, P_region=np.eye(4)), "LMI"),
+    "a slack that is none": (lambda d: _matrices(d, G_region=np.eye(4)[None]), "LMI"),
+    "changed gain": (lambda d: _nudged(d, "Az", 1e-3), "unbiased: dynamics"),
+    "changed By": (lambda d: _nudged(d, "By", 1e-3), "unbiased: dynamics"),
+    "changed Bu": (lambda d: _nudged(d, "Bu", 1e-3), "unbiased: inputs"),
+    "changed Cz": (lambda d: _nudged(d, "Cz", 1e-3), "unbiased: state"),
+    "changed effectiveness": (lambda d: _nudged(d, "effectiveness", 1e-3), "fault estimate"),
+    "vertices in another order": (lambda d: _observer(d, Az=d.observer.Az[::-1]), "unbiased: dynamics"),  # type: ignore[union-attr]
+    "too few rows out": (lambda d: _observer(d, forgetting=3), "rows without a claim"),
+    "other tracking": (lambda d: _matrices(d, tracking=1.01 * d.certificate.matrices["tracking"]), "unbiased: state"),
+    "tracking of other shape": (lambda d: _matrices(d, tracking=np.eye(3)), "fits the plant"),
+    "a claim without a row": (lambda d: _claims(d, gamma_bracket_low=1.0), "claims covered"),
+}
+
+
+@pytest.mark.parametrize("name", _CORRUPTIONS)
+def test_corrupted_designs_are_refused(name: str, design: ObserverDesign) -> None:
+    corrupt, row = _CORRUPTIONS[name]
+    report = obsynth.verify(corrupt(design))
+    assert not report.passed
+    assert not report[row].passed
+
+
+def test_another_scheduling_of_the_observer_is_refused(design: ObserverDesign) -> None:
+    from dataclasses import replace
+
+    held = design.scheduled[1].scheduling
+    for changed in (replace(held, high=1.1 * held.high), replace(held, names=("b", "a"), functions=("b", "a"))):
+        assert not obsynth.verify(_observer(design, scheduling=changed))["scheduling"].passed
+
+
+def test_an_effect_that_is_too_small_is_refused(scaled: ObserverDesign) -> None:
+    assert scaled.report["effectiveness of the faults"].value == pytest.approx(2.0)
+    gone = wang(effectiveness=True).as_dict()
+    gone["plant"] = {**gone["plant"], "Bf": [[f"{a} * (1 + 1.1 * c)", b] for a, b in WANG_BF.tolist()]}
+    with pytest.raises(PreconditionError, match="effectiveness"):
+        obsynth.fault_estimation_filter(PolytopicSystem(**gone))
+
+
+def test_a_gain_set_is_the_design_again(tmp_path: Path, scaled: ObserverDesign) -> None:
+    again = obsynth.load(scaled.save(tmp_path / "region.gains.json"))
+    assert obsynth.verify(again).passed
+    plant, observer = again.scheduled
+    parameters, u, f = _wild(plant, 40)
+    y = record(plant, parameters, u, f)
+    one, other = (each.run(y, np.hstack([u, parameters])) for each in (observer, scaled.scheduled[1]))
+    assert np.array_equal(one.faults, other.faults)
+
+
+def _log(design: ObserverDesign, samples: int = 200) -> pd.DataFrame:
+    plant = design.scheduled[0]
+    parameters, u, f = _wild(plant, samples)
+    f[:] = 0.0
+    f[80:, 0] = 1.0
+    y = record(plant, parameters, u, f)
+    columns = {"time": np.arange(float(samples)), "u1": u[:, 0], "y1": y[:, 0], "y2": y[:, 1], "y3": y[:, 2]}
+    return pd.DataFrame(columns | dict(zip(plant.scheduling.names, parameters.T, strict=True)))
+
+
+def test_rows_outside_the_region_are_out_until_the_error_has_decayed(tmp_path: Path, design: ObserverDesign) -> None:
+    log, left = _log(design), design.scheduled[1].forgetting
+    log.loc[100, "a"], log.loc[104, "b"] = 1.5, np.nan
+    obsynth.run_on_data(design, log, out=tmp_path / "estimates.csv")
+    found = pd.read_csv(tmp_path / "estimates.csv")
+    assert (found.status[100 : 104 + left] == "out").all()
+    assert found.status[104 + left + 1] == "ok"
+    assert (found.status[: left - 1] == "warm-up").all()
+    assert found.status[99] == "ok"
+    good = found.status == "ok"
+    truth = np.r_[np.zeros(81), np.ones(119)]
+    assert np.abs(found["fhat[f1]"] - truth)[good].max() < 1e-6
+
+
+def test_a_run_that_was_stopped_goes_on(tmp_path: Path, design: ObserverDesign) -> None:
+    log = _log(design)
+    log.loc[60, "a"], log.loc[150, "y2"] = -3.0, np.nan
+    obsynth.run_on_data(design, log, out=tmp_path / "whole.csv")
+    obsynth.run_on_data(design, log[:63], out=tmp_path / "first.csv", state=tmp_path / "state.json")
+    obsynth.run_on_data(design, log[63:], out=tmp_path / "second.csv", state=tmp_path / "state.json")
+    whole = pd.read_csv(tmp_path / "whole.csv")
+    parts = pd.concat([pd.read_csv(tmp_path / name) for name in ("first.csv", "second.csv")], ignore_index=True)
+    pd.testing.assert_frame_equal(whole, parts, check_exact=True)
+    assert whole.status[150] == "gap"
+    assert np.isnan(whole["fhat[f1]"][150])
+    assert whole.status[151] == "recovering"
+
+
+def test_what_a_filter_over_a_region_does_not_have_is_refused_by_name() -> None:
+    with pytest.raises(SpecError, match="has no mean"):
+        obsynth.fault_estimation_filter(wang(), mean=3)
+    with pytest.raises(SpecError, match="has no engine"):
+        obsynth.fault_estimation_filter(wang(), engine="riccati")
+    for method in ("pd_observer", "functional_filter"):
+        with pytest.raises(PreconditionError, match="kind of plant"):
+            getattr(obsynth, method)(wang())
+    turning = wang().as_dict()
+    turning["plant"] = {**turning["plant"], "Bf": [["0.1 + a", 0], [1, 1], ["-0.1 + b", 1], [-1, 0]]}
+    with pytest.raises(PreconditionError, match="a fault turns with the scheduling"):
+        obsynth.fault_estimation_filter(PolytopicSystem(**turning))
+    sensor = wang().as_dict()
+    sensor["plant"] = {**sensor["plant"], "C": [[0, "1 + 0.1 * a", 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
+    with pytest.raises(PreconditionError, match="constant outputs"):
+        obsynth.fault_estimation_filter(PolytopicSystem(**sensor))
+
+
+def test_units_do_not_matter() -> None:
+    plain = obsynth.fault_estimation_filter(wang(), gamma_margin=0.02).certificate.claims["gamma_min"]
+    s = np.array([1e3, 1e-4, 1.0, 1e2])
+    vertices = [v.replace(
+        A=s[:, None] * v.A / s, C=v.C / s, B=s[:, None] * v.B, Bf=s[:, None] * v.Bf, Bd=1e-5 * s[:, None] * WANG_BD
+    ) for v in wang().vertices]  # fmt: skip
+    moved = obsynth.fault_estimation_filter(PolytopicSystem(vertices), gamma_margin=0.02)
+    assert moved.report.passed
+    assert moved.certificate.claims["gamma_min"] < 1e-3 * plain
