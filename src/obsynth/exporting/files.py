@@ -12,6 +12,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.exporting.alarms import Alarms, linear_alarms
+from obsynth.exporting.c_scheduled import scheduled_c_texts
 from obsynth.exporting.c_source import c_identifier, comment, header_text, quoted, source_text, with_c_linkage
 from obsynth.exporting.c_window import is_window, require_fixed, window_c_texts
 from obsynth.exporting.dae_c_source import dae_alarms, threshold_header, threshold_source, write_dae_c
@@ -27,6 +28,7 @@ from obsynth.numerics.arguments import arguments_checked
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.outliers import Outliers
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.sensor_timing import require_plain
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.results.gain_set_writing import gain_set_digest
@@ -186,6 +188,8 @@ def export(
     numbers = precision or "double"
     if outliers is not None and not isinstance(design.observer, DAEObserver):
         raise SpecError("outliers is for nonlinear designs: exports of others use every sample.", path="outliers")
+    if isinstance(design.observer, ScheduledObserver):
+        return _write_scheduled(design, target, suffix, monitor, thresholds, warm_up, sample_time, numbers)
     learned = None if monitor is None else _learned_by(monitor, design)
     if suffix == ".fmu":
         from obsynth.exporting.fmu.archive import write_fmu
@@ -228,6 +232,32 @@ def export(
         )
     bound = None if monitor is None or learned is not None else _bound_of(monitor, found)
     return _write_c(found, target, linear_alarms(found, thresholds, warm_up, learned), bound)
+
+
+def _write_scheduled(
+    design: ObserverDesign,
+    target: Path,
+    suffix: str,
+    monitor: Monitor | None,
+    thresholds: Mapping[str, float] | None,
+    warm_up: float | None,
+    sample_time: float | None,
+    numbers: str,
+) -> tuple[Path, ...]:
+    """Write a scheduled observer as C."""
+    if suffix != ".c":
+        raise SpecError(
+            f"A design over a region is exported as C (.c): {suffix} files hold constant matrices.", path="path"
+        )
+    if monitor is not None or thresholds or warm_up is not None or sample_time is not None or numbers != "double":
+        raise SpecError(
+            "C of a design over a region holds the observer alone, in doubles: leave monitor, thresholds, warm-up, "
+            "sample time and precision out.",
+            path="monitor",
+        )
+    prefix, header = c_identifier(target.stem), target.with_suffix(".h")
+    source, declared = (in_precision(text, numbers) for text in scheduled_c_texts(design, prefix, header.name))
+    return write_together({target: source, header: with_c_linkage(declared, prefix)})
 
 
 def _write_window(found: Realisation, target: Path, numbers: str) -> tuple[Path, ...]:

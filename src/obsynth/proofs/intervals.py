@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import SMALLEST
 from obsynth.numerics.expressions import Expression, step_function
 from obsynth.proofs.affine_numbers import FUNCTION_ROUNDINGS
 
@@ -129,24 +130,25 @@ class Range:
 def range_over(expression: Expression, box: Mapping[str, tuple[float, float]]) -> Range:
     """Return the range of an expression over a box of its names.
 
-    Parameters
-    ----------
-    expression : Expression
-        Of names that are all in the box.
-    box : mapping of str to pair of float
-        Least and largest value.
+        Parameters
+        ----------
+        expression : Expression
+            Of names that are all in the box.
+        box : mapping of str to pair of float
+            Least and largest value.
 
-    Raises
-    ------
-    PreconditionError
-        The expression is not finite on the box, or jumps there.
+        Raises
+        ------
+        PreconditionError
+            The expression is not finite on the box, or jumps there.
 
-    Examples
-    --------
-    >>> from obsynth.numerics.expressions import parse_expression
-    >>> found = range_over(parse_expression("x**2 - x"), {"x": (0.0, 1.0)})
-    >>> -0.2505 < found.low <= -0.25, 0.0 <= found.high < 1e-3
-    (True, True)
+        Examples
+        --------
+        >>> from obsynth.numerics.arrays import SMALLEST
+    from obsynth.numerics.expressions import parse_expression
+        >>> found = range_over(parse_expression("x**2 - x"), {"x": (0.0, 1.0)})
+        >>> -0.2505 < found.low <= -0.25, 0.0 <= found.high < 1e-3
+        (True, True)
     """
     names = sorted(expression.names)
     start = tuple((float(box[name][0]), float(box[name][1])) for name in names)
@@ -201,10 +203,11 @@ def _least(
     count, done = 0, math.inf
     while waiting and count < MOST_BOXES:
         low, part = waiting[0]
-        if best - low <= RANGE_SHARE * max(width, best - low if not width else 0.0) or not names:
+        if best - low <= RANGE_SHARE * width or not names:
             break
         heapq.heappop(waiting)
-        place = max(range(len(part)), key=lambda i: (part[i][1] - part[i][0]) / max(start[i][1] - start[i][0], 1e-300))
+        shares = [(b - a) / max(last - first, SMALLEST) for (a, b), (first, last) in zip(part, start, strict=True)]
+        place = shares.index(max(shares))
         middle = 0.5 * (part[place][0] + part[place][1])
         if not part[place][0] < middle < part[place][1]:
             done = min(done, low)

@@ -12,6 +12,7 @@ import numpy as np
 from obsynth.analysis.existence.restricted_equivalent import with_sensor_faults_as_states
 from obsynth.analysis.existence.wang2015 import fault_filter_conditions
 from obsynth.errors import PreconditionError
+from obsynth.methods.fault_estimation_filter.checks_over_region import checks_over_region
 from obsynth.methods.fault_estimation_filter.printed_gains import gain_rows, gains_fit, printed_allowances
 from obsynth.methods.fault_estimation_filter.whole_transfer import Equations, fault_rows
 from obsynth.numerics.arrays import FloatArray
@@ -21,6 +22,7 @@ from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear.derived import modes_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claim_rows, claimed, fault_noise_rows, recovery_rows
@@ -50,6 +52,9 @@ _FILTER_IDENTITIES = {
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
     """Yield every check of ``design``; see `obsynth.verify`."""
+    if isinstance(design.plant, PolytopicSystem):
+        yield from checks_over_region(design)
+        return
     (plant, observer), claims = design.linear, design.certificate.claims
     yield from plant_information(plant)
     yield from condition_rows(fault_filter_conditions(plant))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -23,7 +23,6 @@ from obsynth.numerics.arguments import FewSamples, OpenUnitInterval, Positive, W
 from obsynth.numerics.arrays import require_no_overflow
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
-from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.least_gain_proof import LEAST_GAIN_WITNESSES
@@ -204,23 +203,6 @@ class FaultEstimationFilter(Method):
         from obsynth.analysis.existence.wang2015 import fault_filter_conditions
 
         return fault_filter_conditions(plant, exactly=exactly)
-
-    def synthesise(self, plant: Any, *, progress: Callable[[str], None]) -> Synthesis:
-        """Return gains, observer and certificate, not yet verified."""
-        if isinstance(plant, PolytopicSystem):
-            from obsynth.methods.fault_estimation_filter.over_region import synthesise_over_region
-
-            return synthesise_over_region(plant, self, progress=progress)
-        return super().synthesise(plant, progress=progress)
-
-    @classmethod
-    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-        """Yield a row for each claim, from the plant and the shipped realisation alone."""
-        if isinstance(design.plant, PolytopicSystem):
-            from obsynth.methods.fault_estimation_filter.checks_over_region import checks_over_region
-
-            return checks_over_region(design)
-        return super().checks(design, printed_digits)
 
     @classmethod
     def from_gains(  # type: ignore[override]

@@ -37,6 +37,7 @@ from obsynth.methods.fault_estimation_filter.convex_problem import (
     with_weight_limit,
 )
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
+from obsynth.methods.fault_estimation_filter.over_region import synthesise_over_region
 from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
 from obsynth.methods.fault_estimation_filter.search import NOMINAL_GAIN, FoundGains, found_within
 from obsynth.methods.fault_estimation_filter.small_gains import PrintedInequality
@@ -45,6 +46,7 @@ from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.linear.derived import averaged
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.design import Certificate
 
 if TYPE_CHECKING:
@@ -54,8 +56,12 @@ if TYPE_CHECKING:
 FIRST_TRIES = 4
 
 
-def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progress: Callable[[str], None]) -> Synthesis:
+def synthesise(
+    plant: DescriptorSystem | PolytopicSystem, asked: FaultEstimationFilter, *, progress: Callable[[str], None]
+) -> Synthesis:
     """Design the filter; see `obsynth.fault_estimation_filter` for the options, results and errors."""
+    if isinstance(plant, PolytopicSystem):
+        return synthesise_over_region(plant, asked, progress=progress)
     solver = chosen_solver(asked.solver, asked.solver_options)
     if asked.own_inequality:
         from obsynth.methods.engines.own_terms import filter_by_inequality

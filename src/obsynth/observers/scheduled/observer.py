@@ -202,15 +202,15 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
     def init(self) -> ScheduledState:
         """Return the state before the first sample."""
         unknown = np.full(len(self.scheduling.names), np.nan)
-        return ScheduledState(np.zeros(self.order), self.scheduling.weights(self._middle), unknown, 0)
+        return ScheduledState(np.zeros(self.order), self.scheduling.weights(self.middle), unknown, 0)
 
     @cached_property
-    def _middle(self) -> FloatArray:
+    def middle(self) -> FloatArray:
         """The middle of the region: where parameters are taken to be before the first one is known."""
         return 0.5 * (self.scheduling.low + self.scheduling.high)
 
     @cached_property
-    def _steps(self) -> FloatArray:
+    def steps(self) -> FloatArray:
         """How far parameters may move within a sample; infinite where no rate is stated."""
         rates = [np.inf if rate is None else rate for rate in self.scheduling.rates]
         return np.array(rates) * self.dt * (1.0 + RATE_TOLERANCE)
@@ -226,7 +226,7 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
             ``(ny,)`` and ``(nu + p,)``: known inputs, then parameters, of which NaN is a missing one.
         """
         inputs, given = u[: self.inputs], u[self.inputs :]
-        before = np.where(np.isnan(state.parameters), self._middle, state.parameters)
+        before = np.where(np.isnan(state.parameters), self.middle, state.parameters)
         parameters = np.where(np.isnan(given), before, self.scheduling.nearest(given))
         weights = self.scheduling.weights(parameters)
         row = self.Cz @ state.z + self.Du @ inputs + self.Dy @ y
@@ -238,7 +238,7 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
             if weight:
                 after += weight * (Az @ state.z + Bu @ inputs + By @ y)
         # Before the first sample nothing moved: that comparison with NaN is false.
-        slow = not bool((np.abs(given - state.parameters) > self._steps).any())
+        slow = not bool((np.abs(given - state.parameters) > self.steps).any())
         inside = slow and self.scheduling.is_inside(given)
         unclaimed = max(state.unclaimed - 1, 0) if inside else self.forgetting
         return ScheduledState(after, weights, parameters, unclaimed), row

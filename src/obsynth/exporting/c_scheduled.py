@@ -1,0 +1,171 @@
+"""Scheduled observers as C99: means of the matrices at the vertices, no allocation, rows outside the region marked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.exporting.c_source import comment, filled_template, included, quoted, signal_comments, table_lines
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.expressions import Expression, step_function
+from obsynth.observers.scheduled.observer import ScheduledObserver
+from obsynth.plants.scheduling import WEIGHT_TOLERANCE
+from obsynth.results.design import ObserverDesign, unverified_mark
+from obsynth.results.gain_set_writing import gain_set_digest
+
+#: A known input counts as it last was where it is missing.
+_TAKEN = "if (isfinite(u[i])) {\n            s->u[i] = u[i];\n        } else {\n            whole = 0;\n        }"
+#: What a row is called.
+STATUSES = ("OK", "WARM_UP", "GAP", "RECOVERING", "OUT")
+
+
+def scheduled_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple[str, str]:
+    """Return source and header."""
+    plant, observer = design.scheduled
+    nu, ny, digest = observer.inputs, len(observer.output_names), gain_set_digest(design)
+    upper, mark = prefix.upper(), unverified_mark(design.report)
+    signature = f"int {prefix}_step({', '.join(_arguments(observer, prefix))})"
+    listed = ", ".join(f"{upper}_{name}" for name in STATUSES)
+    declared = [
+        comment(f"Observer {quoted(design.name)} by {quoted(design.method)}, written by obsynth."),
+        *([comment(quoted(mark))] if mark else []),
+        f"#ifndef {upper}_H",
+        f"#define {upper}_H",
+        "",
+        comment("sha256 of the gain set"),
+        f'#define {upper}_SHA256 "{digest}"',
+        comment("seconds between samples; rows without a claim after one outside the region"),
+        f"#define {upper}_DT {observer.dt!r}",
+        f"#define {upper}_FORGETTING {observer.forgetting}",
+        "",
+        comment(f"The region: {quoted(plant.scheduling.sentence())}"),
+        comment("OUT: a parameter is missing, outside its range or too fast, or was so until recently: no claim."),
+        f"enum {{ {listed} }};",
+        "",
+        "typedef struct {",
+        comment("Read this after a step: what the row was."),
+        "    int status;",
+        comment("Everything else is the observer's own."),
+        f"    REAL z[{max(observer.order, 1)}], weights[{observer.count}];",
+        f"    REAL parameters[{len(observer.scheduling.names)}];",
+        f"    REAL u[{max(nu, 1)}], y[{ny}];",
+        "    int unclaimed, settling, is_started, is_recovering;",
+        f"}} {prefix}_state;",
+        "",
+        comment("Start at rest."),
+        f"void {prefix}_reset({prefix}_state *state);",
+        "",
+        comment("Take one sample: deviations from the operating point, parameters as they are; NaN: missing."),
+        comment("Returns 0 for rows that are OK, else 1. Missing signals count as they last were; estimates are NaN."),
+        *signal_comments("u", "", observer.input_names, None, plant.units),
+        *signal_comments("y", "", observer.output_names, None, plant.units),
+        *signal_comments("states", "xhat", observer.state_names, None, plant.units, observer.state_delays),
+        *signal_comments("faults", "fhat", observer.fault_names, None, plant.units, observer.fault_delays),
+        *signal_comments("residuals", "r", observer.residual_names, None, plant.units),
+        f"{signature};",
+        "",
+        "#endif",
+    ]
+    return _source(design, prefix, header, digest), "\n".join(declared) + "\n"
+
+
+def _source(design: ObserverDesign, prefix: str, header: str, digest: str) -> str:
+    _, observer = design.scheduled
+    held, nu, ny = observer.scheduling, observer.inputs, len(observer.output_names)
+    nx, nf, nr = len(observer.state_names), len(observer.fault_names), len(observer.residual_names)
+    sizes = {
+        "Z_COUNT": observer.order, "Y_COUNT": ny, "VERTICES": observer.count,
+        "PARAMETERS": len(held.names), "FUNCTIONS": max(len(held.functions), 1), "STATE_COUNT": nx,
+        "ROW_COUNT": nx + nf + nr, "FORGETTING": observer.forgetting,
+    }  # fmt: skip
+    # These stand in conditions of the preprocessor too.
+    defined = {
+        "U_COUNT": nu, "FAULT_COUNT": nf, "DIVIDES": int(not observer.effectiveness_is_one),
+        "GIVES_WEIGHTS": int(held.gives_weights),
+    }  # fmt: skip
+    first = observer.init()
+    tables: dict[str, FloatArray] = {
+        "first_weights": first.weights[None], "lowest": held.low[None], "highest": held.high[None],
+        "middle": observer.middle[None], "steps": np.minimum(observer.steps, np.finfo(np.float64).max)[None],
+        "Cz": observer.Cz, "Dy": observer.Dy, "Az": np.vstack(list(observer.Az)), "By": np.vstack(list(observer.By)),
+    }  # fmt: skip
+    if nu:
+        tables |= {"Du": observer.Du, "Bu": np.vstack(list(observer.Bu))}
+    if defined["DIVIDES"]:
+        tables["effectiveness"] = np.vstack(list(observer.effectiveness))
+    if not held.gives_weights:
+        tables["bounds"] = held.bounds
+    shown = [("states", nx, 0), ("faults", nf, nx), ("residuals", nr, nx + nf)]
+    copied = " ".join(
+        f"for (i = 0; i < {n}; i++) {{ {to}[i] = rows[{at} + i]; }}" for to, n, at in shown if n
+    )  # fmt: skip
+    taken = "for (i = 0; i < U_COUNT; i++) {\n        TAKE_ONE\n    }".replace("TAKE_ONE", _TAKEN) if nu else ""
+    values = "\n        ".join(f"a[{i}] = {_c_text(text, held.names)};" for i, text in enumerate(held.expressions))
+    body = filled_template(
+        "scheduled_step.c",
+        prefix,
+        {
+            "STEP_ARGUMENTS": ", ".join(_arguments(observer, prefix)).replace("*state", "*s", 1),
+            "COPY_U": taken,
+            "COPY_ROWS": copied,
+            "FUNCTION_VALUES": values,
+        },
+    )
+    lines = [
+        comment(f"sha256 of the gain set: {digest}"),
+        f'#include "{included(header)}"',
+        "",
+        "#include <math.h>",
+        "",
+        "enum { " + ", ".join(f"{name} = {size}" for name, size in sizes.items()) + " };",
+        *(f"#define {name} {size}" for name, size in defined.items()),
+        f"#define WEIGHT_TOLERANCE {WEIGHT_TOLERANCE!r}",
+        "#define LENGTH(n) ((n) > 0 ? (n) : 1)",
+        "",
+        *(line for name, table in tables.items() for line in table_lines(name, table)),
+        "",
+        body,
+    ]
+    return "\n".join(lines)
+
+
+def _arguments(observer: ScheduledObserver, prefix: str) -> list[str]:
+    counts = {
+        "states": len(observer.state_names), "faults": len(observer.fault_names),
+        "residuals": len(observer.residual_names),
+    }  # fmt: skip
+    return [
+        f"{prefix}_state *state",
+        f"const REAL u[{len(observer.input_names)}]",
+        f"const REAL y[{len(observer.output_names)}]",
+        *(f"REAL {name}[{n}]" for name, n in counts.items() if n),
+    ]
+
+
+#: Operations in C, by numpy's.
+_C_FUNCTIONS: dict[Callable[..., Any], str] = {
+    np.negative: "(-{})", np.add: "({} + {})", np.subtract: "({} - {})", np.multiply: "({} * {})",
+    np.divide: "({} / {})", np.power: "pow({}, {})", np.minimum: "fmin({}, {})", np.maximum: "fmax({}, {})",
+    np.sin: "sin({})", np.cos: "cos({})", np.tan: "tan({})", np.arcsin: "asin({})", np.arccos: "acos({})",
+    np.arctan: "atan({})", np.sinh: "sinh({})", np.cosh: "cosh({})", np.tanh: "tanh({})", np.exp: "exp({})",
+    np.log: "log({})", np.log10: "log10({})", np.sqrt: "sqrt({})", np.abs: "fabs({})", np.floor: "floor({})",
+    np.ceil: "ceil({})",
+}  # fmt: skip
+
+
+def _c_text(expression: Expression, names: tuple[str, ...]) -> str:
+    """Return an expression of parameters ``p[i]`` as C; those with jumps are no functions of a region."""
+
+    def operation(given: Callable[..., Any]) -> Callable[..., Any]:
+        if given not in _C_FUNCTIONS or given is step_function:
+            raise SpecError(f"{expression.text!r} has a function that is not written as C.", path="scheduling")
+        return lambda *parts: _C_FUNCTIONS[given].format(*(_operand(part) for part in parts))
+
+    return _operand(expression.translated({name: f"p[{i}]" for i, name in enumerate(names)}, operation))
+
+
+def _operand(part: Any) -> str:
+    return part if isinstance(part, str) else repr(float(part))

@@ -1,0 +1,219 @@
+void PREFIX_reset(PREFIX_state *s)
+{
+    int i;
+    for (i = 0; i < LENGTH(Z_COUNT); i++) {
+        s->z[i] = 0;
+    }
+    for (i = 0; i < VERTICES; i++) {
+        s->weights[i] = first_weights[0][i];
+    }
+    for (i = 0; i < PARAMETERS; i++) {
+        s->parameters[i] = NAN;
+    }
+    for (i = 0; i < LENGTH(U_COUNT); i++) {
+        s->u[i] = 0;
+    }
+    for (i = 0; i < Y_COUNT; i++) {
+        s->y[i] = 0;
+    }
+    s->status = UPPER_WARM_UP;
+    s->unclaimed = 0;
+    s->settling = 0;
+    s->is_started = 0;
+    s->is_recovering = 0;
+}
+
+/* The sum over the vertices of weights times matrices times a vector is added to `sum`. */
+static void scheduled(const REAL *tables, int rows, int columns, const REAL *weights, const REAL *x, REAL *sum)
+{
+    int v, i, j;
+    for (v = 0; v < VERTICES; v++) {
+        const REAL *matrix = tables + (long)v * rows * columns;
+        if (weights[v] == 0) {
+            continue;
+        }
+        for (i = 0; i < rows; i++) {
+            REAL row = 0;
+            for (j = 0; j < columns; j++) {
+                row += matrix[i * columns + j] * x[j];
+            }
+            sum[i] += weights[v] * row;
+        }
+    }
+}
+
+static void fixed(const REAL *matrix, int rows, int columns, const REAL *x, REAL *sum)
+{
+    int i, j;
+    for (i = 0; i < rows; i++) {
+        for (j = 0; j < columns; j++) {
+            sum[i] += matrix[i * columns + j] * x[j];
+        }
+    }
+}
+
+#if DIVIDES
+/* Solve (sum of weights times effectiveness) x = x, by elimination with pivots. */
+static void divided(const REAL *weights, REAL *x)
+{
+    REAL a[FAULT_COUNT][FAULT_COUNT];
+    int i, j, k, v;
+    for (i = 0; i < FAULT_COUNT; i++) {
+        for (j = 0; j < FAULT_COUNT; j++) {
+            a[i][j] = 0;
+            for (v = 0; v < VERTICES; v++) {
+                a[i][j] += weights[v] * effectiveness[v * FAULT_COUNT + i][j];
+            }
+        }
+    }
+    for (k = 0; k < FAULT_COUNT; k++) {
+        int best = k;
+        REAL kept;
+        for (i = k + 1; i < FAULT_COUNT; i++) {
+            best = fabs(a[i][k]) > fabs(a[best][k]) ? i : best;
+        }
+        for (j = 0; j < FAULT_COUNT; j++) {
+            kept = a[k][j];
+            a[k][j] = a[best][j];
+            a[best][j] = kept;
+        }
+        kept = x[k];
+        x[k] = x[best];
+        x[best] = kept;
+        for (i = k + 1; i < FAULT_COUNT; i++) {
+            const REAL factor = a[i][k] / a[k][k];
+            for (j = k; j < FAULT_COUNT; j++) {
+                a[i][j] -= factor * a[k][j];
+            }
+            x[i] -= factor * x[k];
+        }
+    }
+    for (k = FAULT_COUNT - 1; k >= 0; k--) {
+        for (j = k + 1; j < FAULT_COUNT; j++) {
+            x[k] -= a[k][j] * x[j];
+        }
+        x[k] /= a[k][k];
+    }
+}
+#endif
+
+/* Weights of the vertices at parameters; returns whether all of them are there, in their ranges and not too fast. */
+static int scheduling_of(PREFIX_state *s, const REAL *given, REAL *weights)
+{
+    REAL p[PARAMETERS];
+    int i, inside = 1;
+    for (i = 0; i < PARAMETERS; i++) {
+        const REAL before = s->parameters[i];
+        if (!(given[i] >= lowest[0][i] && given[i] <= highest[0][i]) || fabs(given[i] - before) > steps[0][i]) {
+            inside = 0;
+        }
+        if (isnan(given[i])) {
+            p[i] = isnan(before) ? middle[0][i] : before;
+        } else {
+            p[i] = given[i] < lowest[0][i] ? lowest[0][i] : given[i] > highest[0][i] ? highest[0][i] : given[i];
+        }
+        s->parameters[i] = p[i];
+    }
+#if GIVES_WEIGHTS
+    {
+        REAL total = 0, asked = 0;
+        for (i = 0; i < PARAMETERS; i++) {
+            total += p[i];
+            asked += given[i];
+        }
+        inside = inside && fabs(asked - 1) <= WEIGHT_TOLERANCE;
+        for (i = 0; i < PARAMETERS; i++) {
+            weights[i] = total > 0 ? p[i] / total : (REAL)1 / PARAMETERS;
+        }
+    }
+#else
+    {
+        int count = 1, j;
+        REAL a[FUNCTIONS];
+        FUNCTION_VALUES
+        weights[0] = 1;
+        for (i = 0; i < FUNCTIONS; i++) {
+            REAL share = (a[i] - bounds[i][0]) / (bounds[i][1] - bounds[i][0]);
+            share = share < 0 ? 0 : share > 1 ? 1 : share;
+            for (j = count - 1; j >= 0; j--) {
+                const REAL weight = weights[j];
+                weights[2 * j] = weight * (1 - share);
+                weights[2 * j + 1] = weight * share;
+            }
+            count *= 2;
+        }
+    }
+#endif
+    return inside;
+}
+
+int PREFIX_step(STEP_ARGUMENTS)
+{
+    REAL weights[VERTICES], next[LENGTH(Z_COUNT)] = {0}, rows[ROW_COUNT] = {0};
+    int i, whole = 1;
+    COPY_U
+    for (i = 0; i < Y_COUNT; i++) {
+        if (isfinite(y[i])) {
+            s->y[i] = y[i];
+        } else {
+            whole = 0;
+        }
+    }
+    if (!s->is_started && !whole) {
+        for (i = 0; i < ROW_COUNT; i++) {
+            rows[i] = NAN;
+        }
+        COPY_ROWS
+        s->status = UPPER_GAP;
+        return 1;
+    }
+    if (!s->is_started) {
+        s->is_started = 1;
+        s->settling = FORGETTING;
+    }
+    {
+        const int inside = scheduling_of(s, u + U_COUNT, weights);
+        s->unclaimed = inside ? (s->unclaimed > 0 ? s->unclaimed - 1 : 0) : FORGETTING;
+    }
+    fixed(&Cz[0][0], ROW_COUNT, Z_COUNT, s->z, rows);
+    fixed(&Dy[0][0], ROW_COUNT, Y_COUNT, s->y, rows);
+#if U_COUNT
+    fixed(&Du[0][0], ROW_COUNT, U_COUNT, s->u, rows);
+#endif
+#if DIVIDES
+    divided(s->weights, rows + STATE_COUNT);
+#endif
+    scheduled(&Az[0][0], Z_COUNT, Z_COUNT, weights, s->z, next);
+    scheduled(&By[0][0], Z_COUNT, Y_COUNT, weights, s->y, next);
+#if U_COUNT
+    scheduled(&Bu[0][0], Z_COUNT, U_COUNT, weights, s->u, next);
+#endif
+    for (i = 0; i < Z_COUNT; i++) {
+        s->z[i] = next[i];
+    }
+    for (i = 0; i < VERTICES; i++) {
+        s->weights[i] = weights[i];
+    }
+    if (!whole) {
+        for (i = 0; i < ROW_COUNT; i++) {
+            rows[i] = NAN;
+        }
+        if (s->settling <= FORGETTING) {
+            s->is_recovering = s->is_recovering || s->settling <= 0;
+            s->settling = FORGETTING;
+        }
+    }
+    COPY_ROWS
+    if (!whole) {
+        s->status = UPPER_GAP;
+    } else if (s->unclaimed > 0) {
+        s->status = UPPER_OUT;
+    } else if (s->settling > 0) {
+        s->status = s->is_recovering ? UPPER_RECOVERING : UPPER_WARM_UP;
+    } else {
+        s->is_recovering = 1;
+        s->status = UPPER_OK;
+    }
+    s->settling = s->settling > 0 ? s->settling - 1 : 0;
+    return s->status == UPPER_OK ? 0 : 1;
+}
