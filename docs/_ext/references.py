@@ -207,6 +207,9 @@ def command_reference() -> str:
 _COMMANDS = """\
 Made from the parser. `design` alone is short for `obsynth design`. Rare arguments are settings: `--set NAME=VALUE` and
 `--NAME VALUE` mean the same. Every command has `--help`, and prints its result as JSON with `--json`.
+
+Completion in a shell (`pip install '.[completion]'`): `obsynth --print-completion bash > ~/.local/share/bash-completion/completions/obsynth`,
+and the like for zsh and tcsh.
 """
 
 

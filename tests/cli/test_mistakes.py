@@ -91,3 +91,13 @@ def test_help_begins_with_the_example(name: str, capsys: pytest.CaptureFixture[s
         main([name, "--help"])
     text = capsys.readouterr().out
     assert text.index("example:") < text.index("options:")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
+def test_a_shell_completes_commands_and_options(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(["--print-completion", shell])
+    assert left.value.code == 0
+    script = capsys.readouterr().out
+    assert "prove-alarm" in script
+    assert shell == "tcsh" or "--false-alarms" in script

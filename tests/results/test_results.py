@@ -15,7 +15,6 @@ import pytest
 import obsynth
 from obsynth import Certificate, DescriptorSystem, ObserverDesign, SpecError, VerificationReport, load, verify
 from obsynth.files.outputs import write_atomically
-from obsynth.results import gain_set_writing as design_module
 from obsynth.results.checks import Check
 from obsynth.results.gain_set_writing import design_as_dict, digest_of, plain, restored
 

@@ -53,7 +53,7 @@ from obsynth.cli.arguments import (
 )
 from obsynth.cli.examples import EXAMPLES
 from obsynth.cli.output import print_error, print_json
-from obsynth.cli.parser import Parser, meant
+from obsynth.cli.parser import SHELLS, Parser, PrintCompletion, meant
 from obsynth.errors import ObsynthError, SolverError, SpecError
 from obsynth.files.inputs import protected_inputs
 from obsynth.version import __version__
@@ -675,6 +675,12 @@ VERBS = {
 def obsynth_parser(asked: Collection[str] | None = None) -> argparse.ArgumentParser:
     """Return the parser of ``obsynth`` with all its verbs; only those among the words ``asked`` have arguments."""
     parser = _parser("obsynth", "Design, verify and run observers and fault-estimation filters for descriptor systems.")
+    parser.add_argument(
+        "--print-completion",
+        action=PrintCompletion,
+        choices=SHELLS,
+        help="print a script that completes commands and options in this shell, and exit",
+    )
     verbs: Any = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, verb in VERBS.items():
         own = verbs.add_parser(
@@ -771,7 +777,8 @@ def told_error(error: Exception) -> ObsynthError | None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``obsynth``."""
     words = sys.argv[1:] if arguments is None else arguments
-    return _run(obsynth_parser(words), words)
+    # A script of completion knows the arguments of all commands; otherwise only those of one are made.
+    return _run(obsynth_parser(None if "--print-completion" in words else words), words)
 
 
 def design_command(arguments: Sequence[str] | None = None) -> int:

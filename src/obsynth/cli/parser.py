@@ -39,6 +39,21 @@ class Parser(argparse.ArgumentParser):
         super().error(message)
 
 
+#: Shells whose completion scripts shtab writes.
+SHELLS = ("bash", "zsh", "tcsh")
+
+
+class PrintCompletion(argparse.Action):
+    """Print a script that completes commands and options in a shell, and end the program."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        """Print the script of the whole program, whatever words stand beside the option."""
+        from obsynth.numerics.libraries import imported
+
+        print(imported("shtab", extra="completion", what="Completion").complete(parser, shell=values))
+        parser.exit()
+
+
 def meant(word: str, known: Sequence[str]) -> str:
     """Return a question that begins with a blank, "Did you mean ...?", or nothing."""
     close = get_close_matches(word, known, n=MOST_SUGGESTIONS, cutoff=ALIKE)

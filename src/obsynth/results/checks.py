@@ -11,10 +11,6 @@ CheckKind = Literal["proved", "equality", "computed", "condition", "information"
 
 Status = Literal["proved", "recomputed", "estimated", "assumed"]
 
-#: What a status was called in files of earlier versions.
-_FORMER_STATUSES: dict[str, Status] = {"computed twice": "recomputed"}
-
-
 #: The check without which observer and plant say nothing of one another.
 FITS = "fits the plant"
 
@@ -69,8 +65,6 @@ class Check:
     unclear: bool = False
 
     def __post_init__(self) -> None:
-        if self.status in _FORMER_STATUSES:
-            object.__setattr__(self, "status", _FORMER_STATUSES[self.status])
         if not self.status:
             object.__setattr__(self, "status", "proved" if self.kind == "proved" else "recomputed")
         if self.interval is not None:

@@ -105,8 +105,7 @@ class FunctionalFilter(Method):
     plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant",)
     time: ClassVar[str] = "both"
     summary: ClassVar[str] = (
-        "estimates of the faults that are asked for alone, decoupled from every unknown input; the whole state need "
-        "not be observable"
+        "estimates of the selected faults alone, decoupled from unknown inputs; the state need not be observable"
     )
     source: ClassVar[str] = "ours, after Frisk, Nyberg 2001 and Anderson, Moore 1979"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
