@@ -37,7 +37,7 @@ from obsynth.monitoring.thresholds.learned import LearnedThresholds, as_learned,
 from obsynth.monitoring.thresholds.parameter_scores import parameter_walk
 from obsynth.observers.linear.derived import checked_warm_up
 from obsynth.observers.nonlinear.c_code import observer_code, observer_struct
-from obsynth.observers.running import as_run
+from obsynth.observers.running import as_run, rule_of_outliers
 from obsynth.plants.dae import DAEModel
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import gain_set_digest
@@ -101,7 +101,7 @@ def dae_c_texts(
     ``outliers`` says anything of them, as `run` leaves them out."""
     model, observer = design.nonlinear
     digest = gain_set_digest(design)
-    observer = as_run(observer, outliers)
+    observer = as_run(observer, outliers, stated=rule_of_outliers(design))
     if alarms.learned is not None:
         observer = as_learned(observer, alarms.learned)
     inner = f"{prefix}_observer" if observer.timing.is_plain else f"{prefix}_observer_memory"

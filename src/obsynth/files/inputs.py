@@ -7,6 +7,9 @@ import math
 import os
 import re
 import stat
+import struct
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -17,6 +20,25 @@ from obsynth.errors import SpecError, a_kind
 
 #: Documents larger than this are refused: matrices of that size belong in matrix files.
 MOST_DOCUMENT_CHARACTERS = 32_000_000
+
+#: What the readers of numpy and scipy raise for a damaged file.
+READING_ERRORS = (
+    OSError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    EOFError,
+    OverflowError,
+    RuntimeError,
+    MemoryError,
+    AttributeError,
+    NotImplementedError,
+    UserWarning,
+    struct.error,
+    zlib.error,
+    zipfile.BadZipFile,
+)
 
 #: Half of a pair of characters, which no file can hold; as JSON writes it, and as text.
 _HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")

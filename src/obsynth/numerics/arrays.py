@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
+from obsynth.numerics.quantities import require_plain
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
@@ -111,6 +112,7 @@ def require_no_overflow(numbers: Any, what: str, path: str) -> None:
 def as_given(value: Any, name: str, ragged: str) -> NDArray[Any]:
     """Return what a caller gives as an array of any kind; raise `SpecError` where it is none, ``ragged`` where its rows
     have different lengths."""
+    value = require_plain(value, name)
     try:
         return np.asarray(unmasked(value))
     except ValueError:

@@ -260,10 +260,17 @@ def changed(observer: Robust, **options: Any) -> Robust:
     return found
 
 
-def as_run(observer: Robust, outliers: str | None = None) -> Robust:
-    """Return the observer as a run on data has it: outliers are left out where nothing else is said of them."""
-    wanted = outliers or ("gate" if observer.outliers == "none" else observer.outliers)
+def as_run(observer: Robust, outliers: str | None = None, *, stated: str | None = None) -> Robust:
+    """Return the observer as a run on data has it: outliers are left out where neither ``outliers``, nor what is
+    ``stated`` in the options of its design, says anything of them."""
+    wanted = outliers or stated or ("gate" if observer.outliers == "none" else observer.outliers)
     return observer if wanted == observer.outliers else changed(observer, outliers=wanted)
+
+
+def rule_of_outliers(design: Any) -> str | None:
+    """Return what the options of a design state about outliers, as far as its observer still has that rule."""
+    stated: str | None = design.options.get("outliers")
+    return stated if stated == design.observer.outliers else None
 
 
 def plain_recursion(observer: Robust) -> Robust:

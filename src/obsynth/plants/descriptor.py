@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.quantities import in_unit
 from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse, same_matrix
 from obsynth.plants.signal_names import (
     COUNTED_BY,
@@ -385,6 +386,17 @@ def _noise_of_sensors(
     return tuple(f"noise {name}" for name in sensor_noise)
 
 
+def _in_stated_units(units: Any, **given: Any) -> list[Any]:
+    """Return mappings from names of signals, with quantities in the units that are stated of these signals."""
+    stated = units if isinstance(units, Mapping) else {}
+    return [
+        {name: in_unit(value, stated.get(name), f"{kind}[{name!r}]") for name, value in mapping.items()}
+        if isinstance(mapping, Mapping)
+        else mapping
+        for kind, mapping in given.items()
+    ]
+
+
 @dataclass(frozen=True, eq=False, init=False)
 class DescriptorSystem:
     r"""A linear descriptor system with faults, unknown inputs and noise.
@@ -513,8 +525,9 @@ class DescriptorSystem:
             "disturbance_names": disturbance_names,
             "noise_names": noise_names,
         }
+        point, noise = _in_stated_units(units, operating_point=operating_point, sensor_noise=sensor_noise)
         values = plant_fields(
-            asked, names, dt=dt, operating_point=operating_point, scales=scales, units=units, sensor_noise=sensor_noise
+            asked, names, dt=dt, operating_point=point, scales=scales, units=units, sensor_noise=noise
         )
         values["uncertainty"] = uncertainty_of(uncertainty)
         values["exact"] = exact_numbers(exact)

@@ -6,10 +6,8 @@ The reader of Matrix Market is ours, since that of scipy (1.17) crashes the inte
 from __future__ import annotations
 
 import math
-import struct
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -18,28 +16,10 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.files.inputs import input_file
+from obsynth.files.inputs import READING_ERRORS, input_file
+from obsynth.numerics.arguments import number_in_text
 from obsynth.numerics.arrays import MAXIMUM_ENTRIES, FloatArray, as_matrix, read_only, require_readable
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
-
-# What the readers of numpy and scipy raise for a damaged file.
-_READING_ERRORS = (
-    OSError,
-    ValueError,
-    TypeError,
-    KeyError,
-    IndexError,
-    EOFError,
-    OverflowError,
-    RuntimeError,
-    MemoryError,
-    AttributeError,
-    UserWarning,
-    struct.error,
-    zlib.error,
-    zipfile.BadZipFile,
-)
-
 
 #: Smaller matrices become arrays: nothing is gained by sparsity.
 SPARSE_FROM = 300
@@ -107,7 +87,7 @@ def _read_array(path: Path, *, variable: str | None, where: str, keep_sparse: bo
             content = readers[suffix](path) if suffix in readers else archives[suffix](path)
             raw = content if suffix in readers else _selected(content, variable, path, where)
             return raw if keep_sparse and is_sparse(raw) and suffix == ".mtx" else _as_dense(raw)
-    except _READING_ERRORS as error:
+    except READING_ERRORS as error:
         raise SpecError(f"{path} cannot be read as a matrix: {_reason(error)}", path=where) from error
 
 
@@ -174,6 +154,8 @@ def read_matrix_market(path: Path, *, maximum_entries: int, keep_sparse: bool = 
         raise ValueError(f"it is too large ({max(rows * columns, *counts):.1e} entries)")
     if symmetry != "general" and rows != columns:
         raise ValueError(f"it is {symmetry}, but {rows} by {columns}")
+    if field == "complex":
+        tokens, field = _real_parts(tokens, 2 if layout == "coordinate" else 0), "real"
     if layout == "array":
         return _from_array(tokens, rows, columns, symmetry)
     return _from_coordinates(tokens, (rows, columns, counts[2]), field, symmetry, sparse=sparse)
@@ -184,11 +166,12 @@ def _checked_header(line: str) -> tuple[str, str, str]:
     if len(words) != 5 or words[:2] != ["%%matrixmarket", "matrix"]:
         raise ValueError("its first line is no Matrix Market header")
     _, _, layout, field, symmetry = words
-    if field == "complex" or symmetry == "hermitian":
-        raise ValueError("it holds complex numbers")
+    # A matrix of real numbers is hermitian where it is symmetric.
+    if symmetry == "hermitian":
+        symmetry = "symmetric"
     known = (
         layout in ("coordinate", "array")
-        and field in ("real", "double", "integer", "unsigned-integer", "pattern")
+        and field in ("real", "double", "integer", "unsigned-integer", "pattern", "complex")
         and symmetry in ("general", "symmetric", "skew-symmetric")
         and (layout, field) != ("array", "pattern")
     )
@@ -239,8 +222,27 @@ def _both_triangles(positions: list[Any], values: FloatArray, symmetry: str) -> 
     return mirrored, np.concatenate([values, sign * values[below]])
 
 
+def _real_parts(tokens: list[str], positions: int) -> list[str]:
+    """Return the tokens of a file of complex numbers without the imaginary parts, which must all be zero; ``positions``
+    tokens of each entry go before its number."""
+    width = positions + 2
+    if len(tokens) % width:
+        raise ValueError("the entries of a matrix of complex numbers have a real and an imaginary part each")
+    if np.any(_numbers(tokens[width - 1 :: width]) != 0.0):
+        raise ValueError("it holds complex numbers")
+    return [token for place, token in enumerate(tokens) if place % width != width - 1]
+
+
 def _numbers(tokens: list[str]) -> FloatArray:
-    return np.fromiter(map(float, tokens), dtype=np.float64, count=len(tokens))
+    return np.fromiter(map(_number, tokens), dtype=np.float64, count=len(tokens))
+
+
+def _number(token: str) -> float:
+    """Return the number of a token; Fortran marks the exponent of double precision by D."""
+    try:
+        return number_in_text(token)
+    except ValueError:
+        return number_in_text(token.replace("D", "e").replace("d", "e"))
 
 
 def _indices(tokens: list[str]) -> Any:

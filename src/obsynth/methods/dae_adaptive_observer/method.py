@@ -152,7 +152,7 @@ class DaeAdaptiveObserver(Method):
     bounds: Annotated[Any, WrittenAs("named pairs")] = None
     largest_move: Positive | None = None
     window: Count = 50
-    outliers: Outliers = "none"
+    outliers: Outliers | None = None
     outlier_limit: Positive | None = None
     outlier_sizes: Annotated[Any, WrittenAs("named vector")] = None
     sensors: Annotated[Any, WrittenAs("sensor times")] = None

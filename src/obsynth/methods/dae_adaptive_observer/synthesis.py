@@ -40,7 +40,7 @@ def synthesise(plant: DAEModel, asked: DaeAdaptiveObserver, *, progress: Callabl
         "steps": float(facts.steps),
     }
     return Synthesis(
-        resolved_options(observer),
+        resolved_options(observer) | {"outliers": asked.outliers},
         {"K": facts.K, "Upsilon": facts.Upsilon},
         observer,
         Certificate({}, claims),

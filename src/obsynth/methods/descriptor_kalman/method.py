@@ -44,6 +44,8 @@ class DescriptorKalman(Method):
         Use the equations of step k + 1 in which x(k + 2) does not appear already for x(k + 1).  They need u(k + 1),
         which `step` has; Q must not couple them with the others.
     outliers : {"none", "gate", "huber"}, optional
+        By default none; only a run on data, and a C or FMU file of a nonlinear design, then has a gate.  What is stated
+        is the rule everywhere.
         What is done with a sample that its prediction excludes: taken as it is; left out, at most twice in a row
         of one sensor; or taken at the limit (Huber's weight).
     outlier_limit : float, optional
@@ -118,7 +120,7 @@ class DescriptorKalman(Method):
     initial_state: Annotated[Any, WrittenAs("vector")] = None
     initial_covariance: Annotated[Any, WrittenAs("covariance")] = None
     early_constraints: bool = False
-    outliers: Outliers = "none"
+    outliers: Outliers | None = None
     outlier_limit: Positive | None = None
     outlier_sizes: Annotated[Any, WrittenAs("named vector")] = None
     sensors: Annotated[Any, WrittenAs("sensor times")] = None

@@ -39,8 +39,8 @@ AS_CLOSE = 0.05
 #: is taken only where rounding hides what faster ones show.
 NOTHING_SHOWN, LONGER, MOST_LONGER = 0.5, 2.0, 55
 
-#: Errors that need longer than so many settling times to decay would stay in any run: the gain moves such poles.
-FOR_GOOD = 1e5
+#: Default gains move poles whose errors need longer than so many settling times of the plant to decay.
+FOR_GOOD = 20.0
 
 #: Decades of the search around a rate of the size of the noise, and its steps per decade at the end.
 DECADES, RATE_BISECTIONS = 8, 9

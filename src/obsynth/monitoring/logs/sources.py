@@ -70,7 +70,7 @@ _BEGINNINGS = {".parquet": b"PAR1", ".tdms": b"TDSm", ".mf4": b"MDF ", ".mdf": b
 def chunks(data: Data, signals: LogSignals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
     """Yield ``(rows, 1 + nu + ny)``: time and signals, in order; NaN where a sample is missing.  Inputs are those that
     act in a row as the design takes it."""
-    found = _chunks(data, signals, stamps, rows)
+    found = _without_days(_chunks(data, signals, stamps, rows), stamps)
     if not signals.delay or not signals.inputs:
         yield from found
     elif signals.delay > 0:
@@ -79,6 +79,14 @@ def chunks(data: Data, signals: LogSignals, stamps: Stamps, rows: int) -> Iterat
         yield from _advanced(found, signals)
     # Whether columns hold numbers is known at the end, wherever the words in them stand.
     stamps.require_numbers()
+
+
+def _without_days(found: Iterator[FloatArray], stamps: Stamps) -> Iterator[FloatArray]:
+    """Yield rows, of which the first ones must not be stamped in days."""
+    for count, chunk in enumerate(found):
+        if not count:
+            stamps.require_no_days(chunk[:, 0])
+        yield chunk
 
 
 def _delayed(found: Iterator[FloatArray], signals: LogSignals, stamps: Stamps) -> Iterator[FloatArray]:

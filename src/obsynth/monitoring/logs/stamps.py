@@ -78,7 +78,17 @@ _UNITS_OF_TIME = {
     **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e9),
     **dict.fromkeys(("min", "minute", "minutes"), 1 / 60),
     **dict.fromkeys(("h", "hr", "hour", "hours"), 1 / 3600),
+    **dict.fromkeys(("d", "day", "days"), 1 / 86400),
 }
+
+#: Serial days of spreadsheets (since 1900) and of MATLAB's ``datenum`` (since year 0) from 1990 to 2099.
+_SERIAL_DAYS = ((32874.0, 73050.0), (726834.0, 767010.0))
+
+#: Rows of a log in days are at most an hour apart; a log in seconds whose stamps begin hours after its start is not
+#: sampled that fast (24 Hz) for so many rows.
+_ROWS_OF_DAYS = 3
+
+_STEP_IN_DAYS = 1.0 / 24.0
 
 
 #: A name of a column with a unit in brackets behind it.
@@ -136,6 +146,7 @@ class Stamps:
         self.digits = "auto"  # how dates are written back: with a fraction in every row where the log has one
         self.day_first: bool | None = None  # of dates with slashes, by the first one
         self.per_second: float | None = None  # how many of the numbers of the log are a second, by the first one
+        self.has_unit = False  # whether the file states the unit of its stamps
         self.notes: list[str] = []  # what is to be said of the file
         #: Cells that hold a word instead of a number, which are missing, by column: how many; first row and text.
         self.words: dict[str, tuple[int, int, str]] = {}
@@ -192,6 +203,7 @@ class Stamps:
         per_second = None if found is None else _UNITS_OF_TIME.get(found.group(2).strip().lower())
         if per_second not in (None, 1.0):
             self.per_second = per_second
+        self.has_unit = per_second is not None
         named = [repr(header[place]) for name, place in zip(wanted, places, strict=True) if header[place] != name]
         if named:
             self.notes.append(f"Columns are found by their names without units: {', '.join(named)}.")
@@ -212,6 +224,7 @@ class Stamps:
             return False
         if unit:
             self.per_second = per_second
+            self.has_unit = True
         self.notes.append(f"The line below the header is taken as units: {', '.join(map(repr, cells))}.")
         return True
 
@@ -269,6 +282,23 @@ class Stamps:
             if _LARGEST_SECONDS <= first < _LARGEST_SECONDS * _PARTS[-1]:
                 self.per_second = next(parts for parts in _PARTS if first < _LARGEST_SECONDS * parts)
         return numbers if self.per_second in (None, 1.0) else np.asarray(numbers / self.per_second)
+
+    def require_no_days(self, seconds: FloatArray) -> None:
+        """Raise `SpecError` for stamps ``(rows,)`` of the first rows that can only be serial days, taken as seconds."""
+        known = seconds[np.isfinite(seconds)]
+        if self.is_dated is not False or self.per_second not in (None, 1.0) or self.has_unit:
+            return
+        if known.size < _ROWS_OF_DAYS:
+            return
+        steps = np.diff(known)
+        within = any(low <= known[0] and known[-1] <= high for low, high in _SERIAL_DAYS)
+        if within and np.all(steps > 0.0) and np.max(steps) <= _STEP_IN_DAYS:
+            raise SpecError(
+                f"The time begins with {float(known[0]):.10g} and rises by {float(np.median(steps)):.3g} a row: these "
+                "are serial days of a spreadsheet or of MATLAB, not seconds. State the unit in the name of the column, "
+                "'time [d]' or 'time [s]'.",
+                path="data",
+            )
 
     def _as_iso(self, cell: str, row: int, column: str) -> str:
         """Return a date as ISO 8601 writes it: one with points, such as 5.3.2026 08:30:00,5, has the day first; of one

@@ -13,7 +13,7 @@ from obsynth.monitoring.thresholds.monitor import Evidence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.running import as_run
+from obsynth.observers.running import as_run, rule_of_outliers
 from obsynth.observers.smoothing_chain import SmootherHistory
 from obsynth.results.design import ObserverDesign
 
@@ -27,7 +27,7 @@ class SteppingLogObserver(LogObserver):
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:
         observer: Any = design.observer
-        self.observer: RecursiveObserver | DAEObserver = as_run(observer, outliers)
+        self.observer: RecursiveObserver | DAEObserver = as_run(observer, outliers, stated=rule_of_outliers(design))
         plant = design.plant
         super().__init__(self.observer, warm_up, 0.0)
         self.input_names, self.output_names = plant.input_names, plant.output_names

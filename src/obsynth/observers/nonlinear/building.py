@@ -119,7 +119,11 @@ def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DA
         upper=bounds[:, 1],
         form=form,
         integration=integration,
-        **{name: options[name] for name in AS_GIVEN if name in options},
+        **{
+            name: options[name]
+            for name in AS_GIVEN
+            if name in options and not (name == "outliers" and options[name] is None)
+        },
     )
 
 

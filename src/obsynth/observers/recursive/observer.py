@@ -965,7 +965,7 @@ def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[s
         _square(options["initial_covariance"], plant.nx, 1.0, "initial_covariance"),
         adaptation,
         options["early_constraints"],
-        options.get("outliers", "none"),
+        options.get("outliers") or "none",
         options.get("outlier_limit"),
         options.get("outlier_sizes"),
         options.get("sensors"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -11,6 +12,7 @@ import numpy as np
 import scipy
 
 from obsynth.errors import SpecError
+from obsynth.files.inputs import READING_ERRORS
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import imported
@@ -100,7 +102,7 @@ def _written_pencil(folder: Path) -> tuple[FloatArray, FloatArray, list[str]]:
         e, a = (np.asarray(_dense(scipy.io.mmread(folder / name)), dtype=np.float64) for name in _PENCIL[:2])
         names = json.loads((folder / _PENCIL[2]).read_text(encoding="utf-8"))
         listed = [*names["differential"], *names["algebraic"]]
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except READING_ERRORS as error:
         raise SpecError(f"{folder} holds no pencil of ANDES: {error}", path=str(folder)) from error
     return e, a, listed
 
@@ -125,9 +127,34 @@ def _solved_case(case: Any) -> tuple[FloatArray, FloatArray, list[str], dict[str
     a = np.block([[_dense(block) for block in row] for row in blocks])
     e = np.zeros((n + m, n + m))
     e[np.arange(n), np.arange(n)] = np.asarray(dae.Tf, dtype=np.float64)
-    names = [str(name) for name in (*dae.x_name, *dae.y_name)]
+    names = _completed_names(system, [str(name) for name in (*dae.x_name, *dae.y_name)], n)
     values = np.concatenate([np.asarray(dae.x), np.asarray(dae.y)])
     return e, a, names, dict(zip(names, map(float, values), strict=True))
+
+
+def _completed_names(system: Any, names: list[str], differential: int) -> list[str]:
+    """Return names with empty and repeated ones completed from the device that has the variable: ``<variable> <model>
+    <idx>``; what is still empty or repeated gets its number."""
+    counts = Counter(name.strip() for name in names)
+    if all(name and count == 1 for name, count in counts.items()):
+        return names
+    of_devices: dict[int, str] = {}
+    for model in getattr(system, "models", {}).values():
+        listed = getattr(getattr(model, "cache", None), "all_vars", None) or {}
+        idx = list(getattr(getattr(model, "idx", None), "v", ()))
+        for variable in listed.values():
+            start = 0 if getattr(variable, "v_code", "x") == "x" else differential
+            for device, address in zip(idx, np.ravel(getattr(variable, "a", ())), strict=False):
+                of_devices.setdefault(start + int(address), f"{variable.name} {type(model).__name__} {device}")
+    found: list[str] = []
+    for place, name in enumerate(names):
+        text = name.strip()
+        if not text or counts[text] > 1:
+            text = of_devices.get(place, text or "variable")
+        if text in found or (text != name.strip() and counts[text]):
+            text = f"{text} {place + 1}"
+        found.append(text)
+    return found
 
 
 def _dense(matrix: Any) -> FloatArray:

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from obsynth.errors import SpecError
-from obsynth.files.inputs import path_of, read_text
+from obsynth.files.inputs import READING_ERRORS, path_of, read_text
 from obsynth.numerics.arguments import arguments_checked, number_in_text
 from obsynth.numerics.arrays import FloatArray, require_readable
 from obsynth.plants.descriptor import DescriptorSystem
@@ -34,8 +34,55 @@ _MATLAB_NAMES = {
 
 _SAMPLE_TIME_NAMES = ("Ts", "dt")
 
+#: What MATLAB writes for a sampled model whose sampling time is not stated.
+_UNSAID = -1.0
 
-_SIZE = re.compile(r"parameter\s+Integer\s+([nmp])\s*=\s*(\d+)")
+#: Sampling times that differ by less were rounded.
+_SAME_TIME = 1e-12
+
+#: Delays in a file; zero in all of them is no delay.
+_DELAYS = ("InternalDelay", "InputDelay", "OutputDelay", "IODelay")
+
+#: Fields with an operating point, and with units: what they are of.
+_POINTS = {"x0": "state_names", "u0": "input_names", "y0": "output_names"}
+
+_UNIT_FIELDS = {"StateUnit": "state_names", "InputUnit": "input_names", "OutputUnit": "output_names"}
+
+#: Fields on which no equation of the model depends.
+_WITHOUT_MEANING = frozenset(
+    ("TimeUnit", "Scaled", "StatePath", "InputGroup", "OutputGroup", "Notes", "UserData", "Name", "SamplingGrid")
+)
+
+#: MATLAB's units of time in s.
+_SECONDS_OF_TIME_UNITS = {
+    "nanoseconds": 1e-9,
+    "microseconds": 1e-6,
+    "milliseconds": 1e-3,
+    "seconds": 1.0,
+    "minutes": 60.0,
+    "hours": 3600.0,
+    "days": 86400.0,
+    "weeks": 7 * 86400.0,
+    "months": 365.25 / 12 * 86400.0,
+    "years": 365.25 * 86400.0,
+}
+
+#: Octave's names of the fields of a struct of a system, and MATLAB's.
+_OCTAVE_NAMES = {
+    **{name: name.upper() for name in "abcde"},
+    "stname": "StateName",
+    "inname": "InputName",
+    "outname": "OutputName",
+    "tsam": "Ts",
+    "scaled": "Scaled",
+    "ingroup": "InputGroup",
+    "outgroup": "OutputGroup",
+    "name": "Name",
+    "notes": "Notes",
+    "userdata": "UserData",
+}
+
+_SIZE = re.compile(r"parameter\s+Integer\s+([nmpkl])\s*=\s*(\d+)")
 
 _MODELICA_MATRIX = re.compile(r"parameter\s+Real\s+([ABCD])\s*\[[^\]]*\]\s*=\s*(\[[^\]]*\]|zeros\([^)]*\))\s*;")
 
@@ -63,7 +110,8 @@ def from_matlab(
         The file.
     variable : str, optional
         A struct with fields ``A`` and, as far as there are any, ``E, B, C, D, Bf, Df, Bd, Dd, Bw, Dw``, ``Ts`` or
-        ``dt`` (seconds, 0 for continuous time) and names (``StateName``, ``InputName``, ``OutputName``, as
+        ``dt`` (0 for continuous time, in the ``TimeUnit`` of the file; -1 does not say it) and names (``StateName``,
+        ``InputName``, ``OutputName``, as
         ``struct(sys)`` has them, or ``state_names`` and so on).  May be left out where the file has one struct, or the
         matrices themselves.
     dt : float, optional, seconds
@@ -76,12 +124,14 @@ def from_matlab(
     Returns
     -------
     DescriptorSystem
-        With the names in the file.
+        With the names and units in the file, in seconds whatever the ``TimeUnit``, and with ``x0, u0, y0`` as operating
+        point.
 
     Raises
     ------
     SpecError
-        The file cannot be read, holds no such struct, or its matrices do not fit together.
+        The file cannot be read, holds no such struct, its matrices do not fit together, or it has a delay or a field
+        that is not read and may change what the matrices mean.
 
     Examples
     --------
@@ -100,21 +150,21 @@ def from_matlab(
         raise SpecError(
             f"{source} has no matrix A{_in(variable)}; it has: {', '.join(fields) or 'nothing'}.", path=str(source)
         )
-    times = [
-        float(np.squeeze(fields[name])) for name in _SAMPLE_TIME_NAMES if name in fields and np.size(fields[name]) == 1
-    ]
-    if dt is None and not times:
-        raise SpecError(f"{source} has no sampling time (Ts): give dt in seconds, or 0 for continuous time.", path="dt")
-    if dt is not None and times and dt != times[0]:
-        raise SpecError(f"dt is {dt}, but {source} has {times[0]:g}: leave dt out.", path="dt")
+    _require_understood(fields, source, is_struct=fields is not content and fields.keys() != content.keys())
+    unit = _seconds_of_unit(fields, source)
+    step = _step(fields, dt, unit, source)
     names = {ours: _texts(fields[theirs]) for theirs, ours in _MATLAB_NAMES.items() if theirs in fields}
     labels = {ours: names.pop(ours, None) for ours in ("state_names", "input_names", "output_names")}
     given = {name: _dense_value(fields[name]) for name in (*_MODEL_MATRICES, *_MORE) if name in fields}
+    if step == 0.0 and unit != 1.0:
+        given = _per_second(given, unit, source)
     return plant_of(
         {name: given[name] for name in _MODEL_MATRICES if name in given and np.size(given[name])},
         {**{name: given[name] for name in _MORE if name in given}, **names, **plant},
         labels=labels,
-        dt=times[0] if dt is None else dt,
+        dt=step,
+        point=_point(fields, labels),
+        units=_units(fields, labels),
     )
 
 
@@ -136,7 +186,7 @@ def _content(source: Path) -> dict[str, Any]:
         raise SpecError(f"{source} does not exist.", path=str(source))
     try:
         return mat_arrays(source)
-    except (OSError, ValueError, TypeError, KeyError, EOFError, OverflowError) as error:
+    except READING_ERRORS as error:
         raise SpecError(f"{source} cannot be read as a .mat file: {error}", path=str(source)) from error
 
 
@@ -146,8 +196,8 @@ def _fields(content: Mapping[str, Any], variable: str | None, source: Path) -> d
         for name, value in content.items()
         if getattr(value, "dtype", None) is not None and value.dtype.names and value.size == 1
     ]
-    if variable is None and "A" in content:
-        return dict(content)
+    if variable is None and ("A" in content or (not structs and "a" in content)):
+        return _as_matlab_names(content)
     if variable is None and len(structs) != 1:
         found = ", ".join(map(repr, structs)) or "none"
         raise SpecError(f"{source}: name the struct of the plant (variable=...); it has: {found}.", path=str(source))
@@ -157,7 +207,126 @@ def _fields(content: Mapping[str, Any], variable: str | None, source: Path) -> d
             f"{source} has no struct {name!r}; it has: {', '.join(map(repr, structs)) or 'none'}.", path=str(source)
         )
     record = content[name].reshape(-1)[0]
-    return {field: record[field] for field in content[name].dtype.names}
+    return _as_matlab_names({field: record[field] for field in content[name].dtype.names})
+
+
+def _as_matlab_names(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return fields by the names that MATLAB has: Octave's are in lower case, and some in a struct of their own."""
+    if "A" in fields or "a" not in fields:
+        return dict(fields)
+    found = {_OCTAVE_NAMES.get(name, name): value for name, value in fields.items()}
+    inner = found.pop("lti", None)
+    if getattr(getattr(inner, "dtype", None), "names", None) and inner.size == 1:
+        record = inner.reshape(-1)[0]
+        found |= {_OCTAVE_NAMES.get(name, name): record[name] for name in inner.dtype.names}
+    return found
+
+
+def _require_understood(fields: Mapping[str, Any], source: Path, *, is_struct: bool) -> None:
+    """Refuse, by name, what would change the meaning of the matrices and is not read."""
+    for name in _DELAYS:
+        if name in fields and np.any(_numbers_in(fields[name])):
+            raise SpecError(
+                f"{source} has a delay ({name}), which is not read: give a model without it (pade or absorbDelay of "
+                "MATLAB), or set it to zero and delay the columns of the log.",
+                path=str(source),
+            )
+    known = {*_MODEL_MATRICES, *_MORE, *_MATLAB_NAMES, *_SAMPLE_TIME_NAMES, *_DELAYS, *_POINTS, *_UNIT_FIELDS}
+    unknown = [
+        name
+        for name, value in fields.items()
+        if is_struct and name not in known | _WITHOUT_MEANING and np.size(value) and np.any(_nonempty(value))
+    ]
+    if unknown:
+        raise SpecError(
+            f"{source} has the field(s) {', '.join(unknown)}, whose meaning is not known here: remove them where the "
+            "matrices do not depend on them.",
+            path=str(source),
+        )
+
+
+def _numbers_in(value: Any) -> FloatArray:
+    try:
+        return np.asarray(_dense_value(value), dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.array([float(np.size(value) > 0)])
+
+
+def _nonempty(value: Any) -> Any:
+    return [bool(np.size(cell)) for cell in np.ravel(value)] if np.asarray(value).dtype == object else [True]
+
+
+def _seconds_of_unit(fields: Mapping[str, Any], source: Path) -> float:
+    """Return how many seconds are in the unit of time of a file; one where it states none."""
+    found = _texts(fields["TimeUnit"]) if "TimeUnit" in fields else None
+    if found is None:
+        return 1.0
+    text = found[0].lower()
+    if len(found) != 1 or text not in _SECONDS_OF_TIME_UNITS:
+        raise SpecError(
+            f"{source}: TimeUnit is {found[0]!r}; known are: {', '.join(_SECONDS_OF_TIME_UNITS)}.", path=str(source)
+        )
+    return _SECONDS_OF_TIME_UNITS[text]
+
+
+def _step(fields: Mapping[str, Any], dt: float | None, unit: float, source: Path) -> float:
+    """Return the sampling time in s; MATLAB has -1 for a sampled model that does not say it."""
+    times = [
+        float(np.squeeze(fields[name])) for name in _SAMPLE_TIME_NAMES if name in fields and np.size(fields[name]) == 1
+    ]
+    if not times:
+        if dt is None:
+            raise SpecError(
+                f"{source} has no sampling time (Ts): give dt in seconds, or 0 for continuous time.", path="dt"
+            )
+        return dt
+    if times[0] == _UNSAID:
+        if dt is None or dt == 0.0:
+            raise SpecError(
+                f"{source} is sampled, but does not say its sampling time (Ts = -1): give dt in seconds, above 0.",
+                path="dt",
+            )
+        return dt
+    own = times[0] * unit
+    if dt is not None and not math.isclose(dt, own, rel_tol=_SAME_TIME):
+        raise SpecError(f"dt is {dt}, but {source} has {own:g} s: leave dt out.", path="dt")
+    return own
+
+
+def _per_second(given: Mapping[str, Any], unit: float, source: Path) -> dict[str, Any]:
+    """Return the matrices of ``E x' = A x + ...`` with the derivative in a unit of time of ``unit`` s, per second."""
+    noisy = [name for name in ("Bw",) if name in given and np.any(given[name])]
+    if noisy:
+        raise SpecError(
+            f"{source}: {noisy[0]} is the intensity of noise in a TimeUnit that is not the second: convert the model "
+            "to seconds (chgTimeUnit of MATLAB).",
+            path=noisy[0],
+        )
+    dynamic = ("A", "B", "Bf", "Bd")
+    return {name: np.asarray(value) / unit if name in dynamic else value for name, value in given.items()}
+
+
+def _labelled(fields: Mapping[str, Any], labels: Mapping[str, Any], wanted: Mapping[str, str], prefixes: str) -> Any:
+    """Yield names of signals with what a field says of each of them."""
+    for (field, kind), prefix in zip(wanted.items(), prefixes, strict=True):
+        if field in fields:
+            values = np.ravel(_dense_value(fields[field]))
+            names = labels[kind] or [f"{prefix}{i + 1}" for i in range(len(values))]
+            yield from zip(names, values, strict=False)
+
+
+def _point(fields: Mapping[str, Any], labels: Mapping[str, Any]) -> dict[str, float]:
+    """Return the operating point of states, inputs and outputs, as fields ``x0``, ``u0`` and ``y0`` have it."""
+    if not any(name in fields for name in _POINTS):
+        return {}
+    return {name: float(np.squeeze(value)) for name, value in _labelled(fields, labels, _POINTS, "xuy")}
+
+
+def _units(fields: Mapping[str, Any], labels: Mapping[str, Any]) -> dict[str, str]:
+    found = {
+        name: str(np.squeeze(cell)) for name, cell in _labelled(fields, labels, _UNIT_FIELDS, "xuy") if np.size(cell)
+    }
+    return {name: unit.strip() for name, unit in found.items() if unit.strip()}
 
 
 def _in(variable: str | None) -> str:
@@ -227,6 +396,9 @@ def from_modelica(path: str | Path, **plant: Any) -> DescriptorSystem:
     text = re.sub(r"//[^\n]*|/\*.*?\*/", "", read_text(source), flags=re.DOTALL)
     sizes = {name: int(count) for name, count in _SIZE.findall(text)}
     found = {name: body for name, body in _MODELICA_MATRIX.findall(text)}
+    if "m" not in sizes and "p" not in sizes:
+        # Older versions call them so.
+        sizes |= {new: sizes[old] for new, old in (("m", "k"), ("p", "l")) if old in sizes}
     missing = [name for name in ("n", "m", "p") if name not in sizes] + [name for name in "ABCD" if name not in found]
     if missing:
         raise SpecError(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from decimal import Decimal
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import imported
 from obsynth.plants.descriptor import ALL_MATRICES, SIGNAL_NAMES, DescriptorSystem
 from obsynth.plants.importing.roles import plant_of
+from obsynth.plants.importing.transfer_functions import realised
 from obsynth.plants.signal_names import suggestion
 
 #: What goes in and what comes out, by the names that CasADi's integrators have; y is ours.
@@ -33,7 +36,8 @@ def from_control(
     Parameters
     ----------
     system : control.StateSpace or control.TransferFunction
-        A transfer function is realised by ``control.ss``.
+        A transfer function is realised by ``control.ss``; one with more zeros than poles (continuous time) by a
+        descriptor system, whose polynomial part are derivatives of the inputs in algebraic equations.
     E : array_like, optional
         ``(nx, nx)``: python-control has none; ``None`` means the identity.
     dt : float, optional, seconds
@@ -64,7 +68,16 @@ def from_control(
     """
     control = imported("control", extra=None)
     if isinstance(system, control.TransferFunction):
-        system = control.ss(system)
+        system, chain = realised(system, control)
+        if chain is not None:
+            if E is not None:
+                raise SpecError("E is for systems of states: a transfer function has its own.", path="E")
+            return plant_of(
+                chain,
+                plant,
+                labels={"input_names": system.input_labels, "output_names": system.output_labels},
+                dt=_sampling_time(system.dt, dt),
+            )
     require_kind(system, control.StateSpace, "system", "a control.StateSpace, such as control.ss(...)")
     labels = {
         "state_names": system.state_labels,
@@ -249,13 +262,27 @@ def _require_values(free: set[str], values: Mapping[str, float]) -> None:
         raise SpecError(
             f"No matrix holds the symbol {unused[0]!r}.{suggestion(unused[0], sorted(free))}", path="parameters"
         )
-    wrong = [name for name, value in values.items() if not is_finite_number(value)]
+    wrong = [name for name, value in values.items() if not (is_finite_number(value) or _is_rational(value))]
     if wrong:
         raise SpecError(f"The parameter {wrong[0]!r} is {values[wrong[0]]!r}: give a finite number.", path="parameters")
 
 
-def _exact(value: float, sympy: Any) -> Any:
-    return sympy.Rational(*float(value).as_integer_ratio())
+def _is_rational(value: Any) -> bool:
+    """Whether a value is an exact number: of fractions, decimal or sympy (which need not be rational, but must be real
+    and finite there)."""
+    if isinstance(value, Fraction):
+        return True
+    if isinstance(value, Decimal):
+        return value.is_finite()
+    return bool(getattr(value, "is_number", False) and value.is_real and value.is_finite)
+
+
+def _exact(value: Any, sympy: Any) -> Any:
+    if isinstance(value, sympy.Float) or is_finite_number(value):
+        return sympy.Rational(*float(value).as_integer_ratio())
+    if isinstance(value, (Fraction, Decimal)):
+        return sympy.Rational(*value.as_integer_ratio())
+    return value
 
 
 def _evaluated(matrix: Any, numbers: Mapping[Any, Any], name: str) -> FloatArray:

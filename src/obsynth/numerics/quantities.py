@@ -1,0 +1,82 @@
+"""Quantities: numbers that carry a unit of measurement, of pint, unyt and astropy.
+
+Each of these libraries has its own class; what is common is asked for by name (duck typing), and none is imported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+
+#: How a number is converted: ``to`` of pint and astropy (unyt has both).
+_NUMBER = ("magnitude", "value")
+
+#: What dimensionless units are called.
+_NO_UNIT = frozenset({"", "1", "dimensionless"})
+
+
+def unit_of(value: Any) -> str | None:
+    """Return the unit that a number or an array carries, as text; `None` where it carries none."""
+    if isinstance(value, (int, float, str, np.generic, Mapping, list, tuple)) or type(value) is np.ndarray:
+        return None
+    unit = getattr(value, "units", getattr(value, "unit", None))
+    if unit is None or not any(hasattr(value, name) for name in _NUMBER) or callable(unit):
+        return None
+    return str(unit).strip()
+
+
+def require_plain(value: Any, name: str) -> Any:
+    """Return numbers that carry no unit; raise `SpecError` for a quantity, also for one in a list of rows."""
+    if isinstance(value, (list, tuple)):
+        return [require_plain(item, name) for item in value] if any(map(_may_carry, value)) else value
+    unit = unit_of(value)
+    if unit is None:
+        return value
+    if unit in _NO_UNIT:
+        return _number(value)
+    raise SpecError(
+        f"{name} is a quantity in {unit}, but plain numbers are taken here: convert it to the unit of the model and "
+        "give the number alone.",
+        path=name,
+    )
+
+
+def in_unit(value: Any, unit: str | None, name: str) -> Any:
+    """Return a quantity as a number in the ``unit`` that a plant states; other values as they are.
+
+    Raises
+    ------
+    SpecError
+        No unit is stated, or the quantity cannot be converted to it.
+    """
+    own = unit_of(value)
+    if own is None:
+        return value
+    if unit is None:
+        if own in _NO_UNIT:
+            return _number(value)
+        raise SpecError(
+            f"{name} is a quantity in {own}, but the plant states no unit of this signal: state it "
+            "(units={...}), or give a plain number.",
+            path=name,
+        )
+    try:
+        return _number(value.to(unit))
+    except Exception as error:  # each library has its own errors, which share no base class
+        raise SpecError(
+            f"{name} is a quantity in {own}, which cannot be converted to {unit!r}, the unit of this signal: {error}",
+            path=name,
+        ) from error
+
+
+def _may_carry(value: Any) -> bool:
+    return isinstance(value, (list, tuple)) or unit_of(value) is not None
+
+
+def _number(value: Any) -> Any:
+    found = next(getattr(value, name) for name in _NUMBER if hasattr(value, name))
+    return float(found) if np.ndim(found) == 0 else np.asarray(found)

@@ -1,0 +1,215 @@
+"""What changes the meaning of a model is read or refused by name: units of time, delays, quantities, exact numbers."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from fractions import Fraction
+from types import SimpleNamespace
+from typing import ClassVar
+
+import control
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+import sympy
+
+import obsynth
+from obsynth.numerics.quantities import in_unit
+from obsynth.plants.importing.andes import _completed_names
+
+
+def written(tmp_path, **fields):
+    path = tmp_path / "plant.mat"
+    scipy.io.savemat(path, {"sys": {"A": [[-1.0]], "B": [[1.0]], "C": [[1.0]], **fields}})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("unit", "seconds"), [("minutes", 60.0), ("milliseconds", 1e-3), ("hours", 3600.0), ("seconds", 1.0)]
+)
+def test_a_model_of_matlab_is_read_in_seconds(tmp_path, unit, seconds):
+    plant = obsynth.from_matlab(written(tmp_path, Ts=0.0, TimeUnit=unit))
+    assert np.isclose(plant.A[0, 0], -1 / seconds, rtol=1e-15)
+    assert np.isclose(plant.B[0, 0], 1 / seconds, rtol=1e-15)
+    assert plant.C[0, 0] == 1.0
+    sampled = obsynth.from_matlab(written(tmp_path, Ts=2.0, TimeUnit=unit))
+    assert np.isclose(sampled.dt, 2.0 * seconds, rtol=1e-15)
+    assert sampled.A[0, 0] == -1.0
+
+
+def test_a_sampled_model_without_its_sampling_time_takes_the_one_that_is_given(tmp_path):
+    path = written(tmp_path, Ts=-1.0)
+    assert obsynth.from_matlab(path, dt=0.1).dt == 0.1
+    for given in (None, 0.0):
+        with pytest.raises(obsynth.SpecError, match="Ts = -1"):
+            obsynth.from_matlab(path, dt=given)
+    with pytest.raises(obsynth.SpecError, match="leave dt out"):
+        obsynth.from_matlab(written(tmp_path, Ts=0.2), dt=0.1)
+
+
+@pytest.mark.parametrize("field", ["InputDelay", "OutputDelay", "InternalDelay"])
+def test_delays_of_a_model_are_refused_by_name_and_zeros_are_none(tmp_path, field):
+    with pytest.raises(obsynth.SpecError, match=field):
+        obsynth.from_matlab(written(tmp_path, Ts=0.0, **{field: [[0.5]]}))
+    assert obsynth.from_matlab(written(tmp_path, Ts=0.0, **{field: [[0.0]]})).nx == 1
+
+
+def test_units_of_signals_are_read_and_an_unknown_field_is_named(tmp_path):
+    fields = {"Ts": 0.0, "OutputUnit": np.array(["V"], dtype=object), "OutputName": np.array(["gauge"], dtype=object)}
+    assert obsynth.from_matlab(written(tmp_path, **fields, Notes="")).units == {"gauge": "V"}
+    with pytest.raises(obsynth.SpecError, match="Offsets"):
+        obsynth.from_matlab(written(tmp_path, Ts=0.0, Offsets=[[1.0]]))
+    with pytest.raises(obsynth.SpecError, match="fortnights"):
+        obsynth.from_matlab(written(tmp_path, Ts=0.0, TimeUnit="fortnights"))
+
+
+def test_a_struct_of_octave_is_read(tmp_path):
+    path = tmp_path / "octave.mat"
+    lti = {"tsam": 0.25, "inname": np.array(["valve"], dtype=object), "outname": np.array(["level"], dtype=object)}
+    scipy.io.savemat(
+        path, {"sys": {"a": [[0.5]], "b": [[1.0]], "c": [[2.0]], "d": [[0.0]], "e": np.zeros((0, 0)), "lti": lti}}
+    )
+    plant = obsynth.from_matlab(path)
+    assert (plant.dt, plant.input_names, plant.output_names) == (0.25, ("valve",), ("level",))
+    assert plant.C[0, 0] == 2.0
+
+
+def test_a_damaged_file_is_refused_in_words(tmp_path):
+    path = tmp_path / "plant.mat"
+    scipy.io.savemat(path, {"A": -np.eye(40), "C": np.eye(40)}, do_compression=True)
+    whole = path.read_bytes()
+    for place in range(128, len(whole), 7):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
+        try:
+            obsynth.from_matlab(path, dt=0)
+        except obsynth.SpecError as error:
+            assert "plant.mat" in str(error) or error.problems  # noqa: PT017 (what is not refused may be right)
+
+
+class Quantity:
+    """A number with a unit, as pint has it."""
+
+    factors: ClassVar = {("mV", "V"): 1e-3, ("V", "mV"): 1e3}
+
+    def __init__(self, magnitude, units):
+        self.magnitude, self.units = magnitude, units
+
+    def __array__(self, dtype=None, copy=None):
+        return np.asarray(self.magnitude, dtype=dtype)
+
+    def to(self, unit):
+        return Quantity(self.magnitude * self.factors[self.units, unit], unit)
+
+
+def test_a_quantity_is_converted_where_the_plant_states_the_unit():
+    plant = obsynth.DescriptorSystem(
+        A=[[-1.0]], C=[[1.0]], units={"y1": "V"}, sensor_noise={"y1": Quantity(5, "mV")},
+        operating_point={"y1": Quantity(2.0, "mV")},
+    )  # fmt: skip
+    assert np.isclose(plant.Dw[0, 0], 0.005)
+    assert np.isclose(plant.operating_point["y1"], 0.002)
+    assert in_unit(3.0, None, "x") == 3.0
+
+
+def test_a_quantity_is_refused_where_no_unit_is_stated_or_another_one():
+    for units in ({}, {"y1": "K"}):
+        with pytest.raises(obsynth.SpecError, match="quantity in mV"):
+            obsynth.DescriptorSystem(A=[[-1.0]], C=[[1.0]], units=units, sensor_noise={"y1": Quantity(5, "mV")})
+    for given in (Quantity([[-1.0]], "1/s"), [[Quantity(-1.0, "1/s")]]):
+        with pytest.raises(obsynth.SpecError, match="A is a quantity"):
+            obsynth.DescriptorSystem(A=given, C=[[1.0]])
+    dimensionless = obsynth.DescriptorSystem(A=[[Quantity(-1.0, "dimensionless")]], C=[[1.0]])
+    assert dimensionless.A[0, 0] == -1.0
+
+
+def response(plant, s):
+    return plant.C @ np.linalg.solve(s * plant.E - plant.A, plant.B) + plant.D
+
+
+@pytest.mark.parametrize(
+    ("top", "bottom"),
+    [
+        ([1, 0, 0], [1, 1]),
+        ([2, 1, 3, 1], [1, 2]),
+        ([1, 0], [1]),
+        ([[[1, 0, 0], [1]], [[1, 2, 3], [1, 0, 0, 4]]], [[[1, 1], [1, 3]], [[2], [1, 5]]]),
+    ],
+)
+def test_an_improper_transfer_function_has_a_descriptor_realisation(top, bottom):
+    system = control.tf(top, bottom)
+    plant = obsynth.from_control(system)
+    for s in (0.3 + 0.7j, 2.0j, 1.5):
+        assert np.allclose(response(plant, s), np.atleast_2d(system(s)), rtol=1e-10, atol=1e-10)
+    with pytest.raises(obsynth.SpecError, match="later samples"):
+        obsynth.from_control(control.tf([1, 0, 0], [1, 0.5], 0.1))
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("coordinate integer hermitian\n2 2 1\n2 1 1\n", [[0, 1], [1, 0]]),
+        ("coordinate complex general\n2 2 2\n1 1 1.5 0\n2 1 -2 0.0\n", [[1.5, 0], [-2, 0]]),
+        ("array real general\n1 2\n1.0D+00\n-2.5d-1\n", [[1.0, -0.25]]),
+        ("array complex symmetric\n2 2\n1 0\n2 0\n3 0\n", [[1, 2], [2, 3]]),
+    ],
+)
+def test_kinds_of_matrix_market_that_hold_real_numbers_are_read(tmp_path, text, wanted):
+    from obsynth.specs.matrix_files import read_matrix
+
+    path = tmp_path / "M.mtx"
+    path.write_text(f"%%MatrixMarket matrix {text}")
+    assert np.array_equal(read_matrix(path, where="A"), wanted)
+    path.write_text("%%MatrixMarket matrix coordinate complex general\n1 1 1\n1 1 1 2\n")
+    with pytest.raises(obsynth.SpecError, match="complex numbers"):
+        read_matrix(path, where="A")
+
+
+@pytest.mark.parametrize(
+    "value", [sympy.Rational(1, 3), Fraction(1, 3), sympy.sqrt(sympy.Rational(1, 9)), Decimal("0.25")]
+)
+def test_exact_numbers_are_values_of_symbols(value):
+    k = sympy.Symbol("k")
+    plant = obsynth.from_sympy(sympy.Matrix([[-k]]), C=sympy.Matrix([[1]]), parameters={k: value})
+    assert plant.A[0, 0] == -float(value)
+    for wrong in (sympy.I, sympy.oo, sympy.Symbol("a"), Decimal("nan")):
+        with pytest.raises(obsynth.SpecError, match="finite number"):
+            obsynth.from_sympy(sympy.Matrix([[-k]]), C=sympy.Matrix([[1]]), parameters={k: wrong})
+
+
+def test_nameless_and_repeated_variables_get_the_names_of_their_devices():
+    variable = SimpleNamespace(name="p", v_code="y", a=[0, 1])
+    load = type("Load", (), {})()
+    load.cache, load.idx = SimpleNamespace(all_vars={"p": variable}), SimpleNamespace(v=["L1", "L2"])
+    system = SimpleNamespace(models={"Load": load})
+    assert _completed_names(system, ["omega", "", "a", "a"], 1) == ["omega", "p Load L1", "p Load L2", "a"]
+    assert _completed_names(system, ["omega", "v"], 1) == ["omega", "v"]
+    found = _completed_names(system, ["b", "b", "", "x", ""], 5)
+    assert len(set(found)) == len(found)
+
+
+def test_serial_days_are_refused_and_read_by_their_unit():
+    plant = obsynth.DescriptorSystem(
+        A=[[-0.1]], B=[[0.1]], C=[[1.0]], Bf=[[1.0]], input_names=["u"], output_names=["y"]
+    )
+    design = obsynth.ui_pi_observer(plant)
+    k = np.arange(600)
+    for start in (45321.5, 738000.25):
+        log = pd.DataFrame({"time": start + k / 86400, "u": np.ones(len(k)), "y": 1 - np.exp(-0.1 * k)})
+        with pytest.raises(obsynth.SpecError, match=r"time \[d\]"):
+            obsynth.run_on_data(design, log)
+        run = obsynth.run_on_data(design, log.rename(columns={"time": "time [d]"}))
+        assert (run.table["status"] == "ok").any()
+        assert np.isclose(run.table["time"].iloc[-1] - run.table["time"].iloc[0], 599.0, atol=1e-3)
+
+
+def test_what_a_design_states_of_outliers_is_the_rule_everywhere():
+    plant = obsynth.DescriptorSystem(A=[[0.9]], C=[[1.0]], dt=1.0)
+    y = np.array([0, 0.1, 0, 5.0, 0, 0.1])
+    log = pd.DataFrame({"time": np.arange(6.0), "y1": y})
+    for rule in ("none", "gate", "huber"):
+        design = obsynth.descriptor_kalman(plant, Q=[[0.01]], R=[[0.01]], outliers=rule)
+        own = np.ravel(design.observer.run(y[:, None]).states)
+        assert np.allclose(obsynth.run_on_data(design, log).table["xhat[x1]"], own)
+    unsaid = obsynth.descriptor_kalman(plant, Q=[[0.01]], R=[[0.01]])
+    assert obsynth.run_on_data(unsaid, log).outliers == {"y1": 1}
