@@ -64,7 +64,7 @@ def mutants(heading: str | None = None) -> list[Mutant]:
 
 def verdict(mutant: Mutant, tests: list[str], work: Path) -> str:
     """Return ``killed``, ``survives``, or why nothing is known, of one mutant in a copy of the sources."""
-    file = work / "src/obsynth" / mutant.file
+    file = work / (mutant.file if mutant.file.startswith("checker/") else f"src/obsynth/{mutant.file}")
     original = file.read_text(encoding="utf-8")
     try:
         changed = mutant.source(original)
@@ -101,7 +101,7 @@ def main() -> int:
     alive = 0
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        for name in ("src", "tests", "designs", "docs", "notebooks", "benchmarks"):
+        for name in ("src", "tests", "designs", "docs", "notebooks", "benchmarks", "checker"):
             shutil.copytree(ROOT / name, work / name, ignore=shutil.ignore_patterns("__pycache__"))
         for name in ("pyproject.toml", "README.md", "CHANGELOG.md", "CONTRIBUTING.md"):
             shutil.copy(ROOT / name, work / name)

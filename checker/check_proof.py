@@ -364,14 +364,15 @@ def identities_hold(system, claim):
 
     Each entry of what the identities miss (see ``System.identities``) is at most ``share`` times the sum of the
     absolute values of its terms, or ``share`` times the largest such sum of its column where this is far larger
-    (``floor`` times it: what is nothing but rounding of large terms is compared with these).
+    (``floor`` times it: what is nothing but rounding of large terms is compared with these). What
+    disturbances do to an observer that is decoupled from them (V, W) is bounded in ``rounding``.
     """
     share, floor = read_matrix(claim["share"]).number(), read_matrix(claim["floor"]).number()
     require(0 <= share <= LARGEST_SHARE and 0 <= floor <= 1, "the identities are allowed to miss too much")
     for name, (missed, sizes) in system.identities().items():
-        require_small(missed, sizes, share, floor, f"identity {name}")
-    besides = ", whatever the disturbances do" if system.decoupled else ""
-    return f"without faults{besides}, z follows T E x, and the rows what they stand for, to {shown(share)} of all terms"
+        if name in ("K", "U", "J", "L"):
+            require_small(missed, sizes, share, floor, f"identity {name}")
+    return f"without faults, z follows T E x, and the rows what they stand for, to {shown(share)} of all terms"
 
 
 def lyapunov(system, claim, rate, a):
@@ -429,7 +430,7 @@ def stable(system, claim):
     require(0 < value < 1 if system.discrete else value >= 0, "the rate is none of decay")
     lyapunov(system, claim, rate, system.Az)
     if system.discrete:
-        return f"every error decays, faster than {shown(value)}^k"
+        return f"every error decays, faster than (1 - {shown(1 - value, down=True)})^k"
     return f"every error decays, faster than exp(-{shown(value, down=True)} t)" if value else "every error decays"
 
 
@@ -506,13 +507,17 @@ def rounding_adds_little(system, claim):
     for kind, (moved, seen) in pairs.items():
         bounds = read_matrix(claim["bounds"][kind])
         contraction.require_bounds(bounds, found[moved][0], own[seen], kind)
-        worst = max([worst, *entries_of(bounds)])
+        worst = max([worst, *entries_of(bounds)]) if kind != "disturbances" else worst
         first = system.T.columns - system.Phi.rows
         for i in system.rows_of(["fault"]) if kind == "states" else []:
             for j in range(first, bounds.columns):
                 size = abs(system.goal.fraction(i, j))
                 require(not size or bounds.fraction(i, j) <= LARGEST_SHARE * size, NOT_ITS_FAULT)
-    return f"rounding of the stored numbers adds at most {shown(worst)} to any row, per unit of any state or input"
+    besides = ""
+    if system.decoupled and system.Bd.columns:
+        most = max(entries_of(read_matrix(claim["bounds"]["disturbances"])), default=0)
+        besides = f"; disturbances, whatever their course, add at most {shown(most)} per unit"
+    return f"rounding adds at most {shown(worst)} to any row, per unit of any state or input{besides}"
 
 
 def faults_are_estimated(system, claim):

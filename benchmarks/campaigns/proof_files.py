@@ -23,7 +23,7 @@ import obsynth
 from obsynth.exporting.proof_file import proof_bytes, proof_of
 
 CASES = 450
-LIMIT = 120.0
+LIMIT = 300.0
 METHODS = ("fault-estimation-filter", "pd-observer", "ui-pi-observer", "functional-filter", "detection-filter",
            "guaranteed-test")  # fmt: skip
 #: Changes of each file.

@@ -224,7 +224,6 @@ CHANGES = {
     "an input in the rows": lambda file: file["observer"].update(Du=data(2.0**-30)),
     "the rows": lambda file: file["observer"].update(Dy=data(1.0 + 2.0**-30)),
     "equations that are added": lambda file: file["follows"].update(T0=data(2.0**-30)),
-    "unknown inputs": lambda file: file["follows"].update(decoupled=True),
     "feedthrough": lambda file: file["plant"].update(D=data(2.0**-30)),
 }
 
@@ -262,6 +261,16 @@ def test_what_rounding_adds_to_known_inputs_counts() -> None:
     assert not accepted(file)
     file["claims"][0]["bounds"]["inputs"] = data(2.0**-19 * 1.001)
     assert accepted(file)
+
+
+def test_an_observer_is_not_decoupled_because_a_file_says_so() -> None:
+    """e+ = e / 4 + d: a contraction of one half makes two of it."""
+    claim = {"claim": "rounding", "bounds": {"states": data(0.0), "inputs": data(0.0)}}
+    file = file_of(claim, contraction=contraction())
+    file["follows"]["decoupled"] = True
+    for bound, proved in ((None, False), (0.0, False), (1.99, False), (2.01, True)):
+        claim["bounds"] = {**claim["bounds"], **({} if bound is None else {"disturbances": data(bound)})}
+        assert accepted(file) == proved
 
 
 def test_a_contraction_needs_its_inverse_and_a_rate_of_decay() -> None:

@@ -55,6 +55,8 @@ NORM_ROOM = (1.0, 1.0 + 1e-12, 1.0 + 1e-9)
 LOGARITHM_ROOM = 1e-9
 #: Identities are stated to a power of two of their terms, and of this share of the largest in a column.
 IDENTITY_FLOOR = 2.0**-20
+#: Those that are stated to a share of their terms: the others are bounded per unit of what enters.
+IDENTITIES = ("K", "U", "J", "L")
 #: Relative room of bounds above what they are computed as.
 BOUND_ROOM = 1.0 + 2.0**-20
 #: Bits of the covariances, and the share of process noise that is added to make their inequality strict.
@@ -365,7 +367,7 @@ class _Exact:
         return {name: (_sum(found[name]), _sum(sizes[name])) for name in found}
 
     def identities_claim(self) -> dict[str, Any] | None:
-        share = max((_share(*both) for both in self.missed.values()), default=Fraction(0))
+        share = max((_share(*both) for name, both in self.missed.items() if name in IDENTITIES), default=Fraction(0))
         stated = 0.0 if not share else float(2.0 ** np.ceil(np.log2(float(share)) + LOGARITHM_ROOM))
         if stated > ESTIMATE_SHARE:
             return None
