@@ -149,6 +149,9 @@ def test_a_witness_is_as_large_as_its_farthest_exact_point_allows(seed: int, nor
     worst = max(
         [1.0, *shares[groups < 0], *(np.sqrt(np.sum(shares[groups == g] ** 2)) for g in set(groups[groups >= 0]))]
     )
+    near = np.where(bounded, 0.1 * np.where(bounded, bar, 0.0), 1.0)
+    near[0] = 0.7
+    assert proved_least(window, Repaired(near, np.zeros(len(bar)))) <= 0.7
     assert found <= 0.7 / worst * (1.0 + 1e-12)
     assert found >= 0.7 / worst * (1.0 - 1e-9)
 
@@ -287,6 +290,18 @@ def test_the_fixed_test_says_nothing_of_a_window_with_an_incomplete_row(missing:
             assert np.isfinite(judged.statistic) == (before - 1 <= k < 9 or k >= 9 + before)
 
 
+def test_a_window_begins_again_after_rows_that_are_missing() -> None:
+    rule, (y, u) = rule_of(design_of(0)), rows_for(12)
+    state = rule.init()
+    for k in range(6):
+        state, _ = stepped(rule, state, k, np.zeros(1), y[k], u[k])
+    state, found = rule.restart(state, 1), []
+    for k in range(7, 12):
+        state, judged = stepped(rule, state, k, np.zeros(1), y[k], u[k])
+        found.append(np.isfinite(judged.statistic))
+    assert found == [False] * (rule._length - 1) + [True] * (5 - rule._length + 1)
+
+
 def test_a_verdict_waits_for_a_full_window() -> None:
     rule, (y, u) = rule_of(design_of(0)), rows_for(8)
     state, found = rule.init(), []
@@ -381,5 +396,6 @@ def test_a_remainder_is_of_the_sample_time_that_was_asked_for(
     )  # fmt: skip
     design: Any = SimpleNamespace(linear=(plant, None), options={})
     monkeypatch.setattr(regions, "DAEModel", lambda **_: None)
-    monkeypatch.setattr(regions, "bounded_model", lambda *_, **__: (None, dict.fromkeys(names, size)))
+    bounds = dict(zip(names, (size, 0.1, 0.2), strict=True))
+    monkeypatch.setattr(regions, "bounded_model", lambda *_, **__: (None, bounds))
     assert regions.remainder_check(design, lambda _: asked).passed == passed
