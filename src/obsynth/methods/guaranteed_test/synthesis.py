@@ -333,8 +333,8 @@ def _notes(
         )
     elif least is not None:
         words.append(
-            f"The threshold is {threshold:.9g}, and no function of {question.samples} samples has one below "
-            f"{least:.9g}: they differ by {threshold - least:.1e}. "
+            f"The threshold is {threshold:.4g}; the smallest possible with {question.samples} samples is {least:.4g} "
+            "(proved). "
             + (
                 "A fault of twice that is certain to raise an alarm."
                 if mean is None
@@ -343,10 +343,8 @@ def _notes(
         )
         if not window.twice_is_hidden:
             words.append(
-                "As states have bounds, the latter is about intervals: no function estimates the fault to within "
-                "less. It is "
-                "not claimed that none detects every fault of less than twice that size: bounds of states may make "
-                "that possible."
+                "As states have bounds, the latter is about intervals: no function of the samples estimates the fault to "
+                "within less, but a fault of less than twice that size may be detectable."
             )
     else:
         words.append("That there is no smaller threshold could not be proved on these numbers: least is not claimed.")
