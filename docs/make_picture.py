@@ -8,18 +8,20 @@ from __future__ import annotations
 from pathlib import Path
 
 import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
 
 import obsynth
 from obsynth.plotting import plot_faults
+from obsynth.report.plots.panels import label_time
 from obsynth.simulation.linear import simulate_plant
 from obsynth.specs.loader import load_spec
 
 mpl.use("Agg")
 HERE = Path(__file__).parent
 STEPS = 200
-#: Pixels of the width, for figures of the plotting module's 7.5 inches.
-WIDTH_IN_PIXELS = 1200
+#: Inches, and pixels of the width.
+SIZE, WIDTH_IN_PIXELS = (10.0, 2.8), 1500
 
 
 def main() -> None:
@@ -33,8 +35,11 @@ def main() -> None:
     run = simulate_plant(plant, steps=STEPS, u=inputs, f=faults, d=disturbance, initial_state=[0.5, 1.0, 0.0, -0.5])
     start = np.array([0.0, 1.0, 0.0, -0.5]) - design.gains["N"] @ run.outputs[0]
     estimates = design.observer.run(run.outputs, inputs, initial_state=start)
-    panels = plot_faults(estimates, faults=faults, dt=plant.dt)
-    figure = panels[0].figure
+    # Side by side: on the first screen of a page there is room for more.
+    figure, panels = plt.subplots(1, 2, figsize=SIZE, layout="constrained")
+    plot_faults(estimates, faults=faults, dt=plant.dt, axes=panels)
+    for panel in panels:
+        label_time(panel)
     figure.savefig(HERE / "fault_estimation.png", dpi=WIDTH_IN_PIXELS / figure.get_size_inches()[0])
 
 
