@@ -10,7 +10,7 @@ What is possible
     check, analyse_structure, diagnose, identifiability.
 Designs
     design, and one function for each method: fault_estimation_filter, pd_observer, ui_pi_observer, descriptor_kalman,
-    adaptive_observer, dae_adaptive_observer, guaranteed_test; verify, load.
+    adaptive_observer, dae_adaptive_observer, guaranteed_test; verify, load; optimal_filter: the least gain possible.
 On data
     run_on_data, smooth, learn_thresholds, online_monitor, plotting.plot_data, html_report, export.
 In simulation
@@ -46,6 +46,7 @@ _PUBLIC_NAMES = {
         "fault_estimation_filter functional_filter pd_observer ui_pi_observer"
     ),
     "methods.guaranteed_test.result": "GuaranteedTest guaranteed_test",
+    "methods.optimal_filter.public": "OptimalFilter optimal_filter",
     "methods.pd_observer.public": "apply_adaptation_gain",
     "methods.ui_pi_observer.fault_response": "fault_response",
     "methods.verifying": "verify",

@@ -25,6 +25,8 @@ from obsynth.methods.functions import pd_observer as pd_observer
 from obsynth.methods.functions import ui_pi_observer as ui_pi_observer
 from obsynth.methods.guaranteed_test.result import GuaranteedTest as GuaranteedTest
 from obsynth.methods.guaranteed_test.result import guaranteed_test as guaranteed_test
+from obsynth.methods.optimal_filter.public import OptimalFilter as OptimalFilter
+from obsynth.methods.optimal_filter.public import optimal_filter as optimal_filter
 from obsynth.methods.pd_observer.public import apply_adaptation_gain as apply_adaptation_gain
 from obsynth.methods.ui_pi_observer.fault_response import fault_response as fault_response
 from obsynth.methods.verifying import verify as verify
