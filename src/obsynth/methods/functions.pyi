@@ -19,6 +19,7 @@ def fault_estimation_filter(
     gamma_search: Literal["direct", "bisection"] = ...,
     gamma_margin: float = ...,
     free_residual_weight: bool | None = ...,
+    weight: Literal["paper", "free"] | None = ...,
     residual_weight_limit: float | None = ...,
     S: Any = ...,
     engine: Literal["auto", "riccati", "lmi"] = ...,

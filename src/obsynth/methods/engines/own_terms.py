@@ -61,7 +61,7 @@ def filter_by_inequality(
     """Return a fault-estimation filter by (45) with what was asked for in it; see `obsynth.fault_estimation_filter`."""
     progress("checking the existence conditions")
     require_all(fault_filter_conditions(plant))
-    free = bool(asked.free_residual_weight)
+    free = bool(asked.asks_for_free_weight)
     found = wang2015(plant, S=asked.S, W="free" if free else None, gamma=None)
     squared, P, Y = found.variables["gamma_squared"], found.variables["P"], found.variables["Y"]
     parts = [] if asked.region is None else [checked_region(asked.region)]

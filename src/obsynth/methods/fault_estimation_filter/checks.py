@@ -111,7 +111,9 @@ def _gain_set_rows(
     if printed_digits is not None:
         allowances = printed_allowances(plant, work, observer, gains, scaling, printed_digits)
     equations = Equations.of(plant, work, observer.fault_delays)
-    fixed = design.options.get("free_residual_weight") is False and design.options.get("S") is None
+    options = design.options
+    # The W of this identity is that of balanced units, without S and without the paper's weight.
+    fixed = options.get("free_residual_weight") is False and not (options.get("S") or options.get("weight"))
     yield from gain_rows(work, gains, observer, tracking, equations, scaling, allowances, fixed_weight=fixed)
     yield from _least_gain(design, work)
     return allowances

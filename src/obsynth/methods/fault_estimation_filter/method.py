@@ -56,6 +56,9 @@ class FaultEstimationFilter(Method):
         bare optimum is badly conditioned.
     free_residual_weight : bool, optional
         Whether W is free within ``W Upsilon = I``.  By default yes when the plant states noise, else no.
+    weight : {"paper", "free"}, optional
+        Residual weight W: ``"paper"`` is W = Upsilon^+ of Theorem 2 in the outputs as given; ``"free"`` any W with ``W
+        Upsilon = I``.  By default as ``free_residual_weight`` says, whose fixed W is Upsilon^+ in balanced units.
     residual_weight_limit : float, optional
         Bound on the spectral norm of W (implies a free W; not with engine "riccati").
     S : array_like, optional
@@ -162,6 +165,7 @@ class FaultEstimationFilter(Method):
     gamma_search: Literal["direct", "bisection"] = "direct"
     gamma_margin: Annotated[float, Ge(LEAST_MARGIN)] = 0.05
     free_residual_weight: bool | None = None
+    weight: Literal["paper", "free"] | None = None
     residual_weight_limit: Positive | None = None
     S: Annotated[Any, WrittenAs("matrix")] = None
     engine: Literal["auto", "riccati", "lmi"] = "auto"
@@ -179,6 +183,10 @@ class FaultEstimationFilter(Method):
         """Yield a sentence for each rule across options that is broken."""
         if self.residual_weight_limit is not None and self.free_residual_weight is False:
             yield "residual_weight_limit needs free_residual_weight: the weight is fixed otherwise."
+        if self.weight is not None and self.free_residual_weight is not None:
+            yield "weight and free_residual_weight both say what W is: leave free_residual_weight out."
+        if self.weight == "paper" and self.residual_weight_limit is not None:
+            yield "residual_weight_limit needs a free weight: leave weight: paper out."
         if self.residual_weight_limit is not None and self.engine == "riccati":
             yield "residual_weight_limit is not covered by engine 'riccati': use 'auto' or 'lmi'."
         if self.objective is not None and "objective" not in own_terms(self):
@@ -188,6 +196,11 @@ class FaultEstimationFilter(Method):
         yield from own_term_conflicts(self, beside=("residual_weight_limit", "prove_least"), engines=("riccati",))
         if self.decay is not None and self.engine == "riccati":
             yield "engine 'riccati' imposes no decay: use 'auto' or 'lmi'."
+
+    @property
+    def asks_for_free_weight(self) -> bool | None:
+        """Whether W is asked to be free; ``None``: nothing is said of it."""
+        return self.free_residual_weight if self.weight is None else self.weight == "free"
 
     @property
     def own_inequality(self) -> bool:

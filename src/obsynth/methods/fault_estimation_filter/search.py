@@ -168,7 +168,7 @@ def _require_reachable(problem: GainProblem, least: LeastGain, gain: float, *, s
         bound = proved_lower_bound(problem, solver=solver, best=least.injection, enough=gain)
     choice = "for this T and N" if problem.free_weight else "for this T, N and W"
     if bound > gain:
-        remedy = "" if problem.free_weight else ", or set free_residual_weight: true"
+        remedy = "" if problem.free_weight else ", or set weight: free"
         raise InfeasibleError(
             f"No filter reaches gamma = {gain:.6g} {choice}: a checked certificate proves gamma >= {bound:.6g}, and "
             f"the best filter found has {best:.6g}. Ask for a larger gamma, leave it out for the least{remedy}.",

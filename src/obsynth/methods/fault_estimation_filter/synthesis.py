@@ -74,11 +74,13 @@ def synthesise(
     s = None if asked.S is None else as_matrix(asked.S, "S")
     prepared = prepare(plant, s) if prepared is None or s is not None else prepared
     limit = asked.residual_weight_limit
-    free = asked.free_residual_weight if asked.free_residual_weight is not None else plant.nw > 0 or limit is not None
+    free = asked.asks_for_free_weight
+    if free is None:
+        free = plant.nw > 0 or limit is not None
     problem, parts = gain_problem(prepared, free_weight=free)
     # Where nothing disturbs the estimates, a small share of what disturbances could do is proved.
     nominal = NOMINAL_GAIN * max(problem.disturbance_size, NOMINAL_GAIN)
-    if s is not None or limit is not None:
+    if s is not None or limit is not None or asked.weight == "paper":
         # With the paper's S the weight is its W = Upsilon^+ too, which is that of the outputs as given.
         problem, parts = centred(problem, prepared, parts)
     limited = None if limit is None else with_weight_limit(problem, prepared, parts, limit)
