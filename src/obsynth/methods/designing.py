@@ -15,7 +15,7 @@ from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.methods.method import Method, Synthesis, silent
 from obsynth.methods.refusals import require_above_rounding, with_advice
-from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_class
+from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_class, methods_for
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import arguments_checked, field_types
 from obsynth.numerics.libraries import failed_computations, failure_of, one_thread_if_small
@@ -120,7 +120,8 @@ def design(
         from obsynth.methods.automatic import automatic_design
 
         report_stage("designing by every method that exists")
-        kind_of(own)
+        if kind_of(own) == "polytopic":
+            return made(own, methods_for("polytopic")[0], options, advise=True)
         with failed_computations(), one_thread_if_small(own.nx):
             own, recovery, _ = _with_arrays(own, recovery, report_stage)
             return automatic_design(own, options, made, partial(made, advise=True))

@@ -18,6 +18,7 @@ from obsynth.observers.linear.observer import LinearObserver, split_rows
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.signal_names import index_of
@@ -160,6 +161,12 @@ def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
         raise SpecError(
             f"Design {design.name!r} is a test whose weights change with k: it cannot be simulated. Simulate the "
             "plant (obsynth.simulate(plant, scenario)) and run the test on the outputs (design.observer.run).",
+            path="observer",
+        )
+    if isinstance(design.observer, ScheduledObserver):
+        raise SpecError(
+            f"Design {design.name!r} is for a region: scenarios have no courses of scheduling parameters yet. Run the "
+            "observer on outputs, inputs and parameters (design.observer.run), or on a log (obsynth.run_on_data).",
             path="observer",
         )
     observer: RecursiveObserver | DAEObserver

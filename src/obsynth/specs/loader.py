@@ -14,6 +14,7 @@ from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.libraries import one_thread_if_small
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.plants.transformations.recovery import Transformation
@@ -73,7 +74,7 @@ class Spec:
     name: str
     description: str
     path: Path
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem | DAEModel
     transformation: Transformation | None
     method: str
     options: Mapping[str, Any]
@@ -122,7 +123,7 @@ def load_model(path: str | Path) -> tuple[DAEModel, Spec | None]:
 
 def load_plant(
     path: str | Path,
-) -> tuple[DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, Spec | None]:
+) -> tuple[DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem | DAEModel, Spec | None]:
     """Return the plant of a spec as it was written, with the spec, or that of a file that holds a plant alone."""
     source = Path(path)
     document = read_yaml(source)

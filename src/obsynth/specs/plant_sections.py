@@ -13,6 +13,7 @@ from obsynth.plants.calibrated_box import does_not_stand
 from obsynth.plants.constants import constant_of
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import ALL_MATRICES, SIGNAL_NAMES, DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.signal_names import index_of
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.uncertain_system import with_expressions
@@ -54,11 +55,11 @@ _OUTPUT_ROWS = ("C", "D", "Df", "Dd")
 
 def built_plant(
     section: PlantSection | TimeVaryingSection | DAESection, source: Path, prefix: str
-) -> DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel:
+) -> DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem | DAEModel:
     """Return the plant of a section, as written."""
     kind = getattr(section, "kind", None)
     make: Any = _invariant_plant if kind is None else _nonlinear_plant if kind == "dae" else _varying_plant
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel = make(section, source, prefix)
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem | DAEModel = make(section, source, prefix)
     return plant
 
 
@@ -165,7 +166,39 @@ def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel
     return _placed(made, source, prefix)
 
 
-def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> DescriptorSystem:
+def _polytopic_plant(section: PlantSection, source: Path, prefix: str) -> PolytopicSystem:
+    """Return the plant of a section with scheduling parameters."""
+    arguments = _read(section, source, prefix, ("dt", "sensor_noise", *_LABELS), ALL_MATRICES, SIGNAL_NAMES)
+    for name in ("tolerance", "variation", "box", "transform"):
+        if getattr(section, name) is not None:
+            raise SpecError(f"{source}: {name} is for plants without scheduling: remove it.", path=joined(prefix, name))
+    if noise_needs_states(noise_model_of(section)):
+        raise SpecError(
+            f"{source}: noise with states of its own is for plants without scheduling: state white noise.",
+            path=joined(prefix, "sensor_noise"),
+        )
+
+    def made() -> PolytopicSystem:
+        given = {name: value for name, value in arguments.items() if value is not None}
+        for matrix, names in _SIGNAL_OF_PICK.items():
+            if isinstance(arguments[matrix], list) and arguments[names] is None:
+                given[names] = arguments[matrix]
+        base = DescriptorSystem(**given)
+        for name, entries in (section.entries or {}).items():
+            places = [_entry(base, name, item) for item in entries]
+            rows = getattr(base, name).tolist()
+            for row, column, text in places:
+                rows[row][column] = text
+            given[name] = rows
+        scheduling = {name: item.model_dump(exclude_none=True) for name, item in (section.scheduling or {}).items()}
+        return PolytopicSystem(plant=given, scheduling=scheduling, constants=section.constants)
+
+    return _placed(made, source, prefix)
+
+
+def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> DescriptorSystem | PolytopicSystem:
+    if section.scheduling is not None:
+        return _polytopic_plant(section, source, prefix)
     arguments = _read(
         section, source, prefix, ("dt", "sensor_noise", *_LABELS), ALL_MATRICES, SIGNAL_NAMES, keep_sparse=True
     )

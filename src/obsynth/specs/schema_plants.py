@@ -70,6 +70,16 @@ class EntrySection(Section):
     value: Text | float
 
 
+class SchedulingSection(Section):
+    """A measured parameter that the matrices depend on: its range, largest change in a second, and column of a log."""
+
+    range: Annotated[list[float], Field(min_length=2, max_length=2)]
+    rate: float | None = None
+    column: Text | None = None
+    unit: Text | None = None
+    measured: bool = True
+
+
 class BoxSection(Section):
     """Where the tolerances come from: a source, or a file that ``obsynth calibrate --out`` has written."""
 
@@ -124,6 +134,7 @@ class PlantSection(Section):
     offset: Sizes | None = None
     walks: Sizes | None = None
     constants: dict[Text, Any] | None = None
+    scheduling: dict[Text, SchedulingSection] | None = None
     entries: dict[Text, list[EntrySection]] | None = None
     tolerance: dict[Text, Text | float] | None = None
     variation: Literal["constant", "varying"] | None = None
@@ -133,8 +144,10 @@ class PlantSection(Section):
     @model_validator(mode="before")
     @classmethod
     def _expressions(cls, data: Any) -> Any:
-        """Return a raw plant section with expressions in rows moved to ``entries``; only where there are constants."""
-        if not isinstance(data, dict) or not isinstance(data.get("constants"), dict):
+        """Return a raw plant section with expressions in rows moved to ``entries``; only where there are constants, or
+        scheduling parameters."""
+        known = isinstance(data, dict) and any(isinstance(data.get(name), dict) for name in ("constants", "scheduling"))
+        if not isinstance(data, dict) or not known:
             return data
         found, entries = dict(data), data.get("entries")
         entries = dict(entries) if isinstance(entries, dict) else entries

@@ -158,6 +158,11 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
         """Rows that hold the fault estimates."""
         return slice(len(self.state_names), len(self.state_names) + len(self.fault_names))
 
+    @property
+    def residual_rows(self) -> slice:
+        """Rows that hold the residuals."""
+        return slice(self.fault_rows.stop, len(self.Cz))
+
     @cached_property
     def effectiveness_is_one(self) -> bool:
         """Whether fault rows are divided by nothing."""
