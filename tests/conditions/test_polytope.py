@@ -204,3 +204,14 @@ def test_what_cannot_be_asked_is_refused() -> None:
         vertex_inequalities(_spring(2.0), steps=0.1)
     with pytest.raises(SpecError, match="needs the rate"):
         vertex_inequalities(errors, goal="decay")
+
+
+def test_in_continuous_time_one_gain_is_enough_and_it_is_small() -> None:
+    # A lightly damped spring, k in [1, 6]: .8803 for any course (measured position).
+    A = [[[0, 1], [-k, -0.4]] for k in (1.0, 6.0)]
+    B, D = [[0, 0], [1.0, 0]], [[0, 0.1]]
+    errors = ErrorPolytope(A, [[1.0, 0]], B=B, D=D, dt=0.0)
+    made = certified(errors)
+    assert len(made.gains) == 1
+    assert np.linalg.norm(made.gains[0]) < 1e5
+    assert made.level <= 1.001 * made.least

@@ -263,3 +263,30 @@ def test_units_do_not_matter() -> None:
     moved = obsynth.fault_estimation_filter(PolytopicSystem(vertices), gamma_margin=0.02)
     assert moved.report.passed
     assert moved.certificate.claims["gamma_min"] < 1e-3 * plain
+
+
+def test_feedthrough_and_a_sensor_fault_are_exact_too() -> None:
+    A = WANG_A.tolist()
+    A[0][0] = "0.9 + 0.05 * a"
+    plant = PolytopicSystem(
+        plant={
+            "E": np.diag([1.0, 1, 1, 0]), "A": A, "B": [["1 + 0.2 * a"], [0], [0], [0]],
+            "C": np.eye(4)[1:], "D": [[0.3], [0], [-0.2]],
+            "Bf": [[0.1, 0], [1, 0], [-0.1, 0], [-1, 0]], "Df": [[0, 0], [0, 1], [0, 0]],
+            "Bd": WANG_BD, "Dd": [[0.1], [0], [0.2]], "dt": 1.0,
+        },
+        scheduling={"a": [-1, 1]},
+    )  # fmt: skip
+    made = obsynth.fault_estimation_filter(plant)
+    observer, gamma = made.scheduled[1], made.certificate.claims["gamma"]
+    parameters, u, f = _wild(plant, 700)
+    y, inputs = record(plant, parameters, u, f), np.hstack([u, parameters])
+    found = observer.run(y, inputs)
+    left = observer.forgetting
+    assert np.abs(found.faults[left + 1 :] - f[left:-1]).max() < 1e-10
+    for seed in range(4):
+        d = np.random.default_rng(seed).standard_normal((700, 1))
+        d = np.cumsum(d, axis=0) if seed % 2 else d
+        moved = observer.run(record(plant, parameters, u, f, d), inputs).faults - found.faults
+        assert np.linalg.norm(moved) <= gamma * np.linalg.norm(d)
+        assert np.linalg.norm(moved) >= 0.05 * gamma * np.linalg.norm(d)

@@ -27,6 +27,8 @@ from obsynth.proofs.intervals import range_over
 MOST_FUNCTIONS = 12
 #: What a weight given by its column may be off by: logs have about six digits.
 WEIGHT_TOLERANCE = 1e-6
+#: What a step of a parameter may exceed its rate by, from rounding of logs; certificates allow for twice as much.
+RATE_TOLERANCE = 1e-6
 #: Whole numbers below this one are written without a point.
 LARGEST_WHOLE = 1e15
 #: Keys of a parameter as it is given.
@@ -205,7 +207,7 @@ class Scheduling:
         """Return by how much the weight of the second of two vertices can change within a sample, where it is known."""
         if self.count != 2 or len(self.names) != 1 or self.rates[0] is None or self.functions != self.names:
             return None
-        return self.rates[0] * dt / float(self.high[0] - self.low[0])
+        return self.rates[0] * dt * (1.0 + 2.0 * RATE_TOLERANCE) / float(self.high[0] - self.low[0])
 
     def sentence(self) -> str:
         """Return the region in words."""

@@ -16,6 +16,7 @@ from obsynth.files.outputs import yaml_text
 from obsynth.files.tables import aligned
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import plant_facts
 from obsynth.results.checks import Check
@@ -76,7 +77,7 @@ def plain_table(headings: Sequence[str], rows: Sequence[Sequence[str]], width: i
 
 
 def check_report(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel,
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem | DAEModel,
     structures: Mapping[str, Structure],
     methods: Mapping[str, VerificationReport],
     *,

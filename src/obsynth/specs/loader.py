@@ -123,16 +123,24 @@ def load_model(path: str | Path) -> tuple[DAEModel, Spec | None]:
 
 def load_plant(
     path: str | Path,
-) -> tuple[DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem | DAEModel, Spec | None]:
-    """Return the plant of a spec as it was written, with the spec, or that of a file that holds a plant alone."""
+) -> tuple[DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, Spec | None]:
+    """Return the plant of a spec as it was written, with the spec, or that of a file that holds a plant alone; one over
+    a region is refused, as nothing is fitted to it."""
     source = Path(path)
     document = read_yaml(source)
+    spec = None
     if "method" not in document and "plant" not in document:
-        return built_plant(checked_plant(document, source), source, ""), None
-    spec = spec_of(document, source, with_states=False)
-    if spec.model is not None:
-        return spec.model, spec
-    return spec.plant if spec.transformation is None else spec.transformation.source, spec
+        plant = built_plant(checked_plant(document, source), source, "")
+    else:
+        spec = spec_of(document, source, with_states=False)
+        plant = spec.plant if spec.transformation is None else spec.transformation.source
+        plant = plant if spec.model is None else spec.model
+    if isinstance(plant, PolytopicSystem):
+        raise SpecError(
+            f"{source} holds a plant over a region (scheduling), which is not calibrated: give one with constants.",
+            path="plant.scheduling",
+        )
+    return plant, spec
 
 
 @arguments_checked

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from obsynth.specs.schema_plants import EntrySection, PlantReference, PlantSection
     from obsynth.specs.schema_sections import DAESection, TimeVaryingSection
 
-_Plant = TypeVar("_Plant", DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
+_Plant = TypeVar("_Plant", DescriptorSystem, TimeVaryingDescriptorSystem, PolytopicSystem, DAEModel)
 
 # Equations picked by name also name the signal that enters there.
 _SIGNAL_OF_PICK = {"B": "input_names", "Bw": "noise_names"}

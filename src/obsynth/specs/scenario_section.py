@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from obsynth.errors import SpecError
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.profiles import Profile
 from obsynth.simulation.scenario import PROFILE_KINDS, Scenario
@@ -22,11 +23,18 @@ _SCENARIO_GROUPS = ("inputs", "faults", "disturbances", "sensors")
 
 
 def built_scenario(
-    section: ScenarioSection | None, plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, source: Path
+    section: ScenarioSection | None,
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem | DAEModel,
+    source: Path,
 ) -> Scenario | None:
     """Return the scenario of a spec; `None` if it has none."""
     if section is None:
         return None
+    if isinstance(plant, PolytopicSystem):
+        raise SpecError(
+            f"{source}: a plant over a region has no scenario: these have no courses of parameters yet.",
+            path="scenario",
+        )
     problems = DocumentProblems(source, what="spec")
     given: dict[str, Any] = {name: getattr(section, name) for name in section.model_fields_set}
     for group in _SCENARIO_GROUPS:

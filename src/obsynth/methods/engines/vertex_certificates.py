@@ -18,6 +18,7 @@ from obsynth.conditions.polytope import vertex_inequalities, witness_of
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import state_units
+from obsynth.numerics.ranks import decide_rank
 from obsynth.proofs.vertex_inequalities import VertexProof, Witness, prove_decay, prove_gain, prove_mean_square
 from obsynth.verification.error_polytope import ErrorPolytope
 
@@ -116,6 +117,8 @@ def certified(
         if not _solve(found, solver, settings, runs):
             continue
         inner, own = witness_of(moved, found, steps=steps)
+        if goal == "gain" and gains is None and _one_gain_is_enough(moved):
+            own = [_best_gain(moved, inner.P[0], target / z_unit)]
         made = [units.gain_out(L) for L in own] if gains is None else [np.asarray(L, dtype=np.float64) for L in gains]
         witness = units.witness_out(inner, z_unit)
         proof = prover(errors.closed(made), witness, target, discrete=errors.dt > 0.0, **more)
@@ -132,6 +135,26 @@ def certified(
         "A gain was found, but no certificate at the vertices could be proved. That is no proof that there is none: "
         "give a smaller region, or a larger margin.",
     )
+
+
+def _one_gain_is_enough(errors: ErrorPolytope) -> bool:
+    """Whether in continuous time the best gain does not change: C, D and B D' are constant, D D' is nonsingular.
+
+    *Proof:* with w in terms of the innovation, L enters the inequality by the term of e and the innovation alone, which
+    ``L = P^-1 C' (D D')^-1 gamma^2 + B D^+`` makes zero, the best for every weight.
+    """
+    if errors.dt > 0.0 or errors.differential is not None or any(d.any() for d in errors.Dz):
+        return False
+    seen = [b @ errors.D[0].T for b in errors.B]
+    same = errors.constant_output and all(np.array_equal(each, seen[0]) for each in seen)
+    return same and decide_rank(errors.D[0], expected=errors.outputs).full
+
+
+def _best_gain(errors: ErrorPolytope, P: FloatArray, level: float) -> FloatArray:
+    """Return the gain of `_one_gain_is_enough`."""
+    D, C = errors.D[0], errors.C[0]
+    seen = np.linalg.inv(D @ D.T)
+    return np.asarray(level**2 * np.linalg.solve(P, C.T @ seen) + errors.B[0] @ D.T @ seen)
 
 
 def best_decay(

@@ -27,10 +27,8 @@ from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import NAME_FIELDS, checked_sample, require_names, whole_record
 from obsynth.observers.running import Observer
-from obsynth.plants.scheduling import Scheduling
+from obsynth.plants.scheduling import RATE_TOLERANCE, Scheduling
 
-#: What a step of a parameter may exceed its rate by, from rounding of logs.
-RATE_TOLERANCE = 1e-6
 #: The matrices that have a value at each vertex; of the others there is one.
 SCHEDULED = ("Az", "Bu", "By")
 FIXED = ("Cz", "Du", "Dy")
