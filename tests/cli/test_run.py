@@ -164,7 +164,10 @@ BAD_LOGS = {
     "no time in a row": ([HEADER, ROWS[0], ",0,0,0,0,0"], "Row 2 has no time"),
     "irregular times": ([HEADER, ROWS[0], ROWS[1], "2.48,0,0,0,0,0"], "Row 3 comes 1.48 s after"),
     "another dt": ([HEADER, "0,0,0,0,0,0", "0.5,0,0,0,0,0"], "Row 2 comes 0.5 s after"),
-    "twice the dt": ([HEADER, "0,0,0,0,0,0", "2,0,0,0,0,0", "4,0,0,0,0,0"], "the log is sampled every 2 s, but the design needs 1 s"),
+    "twice the dt": (
+        [HEADER, "0,0,0,0,0,0", "2,0,0,0,0,0", "4,0,0,0,0,0"],
+        "the log is sampled every 2 s, but the design needs 1 s",
+    ),
     "no rows": ([HEADER], "no rows"),
     "nothing": ([], "cannot be read"),
 }

@@ -343,8 +343,8 @@ def _notes(
         )
         if not window.twice_is_hidden:
             words.append(
-                "As states have bounds, the latter is about intervals: no function of the samples estimates the fault to "
-                "within less, but a fault of less than twice that size may be detectable."
+                "As states have bounds, the latter is about intervals: no function of the samples estimates the fault "
+                "to within less, but a fault of less than twice that size may be detectable."
             )
     else:
         words.append("That there is no smaller threshold could not be proved on these numbers: least is not claimed.")
