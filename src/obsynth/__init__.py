@@ -128,6 +128,18 @@ def _summary_of_design(design: Any) -> Any:
     return summary(design)
 
 
+def _monitor_in_c(monitor: Any, design: Any) -> Any:
+    from obsynth.monitoring.exporting import monitor_in_c
+
+    return monitor_in_c(monitor, design)
+
+
+def _bound_of_monitor(monitor: Any, observer: Any) -> Any:
+    from obsynth.monitoring.exporting import bound_of_monitor
+
+    return bound_of_monitor(monitor, observer)
+
+
 def _plot_least_thresholds(test: Any, **options: Any) -> Any:
     from obsynth.report.plots.guaranteed import plot_least_thresholds
 
@@ -136,8 +148,10 @@ def _plot_least_thresholds(test: Any, **options: Any) -> Any:
 
 # What methods of results and of conditions call in rooms above their own.
 register(
+    bound_of_monitor=_bound_of_monitor,
     conditions_of_design=_conditions_of_design,
     design_of_conditions=_design_of_conditions,
+    monitor_in_c=_monitor_in_c,
     plot_least_thresholds=_plot_least_thresholds,
     summary_of_design=_summary_of_design,
 )
