@@ -24,6 +24,7 @@ Types
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 from obsynth.results.registered import register
@@ -140,6 +141,24 @@ def _bound_of_monitor(monitor: Any, observer: Any) -> Any:
     return bound_of_monitor(monitor, observer)
 
 
+def _page_sections_of_run(*given: Any) -> Any:
+    from obsynth.monitoring.page_sections import page_sections_of_run
+
+    return page_sections_of_run(*given)
+
+
+def _detections(*given: Any) -> Any:
+    from obsynth.monitoring.page_sections import detections
+
+    return detections(*given)
+
+
+def _robustness(design: Any) -> Any:
+    from obsynth.studies.robustness import robustness
+
+    return robustness(design)
+
+
 def _plot_least_thresholds(test: Any, **options: Any) -> Any:
     from obsynth.report.plots.guaranteed import plot_least_thresholds
 
@@ -148,13 +167,21 @@ def _plot_least_thresholds(test: Any, **options: Any) -> Any:
 
 # What methods of results and of conditions call in rooms above their own.
 register(
-    bound_of_monitor=_bound_of_monitor,
     conditions_of_design=_conditions_of_design,
     design_of_conditions=_design_of_conditions,
-    monitor_in_c=_monitor_in_c,
     plot_least_thresholds=_plot_least_thresholds,
     summary_of_design=_summary_of_design,
 )
+# Rooms on data and on many designs may be left out: the design half is whole without them.
+if find_spec("obsynth.monitoring") is not None:
+    register(
+        bound_of_monitor=_bound_of_monitor,
+        detections=_detections,
+        monitor_in_c=_monitor_in_c,
+        page_sections_of_run=_page_sections_of_run,
+    )
+if find_spec("obsynth.studies") is not None:
+    register(robustness=_robustness)
 
 
 def __getattr__(name: str) -> Any:

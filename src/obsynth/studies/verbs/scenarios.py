@@ -137,8 +137,8 @@ def run_evaluate(options: argparse.Namespace) -> int:
                 plants=options.plants,
                 **({} if options.confidence is None else {"confidence": options.confidence}),
             )
-    from obsynth.report.scenarios import described, evaluation_report, final_threshold
     from obsynth.studies.least_thresholds import design_beside_least, in_words
+    from obsynth.studies.tables import described, evaluation_report, final_threshold
 
     least = design_beside_least(design, scenario)
     sentences = [in_words(name, *pair, design.plant.units.get(name, "")) for name, pair in least.items()]
@@ -194,7 +194,7 @@ def run_compare(options: argparse.Namespace) -> int:
                 found.save(options.out)
             else:
                 write_atomically(options.out, found.page())
-    from obsynth.report.scenarios import comparison_report
+    from obsynth.studies.tables import comparison_report
 
     answer(
         options,
