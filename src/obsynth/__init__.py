@@ -153,6 +153,12 @@ def _detections(*given: Any) -> Any:
     return detections(*given)
 
 
+def _run_many(options: Any) -> int:
+    from obsynth.studies.verbs.sweeps import run_many
+
+    return run_many(options)
+
+
 def _robustness(design: Any) -> Any:
     from obsynth.studies.robustness import robustness
 
@@ -181,7 +187,7 @@ if find_spec("obsynth.monitoring") is not None:
         page_sections_of_run=_page_sections_of_run,
     )
 if find_spec("obsynth.studies") is not None:
-    register(robustness=_robustness)
+    register(robustness=_robustness, run_many=_run_many)
 
 
 def __getattr__(name: str) -> Any:

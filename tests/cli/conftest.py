@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from obsynth import ObserverDesign
-from obsynth.cli import output
 from obsynth.monitoring.verbs import logs
 from obsynth.report import designs as tables
 from obsynth.report import page
+from obsynth.report.terminal import output
 from obsynth.results.gain_set_writing import gain_set_digest
 
 
