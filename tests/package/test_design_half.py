@@ -74,11 +74,10 @@ def test_the_copy_is_what_runs_and_lacks_both_rooms(design_half: Path, tmp_path:
     assert not any(verb in listed for verb in ("calibrate", "sweep"))
 
 
-@pytest.mark.long
 def test_every_shipped_spec_is_designed_by_python(
     design_half: Path, tmp_path: Path, share: Callable[..., Sequence[Any]]
 ) -> None:
-    for number, spec in enumerate(share(SPECS, 6)):
+    for number, spec in enumerate(share(SPECS, 12)):
         folder = tmp_path / str(number)
         folder.mkdir()
         done = run(design_half, folder, "-c", PROGRAM, str(spec))
@@ -89,12 +88,11 @@ def test_every_shipped_spec_is_designed_by_python(
         assert found["varies"] or found["files"], spec
 
 
-@pytest.mark.long
 def test_every_shipped_spec_is_designed_by_the_command_line(
     design_half: Path, tmp_path: Path, share: Callable[..., Sequence[Any]]
 ) -> None:
     program = "import sys; from obsynth.cli.main import design_command; sys.exit(design_command(sys.argv[1:]))"
-    for number, spec in enumerate(share(SPECS, 6)):
+    for number, spec in enumerate(share(SPECS, 12)):
         folder = tmp_path / str(number)
         folder.mkdir()
         done = run(design_half, folder, "-c", program, "--system", str(spec), "--output", "design.gains.json")
