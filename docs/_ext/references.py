@@ -14,11 +14,11 @@ from pydantic.fields import FieldInfo
 from spec_keys import KEYS, OPTION_SECTIONS, SECTIONS
 
 from obsynth.cli import main as command_line
-from obsynth.cli.arguments import settings_of
 from obsynth.cli.examples import EXAMPLES
 from obsynth.methods.installed import REGISTRY
 from obsynth.methods.registry import method_class
 from obsynth.numerics.arguments import WrittenAs, field_types
+from obsynth.report.terminal.arguments import settings_of
 from obsynth.specs import schema, schema_plants, schema_sections, schema_values
 
 _SCHEMA = (schema_values, schema_plants, schema_sections, schema)

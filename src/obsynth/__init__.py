@@ -24,6 +24,7 @@ Types
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 from obsynth.results.registered import register
@@ -128,6 +129,42 @@ def _summary_of_design(design: Any) -> Any:
     return summary(design)
 
 
+def _monitor_in_c(monitor: Any, design: Any) -> Any:
+    from obsynth.monitoring.exporting import monitor_in_c
+
+    return monitor_in_c(monitor, design)
+
+
+def _bound_of_monitor(monitor: Any, observer: Any) -> Any:
+    from obsynth.monitoring.exporting import bound_of_monitor
+
+    return bound_of_monitor(monitor, observer)
+
+
+def _page_sections_of_run(*given: Any) -> Any:
+    from obsynth.monitoring.page_sections import page_sections_of_run
+
+    return page_sections_of_run(*given)
+
+
+def _detections(*given: Any) -> Any:
+    from obsynth.monitoring.page_sections import detections
+
+    return detections(*given)
+
+
+def _run_many(options: Any) -> int:
+    from obsynth.studies.verbs.sweeps import run_many
+
+    return run_many(options)
+
+
+def _robustness(design: Any) -> Any:
+    from obsynth.studies.robustness import robustness
+
+    return robustness(design)
+
+
 def _plot_least_thresholds(test: Any, **options: Any) -> Any:
     from obsynth.report.plots.guaranteed import plot_least_thresholds
 
@@ -141,6 +178,16 @@ register(
     plot_least_thresholds=_plot_least_thresholds,
     summary_of_design=_summary_of_design,
 )
+# Rooms on data and on many designs may be left out: the design half is whole without them.
+if find_spec("obsynth.monitoring") is not None:
+    register(
+        bound_of_monitor=_bound_of_monitor,
+        detections=_detections,
+        monitor_in_c=_monitor_in_c,
+        page_sections_of_run=_page_sections_of_run,
+    )
+if find_spec("obsynth.studies") is not None:
+    register(robustness=_robustness, run_many=_run_many)
 
 
 def __getattr__(name: str) -> Any:

@@ -12,8 +12,8 @@ from obsynth.monitoring.calibration.result import Calibration as Calibration
 from obsynth.monitoring.calibration.validity import Validity as Validity
 from obsynth.monitoring.logs.run import DataRun as DataRun
 from obsynth.monitoring.thresholds.learned import LearnedThresholds as LearnedThresholds
-from obsynth.monitoring.thresholds.monitor import Detection as Detection
 from obsynth.monitoring.thresholds.monitor import Monitor as Monitor
+from obsynth.observers.detection import Detection as Detection
 from obsynth.observers.estimates import Estimates as Estimates
 from obsynth.observers.parameter_alarms import Alarm as Alarm
 from obsynth.observers.parameter_alarms import Decision as Decision

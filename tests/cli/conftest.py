@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from obsynth import ObserverDesign
-from obsynth.cli import output
-from obsynth.monitoring.verbs import logs
+from obsynth.cli import gain_sets
 from obsynth.report import designs as tables
 from obsynth.report import page
+from obsynth.report.terminal import output
 from obsynth.results.gain_set_writing import gain_set_digest
 
 
@@ -36,7 +36,7 @@ def verified_again() -> Callable[[Path], Any]:
 @pytest.fixture(autouse=True)
 def _verified_once(verified_again: Callable[[Path], Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """The verbs that hand a gain set on remember; ``verify`` does not."""
-    for module in (output, logs):
+    for module in (output, gain_sets):
         monkeypatch.setattr(module, "verified_again", verified_again)
 
 

@@ -6,8 +6,8 @@ import argparse
 
 import pytest
 
-from obsynth.cli.arguments import read_settings, settings_of
 from obsynth.cli.main import VERBS, main, obsynth_parser
+from obsynth.report.terminal.arguments import read_settings, settings_of
 
 
 def read(*line: str) -> argparse.Namespace:

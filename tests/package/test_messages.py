@@ -11,7 +11,7 @@ import obsynth
 from obsynth.cli.main import main
 from obsynth.errors import SpecError
 from obsynth.plants.signal_names import index_of
-from obsynth.report.page import value_text
+from obsynth.report.page_tables import value_text
 
 PLANT = {
     "E": [[1.0, 0.0], [0.0, 1.0]],

@@ -11,8 +11,8 @@ from rich.console import Console
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.report.scenarios import comparison_report
 from obsynth.studies.least_thresholds import design_beside_least, in_words
+from obsynth.studies.tables import comparison_report
 
 DRIVE = Path(__file__).parents[2] / "designs/drive/spec.yaml"
 

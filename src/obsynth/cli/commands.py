@@ -11,26 +11,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import obsynth
-from obsynth.cli.arguments import refuse_given
-from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json, progress, stdout_console
 from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.files.inputs import input_file, read_json
-from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.outputs import write_atomically
 from obsynth.methods.registry import AUTO
 from obsynth.numerics.libraries import failure_of
-from obsynth.plants.transformations.recovery import linear_plant
+from obsynth.report.terminal.arguments import refuse_given
+from obsynth.report.terminal.output import answer, print_json, progress, stdout_console
+from obsynth.report.terminal.specs import prepared, spec_output
 from obsynth.results.calibration_files import CALIBRATION_KIND, box_row, verify_calibration
-from obsynth.results.certificate_files import RESULTS
+from obsynth.results.certificate_files import ALARM_KIND, RESULTS, kind_of_file
 from obsynth.results.gain_set_writing import GAIN_SET, design_as_dict, gain_set_bytes, place_of, restored
 from obsynth.results.gain_sets import written_for
 from obsynth.specs.loader import design_of_spec, load_plant
 
 if TYPE_CHECKING:
     from obsynth.analysis.structure import Structure
-
-
-#: Constants of a gain set that differ from those of a spec and are told.
-MOST_TOLD_CONSTANTS = 4
 
 
 def run_design(options: argparse.Namespace) -> int:
@@ -85,42 +81,6 @@ def default_gains(spec: obsynth.Spec) -> Path:
         if not target.is_file() or written_for(target) in (None, place_of(spec.path)):
             return target
     raise SpecError(f"{' and '.join(names)} are of other specs called {spec.name!r}: give --output.", path=names[0])
-
-
-def designed_or_loaded(
-    spec: obsynth.Spec, gains: Path | None, report_stage: Any, *, unverified: bool = False
-) -> obsynth.ObserverDesign:
-    """Return the design that a spec asks for, or a saved one of the same plant, verified again."""
-    if gains is None:
-        return design_of_spec(spec, progress=report_stage)
-    design, _ = gains_to_hand_on(gains, unverified=unverified)
-    require_same_signals(design, gains, spec)
-    return design
-
-
-def require_same_signals(design: obsynth.ObserverDesign, gains: Path, spec: obsynth.Spec) -> None:
-    """Raise `SpecError` unless a gain set is for a plant with the inputs and outputs of a spec's plant."""
-    # States may differ: a method may have eliminated some.
-    if any(getattr(design.plant, name) != getattr(spec.plant, name) for name in ("input_names", "output_names")):
-        raise SpecError(f"{gains} is for a plant with other signals than that of {spec.path}.", path=str(gains))
-    own, stated = (getattr(plant, "constants", None) or {} for plant in (design.plant, spec.plant))
-    others = [name for name, value in own.items() if stated.get(name, value) != value]
-    if others:
-        told = ", ".join(f"{name} {own[name]:.6g} for {stated[name]:.6g}" for name in others[:MOST_TOLD_CONSTANTS])
-        print(
-            f"Warning: {gains} is for a plant with other constants than that of {spec.path} ({told}"
-            f"{', ...' if len(others) > MOST_TOLD_CONSTANTS else ''}): the plant of the gain set is used.",
-            file=sys.stderr,
-        )
-
-
-def spec_output(
-    wanted: Path, kind: FileKind | None, spec: obsynth.Spec, options: argparse.Namespace, *, option: str
-) -> Path:
-    """Return where to write what a spec asks for; refuse a hopeless place before any work is done."""
-    if wanted.exists() and wanted.samefile(spec.path):
-        raise SpecError(f"{wanted} is the spec itself: give another file to {option}.", path=str(wanted))
-    return output_file(wanted, kind, options, option=option)
 
 
 def run_check(options: argparse.Namespace) -> int:
@@ -198,31 +158,8 @@ def _structure_as_dict(structure: Structure) -> dict[str, Any]:
     return facts
 
 
-def run_sensors(options: argparse.Namespace) -> int:
-    """Run ``sensors``: spec in, least sets of sensors to add out; 3 where nothing reaches the goal."""
-    with progress(quiet=options.quiet) as report_stage:
-        spec = obsynth.load_spec(options.system)
-        plant = linear_plant(spec.plant)
-        given: dict[str, Any] = {"goal": options.goal, "noise": options.noise, "largest": options.largest}
-        if options.goal == "threshold":
-            own = dict(spec.options) if spec.method == "guaranteed-test" else {}
-            fault = options.fault or own.pop("fault", None)
-            if fault is None and plant.nf == 1:
-                fault = plant.fault_names[0]
-            own = {name: value for name, value in own.items() if name != "fault"}
-            given |= {"fault": fault, "below": options.below, "sample_time": options.sample_time, "test": own}
-        else:
-            refuse_given(options, ("below", "sample_time"), "--goal threshold")
-            given |= {"faults": None if options.fault is None else [options.fault]}
-        found = obsynth.sensor_sets(plant, progress=report_stage, **given)
-    answer(options, {"spec": spec.path, **found.to_dict()}, lambda: stdout_console().print(str(found), highlight=False))
-    return 0
-
-
 def run_verify(options: argparse.Namespace) -> int:
     """Run ``verify``: recheck any certificate, without a solver, to the end of what it rests on."""
-    from obsynth.monitoring.alarms.proof_file import ALARM_KIND
-    from obsynth.studies.certificates import kind_of_file, verify_certificate
 
     options.gains = options.gains or options.file
     if options.independent:
@@ -239,6 +176,8 @@ def run_verify(options: argparse.Namespace) -> int:
     if found == CALIBRATION_KIND:
         report = verify_calibration(options.gains, None if options.data is None else _calibrated_again(options))
     else:
+        from obsynth.studies.certificates import verify_certificate
+
         report = verify_certificate(options.gains, data=options.data)
     if options.calibration is not None and report.passed:
         from obsynth.studies.certificates import designs_inside
@@ -301,8 +240,6 @@ def _verify_independently(options: argparse.Namespace) -> int:
         check_independently,
         is_proof_file,
     )
-    from obsynth.monitoring.alarms.proof_file import ALARM_KIND
-    from obsynth.studies.certificates import kind_of_file
 
     for name in ("data", "calibration", "system", "printed_digits"):
         if getattr(options, name) is not None:
@@ -335,3 +272,25 @@ def _verify_gain_set(options: argparse.Namespace) -> int:
         lambda: _print_design(design.replace(report=report), options.gains, verbose=options.verbose),
     )  # fmt: skip
     return 0 if report.passed else VerificationError.exit_code
+
+
+def run_simulate(options: argparse.Namespace) -> int:
+    """Run ``simulate``: spec in, table of errors out, and every signal in a file if asked."""
+    with progress(quiet=options.quiet) as report_stage:
+        from obsynth.simulation.simulate import SIMULATED_SIGNALS, simulate
+
+        spec, scenario, target, design = prepared(options, report_stage, SIMULATED_SIGNALS)
+        report_stage("simulating")
+        found = simulate(design, scenario)
+        # A log as run reads it; a bias of a sensor is a deviation of its own.
+        point = {**getattr(design.plant, "operating_point", {})}
+        point = {name: value for name, value in point.items() if name not in getattr(design.plant, "sensor_faults", ())}
+        written = None if target is None else str(found.write_csv(target, operating_point=point))
+    from obsynth.report.scenarios import simulation_report
+
+    answer(
+        options,
+        {"spec": spec.path, "file": written, **found.summary()},
+        lambda: simulation_report(design.name, found, console=stdout_console(), units=design.plant.units, file=written),
+    )
+    return 0

@@ -1,50 +1,86 @@
-"""Alarms of an exported observer: levels of its outputs, and a monitor that was learned from rows without faults."""
+"""Alarms of an exported observer: levels of its outputs, and a monitor that upper rooms write as C."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from obsynth.errors import SpecError
 from obsynth.exporting.realisation import Realisation
-from obsynth.monitoring.thresholds.learned import LearnedThresholds
 from obsynth.numerics.arguments import real_number, require_mapping
-from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.derived import checked_warm_up, transient
 
-#: What the largest statistic of a learned monitor is called, in units of its level.
+#: What the statistic of a monitor is called, in units of its level.
 STATISTIC = "statistic"
 
 #: Seconds, about thirty years.
 _NEVER = 1e9
 
 
+@runtime_checkable
+class Monitor(Protocol):
+    """What an export takes as a monitor: that of `obsynth.online_monitor`, which upper rooms write as C."""
+
+    @property
+    def statement(self) -> str:
+        """What its threshold means."""
+
+    @property
+    def rule(self) -> Any:
+        """Statistic and threshold."""
+
+
+class MonitorVariable(NamedTuple):
+    """A number that an exported monitor shows after each step, and how C reads it from the monitor's structure."""
+
+    name: str
+    description: str
+    expression: str
+
+
+class ExportedMonitor(Protocol):
+    """A monitor whose C stands beside that of its observer: ``monitor_reset`` and ``monitor_take``."""
+
+    @property
+    def statement(self) -> str:
+        """What its threshold means."""
+
+    @property
+    def variables(self) -> tuple[MonitorVariable, ...]:
+        """What it shows after each step."""
+
+    def watched_observer(self, observer: Any) -> Any:
+        """Return an observer as the monitor expects it."""
+
+    def struct_lines(self, prefix: str) -> list[str]:
+        """Return the declaration of its structure, ``<prefix>_monitor``."""
+
+    def source(self, prefix: str) -> str:
+        """Return its tables and functions."""
+
+
 @dataclass(frozen=True, eq=False)
 class Alarms:
-    """What raises an alarm: ``levels`` by watched output, 0 for none; ``columns``: all outputs that a learned monitor
-    may take, fault estimates first; ``warm_up`` in seconds; ``walk (nf, nf)``: by which faults walk between samples."""
+    """What raises an alarm: ``levels`` by watched output, 0 for none; ``warm_up`` in seconds; a monitor."""
 
     levels: Mapping[str, float]
-    columns: tuple[str, ...]
     fault_names: tuple[str, ...]
     warm_up: float
-    learned: LearnedThresholds | None = None
-    walk: FloatArray | None = None
+    monitor: ExportedMonitor | None = None
 
     @classmethod
     def of(
         cls,
-        columns: Sequence[str],
+        watched: Sequence[str],
         fault_names: Sequence[str],
         thresholds: Mapping[str, float] | None,
         warm_up: float,
-        learned: LearnedThresholds | None,
-        more: Sequence[str] = (),
+        monitor: ExportedMonitor | None,
     ) -> Alarms:
-        """Return alarms; ``more``: what may be watched besides the columns.  Raise `SpecError` for another name."""
+        """Return alarms of outputs that may be watched; raise `SpecError` for another name."""
         require_mapping(thresholds, "thresholds")
-        watched = [*columns, *more]
         for name, level in (thresholds or {}).items():
             if name not in watched:
                 raise SpecError(
@@ -52,16 +88,24 @@ class Alarms:
                 )
             real_number(level, f"The threshold of {name!r}", "a positive number", above=0.0, path="thresholds")
         levels = {name: float((thresholds or {}).get(name, 0.0)) for name in watched}
-        if learned is not None:
+        if monitor is not None:
             levels[STATISTIC] = 1.0
-        return cls(levels, tuple(columns), tuple(fault_names), warm_up, learned)
+        return cls(levels, tuple(fault_names), warm_up, monitor)
+
+    def struct_lines(self, prefix: str) -> list[str]:
+        """Return the declaration of the monitor in C, if there is one."""
+        return [] if self.monitor is None else self.monitor.struct_lines(prefix)
+
+    def source(self, prefix: str) -> str:
+        """Return the tables and functions of the monitor in C, if there is one."""
+        return "" if self.monitor is None else self.monitor.source(prefix)
 
 
 def linear_alarms(
     found: Realisation,
     thresholds: Mapping[str, float] | None,
     warm_up: float | None,
-    learned: LearnedThresholds | None,
+    monitor: ExportedMonitor | None,
 ) -> Alarms:
     """Return the alarms of a linear observer."""
     observer = found.observer
@@ -70,4 +114,4 @@ def linear_alarms(
     seconds = checked_warm_up(warm_up, transient(found.running))
     # A file may hold finite numbers alone: an observer that never settles raises no alarm.
     seconds = seconds if math.isfinite(seconds) else _NEVER
-    return Alarms.of(columns, observer.fault_names, thresholds, seconds, learned)
+    return Alarms.of(columns, observer.fault_names, thresholds, seconds, monitor)

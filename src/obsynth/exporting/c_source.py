@@ -6,16 +6,13 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
-from typing import Any
 
 import numpy as np
 
 from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.realisation import Realisation, verification_words
-from obsynth.monitoring.logs.log_observer import SETTLING_SLACK
-from obsynth.monitoring.thresholds.learned_levels import AGES, FORGETTING, HOLD
-from obsynth.monitoring.thresholds.parameter_scores import DISTINGUISHED, LEAST_ADDED, MODEL_SHARE
-from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.derived import SETTLING_SLACK
 from obsynth.observers.nonlinear.c_code import in_lines
 
 _KEYWORDS = frozenset(
@@ -172,95 +169,10 @@ def header_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
 def alarm_comments(alarms: Alarms) -> list[str]:
     """Return what C says of alarms."""
     found = [f"alarm[{i}]: {quoted(name)}" for i, name in enumerate(alarms.levels)]
-    if alarms.learned is not None:
-        found += [f"Monitor: {quoted(alarms.learned.statement)}"]
+    if alarms.monitor is not None:
+        found += [f"Monitor: {quoted(alarms.monitor.statement)}"]
         found += [f"monitor.fault {i}: {quoted(name)}" for i, name in enumerate(alarms.fault_names)]
     return found
-
-
-def monitor_struct(alarms: Alarms, prefix: str) -> list[str]:
-    """Return the declaration of the learned monitor, if there is one."""
-    if alarms.learned is None:
-        return []
-    model = alarms.learned.statistics.model
-    m, width = model.channels, max(len(alarms.learned.statistics.estimates), 1)
-    return [
-        "typedef struct {",
-        "    /* Read these after a step: the largest statistic in units of its level (NaN where nothing is",
-        "     * decided), whether it passes 1, which fault it points to (-1: none, or not distinguished yet), and an",
-        "     * alarm that lasts. */",
-        "    REAL statistic;",
-        "    int alarm, fault, event;",
-        "    /* Everything else is the monitor's own. */",
-        f"    REAL past[{max(model.order * m, 1)}];",
-        f"    REAL white[{max(AGES) * m}];",
-        f"    REAL means[{len(FORGETTING) * m}];",
-        f"    REAL before[{(1 + width) * width}];",
-        f"    REAL scores[{max(AGES) * 2 * width}];",
-        "    int at, quiet, to_wait;",
-        "    long taken;",
-        f"}} {prefix}_monitor;",
-        "",
-    ]
-
-
-def monitor_source(alarms: Alarms, prefix: str) -> str:
-    """Return the tables and functions of the learned monitor, if there is one."""
-    if alarms.learned is None:
-        return ""
-    found, model = alarms.learned, alarms.learned.statistics.model
-    shapes, slopes = found.statistics.responses()
-    order, shares, faults_watched = model.order, np.array(FORGETTING), len(found.statistics.estimates)
-    straight = shapes[:, -1:] + (np.arange(order + 1) - order)[:, None] * slopes[:, None, :]
-    rows = np.concatenate([shapes, shapes[:, -1:] + np.arange(1, max(AGES))[:, None] * slopes[:, None, :]], axis=1)
-    powers = np.cumsum(np.sum(rows**2, axis=2), axis=1)[:, np.array(AGES) - 1]
-    sizes = {
-        "CHANNELS": model.channels,
-        "ORDER": order,
-        "OLDEST": max(AGES),
-        "AGES": len(AGES),
-        "MEANS": len(shares),
-        "SHAPES": len(shapes),
-        "MONITOR_FAULTS": len(found.scales),
-        "MONITOR_ESTIMATES": faults_watched,
-        "MONITOR_WIDTH": max(faults_watched, 1),
-        "MONITOR_SETTLING": found.settling,
-        "MONITOR_HOLD": HOLD,
-        "MONITOR_WATCHED": sum(name.startswith(("fhat[", "r[")) for name in alarms.columns),
-    }
-    tables: dict[str, Any] = {
-        "monitor_mean": model.mean[None],
-        "monitor_offset": model.offset[None],
-        "monitor_A": model.A.reshape(-1, model.channels),
-        "monitor_whitener": model.whitener,
-        "monitor_precision": model.whitener.T @ model.whitener,
-        "monitor_shares": shares[None],
-        "monitor_sizes": ((2.0 - shares) / shares)[None],
-        "monitor_levels": found.levels[None],
-        "monitor_flat": straight[:, 0],
-        "monitor_slopes": slopes,
-        "monitor_early": (shapes - straight).reshape(-1, model.channels),
-        "monitor_weights": 1.0 / (np.maximum(powers, SMALLEST) * found.statistics.levels_by_age),
-        "monitor_centres": found.centres[None],
-        "monitor_scales": found.scales[None],
-        "monitor_walk": np.zeros((0, 0)) if alarms.walk is None else alarms.walk,
-        "monitor_innovation": np.array([[found.innovation]]),
-    }
-    faults = {f"fhat[{name}]": i for i, name in enumerate(alarms.fault_names)}
-    faults |= {f"fault {name}": i for i, name in enumerate(alarms.fault_names)}
-    listed = ", ".join(f"{name} = {value}" for name, value in sizes.items())
-    lines = [
-        f"enum {{ {listed} }};",
-        f"#define MONITOR_LEAST ((REAL){LEAST_ADDED!r})",
-        f"#define MONITOR_APART ((REAL){DISTINGUISHED!r})",
-        f"#define MONITOR_SHARE ((REAL){MODEL_SHARE!r})",
-        *(line for name, table in tables.items() for line in table_lines(name, filled_table(table))),
-        *integer_table("monitor_ages", AGES),
-        *integer_table("monitor_places", [alarms.columns.index(name) for name in found.columns]),
-        *integer_table("monitor_seldom", [int(name in found.seldom) for name in alarms.columns]),
-        *integer_table("monitor_told", [faults.get(name, -1) for name in found.statistics.told]),
-    ]
-    return "\n".join(lines) + filled_template("learned.c", prefix, {})
 
 
 def _state_struct(found: Realisation, prefix: str, alarms: Alarms) -> list[str]:
@@ -288,7 +200,7 @@ def _state_struct(found: Realisation, prefix: str, alarms: Alarms) -> list[str]:
     }
     watched = max(len(alarms.levels), 1)
     return [
-        *monitor_struct(alarms, prefix),
+        *alarms.struct_lines(prefix),
         "typedef struct {",
         comment("Read these after a step: what the row was, and which outputs passed their levels."),
         "    int status;",
@@ -297,7 +209,7 @@ def _state_struct(found: Realisation, prefix: str, alarms: Alarms) -> list[str]:
         comment("Set these after the reset: levels (0 for none), and seconds without alarms after the start."),
         f"    REAL level[{watched}];",
         "    double warm_up;",
-        *(f"    {prefix}_monitor monitor;" for _ in ("monitor",) if alarms.learned is not None),
+        *(f"    {prefix}_monitor monitor;" for _ in ("monitor",) if alarms.monitor is not None),
         comment("Everything else is the observer's own."),
         *(f"    REAL {name}[{max(size, 1)}];" for name, size in sizes.items()),
         "    double time, from, waiting;",
@@ -367,7 +279,7 @@ def source_text(found: Realisation, prefix: str, header: str, alarms: Alarms) ->
                 template("products.c"),
                 *_products("say", ("z", "u", "y"), said, tuple(groups)),
                 *_products("next_of", tuple(found.transition), moved, ("next",)),
-                monitor_source(alarms, prefix),
+                alarms.source(prefix),
                 _step_text(found, prefix, alarms),
             ]
         )
@@ -421,7 +333,7 @@ def _step_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
     observer = found.observer
     nu, ny = len(observer.input_names), len(observer.output_names)
     nx, nf, nr = len(observer.state_names), len(observer.fault_names), len(observer.residual_names)
-    learned = alarms.learned is not None
+    watched = alarms.monitor is not None
     arguments = ", ".join(_step_arguments(found, prefix))
     taken = (("v", "u", nu, 0), ("v + U_COUNT", "y", ny, nu))
     shown = (("faults", "shown", nf), ("residuals", "shown + FAULT_COUNT", nr))
@@ -434,11 +346,11 @@ def _step_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
             "STATES_SCRATCH": "" if nx else "REAL states[1] = {0};",
             "COPY_IN": " ".join(f"copied({to}, {of}, {n});" for to, of, n, _ in taken if n),
             "COPY_OUT": " ".join(f"copied({to}, {of}, {n});" for to, of, n in shown if n),
-            "MONITOR_RESET": "monitor_reset(&s->monitor);" if learned else "",
+            "MONITOR_RESET": "monitor_reset(&s->monitor);" if watched else "",
             "MONITOR_STEP": (
                 f"monitor_take(&s->monitor, shown, NULL, s->status == {prefix.upper()}_OK, -1);\n"
                 "    shown[SHOWN_COUNT] = s->monitor.statistic;"
-                if learned
+                if watched
                 else ""
             ),
             "STEP_ARGUMENTS": arguments.replace("*state", "*s", 1),
@@ -536,14 +448,14 @@ def integer_table(name: str, values: Sequence[object], kind: str = "int") -> lis
     return [f"static const {kind} {name}[{max(len(values), 1)}] = {{{', '.join(map(str, values)) or '0'}}};"]
 
 
-def template(name: str) -> str:
-    """Return the text of a file of C that is written around tables."""
-    return files("obsynth.exporting").joinpath("templates", name).read_text(encoding="utf-8")
+def template(name: str, package: str = "obsynth.exporting") -> str:
+    """Return the text of a file of C that is written around tables, from the templates of a package."""
+    return files(package).joinpath("templates", name).read_text(encoding="utf-8")
 
 
-def filled_template(name: str, prefix: str, words: Mapping[str, str]) -> str:
+def filled_template(name: str, prefix: str, words: Mapping[str, str], package: str = "obsynth.exporting") -> str:
     """Return a file of C with its prefix and other words put in, each once; a line that holds an empty one goes."""
-    text = template(name)
+    text = template(name, package)
     for word in (word for word, value in words.items() if not value):
         text = re.sub(rf"^ *{word}\n", "", text, flags=re.MULTILINE)
     known = {**words, "PREFIX": prefix, "UPPER": prefix.upper()}

@@ -7,13 +7,12 @@ CasADi writes the equations of a DAE; the loop of Newton around them, its dampin
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.exporting.alarms import Alarms
+from obsynth.exporting.alarms import Alarms, ExportedMonitor
 from obsynth.exporting.c_source import (
     alarm_comments,
     c_identifier,
@@ -21,8 +20,6 @@ from obsynth.exporting.c_source import (
     filled_table,
     filled_template,
     included,
-    monitor_source,
-    monitor_struct,
     quoted,
     signal_comments,
     status_lines,
@@ -32,10 +29,7 @@ from obsynth.exporting.c_source import (
 from obsynth.exporting.dae_float import float_error, in_floats, in_precision
 from obsynth.exporting.realisation import verification_words
 from obsynth.files.outputs import write_together
-from obsynth.monitoring.logs.log_observer import SETTLING_SLACK
-from obsynth.monitoring.thresholds.learned import LearnedThresholds, as_learned, watched_names
-from obsynth.monitoring.thresholds.parameter_scores import parameter_walk
-from obsynth.observers.linear.derived import checked_warm_up
+from obsynth.observers.linear.derived import SETTLING_SLACK, checked_warm_up
 from obsynth.observers.nonlinear.c_code import observer_code, observer_struct
 from obsynth.observers.running import as_run, rule_of_outliers
 from obsynth.plants.dae import DAEModel
@@ -81,17 +75,13 @@ def dae_alarms(
     design: ObserverDesign,
     thresholds: Mapping[str, float] | None,
     warm_up: float | None,
-    learned: LearnedThresholds | None,
+    monitor: ExportedMonitor | None,
 ) -> Alarms:
     """Return the alarms of a nonlinear design."""
-    model, observer = design.nonlinear
+    model, _ = design.nonlinear
     columns = (*(f"fhat[{name}]" for name in model.parameter_names), *(f"r[{name}]" for name in model.output_names))
     seconds = checked_warm_up(warm_up, 0.0)
-    found = Alarms.of(columns, model.parameter_names, thresholds, seconds, learned, more=("nis",))
-    if learned is not None:
-        # A run numbers innovations of any kind.
-        found = replace(found, columns=watched_names(design), walk=parameter_walk(observer))
-    return found
+    return Alarms.of((*columns, "nis"), model.parameter_names, thresholds, seconds, monitor)
 
 
 def dae_c_texts(
@@ -102,8 +92,8 @@ def dae_c_texts(
     model, observer = design.nonlinear
     digest = gain_set_digest(design)
     observer = as_run(observer, outliers, stated=rule_of_outliers(design))
-    if alarms.learned is not None:
-        observer = as_learned(observer, alarms.learned)
+    if alarms.monitor is not None:
+        observer = alarms.monitor.watched_observer(observer)
     inner = f"{prefix}_observer" if observer.timing.is_plain else f"{prefix}_observer_memory"
     source = "\n".join(
         [
@@ -119,7 +109,7 @@ def dae_c_texts(
             "#include <stddef.h>",
             "#define ABS fabs",
             *table_lines("levels", np.array([list(alarms.levels.values())])),
-            monitor_source(alarms, prefix),
+            alarms.source(prefix),
             _dae_step_text(prefix, model, alarms),
         ]
     )
@@ -129,7 +119,7 @@ def dae_c_texts(
 
 def _dae_step_text(prefix: str, model: DAEModel, alarms: Alarms) -> str:
     """Return the two functions of the header; without inputs, C has no array for them."""
-    learned = alarms.learned is not None
+    watched = alarms.monitor is not None
     waiting = (
         f"double shown[{prefix.upper()}_WATCHED];\n"
         f"    for (i = 0; i < {prefix.upper()}_WATCHED; i++) {{\n"
@@ -148,9 +138,9 @@ def _dae_step_text(prefix: str, model: DAEModel, alarms: Alarms) -> str:
         {
             "ARGUMENTS": "const double u[NU], " if model.nu else "",
             "INPUT": "u" if model.nu else "s->u",
-            "MONITOR_RESET": "monitor_reset(&s->monitor);" if learned else "",
-            "WAITING_STEP": waiting if learned else "",
-            "MONITOR_STEP": taking if learned else "",
+            "MONITOR_RESET": "monitor_reset(&s->monitor);" if watched else "",
+            "WAITING_STEP": waiting if watched else "",
+            "MONITOR_STEP": taking if watched else "",
         },
     )
 
@@ -170,7 +160,7 @@ def _dae_header(design: ObserverDesign, prefix: str, digest: str, alarms: Alarms
     listed = [
         line for array, column, names in signals for line in signal_comments(array, column, names, None, model.units)
     ]
-    structs = [*observer_struct(observer.steps, f"{prefix}_observer"), *monitor_struct(alarms, prefix)]
+    structs = [*observer_struct(observer.steps, f"{prefix}_observer"), *alarms.struct_lines(prefix)]
     words = {
         "OBSERVER": f"Observer {quoted(design.name)} by {quoted(design.method)}, written by obsynth.",
         "VERIFIED": quoted(verification_words(design)),
@@ -181,7 +171,7 @@ def _dae_header(design: ObserverDesign, prefix: str, digest: str, alarms: Alarms
         "SOME_LEVELS": str(max(len(alarms.levels), 1)),
         "STATUSES": "\n".join(status_lines(prefix)),
         "STRUCTS": "\n".join(structs),
-        "MONITOR": f"{prefix}_monitor monitor;" if alarms.learned is not None else "",
+        "MONITOR": f"{prefix}_monitor monitor;" if alarms.monitor is not None else "",
         "INPUTS": f"const double u[{model.nu}], " if model.nu else "",
         "SIGNALS": "\n".join(listed),
         **{word: str(size) for word, size in (("NX", model.nx), ("NY", model.ny))},

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.exporting.alarms import Alarms, linear_alarms
+from obsynth.exporting.alarms import Alarms, ExportedMonitor, Monitor, linear_alarms
 from obsynth.exporting.c_scheduled import scheduled_c_texts
 from obsynth.exporting.c_source import c_identifier, comment, header_text, quoted, source_text, with_c_linkage
 from obsynth.exporting.c_window import is_window, require_fixed, window_c_texts
@@ -22,8 +22,6 @@ from obsynth.exporting.independent import copy_checker
 from obsynth.exporting.proof_file import write_proof
 from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import FileKind, write_atomically, write_together
-from obsynth.monitoring.thresholds.learned import LearnedRule, LearnedThresholds
-from obsynth.monitoring.thresholds.monitor import Monitor
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.outliers import Outliers
@@ -31,7 +29,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.sensor_timing import require_plain
 from obsynth.results.design import ObserverDesign, require_verified
-from obsynth.results.gain_set_writing import gain_set_digest
+from obsynth.results.registered import registered
 from obsynth.verification.over_tolerances.adaptive_bound import AdaptiveBound
 
 EXPORT_SUFFIXES = (".mat", ".npz", ".c", ".fmu", ".json")
@@ -177,8 +175,8 @@ def export(
                 "out.",
                 path="sample_time",
             )
-        written = write_proof(design, target)
-        return (written, copy_checker(written.parent)) if checker else (written,)
+        proof = write_proof(design, target)
+        return (proof, copy_checker(proof.parent)) if checker else (proof,)
     require_fixed(design, suffix)
     if isinstance(design.observer, RecursiveObserver):
         require_plain(design.observer, "An export")
@@ -190,11 +188,11 @@ def export(
         raise SpecError("outliers is for nonlinear designs: exports of others use every sample.", path="outliers")
     if isinstance(design.observer, ScheduledObserver):
         return _write_scheduled(design, target, suffix, monitor, thresholds, warm_up, sample_time, numbers)
-    learned = None if monitor is None else _learned_by(monitor, design)
+    written: ExportedMonitor | None = None if monitor is None else registered("monitor_in_c")(monitor, design)
     if suffix == ".fmu":
         from obsynth.exporting.fmu.archive import write_fmu
 
-        if monitor is not None and learned is None:
+        if monitor is not None and written is None:
             raise SpecError(
                 "An FMU holds learned monitors and levels of outputs, not this monitor: write it as C (.c).",
                 path="monitor",
@@ -206,14 +204,14 @@ def export(
             sample_time=sample_time,
             thresholds=thresholds,
             warm_up=warm_up,
-            learned=learned,
+            monitor=written,
             outliers=outliers,
         )
         return (made,)
     if isinstance(design.observer, DAEObserver):
-        if monitor is not None and learned is None:
+        if monitor is not None and written is None:
             raise SpecError("Of nonlinear designs, learned monitors are written as C.", path="monitor")
-        alarms = dae_alarms(design, thresholds, warm_up, learned)
+        alarms = dae_alarms(design, thresholds, warm_up, written)
         return write_dae_c(design, target, sample_time, alarms, numbers, outliers)
     found = Realisation.of(design, sample_time, numbers)
     if suffix != ".c":
@@ -230,8 +228,8 @@ def export(
         raise SpecError(
             "The observer is continuous in time: give the sample time, in seconds, for C.", path="sample_time"
         )
-    bound = None if monitor is None or learned is not None else _bound_of(monitor, found)
-    return _write_c(found, target, linear_alarms(found, thresholds, warm_up, learned), bound)
+    bound = None if monitor is None or written is not None else registered("bound_of_monitor")(monitor, found.observer)
+    return _write_c(found, target, linear_alarms(found, thresholds, warm_up, written), bound)
 
 
 def _write_scheduled(
@@ -313,36 +311,6 @@ def exported_files(target: Path) -> dict[Path, FileKind | None]:
     suffix = target.suffix.lower()
     header = {target.with_suffix(".h"): EXPORTED[".h"]} if suffix == ".c" else {}
     return {target: EXPORTED.get(suffix), **header}
-
-
-def _bound_of(monitor: Monitor, found: Realisation) -> AdaptiveBound:
-    """Return the bound of an adaptive monitor of the design that is written."""
-    monitor.require_fit(len(found.observer.residual_names), found.observer.fault_names)
-    plan = getattr(monitor.rule, "plan", None)
-    bound: AdaptiveBound | None = None if plan is None else plan.bound
-    if bound is None:
-        raise SpecError("The monitor has no thresholds over tolerances: make it with constants.", path="monitor")
-    if bound.first is not None:
-        raise SpecError(
-            "Thresholds of continuous designs are not written as C: sample the plant first.", path="monitor"
-        )
-    return bound
-
-
-def _learned_by(monitor: Monitor, design: ObserverDesign) -> LearnedThresholds | None:
-    """Return what a monitor has learned, of this design."""
-    if not isinstance(monitor.rule, LearnedRule):
-        return None
-    learned = monitor.rule.learned
-    if learned.gains != gain_set_digest(design):
-        raise SpecError("The thresholds were learned with another gain set: learn them again.", path="monitor")
-    if isinstance(design.observer, RecursiveObserver):
-        raise SpecError(
-            "The steady state of a recursive design, which is what is exported, has other innovations than the "
-            "recursion that the thresholds were learned from: use levels of its outputs (thresholds).",
-            path="monitor",
-        )
-    return learned
 
 
 def _write_c(found: Realisation, target: Path, alarms: Alarms, bound: AdaptiveBound | None = None) -> tuple[Path, ...]:

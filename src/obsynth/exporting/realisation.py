@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.monitoring.logs.linear_observer import GAP_LEFT_SHARE, LEAST_SHOWN, LinearLogObserver
+from obsynth.methods.state_solver import state_solver
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.linear.derived import sample_observer
+from obsynth.observers.linear.missing_samples import GAP_LEFT_SHARE, LEAST_SHOWN, MissingSamples
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.gain_schedule import steady_observer
@@ -120,9 +121,10 @@ class Realisation:
             return nothing
         if not set(observer.fault_names) <= set(plant.fault_names):
             return nothing
-        running = LinearLogObserver(self.design.replace(plant=plant, observer=self.running))
-        model = running.gap_model
-        told = tuple(running.told_faults)
+        solver = state_solver(self.design.replace(plant=plant, observer=self.running))
+        missing = MissingSamples(plant, self.running, solver)
+        model = missing.model
+        told = tuple(missing.estimated_faults)
         if model is None:
             return GapTables(plant.nf, told)
         moving = model.plant
@@ -138,12 +140,12 @@ class Realisation:
             moves = (moving.A, moving.B, moving.Bf)
         tables = dict(zip(("model_A", "model_B", "model_F", "model_R"), moves, strict=False))
         tables |= {"model_C": moving.C, "model_D": moving.D, "model_Df": moving.Df, "model_into": model.into}
-        tables |= {"noise_variances": running.noise[None]}
-        if running.solver is not None:
-            tables |= {"source_D": plant.D, "source_Df": plant.Df, "model_solver": running.solver}
-        kept = running.kept_inputs
+        tables |= {"noise_variances": missing.noise[None]}
+        if solver is not None:
+            tables |= {"source_D": plant.D, "source_Df": plant.Df, "model_solver": solver}
+        kept = missing.kept_inputs
         return GapTables(
-            plant.nf, told, kept, moving.nx, len(running.seen), True, running.solver is not None, tables,
+            plant.nf, told, kept, moving.nx, missing.known_states, True, solver is not None, tables,
             GAP_LEFT_SHARE, LEAST_SHOWN,
         )  # fmt: skip
 

@@ -33,6 +33,7 @@ from obsynth.report.plots.frequency import FaultGains, fault_gains
 from obsynth.results.checks import FITS
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import facts_table, headed_table, name_list, number, print_checks, print_section
+from obsynth.results.registered import is_registered, registered
 
 #: Signals of any kind of plant, as they are called here.
 _NAMES_OF_SIGNALS = {
@@ -66,8 +67,6 @@ FAR_FROM_ONE = 10.0
 
 def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
     """Return what holds for every plant within its tolerances, as label and text; none for other designs."""
-    from obsynth.studies.robustness import robustness
-
     if not isinstance(design.plant, DescriptorSystem) or not isinstance(design.observer, LinearObserver):
         return []
     uncertain = design.plant.uncertainty
@@ -75,8 +74,10 @@ def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
         return [("model", "none stated; every claim is for the exact model.")]
     if design.report.checks and not design.report.passed:
         return [("bounds", "none: the design fails its verification")]
+    if not is_registered("robustness"):
+        return [("bounds", "not computed: this installation has no obsynth.studies")]
     try:
-        return list(robustness(design).facts())
+        return list(registered("robustness")(design).facts())
     except PreconditionError as error:
         # The design is one for the nominal plant whatever the box may be.
         return [("bounds", f"none: {error}")]

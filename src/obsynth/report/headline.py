@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from html import escape
 from statistics import NormalDist
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
@@ -15,7 +15,6 @@ from obsynth.report.designs import estimate_figures, followed_steps, gains_if_li
 from obsynth.results.layout import duration, number
 
 if TYPE_CHECKING:
-    from obsynth.monitoring.logs.run import DataRun
     from obsynth.results.design import ObserverDesign
 
 #: A level of so many standard deviations is named for estimates with noise.
@@ -24,6 +23,31 @@ DEVIATIONS = 5
 BEYOND = 2.0 * NormalDist().cdf(-float(DEVIATIONS))
 #: Faults that are told.
 MOST_TOLD = 6
+
+
+@runtime_checkable
+class DataRun(Protocol):
+    """What a page takes as a run on data: that of `obsynth.run_on_data`."""
+
+    @property
+    def rows(self) -> int:
+        """How many rows it has."""
+
+    @property
+    def events(self) -> Any:
+        """Its alarms."""
+
+    @property
+    def stamps(self) -> Any:
+        """How its times are shown."""
+
+    @property
+    def statement(self) -> str:
+        """What the threshold of its monitor means."""
+
+    @property
+    def thresholds(self) -> Mapping[str, float]:
+        """Levels by column."""
 
 
 def headline(design: ObserverDesign, run: DataRun | None) -> Iterator[str]:

@@ -7,12 +7,11 @@ from functools import partial
 from html import escape
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from obsynth.errors import ObsynthError, SpecError
+from obsynth.errors import ObsynthError
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
-from obsynth.monitoring.thresholds.monitor import Detection
-from obsynth.monitoring.thresholds.residual_monitor import monitor
 from obsynth.observers.decisions import decide
+from obsynth.observers.detection import Detection
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.parameter_alarms import Decision
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -24,6 +23,7 @@ from obsynth.report.plots.panels import data_url, image_of
 from obsynth.report.plots.simulation import plot_simulation
 from obsynth.report.plots.spectra import plot_poles
 from obsynth.results.design import ObserverDesign
+from obsynth.results.registered import is_registered, registered
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.simulate import Simulation, simulate
 
@@ -160,13 +160,8 @@ def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Pict
 def _watched(design: ObserverDesign, scenario: Scenario, simulation: Simulation) -> Iterator[Detection | Decision]:
     """Yield what the first monitor sees that this design and this scenario have; nothing where they have none."""
     if isinstance(design.observer, LinearObserver):
-        for kind in ("pointwise", "chi-square"):
-            try:
-                yield monitor(design, scenario, kind).watch(simulation.estimates)
-            except SpecError:
-                # A signal without a bound, or without a covariance; a continuous design has neither threshold.
-                continue
-            return
+        if is_registered("detections"):
+            yield from registered("detections")(design, scenario, simulation)
     elif isinstance(design.observer, RecursiveObserver) and design.observer.fault_names:
         yield decide(design.observer, simulation.estimates)
 

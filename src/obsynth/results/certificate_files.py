@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -123,3 +124,20 @@ def body_of(body: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a certificate of a result holds beside its gain sets, as it was before it was written."""
     found: dict[str, Any] = restored({name: value for name, value in body.items() if name != "gain_sets"})
     return found
+
+
+#: Bytes in which a file says its kind.
+_CERTIFICATE_HEAD_BYTES = 200
+
+
+def kind_of_file(path: Path) -> str:
+    """Return what a file that obsynth wrote says it is; empty where it says nothing."""
+    try:
+        with path.open("rb") as stream:
+            found = re.match(rb'\s*\{\s*"kind":\s*"([a-z ]+)"', stream.read(_CERTIFICATE_HEAD_BYTES))
+    except (OSError, ValueError):  # there is no such file, or no file can have this name
+        return ""
+    return "" if found is None else found.group(1).decode()
+
+
+ALARM_KIND = "obsynth alarm certificate"

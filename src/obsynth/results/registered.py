@@ -13,6 +13,11 @@ def register(**functions: Callable[..., Any]) -> None:
     _FUNCTIONS.update(functions)
 
 
+def is_registered(name: str) -> bool:
+    """Whether a function of this name is there: rooms above may be left out of an installation."""
+    return name in _FUNCTIONS
+
+
 def registered(name: str) -> Callable[..., Any]:
     """Return the function that was registered by this name."""
     return _FUNCTIONS[name]

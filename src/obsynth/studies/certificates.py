@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,17 @@ from typing import Any
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.files.inputs import path_of, read_json
 from obsynth.monitoring.alarms.certificates import gain_set_row, verify_alarm
-from obsynth.monitoring.alarms.proof_file import ALARM_KIND
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.results.calibration_files import CALIBRATION_KIND, verify_calibration
-from obsynth.results.certificate_files import RESULT_VERSION, RESULTS, body_of, differences, opened
+from obsynth.results.certificate_files import (
+    ALARM_KIND,
+    RESULT_VERSION,
+    RESULTS,
+    body_of,
+    differences,
+    kind_of_file,
+    opened,
+)
 from obsynth.results.checks import Check, information, nothing_wrong
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import COMPARISON, ROBUSTNESS, STUDY, loaded
@@ -33,20 +39,6 @@ _SOURCE = "the certificate, computed again from its gain sets"
 
 #: Figures, the sentence made again, and what else differs.
 Again = tuple[dict[str, Any], str, list[str]]
-
-
-#: Bytes in which a file says its kind.
-_CERTIFICATE_HEAD_BYTES = 200
-
-
-def kind_of_file(path: Path) -> str:
-    """Return what a file that obsynth wrote says it is; empty where it says nothing."""
-    try:
-        with path.open("rb") as stream:
-            found = re.match(rb'\s*\{\s*"kind":\s*"([a-z ]+)"', stream.read(_CERTIFICATE_HEAD_BYTES))
-    except (OSError, ValueError):  # there is no such file, or no file can have this name
-        return ""
-    return "" if found is None else found.group(1).decode()
 
 
 @arguments_checked

@@ -19,14 +19,12 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 from obsynth.errors import SpecError
-from obsynth.exporting.alarms import STATISTIC, Alarms, linear_alarms
+from obsynth.exporting.alarms import Alarms, ExportedMonitor, linear_alarms
 from obsynth.exporting.c_source import c_identifier, comment, header_text, integer_table, source_text
 from obsynth.exporting.dae_c_source import dae_alarms, dae_c_texts, require_no_sample_time
 from obsynth.exporting.dae_float import in_precision
 from obsynth.exporting.realisation import Realisation, verification_words
 from obsynth.files.outputs import working_folder, write_atomically
-from obsynth.monitoring.thresholds.learned import LearnedThresholds
-from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.observers.nonlinear.c_code import FLAGS, compiler, shared_library
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.results.design import ObserverDesign, unverified_mark
@@ -117,23 +115,17 @@ def signals_of_linear(found: Realisation, alarms: Alarms) -> FmuSignals:
         for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True)
     ]
     outputs += [Output(f"r[{name}]", None, units.get(name, ""), f"residual {name}") for name in observer.residual_names]
-    outputs += _learned_outputs(alarms)
+    outputs += _monitor_outputs(alarms)
     signals = (*found.inputs, *observer.state_names, *observer.fault_names)
     points = {name: float(stated.get(name, 0.0)) for name in dict.fromkeys(signals)}
     inputs = _apart(observer.input_names, observer.output_names)
     return FmuSignals(inputs, found.inputs, tuple(outputs), points, alarms, units, observer.dt)
 
 
-def _learned_outputs(alarms: Alarms) -> list[Output]:
-    """Return what a learned monitor shows, if there is one."""
-    if alarms.learned is None:
-        return []
-    listed = ", ".join(f"{i + 1}: {name}" for i, name in enumerate(alarms.fault_names))
-    return [
-        Output(STATISTIC, None, "", f"largest statistic in units of its level: {alarms.learned.statement}"),
-        Output("isolated", None, "", f"number of the fault that an alarm points to, 0 for none ({listed})"),
-        Output("event", None, "", f"1 while an alarm lasts, {HOLD} rows more than the statistic is above its level"),
-    ]
+def _monitor_outputs(alarms: Alarms) -> list[Output]:
+    """Return what a monitor shows, if there is one."""
+    shown = () if alarms.monitor is None else alarms.monitor.variables
+    return [Output(variable.name, None, "", variable.description) for variable in shown]
 
 
 def signals_of_dae(design: ObserverDesign, alarms: Alarms) -> FmuSignals:
@@ -151,7 +143,7 @@ def signals_of_dae(design: ObserverDesign, alarms: Alarms) -> FmuSignals:
         ]
     outputs += [Output(f"r[{name}]", None, units.get(name, ""), f"innovation of {name}") for name in model.output_names]
     outputs.append(Output("nis", None, "", "square of the innovations in units of their covariance"))
-    outputs += _learned_outputs(alarms)
+    outputs += _monitor_outputs(alarms)
     return FmuSignals(
         _apart(model.input_names, model.output_names),
         (*model.input_names, *model.output_names),
@@ -296,11 +288,11 @@ def write_fmu(
     sample_time: float | None,
     thresholds: Mapping[str, float] | None,
     warm_up: float | None,
-    learned: LearnedThresholds | None,
+    monitor: ExportedMonitor | None,
     outliers: str | None = None,
 ) -> Path:
     """Write an FMU for co-simulation; the binary is left out where there is no compiler."""
-    signals, texts, digest = _contents(design, sample_time, thresholds, warm_up, learned, outliers)
+    signals, texts, digest = _contents(design, sample_time, thresholds, warm_up, monitor, outliers)
     identifier = c_identifier(target.stem)
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, ' '.join((digest, version, repr(signals))))}}}"
     sentence = f"Observer of {design.name} by {design.method}, written by obsynth; sha256 of the gain set {digest}"
@@ -330,14 +322,14 @@ def _contents(
     sample_time: float | None,
     thresholds: Mapping[str, float] | None,
     warm_up: float | None,
-    learned: LearnedThresholds | None,
+    monitor: ExportedMonitor | None,
     outliers: str | None,
 ) -> tuple[FmuSignals, tuple[str, str], str]:
     """Return the signals, source and header, and the digest of the gain set."""
     header = f"{_PREFIX}.h"
     if isinstance(design.observer, DAEObserver):
         require_no_sample_time(design, sample_time)
-        alarms = dae_alarms(design, thresholds, warm_up, learned)
+        alarms = dae_alarms(design, thresholds, warm_up, monitor)
         text, declared, digest = dae_c_texts(design, _PREFIX, header, alarms, outliers)
         return signals_of_dae(design, alarms), (text, declared), digest
     found = Realisation.of(design, sample_time)
@@ -345,7 +337,7 @@ def _contents(
         raise SpecError(
             "The observer is continuous in time: give the sample time, in seconds, for an FMU.", path="sample_time"
         )
-    alarms = linear_alarms(found, thresholds, warm_up, learned)
+    alarms = linear_alarms(found, thresholds, warm_up, monitor)
     texts = source_text(found, _PREFIX, header, alarms), header_text(found, _PREFIX, alarms)
     source, declared = (in_precision(text, found.precision) for text in texts)
     return signals_of_linear(found, alarms), (source, declared), found.digest
@@ -410,17 +402,15 @@ def _taking_linear(design: ObserverDesign, signals: FmuSignals) -> list[str]:
     arguments = ", ".join(text for text, count in (*counts, *groups) if count)
     return [
         f"    int failed = {_PREFIX}_step(memory, {arguments});",
-        *_taking_learned(signals, place),
+        *_monitor_lines(signals, place),
         "    return failed;",
     ]
 
 
-def _taking_learned(signals: FmuSignals, place: int) -> list[str]:
-    """Return the lines that show what a learned monitor says, if there is one."""
-    if signals.alarms.learned is None:
-        return []
-    said = ("statistic", "fault + 1.0", "event")
-    return [f"    out[{place + i}] = memory->monitor.{text};" for i, text in enumerate(said)]
+def _monitor_lines(signals: FmuSignals, place: int) -> list[str]:
+    """Return the lines that show what a monitor says, if there is one."""
+    shown = () if signals.alarms.monitor is None else signals.alarms.monitor.variables
+    return [f"    out[{place + i}] = memory->monitor.{item.expression};" for i, item in enumerate(shown)]
 
 
 def _taking_dae(design: ObserverDesign, signals: FmuSignals) -> list[str]:
@@ -446,7 +436,7 @@ def _taking_dae(design: ObserverDesign, signals: FmuSignals) -> list[str]:
             lines += [f"    for (i = 0; i < {size}; i++) {{", f"        out[{place} + i] = said.{name}[i];", "    }"]
         place += size
     lines.append(f"    out[{place}] = said.nis;")
-    return [*lines, *_taking_learned(signals, place + 1), "    return failed;"]
+    return [*lines, *_monitor_lines(signals, place + 1), "    return failed;"]
 
 
 def _binary_folder(version: str) -> tuple[str, str] | None:

@@ -13,11 +13,11 @@ from obsynth.errors import ObsynthError
 from obsynth.files.inputs import path_of
 from obsynth.methods.verifying import verify
 from obsynth.monitoring.alarms.multipliers import checked, statement_of
-from obsynth.monitoring.alarms.proof_file import ALARM_KIND, ALARM_VERSION, assumptions_of, programme_of, statement
+from obsynth.monitoring.alarms.proof_file import ALARM_VERSION, assumptions_of, programme_of, statement
 from obsynth.monitoring.alarms.proving import rows_of
 from obsynth.numerics.arguments import arguments_checked, is_whole
 from obsynth.numerics.arrays import FloatArray
-from obsynth.results.certificate_files import SHOWN_DIGITS, opened
+from obsynth.results.certificate_files import ALARM_KIND, SHOWN_DIGITS, opened
 from obsynth.results.checks import Check, information
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import restored

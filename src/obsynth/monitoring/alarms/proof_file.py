@@ -22,14 +22,12 @@ from obsynth.numerics.arguments import whole_number
 from obsynth.numerics.arrays import FloatArray, require_no_overflow
 from obsynth.plants.noise import require_noise
 from obsynth.plants.signal_names import index_of
-from obsynth.results.certificate_files import SHOWN_DIGITS, sealed
+from obsynth.results.certificate_files import ALARM_KIND, SHOWN_DIGITS, sealed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import design_as_dict, plain
 from obsynth.verification.assumptions import Assumptions, LogReference
 
 ALARM_VERSION = 1
-
-ALARM_KIND = "obsynth alarm certificate"
 
 CERTIFICATE = FileKind("an alarm certificate", b'"kind": "obsynth alarm certificate"', suffix=".json")
 

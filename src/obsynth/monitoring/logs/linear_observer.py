@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import ClassVar, TypeVar
 
 import numpy as np
 
-from obsynth.errors import ObsynthError, PreconditionError, SpecError
+from obsynth.errors import ObsynthError, SpecError
+from obsynth.methods.state_solver import state_solver
 from obsynth.monitoring.logs.log_observer import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, LogObserver, Row
 from obsynth.monitoring.logs.scheduled_observer import ScheduledLogObserver
 from obsynth.monitoring.logs.step_observer import SteppingLogObserver
@@ -18,20 +19,19 @@ from obsynth.monitoring.thresholds.monitor import LinearSample
 from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
-from obsynth.observers.linear.derived import noise_variances, transient
+from obsynth.observers.linear.derived import transient
+from obsynth.observers.linear.missing_samples import (
+    GAP_LEFT_SHARE,
+    KEPT_INTERVALS,
+    LEAST_SHOWN,
+    MissingSamples,
+)
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.taken_inputs import no_inputs, over_samples, taken_inputs
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
-
-#: How many lengths of an interval are kept discretised.
-KEPT_INTERVALS = 64
-
-#: A gap is over when what it can have left in fault estimates and residuals is below this share of their usual changes
-#: from row to row, which so many rows must have shown, or below what the stated noise of the sensors makes of them.
-GAP_LEFT_SHARE, LEAST_SHOWN = 1.0, 20
 
 #: What is guaranteed waits until what a gap has left is below this share of that, for so many initial-condition
 #: responses at most.
@@ -47,76 +47,6 @@ SAVED = (
 )
 
 _Part = TypeVar("_Part")
-
-
-class GapModel:
-    """The plant model that stands in for the sensors during a gap: faults held, unknown inputs zero, ``E = I``.
-    ``into (nx, nx_source)``: the dynamic states in an estimate of all states."""
-
-    def __init__(self, plant: DescriptorSystem, into: FloatArray) -> None:
-        self.plant, self.into = plant, into
-        self._hold = lru_cache(KEPT_INTERVALS)(partial(first_order_hold, plant.A, np.hstack([plant.B, plant.Bf])))
-
-    @classmethod
-    def of(cls, plant: DescriptorSystem) -> GapModel | None:
-        """Return the model of a plant; ``None`` where the plant cannot be propagated (index 2 or more)."""
-        if np.array_equal(plant.E, np.eye(plant.nx)):
-            return cls(plant, np.eye(plant.nx))
-        from obsynth.plants.transformations.elimination import eliminate_algebraic_states
-
-        try:
-            done = eliminate_algebraic_states(plant)
-        except PreconditionError:
-            return None
-        moving = plant.E @ done.recovery.from_state
-        return cls(done.plant, np.asarray(np.linalg.pinv(moving) @ plant.E))
-
-    def start(self, estimate: FloatArray, inputs: Iterable[FloatArray], fault: FloatArray) -> FloatArray:
-        """Return the dynamic states now from an estimate ``(nx_source,)`` and the inputs of the samples since."""
-        state = self.into @ estimate
-        for u in inputs:
-            state = self.after(state, 0.0, u, u, fault)
-        return np.asarray(state)
-
-    def after(
-        self, state: FloatArray, seconds: float, before: FloatArray, u: FloatArray, fault: FloatArray
-    ) -> FloatArray:
-        """Return the state a sample later, or after an interval along which inputs go from ``before`` to ``u``."""
-        plant = self.plant
-        if plant.dt > 0.0:
-            return np.asarray(plant.A @ state + plant.B @ before + plant.Bf @ fault)
-        if seconds <= 0.0:
-            return state
-        transition, constant, ramp = self._hold(seconds)
-        rise = np.concatenate([u - before, np.zeros(len(fault))])
-        return np.asarray(transition @ state + constant @ np.concatenate([before, fault]) + ramp @ rise)
-
-    def outputs(self, state: FloatArray, u: FloatArray, fault: FloatArray) -> FloatArray:
-        """Return the outputs ``(ny,)`` of a state."""
-        return np.asarray(self.plant.C @ state + self.plant.D @ u + self.plant.Df @ fault)
-
-    def miss(self, v: FloatArray, state: FloatArray | None = None, fault: FloatArray | None = None) -> float:
-        """Return the distance between measured outputs and those of a state; of rest and no fault by default."""
-        plant = self.plant
-        at = np.zeros(plant.nx) if state is None else state
-        f = np.zeros(plant.nf) if fault is None else fault
-        return float(np.linalg.norm(v[plant.nu :] - self.outputs(at, v[: plant.nu], f)))
-
-
-def _state_solver(design: ObserverDesign) -> FloatArray | None:
-    """Return what gives states from an observer that estimates none, as filters of faults do: the smallest that explain
-    its own state ``z = T E x`` and the outputs, ``(nx, nz + ny)``; ``None`` where faults are not all estimated."""
-    from obsynth.methods.registry import error_model
-
-    plant, observer = design.linear
-    if observer.fault_names != plant.fault_names:
-        # The model needs every fault of the plant: an observer of some of them begins again after a gap.
-        return None
-    try:
-        own = error_model(design).own
-    except SpecError:
-        return None
-    return np.asarray(np.linalg.pinv(np.vstack([own[:, : plant.nx] @ plant.E, plant.C])))
 
 
 def _running(part: _Part | None) -> _Part:
@@ -145,11 +75,8 @@ class LinearLogObserver(LogObserver):
         self.input_names, self.output_names = self.observer.input_names, self.observer.output_names
         self.point, self.scales = self.plant.operating_point, self.plant.scales
         self.columns = self.observer.row_names
-        lags = set(self.observer.state_delays) or {0}
-        states = len(self.observer.state_names) == self.plant.nx
-        self.solver = None if states else _state_solver(design)
-        known = states or self.solver is not None
-        self.gap_model = None if len(lags) > 1 or not known else GapModel.of(self.plant)
+        missing = MissingSamples(self.plant, self.observer, state_solver(design))
+        self.solver, self.gap_model, self.noise = missing.solver, missing.model, missing.noise
         self.nu = len(self.input_names)
         self.b = np.hstack([self.observer.Bu, self.observer.By])
         self.d = np.hstack([self.observer.Du, self.observer.Dy])
@@ -159,8 +86,7 @@ class LinearLogObserver(LogObserver):
         self.row = np.full(len(self.observer.Cz), np.nan)
         self.model: FloatArray | None = None
         # What is known of the plant's states at the last measured row, from which the model starts.
-        width = len(self.observer.state_names) if self.solver is None else self.plant.nx
-        self.seen = np.full(width, np.nan)
+        self.seen = np.full(missing.known_states, np.nan)
         # Since when nothing is left of a gap: bounds that are never passed hold from there on.
         self.clear_at, self.begun = -math.inf, False
         # Since when the initial-condition response has settled, and whether the model has stood in for all that was
@@ -169,9 +95,6 @@ class LinearLogObserver(LogObserver):
         # Squares of changes of fault estimates and residuals from row to row, summed up, and how many there are.
         self.shown = slice(len(self.observer.state_names), None)
         self.changes, self.counted = np.zeros(len(self.observer.Cz[self.shown])), 0
-        # Variances that the stated noise of the sensors gives them.
-        noisy = self.observer.dt > 0.0 and self.observer.By.shape[1] == self.plant.ny
-        self.noise = noise_variances(self.observer, self.plant.Dw)[self.shown] if noisy else np.zeros_like(self.changes)
         # What a unit error of each input that was held, and of each output that the model told, has left in z.
         self.left, self.held = np.zeros(self.b.shape), np.zeros(self.nu)
         # How inputs have moved, and how far those that are missing may have moved since they were known.
@@ -181,10 +104,9 @@ class LinearLogObserver(LogObserver):
         self.transient = transient(self.observer)
         # Of every fault of the plant; those of which nothing is estimated are held to be absent.
         self.fault = np.zeros(self.plant.nf)
-        self.told_faults = [self.plant.fault_names.index(name) for name in self.observer.fault_names]
+        self.told_faults = missing.estimated_faults
         self.measured = self.v
-        # The last of them: from the moment on of which the estimates are.
-        self.kept_inputs = max(lags) + 1
+        self.kept_inputs = missing.kept_inputs
         self.inputs = np.zeros((0, self.nu))
 
     def _usual(self) -> FloatArray | None:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.monitor import Evidence, LinearSample
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.derived import checked_warm_up
+from obsynth.observers.linear.derived import SETTLING_SLACK, checked_warm_up
 from obsynth.observers.running import state_as_data, state_from_data
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -54,8 +54,8 @@ SURE_SHARE = 0.009
 #: Without another word, an interval is a gap when it is longer than this many times the longest one before.
 GAP_FACTOR = 10.0
 
-#: Waiting ends with a sample that rounding, of this share of dt, calls earlier; without dt, of so many roundings.
-SETTLING_SLACK, SETTLING_ULPS = 1e-6, 4.0
+#: Waiting without dt ends with a row that so many roundings call earlier.
+SETTLING_ULPS = 4.0
 
 #: A gap of more samples than this cannot be counted in double precision.
 MOST_COUNTED_SAMPLES = 2.0**53

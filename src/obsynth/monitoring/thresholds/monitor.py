@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.detection import Detection
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.nonlinear.estimates import DAERow
 from obsynth.observers.recursive.observer import RawEstimate
@@ -82,34 +83,6 @@ def statement_of(
     kept = "" if assumed is None else assumed.bounds_phrase
     words = (STATEMENTS[kind] + "{kept}" + ending).format(kept=f", with {kept}" if kept else "", **known)
     return (OF_ESTIMATES if estimates else "") + words
-
-
-@dataclass(frozen=True, eq=False)
-class Detection:
-    """What a monitor saw in one record.
-
-    Parameters
-    ----------
-    kind, statement : str
-        The monitor's, and what its threshold means.
-    values, threshold : FloatArray
-        ``(steps,)``.
-    k : int or None
-        First sample at which the threshold is passed.
-    time : float or None, seconds
-        The same.
-    fault : str
-        The isolated fault: largest estimate at (or a given number of samples after) the alarm, in its own deviations;
-        of guaranteed tests the one that is there, or "one or another"; empty without an alarm.
-    """
-
-    kind: str
-    statement: str
-    values: FloatArray
-    threshold: FloatArray
-    k: int | None
-    time: float | None
-    fault: str
 
 
 class LinearSample(NamedTuple):

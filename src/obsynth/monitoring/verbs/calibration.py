@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import obsynth
-from obsynth.cli.arguments import columns_of, numbers_of, pair, refuse_given
-from obsynth.cli.output import answer, gains_to_hand_on, output_file, progress
 from obsynth.errors import SpecError, VerificationError
 from obsynth.files.inputs import protect
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.monitoring.verbs.data_arguments import with_input_delay
 from obsynth.plants.noise import offset_state
+from obsynth.report.terminal.arguments import columns_of, numbers_of, pair, refuse_given
+from obsynth.report.terminal.output import answer, gains_to_hand_on, output_file, progress
 from obsynth.results.calibration_files import CALIBRATION_KIND, calibration_text
 from obsynth.results.gain_set_writing import plain
 from obsynth.specs.loader import load_model, load_plant
+
+if TYPE_CHECKING:
+    from obsynth.specs.loader import Spec
 
 #: Written by ``linearise`` and ``calibrate``.
 PLANT = FileKind("a plant that obsynth has linearised", rb"\A# Linearised by obsynth", suffix=".yaml")
@@ -39,6 +41,9 @@ def _log_arguments(options: argparse.Namespace) -> dict[str, Any]:
 
 def run_linearise(options: argparse.Namespace) -> int:
     """Run ``linearise``: spec or plant in, matrices and operating point out."""
+    from obsynth.monitoring.calibration.validity import validity
+    from obsynth.plants.descriptor import DescriptorSystem
+    from obsynth.plants.transformations.linearisation import linearise
     from obsynth.report.plants import linear_plant_text, plant_document
 
     model, spec = load_model(options.system)
@@ -53,11 +58,11 @@ def run_linearise(options: argparse.Namespace) -> int:
         whole = (float("-inf"), float("inf"))
         free = {name: whole for name in free} | {name: _range(name, text) for name, text in bounded.items()}
     own = (options.at, options.given, options.free, options.fault, options.disturbance, options.drift)
-    if spec is not None and isinstance(spec.plant, obsynth.DescriptorSystem) and not any(own):
+    if spec is not None and isinstance(spec.plant, DescriptorSystem) and not any(own):
         # The point that the spec states, with its tolerances and noise.
         linear = spec.plant if spec.transformation is None else spec.transformation.source
     else:
-        linear = obsynth.linearise(
+        linear = linearise(
             model,
             at=options.at or "equilibrium",
             given=numbers_of(options.given),
@@ -68,7 +73,7 @@ def run_linearise(options: argparse.Namespace) -> int:
         )
     found = None
     if options.data is not None:
-        found = obsynth.validity(model, linear, options.data, **_log_arguments(options))
+        found = validity(model, linear, options.data, **_log_arguments(options))
     if target is not None:
         write_atomically(target, plant_document(linear, options.system.name))
     told = linear_plant_text(linear) if found is None else f"{linear_plant_text(linear)}\n{found}"
@@ -92,6 +97,7 @@ def run_linearise(options: argparse.Namespace) -> int:
 
 def run_calibrate(options: argparse.Namespace) -> int:
     """Run ``calibrate``: spec and log in, constants with their box and a verdict out."""
+    from obsynth.monitoring.calibration.calibrating import calibrate
     from obsynth.monitoring.calibration.spec_writing import CALIBRATED_SPEC, calibrated_spec
 
     with progress(quiet=options.quiet) as report_stage:
@@ -109,7 +115,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
                 f"{written} is in another folder than {options.system}, whose files it refers to: write it to that "
                 "folder.", path="write-spec",
             )  # fmt: skip
-        found = obsynth.calibrate(plant, log, progress=report_stage, **asked)
+        found = calibrate(plant, log, progress=report_stage, **asked)
         if digest is not None and digest != found.box.digest:
             raise SpecError(
                 f"The log {log} is not the one that the spec names: its digest is {found.box.digest}, and "
@@ -126,11 +132,13 @@ def run_calibrate(options: argparse.Namespace) -> int:
     return 0
 
 
-def _asked(spec: obsynth.Spec | None, options: argparse.Namespace) -> dict[str, Any]:
+def _asked(spec: Spec | None, options: argparse.Namespace) -> dict[str, Any]:
     """Return the arguments of `calibrate`: of the spec, those of its nonlinear method, and of the command line."""
+    from obsynth.plants.dae import DAEModel
+
     asked: dict[str, Any] = {"log": None}
     if spec is not None:
-        if isinstance(spec.plant, obsynth.DAEModel):
+        if isinstance(spec.plant, DAEModel):
             method = spec.options
             if isinstance(method.get("Q"), dict):
                 asked["noisy"] = [name for name, variance in method["Q"].items() if variance > 0.0]
@@ -158,7 +166,7 @@ def _asked(spec: obsynth.Spec | None, options: argparse.Namespace) -> dict[str, 
     return asked
 
 
-def _without_offsets(stated: Any, spec: obsynth.Spec) -> Any:
+def _without_offsets(stated: Any, spec: Spec) -> Any:
     """Return what is said of a start without the offsets that another log has shown: this log shows its own."""
     offsets = {offset_state(name) for name in (spec.noise or {}).get("offset") or ()}
     if not (offsets and isinstance(stated, Mapping)):
@@ -168,11 +176,13 @@ def _without_offsets(stated: Any, spec: obsynth.Spec) -> Any:
 
 def run_validate(options: argparse.Namespace) -> int:
     """Run ``validate``: gain set and log in, verdict out; the exit code is 6 where they do not agree."""
+    from obsynth.monitoring.calibration.validating import validate
+
     design, _ = gains_to_hand_on(options.gains, unverified=options.unverified)
     protect(options.data)
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"running {options.gains} over {options.data}")
-        found = obsynth.validate(
+        found = validate(
             with_input_delay(design, options), options.data, progress=report_stage, **_log_arguments(options)
         )
     answer(options, {"gains": options.gains, "data": options.data, **found.to_dict()}, str(found))

@@ -7,26 +7,24 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
-import obsynth
-from obsynth.cli.arguments import (
-    MONITOR_NAMES,
-    STREAM,
-    columns_of,
-    flag_of,
-    numbers_of,
-    ranges_of,
-    refuse_given,
-    stated_settings,
-)
-from obsynth.cli.commands import require_same_signals
-from obsynth.cli.output import output_file
 from obsynth.errors import SpecError
 from obsynth.files.inputs import protect, protect_stream
 from obsynth.files.tables import text_table
 from obsynth.monitoring.thresholds.options import LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW, refuse_idle
+from obsynth.monitoring.verbs.arguments import MONITOR_NAMES, stated_settings
 from obsynth.plants.signal_names import listed
+from obsynth.report.terminal.arguments import STREAM, columns_of, flag_of, numbers_of, ranges_of, refuse_given
+from obsynth.report.terminal.output import output_file
+from obsynth.report.terminal.specs import require_same_signals, required_scenario
+
+if TYPE_CHECKING:
+    from obsynth.monitoring.alarms.proof_file import AlarmProof
+    from obsynth.monitoring.logs.run import DataRun
+    from obsynth.monitoring.thresholds.monitor import Monitor
+    from obsynth.plants.uncertainty import Uncertainty
+    from obsynth.results.design import ObserverDesign
 
 #: Rows from the alarm on at whose windows a proof is tried, in windows.
 _LATER = (0.0, 0.1, 0.25, 0.5, 0.95)
@@ -43,16 +41,18 @@ def protect_inputs(options: argparse.Namespace) -> None:
 
 
 def run_of(
-    design: obsynth.ObserverDesign,
+    design: ObserverDesign,
     options: argparse.Namespace,
-    watched: obsynth.types.Monitor | None,
+    watched: Monitor | None,
     out: Path | TextIO | None = None,
     **more: Any,
-) -> obsynth.types.DataRun:
+) -> DataRun:
     """Return a run of a design on the data of the command line, with its table where it is not written to ``out``."""
+    from obsynth.monitoring.logs.run import run_on_data
+
     design = with_input_delay(design, options)
     with rows_done(options.data, quiet=getattr(options, "quiet", True) or out is sys.stdout) as progress:
-        found = obsynth.run_on_data(
+        found = run_on_data(
             design,
             sys.stdin if options.data == STREAM else Path(options.data),
             out,
@@ -78,31 +78,36 @@ def stated_delay(options: argparse.Namespace) -> int | None:
     return rows
 
 
-def with_input_delay(design: obsynth.ObserverDesign, options: argparse.Namespace) -> obsynth.ObserverDesign:
+def with_input_delay(design: ObserverDesign, options: argparse.Namespace) -> ObserverDesign:
     """Return a design for a log whose inputs act as many rows later as the command line says."""
     rows = stated_delay(options)
     return design if rows is None else design.replace(input_delay=rows)
 
 
-def own_tolerances(design: obsynth.ObserverDesign, kind: str | None) -> obsynth.types.Uncertainty | None:
+def own_tolerances(design: ObserverDesign, kind: str | None) -> Uncertainty | None:
     """Return the tolerances of a design's plant, which its pointwise threshold holds for."""
+    from obsynth.observers.linear.observer import LinearObserver
+    from obsynth.plants.descriptor import DescriptorSystem
+
     # Continuous designs with known inputs must be asked for it: the inputs have to be held between rows.
 
     plant = design.plant
     if design.method == "guaranteed-test" and not design.observer.state_names:
         # Nothing beside the test follows the state: its threshold is that of an exact model, and says so.
         return None
-    if kind != "pointwise" or not isinstance(plant, obsynth.DescriptorSystem) or (plant.nu and not plant.is_discrete):
+    if kind != "pointwise" or not isinstance(plant, DescriptorSystem) or (plant.nu and not plant.is_discrete):
         return None
-    own = plant.uncertainty if isinstance(design.observer, obsynth.LinearObserver) else None
+    own = plant.uncertainty if isinstance(design.observer, LinearObserver) else None
     # Constants without a tolerance leave nothing to adapt to: the model is exact.
     return own if own is not None and own.box.names else None
 
 
-def monitor_settings(design: obsynth.ObserverDesign, options: argparse.Namespace) -> dict[str, Any]:
+def monitor_settings(design: ObserverDesign, options: argparse.Namespace) -> dict[str, Any]:
     """Return what the monitor of a design that is asked for is made of, by the names of the arguments of
     `obsynth.monitor`."""
-    table = LINEAR_OPTIONS if isinstance(design.observer, obsynth.LinearObserver) else PARAMETER_OPTIONS
+    from obsynth.observers.linear.observer import LinearObserver
+
+    table = LINEAR_OPTIONS if isinstance(design.observer, LinearObserver) else PARAMETER_OPTIONS
     given = stated_settings(options)
     if getattr(options, "prove", None) is not None:
         del given["window"]  # it is that of the proof
@@ -113,24 +118,26 @@ def monitor_settings(design: obsynth.ObserverDesign, options: argparse.Namespace
     return {**settings, "unverified": options.unverified}
 
 
-def monitor_of(
-    design: obsynth.ObserverDesign, options: argparse.Namespace, *, has_scenario: bool = False
-) -> obsynth.types.Monitor | None:
+def monitor_of(design: ObserverDesign, options: argparse.Namespace, *, has_scenario: bool = False) -> Monitor | None:
     """Return the monitor that is asked for."""
+    from obsynth.monitoring.thresholds.online_monitor import online_monitor
+    from obsynth.observers.linear.observer import LinearObserver
+    from obsynth.specs.loader import load_spec
+
     if options.monitor is None:
         of_monitors = (*(() if has_scenario else ("system",)), "sample_time", *MONITOR_NAMES)
         refuse_given(options, of_monitors, "a monitor: name it with --monitor")
         return None
 
-    linear, scenario = isinstance(design.observer, obsynth.LinearObserver), None
+    linear, scenario = isinstance(design.observer, LinearObserver), None
     if not linear:
         refuse_given(options, ("sample_time", *(() if has_scenario else ("system",))), "monitors of linear designs")
     # Of other designs, and beside thresholds that were learned, a scenario is there for the pictures alone.
     if options.system is not None and not (has_scenario and (not linear or options.monitor == "learned")):
-        spec = obsynth.load_spec(options.system)
+        spec = load_spec(options.system)
         require_same_signals(design, options.gains, spec)
         scenario = required_scenario(spec)
-    return obsynth.online_monitor(
+    return online_monitor(
         design,
         options.monitor,
         scenario=scenario,
@@ -139,7 +146,7 @@ def monitor_of(
     )
 
 
-def summary_of_run(found: obsynth.types.DataRun, watched: obsynth.types.Monitor | None) -> str:
+def summary_of_run(found: DataRun, watched: Monitor | None) -> str:
     """Return what a run was, in a few lines."""
     from obsynth.monitoring.alarms.events import alarm_notes, alarm_rows, silence
 
@@ -199,15 +206,6 @@ def _rows_in(path: Path) -> int | None:
         return None
 
 
-def required_scenario(spec: obsynth.Spec) -> obsynth.Scenario:
-    """Return the scenario of a spec."""
-    if spec.scenario is None:
-        raise SpecError(
-            f"{spec.path} has no scenario: add one, for example scenario: {{horizon: 100}}.", path="scenario"
-        )
-    return spec.scenario
-
-
 def certificate_target(options: argparse.Namespace) -> Path | None:
     """Return where ``run --prove`` writes its certificate; refuse what cannot be proved before any work is done."""
     if options.prove is None:
@@ -223,9 +221,7 @@ def certificate_target(options: argparse.Namespace) -> Path | None:
     return output_file(options.prove, CERTIFICATE, options, option="--prove")
 
 
-def alarm_of_run(
-    design: obsynth.ObserverDesign, options: argparse.Namespace, found: obsynth.types.DataRun, target: Path
-) -> dict[str, Any]:
+def alarm_of_run(design: ObserverDesign, options: argparse.Namespace, found: DataRun, target: Path) -> dict[str, Any]:
     """Return whether the first alarm of a run is proved, in words, and the certificate's file."""
     row = found.alarm_rows.get("pointwise")
     if row is None:
@@ -239,11 +235,11 @@ def alarm_of_run(
     return {"proved": False, "row": row, "statement": proof.statement, "file": None}
 
 
-def proof_of(
-    design: obsynth.ObserverDesign, options: argparse.Namespace, row: int, **more: Any
-) -> obsynth.types.AlarmProof:
+def proof_of(design: ObserverDesign, options: argparse.Namespace, row: int, **more: Any) -> AlarmProof:
     """Return the proof, or why there is none, that the window up to a row of the data is not free of faults."""
-    return obsynth.prove_alarm(
+    from obsynth.monitoring.alarms.proving import prove_alarm
+
+    return prove_alarm(
         with_input_delay(design, options),
         Path(options.data),
         row,

@@ -4,31 +4,24 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
-import obsynth
-from obsynth.cli.arguments import STREAM, numbers_of, refuse_given
-from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json, verified_again
-from obsynth.errors import SpecError, VerificationError
-from obsynth.files.outputs import FileKind, require_distinct, write_atomically
+from obsynth.errors import SpecError
+from obsynth.files.outputs import require_distinct
 from obsynth.monitoring.verbs.data_arguments import (
     alarm_of_run,
     certificate_target,
     monitor_of,
     proof_of,
     protect_inputs,
-    required_scenario,
     run_of,
     summary_of_run,
 )
-from obsynth.results.certificate_files import RESULT_FILE
-from obsynth.results.design import unverified_mark
-from obsynth.studies.verbs.sweeps import run_many
-
-#: Formats of pictures, with the mark by which an older one may be replaced.
-PICTURES = {".png": rb"\A\x89PNG", ".svg": rb"<svg", ".pdf": rb"\A%PDF"}
+from obsynth.report.terminal.arguments import STREAM, numbers_of, refuse_given
+from obsynth.report.terminal.output import answer, gains_to_hand_on, output_file, print_json
+from obsynth.report.terminal.pictures import picture_kind, written_picture
+from obsynth.results.registered import registered
 
 
 def run_run(options: argparse.Namespace) -> int:
@@ -38,7 +31,7 @@ def run_run(options: argparse.Namespace) -> int:
             raise SpecError(
                 "--input-delay is for one gain set: state inputs.hold in the specs of a folder.", path="--input-delay"
             )
-        return run_many(options)
+        return int(registered("run_many")(options))
     for name, given in (("--jobs", options.jobs is not None), ("--cluster", options.cluster is not None)):
         if given:
             raise SpecError(
@@ -91,38 +84,12 @@ def _recovered(names: list[str] | None) -> str | list[str] | None:
     return names[0] if names in (["all"], ["none"]) else names
 
 
-def run_export(options: argparse.Namespace) -> int:
-    """Run ``export``: gain set in, file for another program out."""
-    from obsynth.exporting.files import export, exported_files
-
-    design, mark = gains_to_hand_on(options.gains, unverified=options.unverified)
-    for file, kind in exported_files(options.to).items():
-        output_file(file, kind, options, option="--to")
-    monitor = None
-    if options.normal is not None:
-        monitor = obsynth.online_monitor(design, "learned", normal=options.normal, unverified=options.unverified)
-    files = export(
-        design,
-        options.to,
-        sample_time=options.sample_time,
-        **({} if options.fmi is None else {"fmi": options.fmi}),
-        thresholds=numbers_of(options.threshold) or None,
-        warm_up=options.warm_up,
-        monitor=monitor,
-        precision=options.precision,
-        outliers=options.outliers,
-        checker=options.checker,
-        unverified=options.unverified,
-    )
-    answer(options, {"gains": options.gains, "files": files, **({"unverified": mark} if mark else {})}, mark)
-    return 0
-
-
 def run_prove_alarm(options: argparse.Namespace) -> int:
     """Run ``prove-alarm``: 0 whether there is a proof or not; every failure is an error."""
     from obsynth.monitoring.alarms.proof_file import CERTIFICATE
+    from obsynth.results.gain_sets import load
 
-    design = obsynth.load(options.gains)  # `prove_alarm` verifies it
+    design = load(options.gains)  # `prove_alarm` verifies it
     target = None if options.out is None else output_file(options.out, CERTIFICATE, options)
     found = proof_of(design, options, options.row, state_bounds=numbers_of(options.state_bound) or None)
     file = str(found.save(target)) if found.proved and target is not None else None
@@ -140,62 +107,6 @@ def run_prove_alarm(options: argparse.Namespace) -> int:
         },
         found.statement + (f"\nCertificate: {file}" if file else ""),
     )
-    return 0
-
-
-def run_report(options: argparse.Namespace) -> int:
-    """Run ``report``: gain set in, verified again, one HTML page out."""
-    require_distinct({"--gains": options.gains, "--system": options.system, "--out": options.out})
-    if options.out.suffix.lower() == ".json":
-        return _run_robustness(options)
-    if options.data is None:
-        own = ("gains", "unverified", "system", "out", "force", "json", "command")
-        refuse_given(options, [name for name in vars(options) if name not in own], "a log: give --data")
-    from obsynth.report.page import PAGE, html_report
-
-    scenario = None if options.system is None else required_scenario(obsynth.load_spec(options.system))
-    system = None if options.system is None else str(options.system)
-    output_file(options.out, PAGE, options)
-    design, report = verified_again(options.gains)
-    design = design if report.passed else design.replace(report=report)
-    run, watched = None, None
-    if options.data is not None:
-        protect_inputs(options)
-        output_file(options.out, PAGE, options)
-        watched = monitor_of(design, options, has_scenario=True)
-        run = run_of(design, options, watched)
-    file = html_report(
-        design,
-        options.out,
-        report=report,
-        gains_file=str(options.gains),
-        scenario=scenario,
-        system_file=system,
-        run=run,
-        data_file=options.data,
-        statement="" if watched is None else watched.statement,
-        rows=options.rows,
-        command=options.command,
-    )
-    if mark := unverified_mark(report):
-        print(f"Warning: {options.gains}: {mark}", file=sys.stderr)
-    answer(options, {"gains": options.gains, "file": file, "passed": report.passed})
-    return 0 if report.passed else VerificationError.exit_code
-
-
-def _run_robustness(options: argparse.Namespace) -> int:
-    """Write what holds for every plant within its tolerances as a certificate."""
-    refuse_given(
-        options,
-        [name for name in vars(options) if name not in ("gains", "out", "force", "json", "command")],
-        "the page: a certificate (.json) is of the gain set alone",
-    )
-    output_file(options.out, RESULT_FILE, options)
-    design, _ = gains_to_hand_on(options.gains, unverified=False)
-    found = obsynth.robustness(design)
-    file = found.save(options.out)
-    told = {"gains": options.gains, "file": file, "statement": found.statement, **found.as_dict()}
-    answer(options, told, found.statement)
     return 0
 
 
@@ -249,18 +160,3 @@ def run_plot(options: argparse.Namespace) -> int:
         unverified = {"unverified": mark} if mark else {}
         answer(options, {"gains": options.gains, "file": target, **found.as_dict(), **unverified}, told)
     return 0
-
-
-def picture_kind(target: Path) -> FileKind:
-    """Return what kind of picture a file is to be, by its suffix."""
-    suffix = target.suffix.lower()
-    if suffix not in PICTURES:
-        raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(PICTURES)}.", path=str(target))
-    return FileKind(f"a picture ({suffix})", PICTURES[suffix])
-
-
-def written_picture(target: Path, count: int, draw: Callable[[list[Any]], Any]) -> None:
-    """Write a picture of so many panels, one above the other; ``draw`` fills them."""
-    from obsynth.report.plots.panels import image_of
-
-    write_atomically(target, image_of(count, draw, kind=target.suffix[1:].lower()))

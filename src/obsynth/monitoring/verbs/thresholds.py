@@ -6,11 +6,11 @@ import argparse
 import sys
 from pathlib import Path
 
-from obsynth.cli.arguments import STREAM, columns_of, numbers_of
-from obsynth.cli.output import answer, gains_to_hand_on, output_file
 from obsynth.errors import SpecError
 from obsynth.files.outputs import require_distinct
 from obsynth.monitoring.verbs.data_arguments import protect_inputs, with_input_delay
+from obsynth.report.terminal.arguments import STREAM, columns_of, numbers_of
+from obsynth.report.terminal.output import answer, gains_to_hand_on, output_file
 
 
 def run_thresholds(options: argparse.Namespace) -> int:

@@ -26,6 +26,9 @@ STATES_FOR_ALL_MODES = 200
 #: The initial-condition response has settled when its slowest mode has decayed to this share.
 SETTLED_TO = 0.02
 
+#: Waiting for that ends with a sample that rounding, of this share of dt, calls earlier.
+SETTLING_SLACK = 1e-6
+
 
 #: Squarings after which powers of a stable matrix are below rounding, whatever its modes.
 MOST_SQUARINGS = 64

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from obsynth.monitoring.thresholds.monitor import Detection
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.detection import Detection
 from obsynth.observers.parameter_alarms import Decision
 from obsynth.report.plots.estimates import plot_faults, plot_parameters
 from obsynth.report.plots.panels import (

@@ -3,73 +3,40 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import obsynth
-from obsynth.cli.arguments import MONITOR_NAMES, columns_of, flag_of, numbers_of, refuse_given, stated_settings
-from obsynth.cli.commands import designed_or_loaded, spec_output
-from obsynth.cli.output import answer, output_file, progress, stdout_console
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.files.inputs import protect
-from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.outputs import write_atomically
 from obsynth.monitoring.thresholds.options import CHANGE, FALSE_ALARMS, PARAMETER_OPTIONS, refuse_idle
-from obsynth.monitoring.verbs.data_arguments import monitor_settings, required_scenario, stated_delay
-from obsynth.monitoring.verbs.logs import picture_kind, written_picture
+from obsynth.monitoring.verbs.arguments import MONITOR_NAMES, stated_settings
+from obsynth.monitoring.verbs.data_arguments import monitor_settings, stated_delay
 from obsynth.plants.transformations.recovery import linear_plant
+from obsynth.report.terminal.arguments import columns_of, flag_of, numbers_of, refuse_given
+from obsynth.report.terminal.output import answer, output_file, progress, stdout_console
+from obsynth.report.terminal.pictures import picture_kind, written_picture
+from obsynth.report.terminal.specs import prepared
 from obsynth.results.certificate_files import RESULT_FILE
 from obsynth.studies.verbs.sweeps import chosen_executor
 
-
-def _prepared(
-    options: argparse.Namespace, report_stage: Callable[[str], None], kind: FileKind | None = None
-) -> tuple[obsynth.Spec, obsynth.Scenario, Path | None, obsynth.ObserverDesign]:
-    """Return spec, scenario, where to write a file of some kind, and the design, made or loaded."""
-    report_stage(f"reading {options.system}")
-    spec = obsynth.load_spec(options.system)
-    scenario = required_scenario(spec)
-    if options.gains is not None:
-        protect(options.gains)
-    else:
-        refuse_given(options, ("unverified",), "a gain set: give --gains, as what is designed here is verified")
-    target = None if options.out is None else spec_output(options.out, kind, spec, options, option="--out")
-    return spec, scenario, target, designed_or_loaded(spec, options.gains, report_stage, unverified=options.unverified)
-
-
-def run_simulate(options: argparse.Namespace) -> int:
-    """Run ``simulate``: spec in, table of errors out, and every signal in a file if asked."""
-    with progress(quiet=options.quiet) as report_stage:
-        from obsynth.simulation.simulate import SIMULATED_SIGNALS, simulate
-
-        spec, scenario, target, design = _prepared(options, report_stage, SIMULATED_SIGNALS)
-        report_stage("simulating")
-        found = simulate(design, scenario)
-        # A log as run reads it; a bias of a sensor is a deviation of its own.
-        point = {**getattr(design.plant, "operating_point", {})}
-        point = {name: value for name, value in point.items() if name not in getattr(design.plant, "sensor_faults", ())}
-        written = None if target is None else str(found.write_csv(target, operating_point=point))
-    from obsynth.report.scenarios import simulation_report
-
-    answer(
-        options,
-        {"spec": spec.path, "file": written, **found.summary()},
-        lambda: simulation_report(design.name, found, console=stdout_console(), units=design.plant.units, file=written),
-    )
-    return 0
+if TYPE_CHECKING:
+    from obsynth.monitoring.thresholds.monitor import Monitor
+    from obsynth.observers.decisions import ParameterMonitor
 
 
 def _run_tolerances(options: argparse.Namespace) -> int:
     """Run ``evaluate --tolerances``: spec in, a table and a picture out."""
+    from obsynth.studies.tolerance_study import tolerance_study
+
     if options.monitor not in (None, "pointwise"):
         raise SpecError("--tolerances compares two pointwise monitors: leave out --monitor.", path="--tolerances")
     unused = ("plants", "confidence", "jobs", "initial_error", "initial", "false_alarms", "window", "change")
     refuse_given(options, unused, "one monitor on many runs, and --tolerances compares two on plants that it draws")
     with progress(quiet=options.quiet) as report_stage:
         kind = None if options.out is None else RESULT_FILE if _is_json(options.out) else picture_kind(options.out)
-        spec, scenario, target, design = _prepared(options, report_stage, kind)
+        spec, scenario, target, design = prepared(options, report_stage, kind)
 
-        found = obsynth.tolerance_study(
+        found = tolerance_study(
             design,
             scenario,
             tolerances=[_tolerance(item) for item in options.tolerances.split(",")],
@@ -106,28 +73,33 @@ def _tolerance(text: str) -> float | str:
 
 def run_evaluate(options: argparse.Namespace) -> int:
     """Run ``evaluate``: spec in, table of rates and errors out."""
+    from obsynth.monitoring.thresholds.residual_monitor import monitor
+    from obsynth.observers.decisions import ParameterMonitor
+    from obsynth.observers.linear.observer import LinearObserver
+    from obsynth.studies.evaluate import evaluate
+
     if options.tolerances is not None:
         return _run_tolerances(options)
     refuse_given(options, ("out", "force"), "the picture or certificate of --tolerances")
     if options.monitor is None:
         refuse_given(options, MONITOR_NAMES, "a monitor: name it with --monitor")
     with progress(quiet=options.quiet) as report_stage:
-        spec, scenario, _, design = _prepared(options, report_stage)
+        spec, scenario, _, design = prepared(options, report_stage)
         report_stage("running")
 
-        watched: obsynth.types.Monitor | obsynth.ParameterMonitor | None = None
-        if options.monitor is not None and isinstance(design.observer, obsynth.LinearObserver):
-            watched = obsynth.monitor(design, scenario, options.monitor, **monitor_settings(design, options))
+        watched: Monitor | ParameterMonitor | None = None
+        if options.monitor is not None and isinstance(design.observer, LinearObserver):
+            watched = monitor(design, scenario, options.monitor, **monitor_settings(design, options))
         elif options.monitor is not None:
             table = {**PARAMETER_OPTIONS, "glr": ("false_alarms",)}
             refuse_idle(table, options.monitor, stated_settings(options), called=flag_of)
-            watched = obsynth.ParameterMonitor(
+            watched = ParameterMonitor(
                 options.monitor,
                 false_alarms=options.false_alarms or FALSE_ALARMS,
                 change=(options.change or CHANGE) if options.monitor == "cusum" else None,
             )
         with chosen_executor(options.jobs, None) as executor:
-            found = obsynth.evaluate(
+            found = evaluate(
                 design,
                 scenario,
                 runs=options.runs,
@@ -137,8 +109,8 @@ def run_evaluate(options: argparse.Namespace) -> int:
                 plants=options.plants,
                 **({} if options.confidence is None else {"confidence": options.confidence}),
             )
-    from obsynth.report.scenarios import described, evaluation_report, final_threshold
     from obsynth.studies.least_thresholds import design_beside_least, in_words
+    from obsynth.studies.tables import described, evaluation_report, final_threshold
 
     least = design_beside_least(design, scenario)
     sentences = [in_words(name, *pair, design.plant.units.get(name, "")) for name, pair in least.items()]
@@ -163,18 +135,20 @@ def run_evaluate(options: argparse.Namespace) -> int:
 
 def run_compare(options: argparse.Namespace) -> int:
     """Run ``compare``: spec in, table and recommendation out; 3 where no method exists."""
+    from obsynth.specs.loader import load_spec
+    from obsynth.studies.comparing import compare
     from obsynth.studies.comparison import COMPARISON_PAGE
 
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
-        spec = obsynth.load_spec(options.system)
+        spec = load_spec(options.system)
         if options.data is None:
             refuse_given(options, ("map", "scale", "time_column", "input_delay"), "a log: give --data")
         if options.out is not None:
             output_file(options.out, RESULT_FILE if _is_json(options.out) else COMPARISON_PAGE, options)
         given = {} if spec.method == "auto" else {spec.method: spec.options}
         rows = stated_delay(options)
-        found = obsynth.compare(
+        found = compare(
             spec.transformation or linear_plant(spec.plant),
             scenario=spec.scenario,
             options=given,
@@ -194,7 +168,7 @@ def run_compare(options: argparse.Namespace) -> int:
                 found.save(options.out)
             else:
                 write_atomically(options.out, found.page())
-    from obsynth.report.scenarios import comparison_report
+    from obsynth.studies.tables import comparison_report
 
     answer(
         options,

@@ -10,13 +10,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import obsynth
-from obsynth.cli.arguments import MONITOR_NAMES, STREAM, numbers_of, refuse_given
-from obsynth.cli.output import output_file, print_json, progress, stdout_console
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
 from obsynth.files.outputs import FileKind, made_folder, write_together
 from obsynth.methods.registry import REGISTRY, method_class
+from obsynth.monitoring.verbs.arguments import MONITOR_NAMES
+from obsynth.report.terminal.arguments import STREAM, numbers_of, refuse_given
+from obsynth.report.terminal.output import output_file, print_json, progress, stdout_console
 from obsynth.specs.documents import read_yaml
 
 PICTURE = FileKind("a picture", rb"\A\x89PNG")
@@ -28,6 +28,8 @@ _BLANKS_BETWEEN = 2
 
 def run_sweep(options: argparse.Namespace) -> int:
     """Run ``sweep``; the exit code is 0 when every case was decided, whatever it came to."""
+    from obsynth.studies.sweep import sweep
+
     if options.out.exists() and not options.out.is_dir():
         raise SpecError(f"{options.out} is no folder: give --out the name of one.", path="--out")
     listed = [_value_list(text) for text in options.set]
@@ -39,7 +41,7 @@ def run_sweep(options: argparse.Namespace) -> int:
     _require_claim(options, parameters)
 
     def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:
-        return obsynth.sweep(options.system, parameters, executor=executor, folder=options.out, progress=done)
+        return sweep(options.system, parameters, executor=executor, folder=options.out, progress=done)
 
     def draw(found: Any) -> Any:
         claims = {name for result in found.results for name in result.claims}
@@ -77,6 +79,8 @@ def _require_claim(options: argparse.Namespace, parameters: dict[str, list[Any]]
 
 def run_many(options: argparse.Namespace) -> int:
     """Run ``run`` for a folder of gain sets: a table, a picture, and the estimates of each design on each log."""
+    from obsynth.studies.fleet import run_fleet
+
     alone = ("system", "state", "prove", "monitor", "smooth", "lag")
     given = [name for name in alone if getattr(options, name)]
     if given:
@@ -104,7 +108,7 @@ def run_many(options: argparse.Namespace) -> int:
 
     def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:
         stated = {name: value for name, value in asked.items() if value is not None}
-        return obsynth.run_fleet(options.gains, options.data, folder, executor=executor, progress=done, **stated)
+        return run_fleet(options.gains, options.data, folder, executor=executor, progress=done, **stated)
 
     table = FileKind("the table of many runs", rb"\Arun,status,")
     found, files = _carried_out(

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from obsynth.errors import SpecError
-from obsynth.monitoring.thresholds.options import FALSE_ALARMS, LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW
 
 #: An item of a list in help texts: its name with two blanks behind it, or nothing such, as in settings.
 _ITEM = re.compile(r"  (\S.{0,12}? {2,})?(?=\S)")
@@ -19,26 +18,13 @@ _ITEM = re.compile(r"  (\S.{0,12}? {2,})?(?=\S)")
 #: How far the rest of an item without a name hangs, and the widest lines of help texts.
 _HANGING, _WIDEST_HELP = 6, 110
 
-#: What a monitor is made of.
-_WHAT_A_MONITOR_DOES = "compare the residual (or the parameters) with a threshold; obsynth run --help lists the kinds"
-
 
 #: In place of a file: standard input, or standard output.
 STREAM = "-"
 
 
 #: Arguments of the command line that are not called as the options that they give.
-_CALLED = {"disturbance_bounds": "disturbance", "initial_set": "initial"}
-
-#: Options that are no settings of monitors on the command line.
-_ELSEWHERE = {"scenario", "sample_time", "constants", "gamma"}
-
-#: Names of all settings of monitors.
-MONITOR_NAMES = sorted(
-    _CALLED.get(name, name)
-    for name in {name for table in (LINEAR_OPTIONS, PARAMETER_OPTIONS) for names in table.values() for name in names}
-    - _ELSEWHERE
-)
+OPTION_NAMES = {"disturbance_bounds": "disturbance", "initial_set": "initial"}
 
 
 class Argument(NamedTuple):
@@ -272,67 +258,6 @@ LOG_OPTIONS = (
     ),
 )
 
-MONITOR = Group("monitor", (option("--monitor", "KIND", _WHAT_A_MONITOR_DOES),))
-
-#: What its threshold is made of, where the scenario does not say it.
-MONITOR_SETTINGS = Settings(
-    (
-        option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
-        option("--noise-bound", "N", "bound on the noise, in standard deviations", type=float),
-        option(
-            "--initial",
-            "STATE=BOUND",
-            "pointwise, discrete designs: bound of a state of the plant at the start (or LOW:HIGH); may be repeated",
-        ),
-        option("--initial-error", "E", "bound on the norm of the error at the start", type=float),
-        option(
-            "--false-alarms",
-            "P",
-            f"statistical kinds: probability of a false alarm in the whole run (default: {FALSE_ALARMS:g})",
-            type=probability,
-        ),
-        option("--window", "N", f"length of the window in samples (default: {WINDOW})", type=count),
-        option(
-            "--change",
-            "X",
-            "cusum: change to detect, in standard deviations of the residual, or in parameter units (default: 1)",
-            type=positive,
-        ),
-    )
-)
-
-#: How a log is read, and what is watched in it.
-DATA_OPTIONS = (
-    MAP,
-    MONITOR,
-    MONITOR_SETTINGS,
-    Settings(
-        (
-            TIME_COLUMN,
-            INPUT_DELAY,
-            option(
-                "--normal",
-                "FILE",
-                "monitor 'learned': what obsynth thresholds wrote (.json), or a log without faults",
-            ),
-            _SCALE,
-            option(
-                "--threshold",
-                "COLUMN=LEVEL",
-                "alarm when the absolute value of a column of the output passes a level; may be repeated",
-            ),
-            option(
-                "--nominal",
-                "NAME=VALUE",
-                "monitor of a recursive design: nominal value of a parameter; may be repeated",
-            ),
-            option("--sample-time", "SECONDS", "monitor of a continuous design: time between the rows", type=float),
-            option("--gap", "SECONDS", "continuous designs: a longer interval between two rows is a gap", type=float),
-            option("--warm-up", "SECONDS", "length of the warm-up at the start and after gaps", type=float),
-        )
-    ),
-)
-
 
 def number_of(name: str, text: str) -> float:
     """Return the value of an argument of the form NAME=VALUE."""
@@ -358,19 +283,4 @@ def ranges_of(pairs: list[tuple[str, str]]) -> dict[str, float | tuple[float, fl
 
 def flag_of(name: str) -> str:
     """Return what an option is called on the command line."""
-    return f"--{_CALLED.get(name, name).replace('_', '-')}"
-
-
-def stated_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """Return what a command line states of a monitor, by the names of the arguments of `obsynth.online_monitor`."""
-    return {
-        "disturbance_bounds": numbers_of(options.disturbance),
-        "noise_bound": options.noise_bound,
-        "initial_error": options.initial_error,
-        "window": options.window,
-        "false_alarms": options.false_alarms,
-        "change": options.change,
-        "initial_set": ranges_of(options.initial) or None,
-        "nominal": numbers_of(getattr(options, "nominal", [])),
-        "normal": getattr(options, "normal", None),
-    }
+    return f"--{OPTION_NAMES.get(name, name).replace('_', '-')}"

@@ -11,12 +11,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import obsynth
 from obsynth.errors import ObsynthError, VerificationError
 from obsynth.files.outputs import FileKind, check_output, check_replaceable
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from obsynth.results.design import ObserverDesign
+    from obsynth.results.verification_report import VerificationReport
 
 
 _TITLES = {
@@ -62,13 +64,16 @@ def print_json(data: Any, *, is_plain: bool = False) -> None:
     print(json.dumps(data if is_plain else plain(data), indent=1, allow_nan=False))
 
 
-def verified_again(path: Path) -> tuple[obsynth.ObserverDesign, obsynth.VerificationReport]:
+def verified_again(path: Path) -> tuple[ObserverDesign, VerificationReport]:
     """Return a saved design, and what its verification says now."""
-    design = obsynth.load(path)
-    return design, obsynth.verify(design)
+    from obsynth.methods.verifying import verify
+    from obsynth.results.gain_sets import load
+
+    design = load(path)
+    return design, verify(design)
 
 
-def gains_to_hand_on(path: Path, *, unverified: bool) -> tuple[obsynth.ObserverDesign, str]:
+def gains_to_hand_on(path: Path, *, unverified: bool) -> tuple[ObserverDesign, str]:
     """Return a saved design verified again, and the mark of one that fails; `VerificationError` unless that is wanted.
     A file's digest is no signature, and its report may be edited like all else: only a new one counts."""
     from obsynth.results.design import require_verified, unverified_mark

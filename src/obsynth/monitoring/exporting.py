@@ -1,0 +1,170 @@
+"""Monitors in exported files: learned thresholds as C beside their observer, and bounds over tolerances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.exporting.alarms import STATISTIC, MonitorVariable
+from obsynth.exporting.c_source import filled_table, filled_template, integer_table, table_lines
+from obsynth.monitoring.thresholds.learned import LearnedRule, LearnedThresholds, as_learned, watched_names
+from obsynth.monitoring.thresholds.learned_levels import AGES, FORGETTING, HOLD
+from obsynth.monitoring.thresholds.monitor import Monitor
+from obsynth.monitoring.thresholds.parameter_scores import DISTINGUISHED, LEAST_ADDED, MODEL_SHARE, parameter_walk
+from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_set_writing import gain_set_digest
+from obsynth.verification.over_tolerances.adaptive_bound import AdaptiveBound
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedMonitorInC:
+    """Learned thresholds as C: an `obsynth.exporting.alarms.ExportedMonitor`.
+
+    ``columns``: all outputs of a run that may be watched, fault estimates first; ``walk (nf, nf)``: the covariance by
+    which faults walk between samples.
+    """
+
+    learned: LearnedThresholds
+    columns: tuple[str, ...]
+    fault_names: tuple[str, ...]
+    walk: FloatArray | None
+
+    @property
+    def statement(self) -> str:
+        """What its thresholds mean."""
+        return self.learned.statement
+
+    @property
+    def variables(self) -> tuple[MonitorVariable, ...]:
+        """The statistic, the fault that an alarm points to, and whether an alarm lasts."""
+        listed = ", ".join(f"{i + 1}: {name}" for i, name in enumerate(self.fault_names))
+        held = f"1 while an alarm lasts, {HOLD} rows more than the statistic is above its level"
+        return (
+            MonitorVariable(STATISTIC, f"largest statistic in units of its level: {self.statement}", "statistic"),
+            MonitorVariable(
+                "isolated", f"number of the fault that an alarm points to, 0 for none ({listed})", "fault + 1.0"
+            ),
+            MonitorVariable("event", held, "event"),
+        )
+
+    def watched_observer(self, observer: Any) -> Any:
+        """Return an observer as the one from which the thresholds were learned judged outliers."""
+        return as_learned(observer, self.learned)
+
+    def struct_lines(self, prefix: str) -> list[str]:
+        """Return the declaration of the monitor's structure."""
+        model = self.learned.statistics.model
+        m, width = model.channels, max(len(self.learned.statistics.estimates), 1)
+        return [
+            "typedef struct {",
+            "    /* Read these after a step: the largest statistic in units of its level (NaN where nothing is",
+            "     * decided), whether it passes 1, which fault it points to (-1: none, or not distinguished yet), and "
+            "an",
+            "     * alarm that lasts. */",
+            "    REAL statistic;",
+            "    int alarm, fault, event;",
+            "    /* Everything else is the monitor's own. */",
+            f"    REAL past[{max(model.order * m, 1)}];",
+            f"    REAL white[{max(AGES) * m}];",
+            f"    REAL means[{len(FORGETTING) * m}];",
+            f"    REAL before[{(1 + width) * width}];",
+            f"    REAL scores[{max(AGES) * 2 * width}];",
+            "    int at, quiet, to_wait;",
+            "    long taken;",
+            f"}} {prefix}_monitor;",
+            "",
+        ]
+
+    def source(self, prefix: str) -> str:
+        """Return the tables and functions of the monitor."""
+        found, model = self.learned, self.learned.statistics.model
+        shapes, slopes = found.statistics.responses()
+        order, shares, faults_watched = model.order, np.array(FORGETTING), len(found.statistics.estimates)
+        straight = shapes[:, -1:] + (np.arange(order + 1) - order)[:, None] * slopes[:, None, :]
+        rows = np.concatenate([shapes, shapes[:, -1:] + np.arange(1, max(AGES))[:, None] * slopes[:, None, :]], axis=1)
+        powers = np.cumsum(np.sum(rows**2, axis=2), axis=1)[:, np.array(AGES) - 1]
+        sizes = {
+            "CHANNELS": model.channels,
+            "ORDER": order,
+            "OLDEST": max(AGES),
+            "AGES": len(AGES),
+            "MEANS": len(shares),
+            "SHAPES": len(shapes),
+            "MONITOR_FAULTS": len(found.scales),
+            "MONITOR_ESTIMATES": faults_watched,
+            "MONITOR_WIDTH": max(faults_watched, 1),
+            "MONITOR_SETTLING": found.settling,
+            "MONITOR_HOLD": HOLD,
+            "MONITOR_WATCHED": sum(name.startswith(("fhat[", "r[")) for name in self.columns),
+        }
+        tables: dict[str, Any] = {
+            "monitor_mean": model.mean[None],
+            "monitor_offset": model.offset[None],
+            "monitor_A": model.A.reshape(-1, model.channels),
+            "monitor_whitener": model.whitener,
+            "monitor_precision": model.whitener.T @ model.whitener,
+            "monitor_shares": shares[None],
+            "monitor_sizes": ((2.0 - shares) / shares)[None],
+            "monitor_levels": found.levels[None],
+            "monitor_flat": straight[:, 0],
+            "monitor_slopes": slopes,
+            "monitor_early": (shapes - straight).reshape(-1, model.channels),
+            "monitor_weights": 1.0 / (np.maximum(powers, SMALLEST) * found.statistics.levels_by_age),
+            "monitor_centres": found.centres[None],
+            "monitor_scales": found.scales[None],
+            "monitor_walk": np.zeros((0, 0)) if self.walk is None else self.walk,
+            "monitor_innovation": np.array([[found.innovation]]),
+        }
+        faults = {f"fhat[{name}]": i for i, name in enumerate(self.fault_names)}
+        faults |= {f"fault {name}": i for i, name in enumerate(self.fault_names)}
+        listed = ", ".join(f"{name} = {value}" for name, value in sizes.items())
+        lines = [
+            f"enum {{ {listed} }};",
+            f"#define MONITOR_LEAST ((REAL){LEAST_ADDED!r})",
+            f"#define MONITOR_APART ((REAL){DISTINGUISHED!r})",
+            f"#define MONITOR_SHARE ((REAL){MODEL_SHARE!r})",
+            *(line for name, table in tables.items() for line in table_lines(name, filled_table(table))),
+            *integer_table("monitor_ages", AGES),
+            *integer_table("monitor_places", [self.columns.index(name) for name in found.columns]),
+            *integer_table("monitor_seldom", [int(name in found.seldom) for name in self.columns]),
+            *integer_table("monitor_told", [faults.get(name, -1) for name in found.statistics.told]),
+        ]
+        return "\n".join(lines) + filled_template("learned.c", prefix, {}, "obsynth.monitoring")
+
+
+def monitor_in_c(monitor: Monitor, design: ObserverDesign) -> LearnedMonitorInC | None:
+    """Return what a monitor has learned, of this design, as C; ``None`` where it is of another kind."""
+    if not isinstance(monitor.rule, LearnedRule):
+        return None
+    learned = monitor.rule.learned
+    if learned.gains != gain_set_digest(design):
+        raise SpecError("The thresholds were learned with another gain set: learn them again.", path="monitor")
+    if isinstance(design.observer, RecursiveObserver):
+        raise SpecError(
+            "The steady state of a recursive design, which is what is exported, has other innovations than the "
+            "recursion that the thresholds were learned from: use levels of its outputs (thresholds).",
+            path="monitor",
+        )
+    return LearnedMonitorInC(
+        learned, watched_names(design), tuple(design.observer.fault_names), parameter_walk(design.observer)
+    )
+
+
+def bound_of_monitor(monitor: Monitor, observer: LinearObserver) -> AdaptiveBound:
+    """Return the bound of an adaptive monitor of an observer that is written."""
+    monitor.require_fit(len(observer.residual_names), observer.fault_names)
+    plan = getattr(monitor.rule, "plan", None)
+    bound: AdaptiveBound | None = None if plan is None else plan.bound
+    if bound is None:
+        raise SpecError("The monitor has no thresholds over tolerances: make it with constants.", path="monitor")
+    if bound.first is not None:
+        raise SpecError(
+            "Thresholds of continuous designs are not written as C: sample the plant first.", path="monitor"
+        )
+    return bound

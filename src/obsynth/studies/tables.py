@@ -1,0 +1,128 @@
+"""Evaluations and comparisons as tables: how often alarms were right, how far estimates were off."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from textwrap import fill
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console
+from rich.text import Text
+
+from obsynth.observers.decisions import ParameterMonitor
+from obsynth.report.scenarios import worst_rows
+from obsynth.results.layout import headed_table, number, print_section
+
+if TYPE_CHECKING:
+    from obsynth.monitoring.thresholds.monitor import Monitor
+    from obsynth.studies.comparison import Comparison
+    from obsynth.studies.evaluate import Evaluation, Interval
+
+
+_DECISIONS = {
+    "false_alarm_rate": ("false alarms", "share of runs"),
+    "missed_detection_rate": ("missed detections", "share of runs"),
+    "detection_delay": ("detection delay", "s"),
+    "isolation_error_rate": ("wrong fault named", "share of detections"),
+}
+
+
+#: Columns left out where the console is narrower than so many characters.
+NARROW = 130
+
+_LESS = ("order", "s to 50 %", "at horizon", "peak", "bias", "s to alarm", "smallest", "ms")
+
+#: Columns of names, how wide they are there (eighty columns less six of numbers), and how wide headings of numbers.
+_NAME_COLUMNS = ("method", "fault")
+
+_NAME_WIDTH, _HEADING_WIDTH = 11, 8
+
+
+def evaluation_report(
+    name: str,
+    found: Evaluation,
+    *,
+    monitor: Monitor | ParameterMonitor | None,
+    console: Console,
+    units: Mapping[str, str],
+    beside: Sequence[str] = (),
+) -> None:
+    """Print rates, delays and errors over many runs; ``beside``: sentences on thresholds."""
+    share = f"{100.0 * found.confidence:g} % interval"
+    console.print(Text(f"{name}: {found.runs} runs", style="bold"))
+    console.print()
+    if monitor is not None:
+        table = headed_table("decisions", "value", share, "of", "unit")
+        for key, (title, unit) in _DECISIONS.items():
+            item: Interval = getattr(found, key)
+            if item.count:
+                table.add_row(Text(title), number(item.value), _interval(item), str(item.count), Text(unit))
+        kind, statement = described(monitor)
+        print_section(console, f"Monitor {kind}", table)
+        end = final_threshold(monitor)
+        size = "" if end is None else f" ({number(end)} at the end of a run)"
+        console.print(Text(f"Its threshold{size}: {statement}."))
+        console.print()
+    for sentence in beside:
+        console.print(Text(sentence))
+    for title, errors in (("Fault estimates", found.fault_rmse), ("State estimates", found.state_rmse)):
+        if errors:
+            table = headed_table("signal", "RMSE after warm-up", share, "unit")
+            title, rows = worst_rows(title, list(errors.items()), lambda row: row[1].value)
+            for signal, item in rows:
+                table.add_row(Text(signal), number(item.value), _interval(item), Text(units.get(signal, "")))
+            print_section(console, f"{title} (mean over runs)", table)
+
+
+def described(monitor: Monitor | ParameterMonitor) -> tuple[str, str]:
+    """Return which monitor it is, and what its threshold means."""
+    if not isinstance(monitor, ParameterMonitor):
+        return monitor.kind, monitor.statement
+    return monitor.statistic, (
+        "of a decision on parameters, passed in a run without a change with about the stated probability "
+        f"({monitor.false_alarms:g})"
+    )
+
+
+def final_threshold(monitor: Monitor | ParameterMonitor) -> float | None:
+    """Return the threshold at the end of a run; ``None`` where it is not the same in each run, or decides nothing."""
+    if isinstance(monitor, ParameterMonitor) or not monitor.threshold.size or not np.isfinite(monitor.threshold[-1]):
+        return None
+    return float(monitor.threshold[-1])
+
+
+def _interval(item: Interval) -> str:
+    return "-" if math.isnan(item.low) else f"{number(item.low)} to {number(item.high)}"
+
+
+def comparison_report(found: Comparison, *, console: Console, file: Path | None = None) -> None:
+    """Print what was compared, the table, the refusals and the recommendation."""
+    header, *rows = found.rows()
+    wide = console.width >= NARROW
+    kept = [i for i, name in enumerate(header) if wide or name not in _LESS]
+    table = headed_table(
+        *(header[i] if wide else fill(header[i], _HEADING_WIDTH, break_long_words=False) for i in kept)
+    )
+    # Only names break, and at their hyphens and blanks: a number that is cut is another number.
+    for column, i in zip(table.columns, kept, strict=True):
+        column.no_wrap = header[i] not in _NAME_COLUMNS
+        if not column.no_wrap:
+            words = [word for row in rows for word in row[i].replace("-", "- ").split()]
+            column.min_width = min(max(map(len, [header[i], *words])), _NAME_WIDTH)
+    for row in rows:
+        texts = [row[i] if wide or header[i] not in _NAME_COLUMNS else fill(row[i], _NAME_WIDTH) for i in kept]
+        table.add_row(*map(Text, texts))
+    console.print(Text(found.setting))
+    for note in found.notes:
+        console.print(Text(note, style="yellow"))
+    if rows:
+        print_section(console, "", table)
+        console.print(Text(found.meanings([header[i] for i in kept]), style="dim"))
+    for refusal in found.refusals:
+        console.print(Text(refusal, style="yellow"))
+    console.print(Text(found.advice, style="bold"))
+    if file is not None:
+        console.print(Text(f"Written: {file}"), soft_wrap=True)

@@ -1,0 +1,34 @@
+"""The verb ``sensors``: least sets of sensors to add."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from obsynth.plants.transformations.recovery import linear_plant
+from obsynth.report.terminal.arguments import refuse_given
+from obsynth.report.terminal.output import answer, progress, stdout_console
+
+
+def run_sensors(options: argparse.Namespace) -> int:
+    """Run ``sensors``: spec in, least sets of sensors to add out; 3 where nothing reaches the goal."""
+    from obsynth.specs.loader import load_spec
+    from obsynth.studies.sensor_sets import sensor_sets
+
+    with progress(quiet=options.quiet) as report_stage:
+        spec = load_spec(options.system)
+        plant = linear_plant(spec.plant)
+        given: dict[str, Any] = {"goal": options.goal, "noise": options.noise, "largest": options.largest}
+        if options.goal == "threshold":
+            own = dict(spec.options) if spec.method == "guaranteed-test" else {}
+            fault = options.fault or own.pop("fault", None)
+            if fault is None and plant.nf == 1:
+                fault = plant.fault_names[0]
+            own = {name: value for name, value in own.items() if name != "fault"}
+            given |= {"fault": fault, "below": options.below, "sample_time": options.sample_time, "test": own}
+        else:
+            refuse_given(options, ("below", "sample_time"), "--goal threshold")
+            given |= {"faults": None if options.fault is None else [options.fault]}
+        found = sensor_sets(plant, progress=report_stage, **given)
+    answer(options, {"spec": spec.path, **found.to_dict()}, lambda: stdout_console().print(str(found), highlight=False))
+    return 0
