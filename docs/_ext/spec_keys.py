@@ -114,6 +114,11 @@ KEYS: Keys = {
         **_SIGNALS,
         **_NOISE,
         **_TOLERANCES,
+        "scheduling": (
+            "",
+            "Measured parameters that the matrices depend on: the design then holds over their whole region, see below.",
+            "{v: {range: [-1, 1], column: speed}}",
+        ),
         "entries": (
             "",
             "Entries that are expressions in `constants`, where matrices come from files: by matrix a list, see below. "
@@ -217,6 +222,13 @@ KEYS: Keys = {
         "tolerance": ("%, or a share", "Half of the width of its range, relative to the nominal value.", "5 %"),
         "range": ("of the constant", "Its range, in place of a tolerance; it need not be symmetric.", "[1.9, 2.2]"),
         "unit": ("", "Its unit, as text.", "kJ/K"),
+    },
+    "SchedulingSection": {
+        "range": ("of the parameter", "Its least and its largest value.", "[-1, 1]"),
+        "rate": ("of the parameter / s", "Its largest change in a second. Left out: it may jump.", "0.02"),
+        "column": ("", "Its column in a log. Left out: the column with its name.", "speed"),
+        "unit": ("", "Its unit, as text.", "m/s"),
+        "measured": ("", "Must be true: a parameter that is not measured cannot schedule a gain.", "true"),
     },
     "EntrySection": {
         "row": ("", "Row, by name or by number from 1.", "wall"),
@@ -409,6 +421,7 @@ SECTIONS: tuple[tuple[str, str, str], ...] = (
         "unit: kJ/K}}`. One constant in several entries is one unknown. A name in a matrix that is written out, or in an "
         "equation, stands for the constant: `A: [[-k/C1, k/C1], ...]`.",
     ),
+    ("plant.scheduling", "SchedulingSection", "One parameter, by its name."),
     ("plant.entries", "EntrySection", "One item of the list of a matrix."),
     ("plant.box", "BoxSection", "See [model uncertainty](../explanation/tolerances)."),
     ("plant.sensor_noise: coloured noise", "ColouredNoise", "In place of a number; see `obsynth.with_noise`."),

@@ -48,7 +48,6 @@ CASES: dict[str, tuple[dict[str, Any] | None, dict[str, Any], int, tuple[str, ..
     "range and disk": (None, {"adaptation_range": [1.0, 2.0], "disk": [5.0, 4.5]}, 2, ("cannot be combined", "disk")),
     "singular G": (None, {"adaptation_gain": [[1, 1], [1, 1]]}, 2, ("adaptation_gain", "nonsingular")),
     "G of the wrong shape": (None, {"adaptation_gain": [[1, 0, 0]]}, 2, ("adaptation_gain", "1 by 3")),
-    "scan of old": (None, {"delta_scan": [0.1]}, 2, ("method.options.delta_scan", "a scan is a sweep")),
     "unknown option": (None, {"detla": 0.1}, 2, ("method.options.detla", "delta")),
     "unknown solver": (None, {"solver": "MOSEK"}, 2, ("method.options.solver",)),
     # Existence conditions: 3.

@@ -96,7 +96,7 @@ def test_auto_and_compare_say_why_they_differ() -> None:
     )  # fmt: skip
     chosen, compared = obsynth.design(plant), obsynth.compare(plant, runs=5)
     assert compared.recommended != chosen.method
-    assert f"auto, which knows no scenario, takes {chosen.method}" in compared.advice
+    assert f"`method: auto` would choose {chosen.method}, because it ranks without your scenario" in compared.advice
     assert "obsynth compare ranks by errors over a scenario instead" in chosen.notes[0]
     alone = obsynth.compare(plant, methods=[chosen.method], runs=5)
     assert "auto" not in alone.advice
