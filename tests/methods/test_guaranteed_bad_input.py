@@ -20,9 +20,17 @@ GOOD = {"samples": 5, "course": "constant", "fault": "leak", "disturbance_bounds
 BAD: dict[str, tuple[dict[str, Any], int, str]] = {
     "no bound of noise": ({"noise_bound": None}, 2, "noise_bound: a standard deviation is no bound"),
     "no bound of disturbances": ({"disturbance_bounds": None}, 2, "largest absolute value of inflow is missing"),
-    "a negative bound": ({"noise_bound": {"level": -1.0}}, 2, "noise_bound of level is -1.0"),
-    "an infinite bound": ({"disturbance_bounds": {"inflow": float("inf")}}, 2, "disturbance_bounds of inflow is inf"),
-    "a text": ({"noise_bound": "three"}, 2, "noise_bound is 'three'"),
+    "a negative bound": (
+        {"noise_bound": {"level": -1.0}},
+        2,
+        r"noise_bound.level: must be at least 0|noise_bound of level is -1.0",
+    ),
+    "an infinite bound": (
+        {"disturbance_bounds": {"inflow": float("inf")}},
+        2,
+        r"disturbance_bounds.inflow: must be a finite number|disturbance_bounds of inflow is inf",
+    ),
+    "a text": ({"noise_bound": "three"}, 2, "noise_bound: must be a number|noise_bound is 'three'"),
     "a bound of nothing": ({"disturbance_bounds": {"inflow": 0.25, "rain": 1.0}}, 2, "unknown: rain"),
     "an unknown fault in free": ({"free": ["lek"]}, 2, "free names lek"),
     "its own fault in free": ({"free": ["leak"]}, 2, "free names leak"),
@@ -31,7 +39,7 @@ BAD: dict[str, tuple[dict[str, Any], int, str]] = {
     "a lag that does not fit": ({"course": "any", "lag": 5}, 2, "any does not fit in 5 samples"),
     "a lag of a constant": ({"lag": 1}, 2, "lag is for the courses any, ramp and rate"),
     "no rate": ({"course": "rate"}, 2, "course rate needs fault_rate"),
-    "samples of none": ({"samples": 0}, 2, "samples is 0"),
+    "samples of none": ({"samples": 0}, 2, r"samples: must be at least 1|samples is 0"),
     "a bank of one": ({"isolate": True}, 2, "leave fault and free out"),
     "exact in ellipsoids": ({"exact": True, "norm": "ellipsoid"}, 2, "exact is for norm box"),
     "another way with gaps": ({"missing": "guess"}, 2, "missing"),
@@ -97,7 +105,7 @@ def test_deviations_of_noise_that_nobody_states_are_refused() -> None:
     bounded = obsynth.guaranteed_test(quiet, **{**GOOD, "noise_bound": {"level": 0.3}})
     assert bounded.threshold == pytest.approx(obsynth.guaranteed_test(plant(), **GOOD).threshold, rel=1e-9)
     assert "noise within its stated bounds" in str(bounded)
-    assert "no sensor noise stated" in str(obsynth.guaranteed_test(quiet, **{**GOOD, "noise_bound": None}))
+    assert "no sensor noise given" in str(obsynth.guaranteed_test(quiet, **{**GOOD, "noise_bound": None}))
 
 
 def test_a_log_shorter_than_the_window_is_refused_and_nothing_is_written(tmp_path: Path) -> None:

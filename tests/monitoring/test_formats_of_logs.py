@@ -60,7 +60,7 @@ def test_the_index_of_a_parquet_file_is_the_time_as_that_of_its_frame(design, fr
     log = frame[SIGNALS].set_index(index.rename("time" if has_name else None))
     log.to_parquet(tmp_path / "log.parquet")
     if kind == "counted":
-        with pytest.raises(SpecError, match=r"intervals of 1 s and the like, but the design has dt = 0\.5 s"):
+        with pytest.raises(SpecError, match=r"sampled every 1 s, but the design needs 0\.5 s"):
             obsynth.run_on_data(design, tmp_path / "log.parquet")
         return
     found = same(design, tmp_path / "log.parquet", log)

@@ -300,7 +300,7 @@ def test_row_by_row_is_the_same_as_at_once() -> None:
 def test_too_few_rows_are_told() -> None:
     short = obsynth.learn_thresholds(heated(), log(400, 0), false_alarms="1 per day")
     assert not short.holds
-    assert "needs 864000 rows" in short.statement
+    assert "about 864,000 needed, 1 day" in short.statement
     with pytest.raises(obsynth.SpecError, match="rows"):
         obsynth.learn_thresholds(heated(), log(90, 0))
     with pytest.raises(obsynth.SpecError, match="No monitored signal changes"):

@@ -450,7 +450,7 @@ class TestState:
         ([0.0, *[1.0] * 12], "Row 13 repeats the time 1 s"),
         ([0.0, 1.0, *[0.5] * 12], "Row 13: the time falls from 1 to 0.5 s"),
         ([0.0, 1.0, 2.48], r"Row 3 comes 1\.48 s after the row before, but the design has dt = 1 s"),
-        ([0.0, 2.0, 4.0], "Row 3: the data begin with intervals of 2 s"),
+        ([0.0, 2.0, 4.0], "Row 3: the log is sampled every 2 s, but the design needs 1 s"),
         ([0.0, 0.5, 1.0], "Row 2 comes 0.5 s"),
         ([0.0, np.nan, 2.0], "Row 2 has no time"),
     ],

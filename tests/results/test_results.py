@@ -489,7 +489,7 @@ def test_trouble_inside_lapack_is_a_solver_error(monkeypatch):
     def gives_up(*_: object, **__: object) -> None:
         raise np.linalg.LinAlgError("did not converge")
 
-    monkeypatch.setattr("obsynth.methods.fault_estimation_filter.convex_problem.gain_problem", gives_up)
+    monkeypatch.setattr("obsynth.methods.fault_estimation_filter.synthesis.gain_problem", gives_up)
     plant = obsynth.DescriptorSystem(None, [[0.5]], None, [[1.0]], Bf=[[1.0]], dt=0.1)
     with pytest.raises(obsynth.SolverError, match=r"LAPACK gave up \(did not converge\)"):
         obsynth.fault_estimation_filter(plant)

@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.linalg import LinAlgWarning, eigh, solve_discrete_are, svd
+from scipy.linalg import LinAlgWarning, eigh, svd
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.matrix_equations import discrete_riccati
 from obsynth.numerics.norms import frequency_response, hinf_norm, output_covariance, spectral_radius
 
 #: Relative width at which the bisection of the level ends.
@@ -57,6 +58,30 @@ MOST_SAMPLES = 2000
 
 #: Angles at which the gain of filters that need not be causal is computed, before its largest is refined.
 ANGLES = 600
+
+#: The least frequency of a grid, as a share of half a turn of a sample.
+LEAST_ANGLE = 1e-6
+
+#: Levels start at this share of the size of the data.
+FIRST_LEVEL = 1e-3
+
+#: Innovations whose smallest share of the variance is below this have no inverse.
+SINGULAR_INNOVATION = 1e-11
+
+#: Eigenvalues of a covariance below zero by more than this share are not rounding.
+NEGATIVE_SHARE = 1e-7
+
+#: How far above a bound the level that is tried lies.
+ABOVE_BOUND = 1e-6
+
+#: Responses whose energy grows by less than this share are over.
+FADED = 1e-22
+
+#: A bound from a response is lowered by this, for its rounding.
+ROUNDED_DOWN = 1e-9
+
+#: Equations whose share is below this are not independent.
+DEPENDENT = 1e-12
 
 
 class NoStableFilterError(Exception):
@@ -153,7 +178,7 @@ def _whitened(given: EstimationProblem) -> _Whitened:
     n, measured = len(given.A), len(given.C)
     size = max(
         float(np.linalg.norm(given.C) * np.linalg.norm(given.B) + np.linalg.norm(given.D)),
-        1e-3 * float(np.linalg.norm(given.L) * np.linalg.norm(given.B) + np.linalg.norm(given.H)),
+        FIRST_LEVEL * float(np.linalg.norm(given.L) * np.linalg.norm(given.B) + np.linalg.norm(given.H)),
         float(np.finfo(float).tiny),
     )
     stable = spectral_radius(given.A) < 1.0
@@ -178,7 +203,7 @@ def _whitened(given: EstimationProblem) -> _Whitened:
             continue
         kalman, innovation = found
         values, vectors = np.linalg.eigh(innovation)
-        if values[0] <= 1e-11 * values[-1]:
+        if values[0] <= SINGULAR_INNOVATION * values[-1]:
             continue
         scale = (vectors / np.sqrt(values)).T
         a, b = noisy.A - kalman @ noisy.C, noisy.B - kalman @ noisy.D
@@ -210,7 +235,7 @@ def _riccati(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, r: Floa
         with np.errstate(invalid="ignore", over="ignore"), warnings.catch_warnings():
             # What is ill-conditioned is judged by the solution, not by the estimate of a condition.
             warnings.simplefilter("ignore", LinAlgWarning)
-            solution = solve_discrete_are(a.T, c.T, b @ b.T, r, s=b @ d.T)
+            solution = discrete_riccati(a.T, c.T, b @ b.T, r, s=b @ d.T)
     except (np.linalg.LinAlgError, ValueError):
         return None
     return np.asarray((solution + solution.T) / 2.0)
@@ -261,7 +286,7 @@ def _solution_at(problem: EstimationProblem, level: float) -> FloatArray | None:
     if solution is None or not np.all(np.isfinite(solution)):
         return None
     inertia = both @ solution @ both.T + weight
-    if len(solution) and np.linalg.eigvalsh(solution)[0] < -1e-7 * (1.0 + np.max(np.abs(solution))):
+    if len(solution) and np.linalg.eigvalsh(solution)[0] < -NEGATIVE_SHARE * (1.0 + np.max(np.abs(solution))):
         return None
     if q and np.linalg.eigvalsh(inertia[:q, :q])[0] <= 0.0:
         return None
@@ -285,7 +310,7 @@ def _least_level(
             level = min(level, max(lowest, nothing) * (1.0 + 3.0 * LEVEL_TOLERANCE))
         solution = _solution_at(problem, level)
         if solution is not None and hinf_norm(*problem.error(*_central_gains(problem, solution))).value <= level * (
-            1.0 + 1e-6
+            1.0 + ABOVE_BOUND
         ):
             highest, best = level, solution
         else:
@@ -342,14 +367,14 @@ def _bound_by_past(
         more = np.array([np.sum((rows @ start) ** 2) for rows in (error, noise, missed)])
         sums += more
         start = step @ start
-        if more[0] + more[1] <= 1e-22 * sums[1]:
+        if more[0] + more[1] <= FADED * sums[1]:
             break
     else:
         # What is left out of the noise would make the quotient too large.
         return 0.0
     if not sums[1] > 0.0 or np.sqrt(sums[2] / sums[1]) > PAST_TOLERANCE:
         return 0.0
-    return float(np.sqrt(sums[0] / sums[1]) * (1.0 - 1e-9))
+    return float(np.sqrt(sums[0] / sums[1]) * (1.0 - ROUNDED_DOWN))
 
 
 def _corrected(
@@ -365,7 +390,7 @@ def _corrected(
         ]
     )
     found = np.concatenate([states.ravel(), noise.ravel()])
-    found = found - np.linalg.lstsq(equations, equations @ found, rcond=1e-12)[0]
+    found = found - np.linalg.lstsq(equations, equations @ found, rcond=DEPENDENT)[0]
     return found[: n * n].reshape(n, n), found[n * n :].reshape(k, n)
 
 
@@ -381,7 +406,8 @@ def _worst_start(step: FloatArray, error: FloatArray, noise: FloatArray) -> Floa
     if not (np.all(np.isfinite(above)) and np.all(np.isfinite(below))):
         return None
     values, vectors = eigh((below + below.T) / 2.0)
-    kept = values > GRAMIAN_TOLERANCE * values[-1]
+    least = GRAMIAN_TOLERANCE * values[-1]
+    kept = values > least
     unit = vectors[:, kept] / np.sqrt(values[kept])
     _, turned = eigh(unit.T @ (above + above.T) @ unit / 2.0)
     return np.asarray(unit @ turned[:, -1] / sizes)
@@ -400,7 +426,7 @@ def _non_causal_gain(problem: EstimationProblem) -> float:
             error = error - error @ back @ np.linalg.solve(seen @ back, seen)
         return np.asarray(np.linalg.norm(error, 2, axis=(1, 2))) if error.shape[2] else np.zeros(len(angles))
 
-    ends = np.geomspace(1e-6, 1.0, ANGLES // 3)
+    ends = np.geomspace(LEAST_ANGLE, 1.0, ANGLES // 3)
     modes = np.abs(np.angle(np.linalg.eigvals(problem.A))) if len(problem.A) else np.zeros(0)
     angles = np.unique(np.concatenate([np.linspace(0.0, np.pi, ANGLES), ends, np.pi - ends, modes]))
     found = gains(angles)

@@ -77,12 +77,12 @@ def _of_run(run: DataRun) -> str:
 
 def _of_test(test: GuaranteedTest) -> Iterator[str]:
     """Yield what a guaranteed test detects: its numbers are proved."""
-    unit = test.plant.units.get(test.fault, "")
     if len(test.tests) > 1:
         for own in test.tests:
             size = _size(own.threshold, test.plant.units.get(own.fault, ""))
             yield f"{own.fault}: estimated within {size}, proved."
         return
+    unit = test.plant.units.get(test.fault, "")
     claims = test.certificate.claims
     soon = f", at the latest after {duration(claims['delay'])}" if "delay" in claims else ""
     sure = claims.get("surely_found", 2.0 * test.threshold)

@@ -258,9 +258,11 @@ def _check_version(document: Mapping[str, Any], problems: DocumentProblems) -> N
     from obsynth.specs.schema import SPEC_VERSION
 
     version = document.get("schema_version")
+    if "sha256" in document and "design" in document:
+        problems.add("", "This is a gain set: give the spec that it was made from.")
+        problems.raise_if_any()
     if is_whole(version) and version != SPEC_VERSION:
-        other = " This is a gain set: give the spec that it was made from." if "design" in document else ""
-        told = f"version {version} is unknown; this obsynth reads version {SPEC_VERSION}.{other}"
+        told = f"version {version} is unknown; this obsynth reads version {SPEC_VERSION}."
         problems.add("schema_version", told)
         problems.raise_if_any()
 

@@ -29,6 +29,12 @@ INFINITE_MODE = 1e4
 #: Frequencies outside this range, relative to 1 rad/s, do not take part in the choice of alpha.
 USUAL_RATES = (1e-6, 1e6)
 
+#: Directions that are reached, or seen, by less than this share are rounding.
+REACHED = 1e-10
+
+#: What a state may show in other outputs, relative to the direct term, and still be static.
+SHOWN = 1e-8
+
 #: alpha is off the geometric mean of the modes by this factor, so that it is none of them.
 OFF_MODES = 1.0371
 
@@ -154,7 +160,7 @@ def reduce(plant: Inputs, delay: int, reference: StateSpace | None, *, exact: bo
         core_a, core_b, core_c, wanted, bank = _in(
             _without_cancelled(core_a, np.vstack([core_c, wanted])), core_a, core_b, core_c, wanted, bank
         )
-    basis = reachable_basis(core_a.T, np.hstack([core_c.T, wanted.T]), 1e-10)
+    basis = reachable_basis(core_a.T, np.hstack([core_c.T, wanted.T]), REACHED)
     core_a, core_b, core_c, wanted, bank = _in(basis, core_a, core_b, core_c, wanted, bank)
     old = nw * window
     chain = np.eye(old, k=nw)
@@ -243,13 +249,13 @@ def _without_cancelled(a: FloatArray, rows: FloatArray) -> FloatArray:
     if not count:
         return np.eye(n)
     leading, shown = triangular[:count, :count], rows @ turn[:, :count]
-    scale = float(np.linalg.norm(rows))
+    least = CANCELLED * max(float(np.linalg.norm(rows)), np.finfo(float).tiny)
     basis, new = np.zeros((count, 0)), shown.T
     while basis.shape[1] < count:
         for _ in range(2):
             new = new - basis @ (basis.T @ new)
         left, values, _ = svd(new, full_matrices=False)
-        left = left[:, values > CANCELLED * max(scale, np.finfo(float).tiny)]
+        left = left[:, values > least]
         if not left.shape[1]:
             break
         basis, new = np.hstack([basis, left]), leading.T @ left
@@ -273,9 +279,9 @@ def _standard(plant: Inputs, reference: StateSpace | None) -> tuple[StateSpace, 
         c, d = root * plant.C @ lu_solve(factor, plant.E), direct + plant.C @ driven
     else:
         alpha, (a, b, c, d) = 1.0, _without_infinite_modes(plant, inputs, direct)
-    reached = reachable_basis(a, b, 1e-10)
+    reached = reachable_basis(a, b, REACHED)
     a, b, c = reached.T @ a @ reached, reached.T @ b, c @ reached
-    seen = reachable_basis(a.T, c.T, 1e-10)
+    seen = reachable_basis(a.T, c.T, REACHED)
     return (seen.T @ a @ seen, seen.T @ b, c @ seen, d), alpha
 
 
@@ -306,7 +312,7 @@ def _without_infinite_modes(plant: Inputs, inputs: FloatArray, direct: FloatArra
         direct = direct + c[:, k:] @ state
         for _ in range(m - 1):
             state = nilpotent @ state
-            if np.max(np.abs(c[:, k:] @ state), initial=0.0) > 1e-8 * (1.0 + np.max(np.abs(direct), initial=0.0)):
+            if np.max(np.abs(c[:, k:] @ state), initial=0.0) > SHOWN * (1.0 + np.max(np.abs(direct), initial=0.0)):
                 raise PreconditionError(
                     "The outputs of this discrete-time plant depend on inputs of later samples (its index is above 1 "
                     "and the outputs show it): this method does not take it. Reduce the index first.",
