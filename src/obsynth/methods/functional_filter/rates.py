@@ -39,8 +39,9 @@ AS_CLOSE = 0.05
 #: is taken only where rounding hides what faster ones show.
 NOTHING_SHOWN, LONGER, MOST_LONGER = 0.5, 2.0, 55
 
-#: Default gains move poles whose errors need longer than so many settling times of the plant to decay.
-FOR_GOOD = 20.0
+#: Default gains move poles whose errors need longer than so many settling times of the plant to decay; where no gain
+#: does so, those of errors that would stay in any run.
+TOO_SLOW = (20.0, 1e5)
 
 #: Decades of the search around a rate of the size of the noise, and its steps per decade at the end.
 DECADES, RATE_BISECTIONS = 8, 9
@@ -116,13 +117,16 @@ def default_rates(
 
 def _forgetting(model: FilterModel, walks: FloatArray, found: KalmanGain, seconds: float, lag: int) -> KalmanGain:
     """Return the gain, or one for the same walks whose errors do not stay for good, where there is one."""
-    slowest = 1.0 / (FOR_GOOD * seconds)
-    if not slowest_decay(model.A - found.K @ model.C, model.dt) < slowest:
-        return found
-    try:
-        return kalman_gain(model, walks, lag=lag, decay=slowest)
-    except SolverError:
-        return found
+    speed = slowest_decay(model.A - found.K @ model.C, model.dt)
+    for times in TOO_SLOW:
+        slowest = 1.0 / (times * seconds)
+        if not speed < slowest:
+            break
+        try:
+            return kalman_gain(model, walks, lag=lag, decay=slowest)
+        except SolverError:
+            continue
+    return found
 
 
 def step_misses(model: FilterModel, gain: KalmanGain, seconds: float) -> float:
