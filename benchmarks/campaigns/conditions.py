@@ -16,7 +16,7 @@ from benchmarks.campaigns.frame import Outcome
 
 import obsynth
 from obsynth.analysis.existence.wang2015 import examine_fault_filter
-from obsynth.methods.fault_estimation_filter.convex_problem import _gains, centred, gain_problem
+from obsynth.methods.fault_estimation_filter.convex_problem import centred, gain_problem, gains_in_given_units
 from obsynth.numerics.central_filter import search_least_gain
 
 CASES = 50
@@ -34,7 +34,7 @@ def case(seed: int) -> Outcome:
     problem, parts = centred(*_order(gain_problem(prepared, free_weight=False), prepared))
     least = search_least_gain(problem)
     size = max(least.gain, 1.0)
-    gains = _gains(prepared, parts, least.injection)
+    gains = gains_in_given_units(prepared, parts, least.injection)
     level = least.gain + SAME * size
     given: dict[str, Any] = {letter: gains[letter] for letter in "TNLW"}
     shipped = obsynth.design_from_gains(plant, "fault-estimation-filter", **given, gamma=level).conditions()
