@@ -6,7 +6,7 @@ from pathlib import Path
 
 import obsynth
 
-MOST = 72
+MOST = 60
 
 
 def test_few_statements_are_laid_out_by_hand() -> None:

@@ -77,21 +77,34 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str) -> st
     held, nu, ny = observer.scheduling, observer.inputs, len(observer.output_names)
     nx, nf, nr = len(observer.state_names), len(observer.fault_names), len(observer.residual_names)
     sizes = {
-        "Z_COUNT": observer.order, "Y_COUNT": ny, "VERTICES": observer.count,
-        "PARAMETERS": len(held.names), "FUNCTIONS": max(len(held.functions), 1), "STATE_COUNT": nx,
-        "ROW_COUNT": nx + nf + nr, "FORGETTING": observer.forgetting,
-    }  # fmt: skip
+        "Z_COUNT": observer.order,
+        "Y_COUNT": ny,
+        "VERTICES": observer.count,
+        "PARAMETERS": len(held.names),
+        "FUNCTIONS": max(len(held.functions), 1),
+        "STATE_COUNT": nx,
+        "ROW_COUNT": nx + nf + nr,
+        "FORGETTING": observer.forgetting,
+    }
     # These stand in conditions of the preprocessor too.
     defined = {
-        "U_COUNT": nu, "FAULT_COUNT": nf, "DIVIDES": int(not observer.effectiveness_is_one),
+        "U_COUNT": nu,
+        "FAULT_COUNT": nf,
+        "DIVIDES": int(not observer.effectiveness_is_one),
         "GIVES_WEIGHTS": int(held.gives_weights),
-    }  # fmt: skip
+    }
     first = observer.init()
     tables: dict[str, FloatArray] = {
-        "first_weights": first.weights[None], "lowest": held.low[None], "highest": held.high[None],
-        "middle": observer.middle[None], "steps": np.minimum(observer.steps, np.finfo(np.float64).max)[None],
-        "Cz": observer.Cz, "Dy": observer.Dy, "Az": np.vstack(list(observer.Az)), "By": np.vstack(list(observer.By)),
-    }  # fmt: skip
+        "first_weights": first.weights[None],
+        "lowest": held.low[None],
+        "highest": held.high[None],
+        "middle": observer.middle[None],
+        "steps": np.minimum(observer.steps, np.finfo(np.float64).max)[None],
+        "Cz": observer.Cz,
+        "Dy": observer.Dy,
+        "Az": np.vstack(list(observer.Az)),
+        "By": np.vstack(list(observer.By)),
+    }
     if nu:
         tables |= {"Du": observer.Du, "Bu": np.vstack(list(observer.Bu))}
     if defined["DIVIDES"]:
@@ -99,9 +112,7 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str) -> st
     if not held.gives_weights:
         tables["bounds"] = held.bounds
     shown = [("states", nx, 0), ("faults", nf, nx), ("residuals", nr, nx + nf)]
-    copied = " ".join(
-        f"for (i = 0; i < {n}; i++) {{ {to}[i] = rows[{at} + i]; }}" for to, n, at in shown if n
-    )  # fmt: skip
+    copied = " ".join(f"for (i = 0; i < {n}; i++) {{ {to}[i] = rows[{at} + i]; }}" for to, n, at in shown if n)
     taken = "for (i = 0; i < U_COUNT; i++) {\n        TAKE_ONE\n    }".replace("TAKE_ONE", _TAKEN) if nu else ""
     values = "\n        ".join(f"a[{i}] = {_c_text(text, held.names)};" for i, text in enumerate(held.expressions))
     body = filled_template(
@@ -134,9 +145,10 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str) -> st
 
 def _arguments(observer: ScheduledObserver, prefix: str) -> list[str]:
     counts = {
-        "states": len(observer.state_names), "faults": len(observer.fault_names),
+        "states": len(observer.state_names),
+        "faults": len(observer.fault_names),
         "residuals": len(observer.residual_names),
-    }  # fmt: skip
+    }
     return [
         f"{prefix}_state *state",
         f"const REAL u[{len(observer.input_names)}]",
@@ -147,13 +159,31 @@ def _arguments(observer: ScheduledObserver, prefix: str) -> list[str]:
 
 #: Operations in C, by numpy's.
 _C_FUNCTIONS: dict[Callable[..., Any], str] = {
-    np.negative: "(-{})", np.add: "({} + {})", np.subtract: "({} - {})", np.multiply: "({} * {})",
-    np.divide: "({} / {})", np.power: "pow({}, {})", np.minimum: "fmin({}, {})", np.maximum: "fmax({}, {})",
-    np.sin: "sin({})", np.cos: "cos({})", np.tan: "tan({})", np.arcsin: "asin({})", np.arccos: "acos({})",
-    np.arctan: "atan({})", np.sinh: "sinh({})", np.cosh: "cosh({})", np.tanh: "tanh({})", np.exp: "exp({})",
-    np.log: "log({})", np.log10: "log10({})", np.sqrt: "sqrt({})", np.abs: "fabs({})", np.floor: "floor({})",
+    np.negative: "(-{})",
+    np.add: "({} + {})",
+    np.subtract: "({} - {})",
+    np.multiply: "({} * {})",
+    np.divide: "({} / {})",
+    np.power: "pow({}, {})",
+    np.minimum: "fmin({}, {})",
+    np.maximum: "fmax({}, {})",
+    np.sin: "sin({})",
+    np.cos: "cos({})",
+    np.tan: "tan({})",
+    np.arcsin: "asin({})",
+    np.arccos: "acos({})",
+    np.arctan: "atan({})",
+    np.sinh: "sinh({})",
+    np.cosh: "cosh({})",
+    np.tanh: "tanh({})",
+    np.exp: "exp({})",
+    np.log: "log({})",
+    np.log10: "log10({})",
+    np.sqrt: "sqrt({})",
+    np.abs: "fabs({})",
+    np.floor: "floor({})",
     np.ceil: "ceil({})",
-}  # fmt: skip
+}
 
 
 def _c_text(expression: Expression, names: tuple[str, ...]) -> str:

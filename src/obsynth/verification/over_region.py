@@ -49,11 +49,7 @@ def courses(scheduling: Scheduling, steps: float | None) -> str:
 def same_scheduling_row(plant: PolytopicSystem, observer: ScheduledObserver) -> Check:
     """Return the row that plant and observer read the same parameters in the same way."""
     one, other = plant.scheduling, observer.scheduling
-    wrong = [
-        name
-        for name in ("names", "functions")
-        if getattr(one, name) != getattr(other, name)
-    ]  # fmt: skip
+    wrong = [name for name in ("names", "functions") if getattr(one, name) != getattr(other, name)]
     wrong += [
         name for name in ("low", "high", "corners") if not np.array_equal(getattr(one, name), getattr(other, name))
     ]
@@ -128,8 +124,12 @@ def gain_row(
 ) -> Check:
     """Return the row that the gain over the region is below ``claimed``; proved at ``level``."""
     proof = _no_certificate() if witness is None else prove_gain(vertices, witness, level, discrete=discrete)
-    return _proof_row(GAIN_ROW, f"gain over the region: the l2 gain from the disturbances to the fault errors is below "
-                      f"gamma, {words}", claimed, proof)  # fmt: skip
+    return _proof_row(
+        GAIN_ROW,
+        f"gain over the region: the l2 gain from the disturbances to the fault errors is below gamma, {words}",
+        claimed,
+        proof,
+    )
 
 
 def switching_row(vertices: Sequence[Vertex], level: float) -> Check:
@@ -208,9 +208,14 @@ def _no_certificate() -> VertexProof:
 def _proof_row(name: str, claim: str, value: float, proof: VertexProof) -> Check:
     told = f"{proof.count} matrices positive definite" if proof.proved else f"not proved: {proof.reason}"
     row = upper_bound_check(
-        name, claim, value, value if proof.proved else -np.inf, source="vertex inequalities, proved in balls",
-        kind="proved", detail=told,
-    )  # fmt: skip
+        name,
+        claim,
+        value,
+        value if proof.proved else -np.inf,
+        source="vertex inequalities, proved in balls",
+        kind="proved",
+        detail=told,
+    )
     return replace(row, margin=proof.margin, passed=proof.proved)
 
 

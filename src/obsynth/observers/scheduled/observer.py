@@ -102,9 +102,14 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
         rows = len(self.state_names) + nf + len(self.residual_names)
         nz = np.shape(self.Az)[-1] if np.ndim(self.Az) == 3 else -1
         shapes = {
-            "Az": (count, nz, nz), "Bu": (count, nz, nu), "By": (count, nz, ny), "Cz": (rows, nz), "Du": (rows, nu),
-            "Dy": (rows, ny), "effectiveness": (count, nf, nf),
-        }  # fmt: skip
+            "Az": (count, nz, nz),
+            "Bu": (count, nz, nu),
+            "By": (count, nz, ny),
+            "Cz": (rows, nz),
+            "Du": (rows, nu),
+            "Dy": (rows, ny),
+            "effectiveness": (count, nf, nf),
+        }
         for name, shape in shapes.items():
             matrix = np.asarray(getattr(self, name), dtype=np.float64)
             if matrix.shape != shape or not np.isfinite(matrix).all():
@@ -192,10 +197,21 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
 
     def _linear(self, place: int, Cz: FloatArray, Du: FloatArray, Dy: FloatArray) -> LinearObserver:
         return LinearObserver(
-            self.Az[place], self.Bu[place], self.By[place], Cz, Du, Dy, self.dt, self.input_names[: self.inputs],
-            self.output_names, self.state_names, self.fault_names, self.residual_names, self.state_delays,
+            self.Az[place],
+            self.Bu[place],
+            self.By[place],
+            Cz,
+            Du,
+            Dy,
+            self.dt,
+            self.input_names[: self.inputs],
+            self.output_names,
+            self.state_names,
+            self.fault_names,
+            self.residual_names,
+            self.state_delays,
             self.fault_delays,
-        )  # fmt: skip
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field, as the constructor takes it."""
@@ -320,6 +336,12 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
         """
         states, faults = len(self.state_names), self.fault_rows
         return Estimates(
-            read_only(rows[..., :states]), read_only(rows[..., faults]), read_only(rows[..., faults.stop :]),
-            self.state_names, self.fault_names, self.residual_names, self.state_delays, self.fault_delays,
-        )  # fmt: skip
+            read_only(rows[..., :states]),
+            read_only(rows[..., faults]),
+            read_only(rows[..., faults.stop :]),
+            self.state_names,
+            self.fault_names,
+            self.residual_names,
+            self.state_delays,
+            self.fault_delays,
+        )
