@@ -13,6 +13,9 @@ ALIKE = 0.6
 #: How many words are suggested.
 MOST_SUGGESTIONS = 3
 
+#: Shells whose completion scripts shtab writes.
+SHELLS = ("bash", "zsh", "tcsh")
+
 
 class Parser(argparse.ArgumentParser):
     """An argument parser that names the command or option that a misspelt one may mean."""
@@ -37,10 +40,6 @@ class Parser(argparse.ArgumentParser):
             close = [(word, meant(word, known)) for word in wrong if word not in known]
             message += "".join(f". There is no option {word}.{told}" for word, told in close if told).rstrip(".")
         super().error(message)
-
-
-#: Shells whose completion scripts shtab writes.
-SHELLS = ("bash", "zsh", "tcsh")
 
 
 class PrintCompletion(argparse.Action):

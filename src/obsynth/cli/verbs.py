@@ -5,21 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from obsynth.report.terminal.arguments import (
-    FORCE,
-    GAINS,
-    JSON,
-    QUIET,
-    SPEC_GAINS,
-    SYSTEM,
-    UNVERIFIED,
-    Group,
-    Settings,
-    digits,
-    flag,
-    option,
-    verbose,
-)
+from obsynth.report.terminal.arguments import Group, Settings, flag, option, verbose
+from obsynth.report.terminal.common_options import FORCE, GAINS, JSON, QUIET, SPEC_GAINS, SYSTEM, UNVERIFIED, digits
 from obsynth.report.terminal.verbs import Verb
 
 

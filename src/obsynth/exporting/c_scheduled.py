@@ -21,6 +21,34 @@ _TAKEN = "if (isfinite(u[i])) {\n            s->u[i] = u[i];\n        } else {\n
 #: What a row is called.
 STATUSES = ("OK", "WARM_UP", "GAP", "RECOVERING", "OUT")
 
+#: Operations in C, by numpy's.
+_C_FUNCTIONS: dict[Callable[..., Any], str] = {
+    np.negative: "(-{})",
+    np.add: "({} + {})",
+    np.subtract: "({} - {})",
+    np.multiply: "({} * {})",
+    np.divide: "({} / {})",
+    np.power: "pow({}, {})",
+    np.minimum: "fmin({}, {})",
+    np.maximum: "fmax({}, {})",
+    np.sin: "sin({})",
+    np.cos: "cos({})",
+    np.tan: "tan({})",
+    np.arcsin: "asin({})",
+    np.arccos: "acos({})",
+    np.arctan: "atan({})",
+    np.sinh: "sinh({})",
+    np.cosh: "cosh({})",
+    np.tanh: "tanh({})",
+    np.exp: "exp({})",
+    np.log: "log({})",
+    np.log10: "log10({})",
+    np.sqrt: "sqrt({})",
+    np.abs: "fabs({})",
+    np.floor: "floor({})",
+    np.ceil: "ceil({})",
+}
+
 
 def scheduled_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple[str, str]:
     """Return source and header."""
@@ -155,35 +183,6 @@ def _arguments(observer: ScheduledObserver, prefix: str) -> list[str]:
         f"const REAL y[{len(observer.output_names)}]",
         *(f"REAL {name}[{n}]" for name, n in counts.items() if n),
     ]
-
-
-#: Operations in C, by numpy's.
-_C_FUNCTIONS: dict[Callable[..., Any], str] = {
-    np.negative: "(-{})",
-    np.add: "({} + {})",
-    np.subtract: "({} - {})",
-    np.multiply: "({} * {})",
-    np.divide: "({} / {})",
-    np.power: "pow({}, {})",
-    np.minimum: "fmin({}, {})",
-    np.maximum: "fmax({}, {})",
-    np.sin: "sin({})",
-    np.cos: "cos({})",
-    np.tan: "tan({})",
-    np.arcsin: "asin({})",
-    np.arccos: "acos({})",
-    np.arctan: "atan({})",
-    np.sinh: "sinh({})",
-    np.cosh: "cosh({})",
-    np.tanh: "tanh({})",
-    np.exp: "exp({})",
-    np.log: "log({})",
-    np.log10: "log10({})",
-    np.sqrt: "sqrt({})",
-    np.abs: "fabs({})",
-    np.floor: "floor({})",
-    np.ceil: "ceil({})",
-}
 
 
 def _c_text(expression: Expression, names: tuple[str, ...]) -> str:

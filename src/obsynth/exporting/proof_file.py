@@ -64,6 +64,20 @@ COVARIANCE_BITS, COVARIANCE_ROOM = 400, 2.0**-30
 #: An estimate must be that of its fault to this share: the checker refuses others.
 ESTIMATE_SHARE = 1e-3
 
+#: Matrices of the plant and of the observer that the file holds.
+_PLANT_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
+_OBSERVER_MATRICES = ("Az", "Bu", "By", "Cz", "Du", "Dy")
+
+#: What methods claim besides, by their ids; `obsynth.verify` checks it.
+_NOT_COVERED: Mapping[str, list[str]] = {
+    "fault-estimation-filter": ["that no filter has a smaller gain (gamma_min)", "which gains the realisation has"],
+    "pd-observer": ["the gain from noise and its derivative", "a range of adaptation rates", "a disk of poles"],
+    "ui-pi-observer": ["that the poles are the claimed ones: their decay alone", "a region of poles"],
+    "functional-filter": ["deviations with random walks of the faults", "that estimates are free of other faults"],
+    "detection-filter": ["the least sensitivity to faults over the band"],
+    "guaranteed-test": ["the mean threshold over tolerances", "that no test is insensitive to more faults"],
+}  # fmt: skip
+
 
 def proof_of(design: ObserverDesign) -> dict[str, Any]:
     """Return the proof file of a linear time-invariant design as JSON data.
@@ -263,19 +277,6 @@ class _Proof:
         rows = ["fault"] if self.observer.fault_names else ["residual"]
         if self.plant.nw and self.observer.order and (self.plant.Bw.any() or self.plant.Dw.any()):
             self._add("standard deviations under the stated noise", system.deviation_claim(rows))
-
-
-_PLANT_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
-_OBSERVER_MATRICES = ("Az", "Bu", "By", "Cz", "Du", "Dy")
-#: What methods claim besides, by their ids; `obsynth.verify` checks it.
-_NOT_COVERED: Mapping[str, list[str]] = {
-    "fault-estimation-filter": ["that no filter has a smaller gain (gamma_min)", "which gains the realisation has"],
-    "pd-observer": ["the gain from noise and its derivative", "a range of adaptation rates", "a disk of poles"],
-    "ui-pi-observer": ["that the poles are the claimed ones: their decay alone", "a region of poles"],
-    "functional-filter": ["deviations with random walks of the faults", "that estimates are free of other faults"],
-    "detection-filter": ["the least sensitivity to faults over the band"],
-    "guaranteed-test": ["the mean threshold over tolerances", "that no test is insensitive to more faults"],
-}  # fmt: skip
 
 
 def rows_of(observer: LinearObserver) -> list[tuple[str, str, int]]:

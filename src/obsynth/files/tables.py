@@ -18,6 +18,9 @@ _FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")
 #: Marks a cell as text in spreadsheets.
 _MARK = "'"
 
+#: A number at the begin of a cell of a table, and what follows it, such as a unit.
+_NUMBER_CELL = re.compile(r"(-?(?:\d{1,3}(?:,\d{3})+|\d+))(\.\d+)?(?=$|[ e])(.*)")
+
 
 def standing_page(title: str, body: Iterable[str], *, generator: str = "obsynth") -> str:
     """Return a page that stands alone, in the style of the reports; title and lines of the body are HTML."""
@@ -63,10 +66,6 @@ def _cell(value: Any) -> Any:
     if isinstance(value, str):
         return harmless(value)
     return "" if value != value else value
-
-
-#: A number at the begin of a cell of a table, and what follows it, such as a unit.
-_NUMBER_CELL = re.compile(r"(-?(?:\d{1,3}(?:,\d{3})+|\d+))(\.\d+)?(?=$|[ e])(.*)")
 
 
 def aligned(cells: Sequence[str]) -> list[str]:

@@ -39,6 +39,9 @@ RETREAT = 10.0
 
 HALVINGS = 2
 
+#: Relative distance to the best gain from which a first level that fails ends the descent.
+NEXT_TO = 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class Reached:
@@ -169,7 +172,3 @@ def _vanishing(points: list[tuple[float, float]]) -> float:
         others = [m for j, (_, m) in enumerate(points) if j != i]
         total += u * math.prod(m / (m - margin) for m in others)
     return total
-
-
-#: Relative distance to the best gain from which a first level that fails ends the descent.
-NEXT_TO = 1e-3

@@ -34,6 +34,9 @@ LARGEST_WHOLE = 1e15
 #: Keys of a parameter as it is given.
 PARAMETER_KEYS = ("range", "rate", "column", "unit", "measured")
 
+#: Functions that have one name in formulas and in numpy.
+_NAMES = ["sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "log10", "sqrt", "abs", "sign", "floor", "ceil"]
+
 
 @dataclass(frozen=True, eq=False)
 class Scheduling:
@@ -357,7 +360,6 @@ def _bracketed(text: str) -> str:
     return text if is_call or text.replace(".", "").isdigit() else f"({text})"
 
 
-_NAMES = ["sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "log10", "sqrt", "abs", "sign", "floor", "ceil"]
 _TEXTS: dict[Callable[..., Any], Callable[..., str]] = {
     **{getattr(np, name): partial("{}({})".format, name) for name in _NAMES},
     np.arcsin: lambda x: f"asin({x})",

@@ -42,6 +42,9 @@ PAGE = FileKind("a report of obsynth", rb'name="generator" content="obsynth"', s
 #: Gains with more entries are not printed: the gain set has them.
 MOST_ENTRIES = 900
 
+#: Sections that are closed at first, unless a check fails.
+FOLDED = ("Checks", "Gains", "The plant")
+
 
 @arguments_checked
 def html_report(
@@ -152,10 +155,6 @@ def html_report(
         else:
             parts += [f"<h2>{heading}</h2>", *lines, "</section>"]
     return write_atomically(path, standing_page(escape(f"{shown.name}: {shown.method}"), parts))
-
-
-#: Sections that are closed at first, unless a check fails.
-FOLDED = ("Checks", "Gains", "The plant")
 
 
 def _zooms(design: ObserverDesign, scenario: Scenario | None, run: DataRun | None) -> Iterator[str]:

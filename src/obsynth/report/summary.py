@@ -59,6 +59,12 @@ _PROMISES = ("gamma", "decay")
 #: Errors that shrink to less of them in a step are gone within a few, and how much is left is rounding.
 LEAST_CONTRACTION = 1e-6
 
+#: The inequality of each method that an engine of Riccati equations does without.
+_INEQUALITIES = {"fault-estimation-filter": "(45)", "pd-observer": "the theorem"}
+
+#: How a recursive method notes which covariances nobody stated.
+_IDENTITY_NOTE = re.compile(r"No noise is stated: (Q and R|Q|R) taken as the identity")
+
 
 @dataclass(frozen=True)
 class Summary:
@@ -163,10 +169,6 @@ def _facts(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterato
     yield "assumes", "; ".join(_assumptions(design))
 
 
-#: The inequality of each method that an engine of Riccati equations does without.
-_INEQUALITIES = {"fault-estimation-filter": "(45)", "pd-observer": "the theorem"}
-
-
 def _engine(design: ObserverDesign) -> Iterator[tuple[str, str]]:
     """Yield how the gains were computed, where a method has several ways, and how to have the other one."""
     engine, inequality = design.solver.get("engine"), _INEQUALITIES.get(design.method)
@@ -252,10 +254,6 @@ def _speed(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterato
     ]
     if told:
         yield "step", f"the estimate reaches 90 % after: {listed(told, most=_MOST_IN_SUMMARY)}"
-
-
-#: How a recursive method notes which covariances nobody stated.
-_IDENTITY_NOTE = re.compile(r"No noise is stated: (Q and R|Q|R) taken as the identity")
 
 
 def _assumptions(design: ObserverDesign) -> Iterator[str]:

@@ -34,6 +34,12 @@ SHOWN_DIGITS = 12
 #: Figures that are found again agree to this share of themselves, or of the largest beside them for rounding.
 SAME_FIGURE, FIGURE_ROUNDING_SHARE = 1e-6, 1e-9
 
+#: Bytes in which a file says its kind.
+_CERTIFICATE_HEAD_BYTES = 200
+
+#: What the file of a proof of an alarm calls itself.
+ALARM_KIND = "obsynth alarm certificate"
+
 
 def sealed(kind: str, version: int, body: Any, *, under: str = "certificate") -> str:
     """Return the text of a file that holds a body, plain data, with its digest."""
@@ -126,10 +132,6 @@ def body_of(body: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-#: Bytes in which a file says its kind.
-_CERTIFICATE_HEAD_BYTES = 200
-
-
 def kind_of_file(path: Path) -> str:
     """Return what a file that obsynth wrote says it is; empty where it says nothing."""
     try:
@@ -138,6 +140,3 @@ def kind_of_file(path: Path) -> str:
     except (OSError, ValueError):  # there is no such file, or no file can have this name
         return ""
     return "" if found is None else found.group(1).decode()
-
-
-ALARM_KIND = "obsynth alarm certificate"

@@ -40,6 +40,14 @@ _NUMBER_WIDTH = 10
 #: As wide as "not recomputed".
 _KIND_WIDTH = 14
 
+#: From these sizes on a number has an exponent (of ten), and commas.
+LEAST_WITH_EXPONENT, LEAST_WITH_COMMAS = 7, 10_000
+#: A time is told in a longer unit as well from so many of it on.
+LONG_TIMES = (("d", 86400.0, 2.0), ("h", 3600.0, 2.0), ("min", 60.0, 10.0))
+
+#: Rows of information that are true or false.
+YES_OR_NO = ("plant: regular", "plant: admissible")
+
 
 def number(value: float, *, digits: int = 4) -> str:
     """Return ``value`` with a few significant digits; a dash for "not a number", whatever a changed file may hold.
@@ -58,12 +66,6 @@ def number(value: float, *, digits: int = 4) -> str:
         rounded = float(text)
         return f"{rounded:,.0f}" if abs(rounded) >= LEAST_WITH_COMMAS else f"{rounded:.0f}"
     return f"{mantissa}e{int(exponent)}"
-
-
-#: From these sizes on a number has an exponent (of ten), and commas.
-LEAST_WITH_EXPONENT, LEAST_WITH_COMMAS = 7, 10_000
-#: A time is told in a longer unit as well from so many of it on.
-LONG_TIMES = (("d", 86400.0, 2.0), ("h", 3600.0, 2.0), ("min", 60.0, 10.0))
 
 
 def duration(seconds: float, *, digits: int = 3) -> str:
@@ -191,10 +193,6 @@ def _grid(width: int, *, with_claim: bool) -> Table:
 def _claim(check: Check) -> Text:
     claim = Text(check.claim)
     return claim.append(f"; {check.detail}", style="dim") if check.detail else claim
-
-
-#: Rows of information that are true or false.
-YES_OR_NO = ("plant: regular", "plant: admissible")
 
 
 def shown_numbers(check: Check) -> tuple[str, str, str]:

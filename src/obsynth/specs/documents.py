@@ -43,6 +43,9 @@ _KIND = re.compile(r"<\w+>")
 #: Problems of a value that is of another kind, beside those whose names end with `_type`.
 _OTHER_KIND = ("missing", "extra_forbidden", "literal_error")
 
+#: Of a long line so many characters are shown around the place of an error.
+SHOWN_COLUMNS = 100
+
 
 def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
     """Return the mapping in a YAML 1.2 document; duplicate keys, tags, anchors set twice, and aliases that
@@ -133,10 +136,6 @@ def _quoted(error: Exception, text: str) -> str:
     start = max(column - SHOWN_COLUMNS // 2, 0) if len(line) > SHOWN_COLUMNS else 0
     shown = line[start : start + SHOWN_COLUMNS]
     return f"\n  {number} | {shown}\n  {' ' * len(number)} | {' ' * (column - start)}^"
-
-
-#: Of a long line so many characters are shown around the place of an error.
-SHOWN_COLUMNS = 100
 
 
 def _one_line(error: Exception) -> str:

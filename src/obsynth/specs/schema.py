@@ -37,6 +37,13 @@ ProfileSection: Any = create_model(  # type: ignore[call-overload]
 #: The sections of a spec that are checked by themselves: those which it has not are not made.
 CHECKED_APART = ("plant", "scenario", "inputs", "calibrate")
 
+#: A profile, or several whose sum is taken.
+Profiles = Annotated[
+    Annotated[ProfileSection, Tag(ONE_TAG)]
+    | Annotated[Annotated[list[ProfileSection], Field(min_length=1)], Tag(LIST_TAG)],
+    Discriminator(lambda value: LIST_TAG if isinstance(value, list) else ONE_TAG),
+]
+
 
 def plant_section(kind: object) -> type[Section]:
     """Return the section of a plant of this kind."""
@@ -55,13 +62,6 @@ class MethodSection(Section):
 
     id: Text = "auto"
     options: dict[str, Any] = Field(default_factory=dict)
-
-
-Profiles = Annotated[
-    Annotated[ProfileSection, Tag(ONE_TAG)]
-    | Annotated[Annotated[list[ProfileSection], Field(min_length=1)], Tag(LIST_TAG)],
-    Discriminator(lambda value: LIST_TAG if isinstance(value, list) else ONE_TAG),
-]
 
 
 class ScenarioSection(Section):

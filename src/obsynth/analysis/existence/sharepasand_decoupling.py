@@ -38,6 +38,9 @@ _NOT_ELIMINATED = {
 #: The matrix of (D1).
 D1_BLOCKS = (("E", None, "Bd"), ("C", "Dd", None), (None, None, "Dd"))
 
+#: The source of (D1).
+SOURCE = "Share Pasand, Lemma 4 (9.1), in a form without E#"
+
 
 def decoupling_rank(judge: Evaluator) -> RankDecision:
     """Decide (D1): ``rank [E 0 Bd; C Dd 0; 0 0 Dd]``, with what it must be."""
@@ -167,6 +170,3 @@ def _undecoupled(judge: Evaluator) -> tuple[str, ...]:
     if np.max(shares, initial=0.0) > RANK_TOLERANCE:
         return leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
     return leading_names(np.abs(direction[: plant.nx]), plant.state_names, most=MOST_NAMES)
-
-
-SOURCE = "Share Pasand, Lemma 4 (9.1), in a form without E#"

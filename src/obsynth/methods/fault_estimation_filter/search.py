@@ -41,6 +41,9 @@ ROUNDING_GAIN = 1e-11
 #: many states: far below the least no polish helps, and far above none is needed.
 BELOW_LEAST, ABOVE_LEAST = 0.95, 1.0 + 1e-4
 
+#: Level of the certificate, relative to the same, when no disturbance reaches the fault estimate at all.
+NOMINAL_GAIN = 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class FoundGains:
@@ -179,7 +182,3 @@ def _require_reachable(problem: GainProblem, least: LeastGain, gain: float, *, s
         f"gamma = {gain:.6g} was not reached (best found {best:.6g}), and the proved lower bound {bound:.6g} does not "
         f"rule it out: the result is inconclusive {choice}. Ask for a slightly larger gamma."
     )
-
-
-#: Level of the certificate, relative to the same, when no disturbance reaches the fault estimate at all.
-NOMINAL_GAIN = 1e-3

@@ -50,6 +50,8 @@ COARSE_LINE_STEPS = 3
 
 COARSEST_LINE_STEPS = 2
 
+MOST_STATES_TO_POLISH = 20
+
 
 @dataclass(frozen=True, eq=False)
 class Goal:
@@ -267,6 +269,3 @@ def _towards(goal: Goal, injection: Injection, target: Injection | None, *, slow
             best, least, share = mixed, cost, tried
         step *= 0.5
     return best
-
-
-MOST_STATES_TO_POLISH = 20

@@ -6,21 +6,8 @@ import argparse
 from typing import Any
 
 from obsynth.monitoring.thresholds.options import FALSE_ALARMS, LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW
-from obsynth.report.terminal.arguments import (
-    _SCALE,
-    INPUT_DELAY,
-    MAP,
-    OPTION_NAMES,
-    TIME_COLUMN,
-    Group,
-    Settings,
-    count,
-    numbers_of,
-    option,
-    positive,
-    probability,
-    ranges_of,
-)
+from obsynth.report.terminal.arguments import OPTION_NAMES, Group, Settings, numbers_of, option, ranges_of
+from obsynth.report.terminal.common_options import _SCALE, INPUT_DELAY, MAP, TIME_COLUMN, count, positive, probability
 
 #: What a monitor is made of.
 _WHAT_A_MONITOR_DOES = "compare the residual (or the parameters) with a threshold; obsynth run --help lists the kinds"

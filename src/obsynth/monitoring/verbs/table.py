@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 
 from obsynth.monitoring.verbs.arguments import DATA_OPTIONS
-from obsynth.report.terminal.arguments import (
+from obsynth.report.terminal.arguments import Argument, Group, Settings, flag, option
+from obsynth.report.terminal.common_options import (
     CLUSTER,
     FORCE,
     GAINS,
@@ -20,11 +21,6 @@ from obsynth.report.terminal.arguments import (
     SYSTEM,
     TIME_COLUMN,
     UNVERIFIED,
-    Argument,
-    Group,
-    Settings,
-    flag,
-    option,
 )
 from obsynth.report.terminal.verbs import Verb
 
@@ -67,6 +63,27 @@ _LOG = "text (.csv, .tsv), Parquet, TDMS or MDF file; - for text on standard inp
 _EXPECTED_SCENARIO = option(
     "--system", "FILE", "spec (YAML) whose scenario states the disturbances and noise to expect", type=Path
 )
+
+#: Arguments that monitors add to verbs of designs, by verb.
+ADDED: dict[str, tuple[Argument | Group | Settings, ...]] = {
+    "export": (
+        Settings(
+            (
+                option(
+                    "--normal",
+                    "FILE",
+                    "for .c and .fmu: the monitor that obsynth thresholds wrote (.json)",
+                    type=Path,
+                ),
+            ),
+        ),
+    ),
+    "report": (
+        option("--data", "FILE", "show the design on this log as well: text, Parquet, TDMS or MDF file"),
+        *DATA_OPTIONS,
+        Settings((option("--rows", "A:B", "rows without faults, which are compared with the design (default: all)"),)),
+    ),
+}
 
 
 def _run_run(options: argparse.Namespace) -> int:
@@ -354,26 +371,5 @@ VERBS = {
             JSON,
             FORCE,
         ),
-    ),
-}
-
-#: Arguments that monitors add to verbs of designs, by verb.
-ADDED: dict[str, tuple[Argument | Group | Settings, ...]] = {
-    "export": (
-        Settings(
-            (
-                option(
-                    "--normal",
-                    "FILE",
-                    "for .c and .fmu: the monitor that obsynth thresholds wrote (.json)",
-                    type=Path,
-                ),
-            ),
-        ),
-    ),
-    "report": (
-        option("--data", "FILE", "show the design on this log as well: text, Parquet, TDMS or MDF file"),
-        *DATA_OPTIONS,
-        Settings((option("--rows", "A:B", "rows without faults, which are compared with the design (default: all)"),)),
     ),
 }

@@ -42,6 +42,9 @@ CROSSING_MARKERS = ("o", "s", "^")
 #: Around what is drawn there is this share of its range, and room for this many usual half-widths of the band.
 ROOM_SHARE, USUAL_BANDS = 0.2, 3.0
 
+#: Of more states the worst are drawn, unless axes or names are given.
+MOST_STATE_PANELS = 12
+
 
 @arguments_checked
 def plot_faults(
@@ -174,10 +177,6 @@ def plot_parameters(
         deviations=estimates.parameter_deviations,
     )
     return panels
-
-
-#: Of more states the worst are drawn, unless axes or names are given.
-MOST_STATE_PANELS = 12
 
 
 def _worst_states(estimates: Estimates, states: ArrayLike | None) -> tuple[list[int], str]:

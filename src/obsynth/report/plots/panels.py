@@ -77,6 +77,9 @@ WIDE_AXIS = 10.0
 #: Up to this ratio of largest to smallest, a logarithmic axis has plain numbers.
 SHORT_SPREAD = 300.0
 
+#: Signals whose ranges differ by this factor, and whose units nobody states, are not compared.
+UNLIKE_RANGES = 100.0
+
 
 def new_panels(axes: Iterable[Axes] | None, count: int, *, size: tuple[float, float] | None = None) -> list[Axes]:
     """Return ``count`` axes: the given ones, or new ones one above the other."""
@@ -259,10 +262,6 @@ def share_scale(panels: Sequence[Axes], units: Sequence[str | None]) -> None:
             continue
         for panel in alike:
             panel.set_ylim(min(low for low, _ in ranges), max(high for _, high in ranges))
-
-
-#: Signals whose ranges differ by this factor, and whose units nobody states, are not compared.
-UNLIKE_RANGES = 100.0
 
 
 def with_unit(name: str, units: Mapping[str, str] | None) -> str:

@@ -54,6 +54,15 @@ _ZEROS: dict[str, Any] = {
 #: How far a complex number is outside of a part of the region: negative inside.
 Excess = Callable[[ComplexArray], FloatArray]
 
+#: Damping ratios of the grid behind poles, and the natural frequencies along its lines: many decades in 1/s, of sampled
+#: poles rad per sample.
+DAMPING_RATIOS = (0.2, 0.4, 0.6, 0.8)
+RATES = np.concatenate([[0.0], np.geomspace(1e-9, 1e9, 400)])
+RATES_PER_SAMPLE = np.linspace(0.0, np.pi, 200)
+
+#: Ticks of a logarithmic axis on both sides of zero.
+MOST_DECADE_TICKS = 7
+
 
 @arguments_checked
 def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
@@ -142,15 +151,6 @@ def _continuous_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> N
     _damping_grid(axes, sampled=False)
     axes.set_xlabel("real part (1/s)")
     axes.set_ylabel("imaginary part (1/s)")
-
-
-#: Damping ratios of the grid behind poles, and the natural frequencies along its lines: many decades in 1/s, of sampled
-#: poles rad per sample.
-DAMPING_RATIOS = (0.2, 0.4, 0.6, 0.8)
-RATES = np.concatenate([[0.0], np.geomspace(1e-9, 1e9, 400)])
-RATES_PER_SAMPLE = np.linspace(0.0, np.pi, 200)
-#: Ticks of a logarithmic axis on both sides of zero.
-MOST_DECADE_TICKS = 7
 
 
 def _damping_grid(axes: Axes, *, sampled: bool) -> None:

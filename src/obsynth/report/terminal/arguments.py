@@ -1,13 +1,11 @@
-"""Arguments that several verbs have, as data: each is spelled once."""
+"""Arguments of verbs as data: how they are declared, added to a parser, read and refused."""
 
 from __future__ import annotations
 
 import argparse
-import math
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from obsynth.errors import SpecError
@@ -175,15 +173,6 @@ def number_type(
     return checked
 
 
-digits = number_type("digits", int, lambda value: 1 <= value <= 15, "is not between 1 and 15")
-
-probability = number_type("probability", float, lambda value: 0.0 < value < 1.0, "is no probability between 0 and 1")
-
-positive = number_type("positive", float, lambda value: 0.0 < value < math.inf, "is no positive number")
-
-count = number_type("count", int, lambda value: value >= 1, "is less than 1")
-
-
 def refuse_given(options: argparse.Namespace, names: Iterable[str], meant: str) -> None:
     """Refuse arguments that would do nothing; ``meant`` says what they are for."""
     for name in names:
@@ -195,68 +184,6 @@ def columns_of(options: argparse.Namespace) -> dict[str, str]:
     """Return the columns of signals, and of the time, that the command line names."""
     named = dict(options.map)
     return {**named, "time": options.time_column} if options.time_column else named
-
-
-def delay(text: str) -> int | str:
-    """Return a delay in rows, or ``auto``."""
-    return text if text == "auto" else int(text)
-
-
-INPUT_DELAY = option(
-    "--input-delay",
-    "ROWS",
-    "by how many rows of the log inputs act later than in the design (default: from inputs.hold in the spec; "
-    "calibrate also takes 'auto')",
-    type=delay,
-)
-
-SYSTEM = option("--system", "FILE", "the spec (YAML)", type=Path, required=True)
-
-GAINS = option("--gains", "FILE", "a gain set (JSON) that design wrote", type=Path, required=True)
-
-SPEC_GAINS = option("--gains", "FILE", "a gain set for the spec's plant: nothing is designed", type=Path)
-
-UNVERIFIED = Settings(
-    (flag("--unverified", "use a gain set that fails its verification; every file that is written says so"),)
-)
-
-JSON = flag("--json", "print results and errors as JSON on stdout, for programs")
-
-FORCE = flag("--force", "replace an existing file of any kind (inputs are never replaced)")
-
-QUIET = flag("--quiet", "print no progress")
-
-JOBS = option("--jobs", "N", "processes (default: 1)", type=count)
-
-CLUSTER = option("--cluster", "ADDRESS", "address of the scheduler of a Dask cluster, in place of --jobs")
-
-MAP = option("--map", "SIGNAL=COLUMN", "column of a signal (or of the time) where the names differ; may be repeated")
-
-_SCALE = option("--scale", "SIGNAL=FACTOR", "factor from the unit of the column to that of the signal; may be repeated")
-
-SCALE = Settings((_SCALE,))
-
-TIME_COLUMN = option(
-    "--time-column",
-    "COLUMN",
-    "column with the time, in seconds or as dates (ISO 8601, or 05.03.2026 08:30) (default: time)",
-)
-
-#: How a log without faults is read.
-LOG_OPTIONS = (
-    MAP,
-    SCALE,
-    Settings(
-        (
-            option(
-                "--rows",
-                "A:B",
-                "rows of the log without faults: the first one, counted from 0, and one past the last (default: all)",
-            ),
-            TIME_COLUMN,
-        )
-    ),
-)
 
 
 def number_of(name: str, text: str) -> float:

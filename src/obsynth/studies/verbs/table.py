@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 
 from obsynth.monitoring.verbs.arguments import MONITOR, MONITOR_SETTINGS
-from obsynth.report.terminal.arguments import (
+from obsynth.report.terminal.arguments import Settings, option
+from obsynth.report.terminal.common_options import (
     CLUSTER,
     FORCE,
     INPUT_DELAY,
@@ -19,8 +20,6 @@ from obsynth.report.terminal.arguments import (
     SYSTEM,
     TIME_COLUMN,
     UNVERIFIED,
-    Settings,
-    option,
 )
 from obsynth.report.terminal.verbs import Verb
 
