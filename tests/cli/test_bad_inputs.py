@@ -410,12 +410,6 @@ PRECONDITIONS = [
         signals=["x4"],
     ),
     impossible(
-        "rank C",
-        put("plant", "C", [[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [0, 1, 0, 0]]),
-        "rank C",
-        "Needed: rank C = 4.",
-    ),
-    impossible(
         "rank Bf",
         put("plant", "Bf", [[0.1, 0.1], [1, 1], [-0.1, -0.1], [-1, -1]]),
         "rank F",

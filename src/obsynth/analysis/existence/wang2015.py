@@ -32,6 +32,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import regularity_of
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.signal_names import MOST_NAMES, leading_names
+from obsynth.plants.transformations.redundant_outputs import merged_outputs
 from obsynth.proofs.exact_arithmetic import blocks, picked_columns, pivot_columns, zeros_matrix
 
 _fault_zeros = partial(
@@ -157,9 +158,18 @@ def examine_fault_filter(
     plant: DescriptorSystem, *, exactly: bool = True
 ) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
     """Return the existence conditions, and the prepared plant on which the last of them were decided."""
-    found = reconsidered(Evaluator(plant.dense(), exactly), _examined, lambda found: found[0])
+    dense = plant.dense()
+    merged = merged_outputs(dense)
+    found = _decide(dense if merged is None else merged.plant, exactly)
+    if merged is not None and not merged.exact and not found[0][-1].holds:
+        # The outputs as written show more than the merged ones, by their rounding: that is unclear, not a refusal.
+        found = _decide(dense, exactly)
     _decided(plant)[exactly] = found[0]
     return found
+
+
+def _decide(plant: DescriptorSystem, exactly: bool) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
+    return reconsidered(Evaluator(plant, exactly), _examined, lambda found: found[0])
 
 
 def _examined(judge: Evaluator) -> tuple[tuple[Condition, ...], PreparedPlant | None]:

@@ -16,18 +16,18 @@ Our deviations
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from obsynth.analysis.existence.condition import require_all
-from obsynth.analysis.existence.restricted_equivalent import PreparedPlant, prepare
+from obsynth.analysis.existence.condition import Condition, require_all
+from obsynth.analysis.existence.restricted_equivalent import PreparedPlant, prepare, with_sensor_faults_as_states
 from obsynth.analysis.existence.wang2015 import examine_fault_filter
 from obsynth.conditions.gamma_lower_bound import least_gain_certificate
 from obsynth.conditions.lmi import chosen_solver
+from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
 from obsynth.methods.fault_estimation_filter.convex_problem import (
     GainParts,
@@ -47,10 +47,11 @@ from obsynth.observers.linear.derived import averaged
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.plants.transformations.redundant_outputs import merged_outputs
 from obsynth.results.design import Certificate
 
-if TYPE_CHECKING:
-    pass
+#: Gains that take the outputs.
+_OF_OUTPUTS = ("N", "L", "W", "R")
 
 #: Coordinates in which a certificate is looked for before the gain is judged again.
 FIRST_TRIES = 4
@@ -71,6 +72,40 @@ def synthesise(
     progress("checking the existence conditions")
     held, prepared = examine_fault_filter(plant)
     require_all(held)
+    merged = merged_outputs(plant)
+    if merged is None or not _is_prepared_without(plant, prepared):
+        return _synthesised(plant, held, prepared, asked, progress)
+    if asked.S is not None:
+        raise PreconditionError(
+            f"S is for independent outputs (Wang 2015, below eq. (1), assumes rank C = {plant.ny}), but "
+            f"{plant.ny - merged.plant.ny} of the outputs depend on others. Leave S out: a filter exists, and such "
+            "outputs are merged by their noise then.",
+            condition="rank C",
+        )
+    found = _synthesised(merged.plant, held, prepared, asked, progress)
+    observer, weights = found.observer, merged.weights
+    assert isinstance(observer, LinearObserver)
+    return replace(
+        found,
+        gains={name: gain @ weights if name in _OF_OUTPUTS else gain for name, gain in found.gains.items()}
+        | {"Upsilon": with_sensor_faults_as_states(plant).C @ found.gains["Psi"]},
+        observer=replace(observer, By=observer.By @ weights, Dy=observer.Dy @ weights, output_names=plant.output_names),
+    )
+
+
+def _is_prepared_without(plant: DescriptorSystem, prepared: PreparedPlant | None) -> bool:
+    """Whether the conditions were decided with fewer outputs, the merged ones."""
+    return prepared is None or prepared.plant.ny < plant.ny
+
+
+def _synthesised(
+    plant: DescriptorSystem,
+    held: Sequence[Condition],
+    prepared: PreparedPlant | None,
+    asked: FaultEstimationFilter,
+    progress: Callable[[str], None],
+) -> Synthesis:
+    """Return the filter of a plant with independent outputs."""
     s = None if asked.S is None else as_matrix(asked.S, "S")
     prepared = prepare(plant, s) if prepared is None or s is not None else prepared
     limit = asked.residual_weight_limit

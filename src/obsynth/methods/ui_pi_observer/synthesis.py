@@ -33,6 +33,7 @@ from obsynth.numerics.ranks import NEGLIGIBLE_MODE
 from obsynth.numerics.spectra import decay_rates
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import exosystem
+from obsynth.plants.transformations.redundant_outputs import merged_outputs
 
 #: A default this many times slower than the plant itself is worth a note.
 SLOW_DEFAULT = 1000.0
@@ -99,7 +100,10 @@ def synthesise(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callab
     require_all_conditions(found.conditions)
     working = found.plant
     progress("decoupling the unknown inputs")
-    problem = placement_problem(working, model, found.fixed_modes, joint=asked.joint, given=asked.given_decoupling())
+    given = asked.given_decoupling()
+    merged = None if given is not None or isinstance(weights.get("measurement"), Mapping) else merged_outputs(working)
+    designed = working if merged is None else merged.plant
+    problem = placement_problem(designed, model, found.fixed_modes, joint=asked.joint, given=given)
     if asked.G is not None:
         # On the boundary within rounding is not stable either: an equation that is lost leaves a mode at zero.
         modes = zip(problem.split.fixed_modes, problem.fixed_modes, strict=True)
@@ -115,6 +119,8 @@ def synthesise(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callab
     gain, wanted, claims, runs = _chosen(asked, problem, region, weights, plant.dt)
     progress("building the realisation and its certificate")
     gains = problem.gains(gain)
+    if merged is not None:
+        gains = gains[0], gains[1] @ merged.weights, gains[2] @ merged.weights
     poles = None if wanted is None else np.array([*wanted, *problem.fixed_modes])
     synthesis = assembled(working, model, gains, poles, dict(claims), structured=not asked.joint)
     return Synthesis(

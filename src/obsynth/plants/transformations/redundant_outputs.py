@@ -1,0 +1,88 @@
+"""Outputs that depend on others: a plant with independent outputs, which are weighted means of those that are measured.
+
+``[C Df Dd] = Q [C Df Dd]_p`` for a choice p of independent rows, so ``y - D u = Q (y - D u)_p + noise``. The outputs of
+the merged plant are ``y_p = M y`` with ``M = (Q' R^-1 Q)^-1 Q' R^-1`` (Gauss and Markov: the least variance of all
+unbiased means; R is the noise of the outputs, the identity where none is stated). A sensor that shows nothing, or only
+a known input, has a row of zeros in Q and no weight in M.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray, read_only, remembered
+from obsynth.numerics.ranks import but_rounding, rounding_rank
+from obsynth.numerics.sparse import is_sparse
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.exact_arithmetic import pivot_columns, written_matrix
+
+#: White noise that is added to noise without any in some direction, as a share of its largest: perfect sensors have a
+#: weight of nearly one then, and a mean stays unbiased to as many digits.
+LEAST_NOISE_SHARE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class MergedOutputs:
+    """A plant with independent outputs, and the weights ``M (np, ny)`` of the outputs as measured; ``exact``: the
+    outputs depend on each other as written, not within rounding alone."""
+
+    plant: DescriptorSystem
+    weights: FloatArray
+    exact: bool
+
+
+@remembered
+def merged_outputs(plant: DescriptorSystem) -> MergedOutputs | None:
+    """Return the plant with its dependent outputs merged; ``None`` where all are independent (or matrices sparse)."""
+    if is_sparse(plant.C) or plant.ny == 0:
+        return None
+    shown = np.hstack([plant.C, plant.Df, plant.Dd])
+    picked, q, exact = _independent(shown)
+    if not picked or len(picked) == plant.ny:
+        return None
+    weights = _weights(q, plant.Dw)
+    names = [plant.output_names[i] for i in picked]
+    merged = plant.replace(
+        C=plant.C[list(picked)],
+        Df=plant.Df[list(picked)],
+        Dd=plant.Dd[list(picked)],
+        D=weights @ plant.D,
+        Dw=weights @ plant.Dw,
+        output_names=names,
+    )
+    return MergedOutputs(merged, read_only(weights), exact)
+
+
+def _independent(shown: FloatArray) -> tuple[list[int], FloatArray, bool]:
+    """Return independent rows, the first ones where the numbers as written say which; Q: all rows from these; whether
+    the numbers as written have this rank.  Rows that differ by rounding (a copy in another unit) depend on each
+    other."""
+    lengths = np.linalg.norm(shown, axis=1)
+    moving = np.flatnonzero(lengths)
+    units = shown[moving] / lengths[moving, None]
+    count = rounding_rank(units) if len(moving) else 0
+    picked = pivot_columns(written_matrix(shown).transpose()) if count else []
+    exact = len(picked) == count
+    if not exact:
+        from scipy.linalg import qr
+
+        picked = sorted(int(moving[place]) for place in qr(units.T, mode="r", pivoting=True)[1][:count])
+    q = np.zeros((len(shown), count))
+    if count:
+        unit_rows = shown[picked] / lengths[picked, None]
+        found = np.linalg.lstsq(unit_rows.T, units.T, rcond=None)[0].T
+        q[moving] = but_rounding(found, np.ones_like(found)) * lengths[moving, None] / lengths[picked]
+        q[picked] = np.eye(count)
+    return picked, q, exact
+
+
+def _weights(q: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return M of outputs whose noise has the columns ``noise (ny, nw)``."""
+    covariance = noise @ noise.T
+    largest = float(np.max(np.diag(covariance), initial=0.0))
+    covariance = covariance + LEAST_NOISE_SHARE**2 * largest * np.eye(len(q)) if largest > 0.0 else np.eye(len(q))
+    factor = np.linalg.cholesky(covariance)
+    whitened = np.linalg.solve(factor, q)
+    return np.asarray(np.linalg.lstsq(whitened, np.linalg.solve(factor, np.eye(len(q))), rcond=None)[0])

@@ -1,0 +1,84 @@
+"""One sensor more: a copy, a scaled copy, a dead sensor, one of a known input. Claims and noise are no worse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import obsynth
+from obsynth.plants.transformations.redundant_outputs import merged_outputs
+
+#: Row of C (as a share of the first), D and noise of the sensor that is added.
+MORE = {
+    "copy": (1.0, 0.0, 0.1),
+    "scaled": (10.0, 0.0, 1.0),
+    "dead": (0.0, 0.0, 0.1),
+    "of a known input": (0.0, 2.0, 0.1),
+}
+
+
+def plants(seed, kind, dt=0.0):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 4))
+    a = rng.standard_normal((n, n)) - 1.5 * np.eye(n)
+    a = scipy.linalg.expm(0.1 * a).round(3) if dt else a.round(3)
+    c, b, bf = (rng.standard_normal(shape).round(3) for shape in ((1, n), (n, 1), (n, 1)))
+    share, direct, noise = MORE[kind]
+    one = obsynth.DescriptorSystem(A=a, B=b, C=c, Bf=bf, Dw=[[0.1]], dt=dt)
+    both = obsynth.DescriptorSystem(
+        A=a, B=b, C=np.vstack([c, share * c]), D=[[0.0], [direct]], Bf=bf, Dw=np.diag([0.1, noise]), dt=dt
+    )
+    return one, both
+
+
+def noise_of(design):
+    """The deviation of the fault estimate under the stated noise of the sensors."""
+    observer, noise = design.observer, design.plant.Dw
+    row = observer.Cz[observer.fault_rows]
+    into = observer.By @ noise
+    if design.plant.dt:
+        p = scipy.linalg.solve_discrete_lyapunov(observer.Az, into @ into.T)
+        direct = observer.Dy[observer.fault_rows] @ noise
+        return float(np.sqrt((row @ p @ row.T + direct @ direct.T)[0, 0]))
+    return float(np.sqrt((row @ scipy.linalg.solve_continuous_lyapunov(observer.Az, -into @ into.T) @ row.T)[0, 0]))
+
+
+@pytest.mark.parametrize("kind", MORE)
+@pytest.mark.parametrize("seed", range(3))
+def test_placed_poles_have_no_more_noise_with_a_sensor_more(seed, kind):
+    one, both = plants(seed, kind)
+    poles = list(-np.linspace(3, 4, one.nx + 1))
+    alone, more = (obsynth.ui_pi_observer(plant, poles=poles) for plant in (one, both))
+    assert noise_of(more) <= 1.001 * noise_of(alone)
+    expected = noise_of(alone) / (np.sqrt(2.0) if kind in ("copy", "scaled") else 1.0)
+    assert np.isclose(noise_of(more), expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize("kind", MORE)
+@pytest.mark.parametrize("seed", range(1, 4))
+def test_a_fault_filter_exists_with_a_sensor_more_and_has_no_more_noise(seed, kind):
+    one, both = plants(seed, kind, dt=0.1)
+    alone, more = (obsynth.fault_estimation_filter(plant) for plant in (one, both))
+    assert more.report.passed
+    assert noise_of(more) <= 1.001 * noise_of(alone)
+
+
+def test_the_means_of_sensors_have_the_least_variance():
+    plant = obsynth.DescriptorSystem(
+        A=[[-1.0]], C=[[1.0], [2.0], [0.0]], B=[[1.0]], D=[[0.0], [0.0], [3.0]], Dw=np.diag([0.1, 0.4, 0.1])
+    )
+    merged = merged_outputs(plant)
+    # Variances of y1 and y2 / 2: 0.01 and 0.04.
+    assert np.allclose(merged.weights, [[0.8, 0.1, 0.0]], rtol=1e-9)
+    assert np.isclose(np.linalg.norm(merged.plant.Dw), np.sqrt(1.0 / (1 / 0.01 + 1 / 0.04)))
+    assert merged_outputs(merged.plant) is None
+    assert merged_outputs(plant.replace(Bf=np.zeros((1, 1)), Df=[[0.0], [1.0], [0.0]])).plant.ny == 2
+
+
+def test_a_matrix_that_is_given_for_independent_outputs_is_named():
+    plant = obsynth.DescriptorSystem(A=[[0.9, 0.1], [0.0, 0.8]], C=[[1.0, 0.0], [1.0, 0.0]], Bf=[[1.0], [0.5]], dt=0.1)
+    with pytest.raises(obsynth.PreconditionError, match="Leave S out") as caught:
+        obsynth.fault_estimation_filter(plant, S=np.zeros((2, 4)))
+    assert caught.value.condition == "rank C"
+    assert obsynth.fault_estimation_filter(plant).report.passed
