@@ -23,7 +23,7 @@ import numpy as np
 
 import obsynth
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.recursive.observer import observer_from_options
+from obsynth.observers.recursive.options import observer_from_options
 
 SIZES = ((2, 1, 1), (20, 5, 3))
 STEPS, REPEATS, TRIALS, BATCH_STEPS = 2000, 7, 1000, 200

@@ -15,7 +15,7 @@ from obsynth import PreconditionError, SpecError, run_batch, simulate_time_varyi
 from obsynth.analysis.existence.recursive import residual_condition
 from obsynth.analysis.time_varying import horizon_ranks
 from obsynth.numerics.square_root_estimation import ParameterState, start_of, update
-from obsynth.observers.recursive.observer import RawEstimate
+from obsynth.observers.recursive.sample import RawEstimate
 
 SAMPLES = 40
 

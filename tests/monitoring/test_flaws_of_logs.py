@@ -622,7 +622,7 @@ def test_a_comparison_replays_a_log_with_flaws(flaw: str) -> None:
 def test_rows_after_a_missing_sample_count_by_no_more_than_the_observer_says() -> None:
     from obsynth.monitoring.thresholds.monitor import Sample
     from obsynth.numerics.square_root_estimation import ParameterState
-    from obsynth.observers.recursive.observer import RawEstimate
+    from obsynth.observers.recursive.sample import RawEstimate
 
     design, rng, data = recursive(), np.random.default_rng(8), log(fault=0.5, rows=300)
     data[["a", "b"]] += 0.01 * rng.standard_normal((300, 2))

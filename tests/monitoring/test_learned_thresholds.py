@@ -34,7 +34,7 @@ from obsynth.monitoring.thresholds.learned_levels import (
 from obsynth.monitoring.thresholds.monitor import LinearSample, Sample
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 from obsynth.numerics.square_root_estimation import ParameterState
-from obsynth.observers.recursive.observer import RawEstimate
+from obsynth.observers.recursive.sample import RawEstimate
 
 
 def coloured(rng: np.random.Generator, rows: int, m: int = 1, memory: float = 0.7) -> np.ndarray:

@@ -10,8 +10,8 @@ import pytest
 from time_varying_plants import maximum_likelihood, observer_for, printed, record, textbook, varying
 
 from obsynth import PreconditionError, SpecError, TimeVaryingDescriptorSystem
-from obsynth.observers.recursive import observer as compiled_run
-from obsynth.observers.recursive.observer import Recursion
+from obsynth.observers.recursive import compiled_run
+from obsynth.observers.recursive.recursion import Recursion
 
 SAMPLES = 40
 #: Relative to the largest entry of each result: rounding of well-posed problems over a record.

@@ -25,7 +25,7 @@ from obsynth import (
     smooth,
 )
 from obsynth.cli.main import main
-from obsynth.observers.recursive.observer import observer_from_options
+from obsynth.observers.recursive.options import observer_from_options
 from obsynth.observers.smoothing import smoothed_record
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")

@@ -22,14 +22,10 @@ from obsynth.observers.nonlinear.estimates import DAERow, GatheredRows
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.nonlinear.steps import DAEState, Steps
 from obsynth.observers.records import measured_record, whole_record
-from obsynth.observers.recursive.observer import (
-    RawEstimate,
-    Recursion,
-    RecursiveObserver,
-    RecursiveState,
-    deviations_in,
-    recursive_estimates,
-)
+from obsynth.observers.recursive.estimates import recursive_estimates
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.recursion import Recursion
+from obsynth.observers.recursive.sample import RawEstimate, RecursiveState, deviations_in
 from obsynth.observers.recursive.step_model import StepMatrices, right_side, stacked_noise
 from obsynth.observers.smoothing_chain import Node, ParameterInformation, Smoothed, SmootherHistory, StepLinearisation
 from obsynth.observers.taken_inputs import taken_inputs

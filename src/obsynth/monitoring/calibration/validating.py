@@ -40,7 +40,8 @@ from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.estimates import GatheredRows
 from obsynth.observers.nonlinear.observer import DAEObserver
-from obsynth.observers.recursive.observer import RecursiveObserver, recursive_estimates
+from obsynth.observers.recursive.estimates import recursive_estimates
+from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import changed
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.transformations.noise_states import with_noise

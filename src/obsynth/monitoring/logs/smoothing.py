@@ -19,7 +19,7 @@ from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.recursive.observer import deviations_in
+from obsynth.observers.recursive.sample import deviations_in
 from obsynth.observers.running import changed
 from obsynth.observers.smoothing import (
     checked_lag,

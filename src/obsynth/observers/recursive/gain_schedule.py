@@ -16,7 +16,8 @@ from obsynth.numerics.square_root_estimation import least_squares_step, rank_rev
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import batch_record, require_horizon
-from obsynth.observers.recursive.observer import RecursiveObserver, posterior_residual
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.recursion import posterior_residual
 from obsynth.observers.recursive.step_model import PreparedStep, StepMatrices, spreads
 from obsynth.observers.running import named_estimates
 from obsynth.observers.sensor_timing import require_plain

@@ -11,8 +11,10 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
+from obsynth.observers.recursive.estimates import excitation_levels
 from obsynth.observers.recursive.gain_schedule import Gains, gain_steps
-from obsynth.observers.recursive.observer import RecursiveObserver, deviations_in, excitation_levels
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.sample import deviations_in
 
 #: Errors that shrank below this are gone; the product starts anew from there, so that it does not underflow.
 GONE = 1e-200

@@ -30,7 +30,8 @@ from obsynth.observers.recursive.gain_schedule_summary import (
     gain_schedule_summary,
     looked_at,
 )
-from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.options import observer_from_options
 from obsynth.observers.running import plain_recursion
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check

@@ -21,7 +21,8 @@ from obsynth.observers.recursive.gain_schedule_summary import (
     GainScheduleSummary,
     gain_schedule_summary,
 )
-from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options, plain_options
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.options import observer_from_options, plain_options
 from obsynth.observers.recursive.steady_filter import reached_condition
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import FAR_UNITS, PlantUnits

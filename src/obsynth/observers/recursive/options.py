@@ -1,0 +1,95 @@
+"""A recursive observer from the options of a method: used to design one, and to check the one that was shipped."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_number, real_number, real_vector
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.settings import Adaptation
+from obsynth.plants.sequences import MatrixSequence
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+
+
+def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> RecursiveObserver:
+    """Return the observer that options stand for."""
+    adaptation = None
+    if "form" in options:
+        nq = plant.nq
+        adaptation = Adaptation(
+            form=options["form"],
+            forgetting=options["forgetting"],
+            guard=options["guard"],
+            initial_parameters=_vector(options["initial_parameters"], nq, "initial_parameters"),
+            initial_covariance=_square(
+                options["initial_parameter_covariance"], nq, 1.0, "initial_parameter_covariance"
+            ),
+            walk=_square(options["random_walk"], nq, 0.0, "random_walk"),
+            window=options["window"],
+            reset=options["reset"],
+        )
+    return RecursiveObserver(
+        plant,
+        _sequence(options["Q"], plant.ne, "Q", plant),
+        _sequence(options["R"], plant.ny, "R", plant),
+        _vector(options["initial_state"], plant.nx, "initial_state"),
+        _square(options["initial_covariance"], plant.nx, 1.0, "initial_covariance"),
+        adaptation,
+        options["early_constraints"],
+        options.get("outliers") or "none",
+        options.get("outlier_limit"),
+        options.get("outlier_sizes"),
+        options.get("sensors"),
+        options.get("state_bounds"),
+    )
+
+
+def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options as they are kept with a design: arrays and sequences as data, callables as they are."""
+    plain: dict[str, Any] = {}
+    for name, given in options.items():
+        value = given.item() if isinstance(given, np.generic) else given
+        if isinstance(value, MatrixSequence):
+            plain[name] = value.as_data() if value.is_data else value.function
+        elif (
+            value is None or callable(value) or isinstance(value, (bool, int, float, str, Mapping)) or _has_text(value)
+        ):
+            plain[name] = value
+        else:
+            plain[name] = np.array(value, dtype=np.float64)
+    return plain
+
+
+def _has_text(value: Any) -> bool:
+    return isinstance(value, (list, tuple)) and any(isinstance(item, str) or _has_text(item) for item in value)
+
+
+def _sequence(value: Any, size: int, name: str, plant: TimeVaryingDescriptorSystem) -> MatrixSequence:
+    if value is None:
+        return MatrixSequence.of(np.eye(size), name)
+    if is_number(value):
+        value = real_number(value, name, "a variance, or a covariance matrix") * np.eye(size)
+    found = MatrixSequence.of(value, name, constants=plant.constants)
+    if found.length is not None and (plant.horizon is None or found.length < plant.horizon):
+        raise SpecError(
+            f"{name} is a stack for {found.length} steps: it must reach as far as the plant's horizon "
+            f"({plant.horizon or 'without end'}).",
+            path=name,
+        )
+    return found
+
+
+def _vector(value: Any, size: int, name: str) -> FloatArray:
+    return np.zeros(size) if value is None else real_vector(value, size, name)
+
+
+def _square(value: Any, size: int, default: float, name: str) -> FloatArray:
+    if value is None:
+        return default * np.eye(size)
+    matrix = as_matrix(value, name)
+    return float(matrix[0, 0]) * np.eye(size) if np.ndim(value) == 0 else matrix
