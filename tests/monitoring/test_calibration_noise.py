@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from benchmarks.campaigns._calibration_noise import CASES, calibrated, errors
+
+import obsynth
+from obsynth.monitoring.calibration.variance_names import limited_names, variance_names, with_letter
 
 
 def test_variances_of_a_plant_with_one_sensor_are_found(share):
@@ -28,3 +33,32 @@ def test_a_variance_far_below_the_sensors_is_found_or_bounded_and_never_zero(sha
             assert one.Q[name] > 0.1 * true
             if name in one.upper_limits:
                 assert one.Q[name] > true
+
+
+def test_variances_of_an_equation_and_a_sensor_of_the_same_name_are_apart():
+    rng, x, rows = np.random.default_rng(0), 0.0, []
+    for k in range(1_500):
+        u = np.sign(np.sin(0.05 * k))
+        rows.append([float(k), u, x + 0.1 * rng.standard_normal()])
+        x = 0.9 * x + u + 0.5 * rng.standard_normal()
+    written = {"A": [["a"]], "B": [[1]], "C": [[1]], "dt": 1.0, "state_names": ["level"], "input_names": ["u"]}
+    found = {}
+    for sensor in ("level", "gauge"):
+        log = pd.DataFrame(rows, columns=["time", "u", sensor])
+        plant = obsynth.uncertain_system(
+            {**written, "output_names": [sensor]}, {"a": {"range": [0.5, 0.99], "nominal": 0.8}}
+        )
+        found[sensor] = obsynth.calibrate(plant, log, {"a": (0.5, 0.99)}, input_delay=0)
+    same, other = found["level"], found["gauge"]
+    assert same.Q == other.Q
+    assert list(same.R.values()) == list(other.R.values())
+    assert f"Q per step: level {same.Q['level']:.3g}\n  R: level {same.R['level']:.3g}" in str(same)
+    limited = str(replace(same, upper_limits=("Q of level",)))
+    assert f"Q per step: level <= {same.Q['level']:.3g}\n  R: level {same.R['level']:.3g}" in limited
+
+
+def test_names_of_variances_have_their_letter_only_where_one_is_shared():
+    assert variance_names(["a", "b"], ["b", "c"]) == (["a", "Q of b"], ["R of b", "c"])
+    assert limited_names(["a", "Q of b"], "Q", ["a", "b"], ["b", "c"]) == {"a", "b"}
+    assert limited_names(["a", "Q of b"], "R", ["b", "c"], ["a", "b"]) == set()
+    assert [with_letter(name, ["b", "c"]) for name in ("a", "c", "R of b")] == ["Q of a", "R of c", "R of b"]

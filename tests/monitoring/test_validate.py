@@ -331,3 +331,24 @@ def test_no_run_is_made_twice(tank_design, monkeypatch):
     monkeypatch.setattr(validating, "recorded_innovations", counted)
     validate(walking_design(tank_design, 0.02), walking_tank(0.0))
     assert len(runs) == len(set(runs)) == len(told_variances.VARIANCE_SHARES)
+
+
+@pytest.mark.parametrize("wrong", ["Q", "R"])
+def test_a_wrong_variance_is_told_by_its_letter_where_an_equation_and_a_sensor_share_a_name(wrong):
+    model = obsynth.DAEModel(
+        {"x": "der(x) = (1 - loss) * u - x"}, {"x": "x"}, states={"x": 0.0}, inputs={"u": 0.0}, parameters={"loss": 0.0}
+    )
+    true = {"Q": 1.0, "R": 1e-2}
+    stated = {**true, wrong: true[wrong] / 20}
+    design = dae_adaptive_observer(
+        model, dt=0.1, Q={"x": stated["Q"]}, R={"x": stated["R"]}, random_walk=[[0.0]],
+        initial_parameter_covariance=[[1e-4]],
+    )  # fmt: skip
+    rng, x, rows = np.random.default_rng(3), 0.0, []
+    for k in range(1_500):
+        u = np.sign(np.sin(0.05 * k))
+        x = (x + 0.1 * (u + np.sqrt(true["Q"]) * rng.standard_normal())) / 1.1 if k else x
+        rows.append([0.1 * k, u, x + np.sqrt(true["R"]) * rng.standard_normal()])
+    found = validate(design, pd.DataFrame(rows, columns=["time", "u", "x"]))
+    assert set(found.ratios) == {f"{wrong} of x"}
+    assert any(line.startswith(f"{wrong} of x is ") and "too small" in line for line in found.verdict)

@@ -85,7 +85,7 @@ def _facts(found: Validation, rows: str | None) -> Iterator[tuple[str, str]]:
 def _sensors(design: ObserverDesign, found: Validation) -> Table:
     table = headed_table("sensor", "unit", "mean square", "expected", "mean (deviations)", "white (p)", "variance")
     for name, sensor in found.sensors.items():
-        ratio = found.ratios.get(name)
+        ratio = found.ratios.get(f"R of {name}", found.ratios.get(name))
         told = (
             number(sensor.nis.value),
             f"{sensor.nis.low:.2f} to {sensor.nis.high:.2f}",

@@ -211,8 +211,8 @@ class Validation:
     sensors : mapping of str to SensorValidation
         By output.
     ratios : mapping of str to float
-        Likeliest variance on this log over that of the design, by noisy equation and by sensor, where the log
-        distinguishes them clearly.
+        Likeliest variance on this log over that of the design, by noisy equation and by sensor (``"Q of NAME"`` and
+        ``"R of NAME"`` where both have the same name), where the log distinguishes them clearly.
     change : int or None
         Row of the log at which the mean of the innovations changes.
     verdict : tuple of str

@@ -172,10 +172,17 @@ def _like(problem: CalibrationProblem, new: CalibrationProblem) -> CalibrationPr
     return new.with_start(P0)
 
 
+def _letters(problem: CalibrationProblem) -> list[tuple[str, str]]:
+    """Return letter and name of each variance, in order: an equation and a sensor may share a name."""
+    return [*(("Q", name) for name in problem.noisy), *(("R", name) for name in problem.output_names)]
+
+
 class _Known:
     """What a fit found, by name, from which a search with one more state begins."""
 
-    def __init__(self, t: dict[str, float], variances: dict[str, float], kept: dict[str, float], R: FloatArray) -> None:
+    def __init__(
+        self, t: dict[str, float], variances: dict[tuple[str, str], float], kept: dict[str, float], R: FloatArray
+    ) -> None:
         self.t, self.variances, self.kept, self.R = t, variances, kept, R
 
     @classmethod
@@ -183,8 +190,7 @@ class _Known:
         """Return what a fit found; ``kept``: how much of an innovation of each sensor its next one keeps."""
         columns = zip(problem.output_names, fit.whitened.T, strict=True)
         kept = {name: whiteness(column).first for name, column in columns}
-        both = (*problem.noisy, *problem.output_names)
-        variances = dict(zip(both, (*fit.Q.tolist(), *fit.R.tolist()), strict=True))
+        variances = dict(zip(_letters(problem), (*fit.Q.tolist(), *fit.R.tolist()), strict=True))
         spread = np.nanmean(fit.innovations**2, axis=0)
         return cls(dict(zip(problem.unknown, fit.t.tolist(), strict=True)), variances, kept, spread)
 
@@ -201,17 +207,17 @@ class _Known:
                 time = -longer * problem.log.dt / float(np.log(np.clip(self.kept[name], *FIRST_KEPT)))
                 if correlation_name(name) in problem.unknown:
                     t[correlation_name(name)] = float(np.log(time))
-                variances[noise_state(name)] = process_variance(
+                variances["Q", noise_state(name)] = process_variance(
                     COLOURED_SHARE * self.R[j], time, problem.log.dt, problem.integration
                 )
-                variances[name] = (1.0 - COLOURED_SHARE) * variances[name]
+                variances["R", name] = (1.0 - COLOURED_SHARE) * variances["R", name]
             start = np.clip([t[name] for name in problem.unknown], problem.low, problem.high)
             fit = Fit(start, problem.x0, np.sqrt(self.R), 0.0, np.zeros((0, 0)))
             objective = Objective(problem, fit)
             full = objective.full(objective.start(start))
-            for i, name in enumerate((*problem.noisy, *problem.output_names)):
-                if variances.get(name, 0.0) > 0.0:
-                    full[objective.nt + i] = np.log(variances[name])
+            for i, key in enumerate(_letters(problem)):
+                if variances.get(key, 0.0) > 0.0:
+                    full[objective.nt + i] = np.log(variances[key])
             full[: objective.nt] /= problem.widths
             reached, z = objective.descent(full[objective.free])
             if reached < value and reached < IMPOSSIBLE:
@@ -222,7 +228,7 @@ class _Known:
             return np.inf, self
         objective, z = best
         Q, R = objective.noise(z)
-        found = dict(zip((*problem.noisy, *problem.output_names), (*Q.tolist(), *R.tolist()), strict=True))
+        found = dict(zip(_letters(problem), (*Q.tolist(), *R.tolist()), strict=True))
         return value, _Known(
             dict(zip(problem.unknown, objective.constants(z).tolist(), strict=True)), found, self.kept, self.R
         )

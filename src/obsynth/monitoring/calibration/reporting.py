@@ -28,6 +28,7 @@ from obsynth.monitoring.calibration.noise_states import PlantWithNoise, correlat
 from obsynth.monitoring.calibration.problem import CalibrationProblem
 from obsynth.monitoring.calibration.result import Calibration
 from obsynth.monitoring.calibration.simulation_error import Fit, SimulationError, unexplained
+from obsynth.monitoring.calibration.variance_names import variance_names
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.plants.calibrated_box import CalibratedBox
 from obsynth.plants.dae_functions import BUTCHER
@@ -77,8 +78,9 @@ def reported(
     )
     Q = {name: float(value) for name, value in zip(problem.noisy, found.Q, strict=True)} if fit is not None else {}
     R = {name: float(value) for name, value in zip(problem.output_names, found.R, strict=True)}
-    noises = zip((*problem.noisy, *problem.output_names), (*found.limited_Q, *found.limited_R), strict=True)
-    limited = [name for name, weak in noises if weak]
+    q, r = variance_names(problem.noisy, problem.output_names)
+    limits = zip((*q, *r), (*found.limited_Q, *found.limited_R), strict=True)
+    limited = [name for name, weak in limits if weak]
     row = None if change is None else problem.log.rows[0] + change
     at_end = tuple(name for name, there in zip(problem.unknown, found.at_bounds, strict=True) if there)
     verdict = [
@@ -243,7 +245,8 @@ def _fitted(
         for i, j in itertools.combinations(free, 2)
         if abs(correlation[i, j]) > CORRELATED
     ]
-    values = {**Q, **R}
+    q, r = variance_names(tuple(Q), tuple(R))
+    values = dict(zip((*q, *r), (*Q.values(), *R.values()), strict=True))
     if not box.stands:
         found.append(
             f"The box does not stand: its {100 * box.level:g} % are those of white innovations, which these are not."

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.monitoring.calibration.diagnostics import Consistency, Whiteness
+from obsynth.monitoring.calibration.variance_names import limited_names
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.observers.estimates import BAND_WIDTH
 from obsynth.plants.calibrated_box import CalibratedBox
@@ -40,7 +41,8 @@ class Calibration:
         Variances to design with, by equation (per step) and by sensor; an upper limit where the log cannot tell a
         variance from zero.
     upper_limits : tuple of str
-        Equations and sensors whose variance is such a limit.
+        Equations and sensors whose variance is such a limit; ``"Q of NAME"`` and ``"R of NAME"`` where an equation and
+        a sensor share a name.
     nis : Consistency
         Normalised innovations squared per degree of freedom, with its 95 % interval.
     whiteness : mapping of str to Whiteness
@@ -153,13 +155,11 @@ class Calibration:
             ]
             unit = "" if self.units.get(name, "1") == "1" else f" {self.units[name]}"
             lines.append(f"  {name:<{width}}  {value:.5g}  [{ends[0]}, {ends[1]}]{unit}")
-        told = {
-            name: f"{name} {'<= ' if name in self.upper_limits else ''}{value:.3g}"
-            for name, value in (*self.Q.items(), *self.R.items())
-        }
-        if self.Q:
-            lines.append("  Q per step: " + ", ".join(told[name] for name in self.Q))
-        lines.append("  R: " + ", ".join(told[name] for name in self.R))
+        for heading, letter, variances, others in (("Q per step", "Q", self.Q, self.R), ("R", "R", self.R, self.Q)):
+            limited = limited_names(self.upper_limits, letter, variances, others)
+            sizes = [f"{name} {'<= ' if name in limited else ''}{value:.3g}" for name, value in variances.items()]
+            if sizes:
+                lines.append(f"  {heading}: " + ", ".join(sizes))
         for name, noise in self.sensor_noise.items():
             lines.append(
                 f"  coloured noise of {name}: deviation {noise['deviation']:.3g}, correlation "

@@ -34,6 +34,7 @@ from obsynth.monitoring.calibration.told_variances import (
     told_shares,
     with_walk,
 )
+from obsynth.monitoring.calibration.variance_names import variance_names, with_letter
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.estimates import Estimates
@@ -172,7 +173,9 @@ def noise_ratios(observer: DAEObserver, log: RecordedLog) -> tuple[Mapping[str, 
         return {}, 0.0, walk
     walks = dict(zip(np.array(model.parameter_names)[walking].tolist(), np.diag(walk)[walking].tolist(), strict=True))
     made: Any = with_noise(held, walks=walks)[0] if walks else held
-    names = (*noisy, *walks, *model.output_names)
+    q, r = variance_names(model.equation_names, model.output_names)
+    keys = dict(zip(model.equation_names, q, strict=True))
+    names = (*(keys[name] for name in noisy), *walks, *r)
     # What is added to the equation of a state that walks acts during the whole step.
     designed = np.concatenate([designed_Q[designed_Q > 0.0], np.diag(walk)[walking] / log.dt**2, designed_R])
     nothing, start = np.zeros(0), np.concatenate([observer.initial_state, observer.initial_parameters[walking]])
@@ -218,7 +221,11 @@ def noise_ratios(observer: DAEObserver, log: RecordedLog) -> tuple[Mapping[str, 
         ratio = float(np.exp(best.z[i]) / variance)
         z = best.z.copy()
         z[i] = np.log(variance)
-        if name not in walks and max(ratio, 1.0 / ratio) > TOLD_FACTOR and objective(z)[0] - best.value > CLEAR_NATS:
+        if (
+            not len(noisy) <= i < len(noisy) + len(walks)
+            and max(ratio, 1.0 / ratio) > TOLD_FACTOR
+            and objective(z)[0] - best.value > CLEAR_NATS
+        ):
             found[name] = ratio
     shares = np.ones(model.nq)
     likeliest = np.exp(best.z[len(noisy) : len(noisy) + len(walks)] - np.log(designed[len(noisy) :][: len(walks)]))
@@ -442,9 +449,8 @@ def _sentences(
 ) -> list[str]:
     found = []
     for name, ratio in ratios.items():
-        letter, what = "R" if name in sensors else "Q", "small" if ratio > 1.0 else "large"
-        factor = max(ratio, 1.0 / ratio)
-        found.append(f"{letter} of {name} is {_times(factor)} too {what}.")
+        what, factor = "small" if ratio > 1.0 else "large", max(ratio, 1.0 / ratio)
+        found.append(f"{with_letter(name, sensors)} is {_times(factor)} too {what}.")
     for name, sensor in sensors.items():
         if abs(sensor.mean) > OFFSET:
             found.append(
@@ -476,8 +482,8 @@ def _white(sensors: Mapping[str, SensorValidation]) -> bool:
 
 def _with_variances(observer: DAEObserver, ratios: Mapping[str, float], walk: FloatArray) -> DAEObserver:
     """Return the observer with the likeliest variances on a log, where these are told."""
-    q = [ratios.get(name, 1.0) for name in observer.model.equation_names]
-    r = [ratios.get(name, 1.0) for name in observer.model.output_names]
+    names = variance_names(observer.model.equation_names, observer.model.output_names)
+    q, r = ([ratios.get(name, 1.0) for name in part] for part in names)
     Q, R = np.diag(np.diag(observer.Q) * q), np.diag(np.diag(observer.R) * r)
     return replace(observer, Q=Q, R=R, random_walk=walk)
 
