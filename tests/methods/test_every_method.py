@@ -7,6 +7,7 @@ import io
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -242,6 +243,26 @@ def test_a_claim_that_the_method_does_not_know_fails(method: str) -> None:
     claims = {**design.certificate.claims, "perfection": 1.0}
     assert "perfection" not in method_class(method).claims
     assert not obsynth.verify(design.replace(certificate=replace(design.certificate, claims=claims))).passed
+
+
+#: What a changed file may hold in place of an option.
+ODD_OPTIONS = (None, -1, 2.5, True, "x", "x1", [1.0], {}, {"x1": [0.0, 1.0]}, {"units": {}}, float("nan"))
+
+
+@EACH
+def test_an_option_of_another_kind_in_a_file_is_a_row_that_fails_or_an_error_of_ours(
+    method: str, share: Callable[..., Any]
+) -> None:
+    design = design_of(method)
+    changes = [(name, value) for name in design.options for value in ODD_OPTIONS]
+    judged = 0
+    for name, value in share(changes, 15):
+        changed = design.replace(options={**design.options, name: value})
+        try:
+            judged += bool(obsynth.verify(changed).checks)
+        except obsynth.ObsynthError:
+            judged += 1
+    assert judged == len(share(changes, 15))
 
 
 @pytest.mark.one_in(2)

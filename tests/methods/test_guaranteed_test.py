@@ -244,7 +244,8 @@ def test_what_is_corrupted_fails_its_row(what: str) -> None:
 
 def test_matrices_and_options_that_do_not_fit_fail() -> None:
     design = designed("integrator, 5")
-    for change in ({"samples": 6}, {"samples": "auto"}, {"course": "step"}, {"noise_bound": None}):
+    for change in ({"samples": 6}, {"samples": "auto"}, {"course": "step"}, {"noise_bound": None},
+                   {"region": {"x1": [0.0, 1.0]}}, {"sample_time": 1.0}, {"given": {"x1": 0.0}}):  # fmt: skip
         found = obsynth.verify(design.replace(options={**design.options, **change}))
         assert not found.passed
     for matrix in (np.zeros(3), np.full(9, np.nan)):

@@ -23,6 +23,7 @@ from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.signal_names import listed
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.recovery import StateRecovery
+from obsynth.results.gain_set_writing import digest_of as digest_of
 from obsynth.results.gain_set_writing import save
 from obsynth.results.plant_source import PlantSource
 from obsynth.results.registered import registered

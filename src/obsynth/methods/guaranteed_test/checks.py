@@ -17,6 +17,7 @@ from obsynth.methods.guaranteed_test.problem import (
     observer_of,
     observer_of_rows,
     problem_as_designed,
+    require_linear_options,
     rounding_of,
 )
 from obsynth.methods.guaranteed_test.proofs import (
@@ -57,6 +58,8 @@ def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], TestOptio
     try:
         plant: Any = design.linear[0] if constant else design.plant
         asked = read(design.options)
+        if asked.model is None:
+            require_linear_options(asked)
         problem = problem_as_designed(plant, asked)
         programmes = WindowProgrammes.of(problem, int(asked.samples))
     except (ObsynthError, TypeError, ValueError, AttributeError, ArithmeticError, LookupError) as error:

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from obsynth.analysis.existence.condition import Condition
-from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.options import TestOptions
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind
 from obsynth.plants.dae import DAEModel
@@ -222,9 +221,9 @@ class GuaranteedTestMethod(TestOptions, Method):
             from obsynth.methods.guaranteed_test.nonlinear import synthesise_nonlinear
 
             return synthesise_nonlinear(plant, self, progress=progress)
-        for option in ("region", "sample_time", "given", "model"):
-            if getattr(self, option) is not None:
-                raise SpecError(f"{option} is for nonlinear plants: leave it out.", path=f"method.options.{option}")
+        from obsynth.methods.guaranteed_test.problem import require_linear_options
+
+        require_linear_options(self)
         if self.isolate and isinstance(plant, DescriptorSystem):
             from obsynth.methods.guaranteed_test.bank_synthesis import synthesise_bank
 

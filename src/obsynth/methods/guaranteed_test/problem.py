@@ -190,6 +190,13 @@ def problem_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Tes
     return WindowProblem(plant, bounds_of(plant, asked), question)
 
 
+def require_linear_options(asked: TestOptions) -> None:
+    """Raise `SpecError` for options of nonlinear plants."""
+    for option in ("region", "sample_time", "given", "model"):
+        if getattr(asked, option) is not None:
+            raise SpecError(f"{option} is for nonlinear plants: leave it out.", path=f"method.options.{option}")
+
+
 def samples_given(asked: TestOptions) -> Any:
     """Return the number of samples, or ``auto``."""
     return asked.before + asked.after if asked.after is not None else asked.samples

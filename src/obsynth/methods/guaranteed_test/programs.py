@@ -35,7 +35,10 @@ SOLVED_STATUS, UNBOUNDED = 0, 3
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """A solution as the solver gives it: ``multipliers (rows,)``, ``point (columns,)``; neither where unbounded."""
+    """A solution as the solver gives it: ``multipliers (rows,)``, ``point (columns,)``; neither where unbounded.
+
+    ``size`` is 0 or more: zero is a point of every window, and solvers give -1e-17 for an optimum of zero.
+    """
 
     size: float
     multipliers: FloatArray | None = None
@@ -73,7 +76,7 @@ def largest_hidden_fault(window: Window) -> Optimum:
     point = np.ldexp(np.asarray(found.x), columns)
     if abs(scale) > 0.0:
         multipliers = multipliers / scale
-    return Optimum(float(point[0]), multipliers, point)
+    return Optimum(max(float(point[0]), 0.0), multipliers, point)
 
 
 def _in_ellipsoids(window: Window) -> Optimum:
@@ -101,4 +104,4 @@ def _in_ellipsoids(window: Window) -> Optimum:
     multipliers = np.ldexp(np.asarray(equations.dual_value).ravel(), rows)
     scale = float(window.matrix[:, [0]].toarray().ravel() @ multipliers)
     point = np.ldexp(np.asarray(x.value), columns)
-    return Optimum(float(point[0]), multipliers / scale if scale else multipliers, point)
+    return Optimum(max(float(point[0]), 0.0), multipliers / scale if scale else multipliers, point)

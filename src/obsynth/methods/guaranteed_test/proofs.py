@@ -466,7 +466,8 @@ def proved_ray(window: Window) -> FloatArray | None:
     theta = window.matrix[:, [0]].toarray().ravel()
     scaled = np.ldexp(np.ldexp(matrix, columns[told]), rows[:, None])
     found = np.linalg.lstsq(scaled, -np.ldexp(theta, rows), rcond=None)[0]
-    if np.max(np.abs(scaled @ found + np.ldexp(theta, rows)), initial=0.0) > HIDDEN * (1.0 + np.max(np.abs(found))):
+    size = 1.0 + float(np.max(np.abs(found), initial=0.0))
+    if np.max(np.abs(scaled @ found + np.ldexp(theta, rows)), initial=0.0) > HIDDEN * size:
         return None
     point = np.zeros(len(window.bar))
     point[0], point[told] = 1.0, np.ldexp(found, columns[told])

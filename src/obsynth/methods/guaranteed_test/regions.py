@@ -17,10 +17,10 @@ from obsynth.results.design import ObserverDesign
 
 def while_inside(design: ObserverDesign) -> str:
     """Return the region of a design in words; empty for linear plants."""
-    region = design.options.get("region")
-    if not region:
+    region, model = (design.options.get(name) for name in ("region", "model"))
+    if not region or model is None:
         return ""
-    units = design.options["model"]["units"]
+    units = model["units"]
     told = [
         f"{name} stays within {shown(low)} to {shown(high, units.get(name, ''))}"
         for name, (low, high) in region.items()

@@ -103,6 +103,7 @@ def error_structure(
     picked = np.zeros((n + nf + len(watched), len(observer.Cz)))
     picked[:n, observer.state_rows] = back if reading is None else reading
     if faults:
+        _require_every_fault(observer, nf)
         picked[n : n + nf, shown] = np.eye(nf)
     picked[n + nf :, watched] = back if states else np.eye(len(watched))
     c, dy, du, algebraic = picked @ observer.Cz, picked @ observer.Dy, picked @ observer.Du, picked @ t0
@@ -189,6 +190,14 @@ def _missed(matrix: AffineMatrix, offsets: FloatArray) -> FloatArray:
     return np.maximum(np.abs(matrix.at(offsets)) - matrix.radius, 0.0) if offsets.any() else np.abs(matrix.center)
 
 
+def _require_every_fault(observer: LinearObserver, nf: int) -> None:
+    """Raise `PreconditionError` where faults of the plant are not estimated: they are no part of the error system."""
+    if len(observer.fault_names) != nf:
+        raise PreconditionError(
+            "Not every fault is estimated, so none has a guaranteed interval.", condition="fault interval"
+        )
+
+
 def _fault_columns(
     direct: AffineMatrix, observer: LinearObserver, c: FloatArray, n: int, offsets: FloatArray
 ) -> AffineMatrix:
@@ -198,10 +207,6 @@ def _fault_columns(
     target[nz + n : nz + n + nf] = np.eye(nf)
     target[nz + n + nf :] = np.eye(nf)
     late = np.array(observer.fault_delays, dtype=np.int64)
-    if len(late) != nf:
-        raise PreconditionError(
-            "Not every fault is estimated, so none has a guaranteed interval.", condition="fault interval"
-        )
     if (late > 1).any():
         raise PreconditionError(
             "A fault estimate that lags by more than one sample has no guaranteed interval.", condition="fault interval"
