@@ -17,7 +17,7 @@ from obsynth.files.outputs import write_atomically
 from obsynth.methods.registry import AUTO
 from obsynth.numerics.libraries import failure_of
 from obsynth.report.terminal.arguments import refuse_given
-from obsynth.report.terminal.output import answer, print_json, progress, stdout_console
+from obsynth.report.terminal.output import emit, print_json, progress, stdout_console
 from obsynth.report.terminal.specs import prepared, spec_output
 from obsynth.results.calibration_files import CALIBRATION_KIND, box_row, verify_calibration
 from obsynth.results.certificate_files import ALARM_KIND, RESULTS, kind_of_file
@@ -107,7 +107,7 @@ def run_check(options: argparse.Namespace) -> int:
     own = methods.values() if spec.method == AUTO else [methods[spec.method]]
     passed = any(report.passed for report in own)
 
-    def told() -> None:
+    def reported() -> None:
         console = stdout_console()
         if diagnosis is not None:
             diagnosis_report(diagnosis, console=console, everything=options.verbose)
@@ -119,7 +119,7 @@ def run_check(options: argparse.Namespace) -> int:
             console.print()
         print_methods(methods, own=spec.method, console=console)
 
-    answer(
+    emit(
         options,
         {
             "spec": spec.path,
@@ -130,7 +130,7 @@ def run_check(options: argparse.Namespace) -> int:
             "structure": {name.replace(" ", "_"): _structure_as_dict(found) for name, found in structures.items()},
             "methods": {name: report.as_dict() for name, report in methods.items()},
         },
-        told,
+        reported,
     )
     # What double precision cannot decide is no impossibility: it is inconclusive.
     undecided = any(is_unclear(report.failures) for report in own)
@@ -184,11 +184,11 @@ def run_verify(options: argparse.Namespace) -> int:
 
         for design in designs_inside(options.gains):
             report = _with_calibration(report, design, options.calibration)
-    told = next((row.claim for row in report.checks if row.name == "statement"), "")
-    answer(
+    statement = next((row.claim for row in report.checks if row.name == "statement"), "")
+    emit(
         options,
         {
-            "file": str(options.gains), "kind": kind, "passed": report.passed, "statement": told,
+            "file": str(options.gains), "kind": kind, "passed": report.passed, "statement": statement,
             "report": report.as_dict(),
         },
         lambda: print_checks(report.checks, console=stdout_console()),
@@ -254,7 +254,7 @@ def _verify_independently(options: argparse.Namespace) -> int:
         found = check_alarm_independently(read_json(options.gains))
     else:
         found = check_design_independently(obsynth.load(options.gains))
-    answer(options, {"file": str(options.gains), "passed": found.passed, "text": found.text}, found.text)
+    emit(options, {"file": str(options.gains), "passed": found.passed, "text": found.text}, found.text)
     return 0 if found.passed else VerificationError.exit_code
 
 
@@ -263,7 +263,7 @@ def _verify_gain_set(options: argparse.Namespace) -> int:
     report = obsynth.verify(design, printed_digits=options.printed_digits)
     if options.calibration is not None:
         report = _with_calibration(report, design, options.calibration)
-    answer(
+    emit(
         options,
         {
             "file": str(options.gains), "name": design.name, "method": design.method, "passed": report.passed,
@@ -288,7 +288,7 @@ def run_simulate(options: argparse.Namespace) -> int:
         written = None if target is None else str(found.write_csv(target, operating_point=point))
     from obsynth.report.scenarios import simulation_report
 
-    answer(
+    emit(
         options,
         {"spec": spec.path, "file": written, **found.summary()},
         lambda: simulation_report(design.name, found, console=stdout_console(), units=design.plant.units, file=written),

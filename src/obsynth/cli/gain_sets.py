@@ -9,7 +9,7 @@ import obsynth
 from obsynth.errors import VerificationError
 from obsynth.files.outputs import require_distinct
 from obsynth.report.terminal.arguments import numbers_of, refuse_given
-from obsynth.report.terminal.output import answer, gains_to_hand_on, output_file, verified_again
+from obsynth.report.terminal.output import emit, gains_to_hand_on, output_file, verified_again
 from obsynth.report.terminal.specs import required_scenario
 from obsynth.results.certificate_files import RESULT_FILE
 from obsynth.results.design import unverified_mark
@@ -38,7 +38,7 @@ def run_export(options: argparse.Namespace) -> int:
         checker=options.checker,
         unverified=options.unverified,
     )
-    answer(options, {"gains": options.gains, "files": files, **({"unverified": mark} if mark else {})}, mark)
+    emit(options, {"gains": options.gains, "files": files, **({"unverified": mark} if mark else {})}, mark)
     return 0
 
 
@@ -81,7 +81,7 @@ def run_report(options: argparse.Namespace) -> int:
     )
     if mark := unverified_mark(report):
         print(f"Warning: {options.gains}: {mark}", file=sys.stderr)
-    answer(options, {"gains": options.gains, "file": file, "passed": report.passed})
+    emit(options, {"gains": options.gains, "file": file, "passed": report.passed})
     return 0 if report.passed else VerificationError.exit_code
 
 
@@ -97,5 +97,5 @@ def _run_robustness(options: argparse.Namespace) -> int:
     found = obsynth.robustness(design)
     file = found.save(options.out)
     told = {"gains": options.gains, "file": file, "statement": found.statement, **found.as_dict()}
-    answer(options, told, found.statement)
+    emit(options, told, found.statement)
     return 0

@@ -168,7 +168,7 @@ def unwritable_output(error: OSError) -> int:
     return SpecError.exit_code
 
 
-def told_error(error: Exception) -> ObsynthError | None:
+def reported_error(error: Exception) -> ObsynthError | None:
     """Return what an error of Python or of a library is for the user; `None` if it is a mistake of obsynth."""
     if isinstance(error, MemoryError):
         return SolverError("The computation does not fit into the memory: the result is inconclusive.")
@@ -257,7 +257,7 @@ def _outcome(options: argparse.Namespace) -> int:
         told = error
     except (ImportError, MemoryError, RecursionError, ArithmeticError, ValueError) as error:
         # LAPACK's errors are among the last.
-        found = told_error(error)
+        found = reported_error(error)
         if found is None:
             raise
         told = found

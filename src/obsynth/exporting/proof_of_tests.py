@@ -52,7 +52,7 @@ def _threshold(whole: ObserverDesign, test: ObserverDesign, window: Window, row:
     exact = exact_test(window, test.certificate.matrices["multipliers"].ravel(), all_columns=threshold == 0.0)
     if exact is None:
         return None
-    parts = _seen(window, exact)
+    parts = _transposed_product(window, exact)
     proved = _largest(window, parts)
     # The exact multipliers are next to the shipped ones: their own threshold may be larger by rounding.
     stated = max(threshold, above(proved)) if threshold else 0.0
@@ -133,7 +133,7 @@ def question_of_window(window: Window) -> dict[str, Any]:
 def exact_test(window: Window, multipliers: FloatArray, *, all_columns: bool = False) -> list[Fraction] | None:
     """Return fractions next to multipliers: theta has weight one, every free column zero; ``None``: not found."""
     told = [0, *(range(1, len(window.bar)) if all_columns else np.flatnonzero(window.free).tolist())]
-    seen = _seen(window, [Fraction(float(value)) for value in multipliers])
+    seen = _transposed_product(window, [Fraction(float(value)) for value in multipliers])
     missing = [Fraction(int(column == 0)) - seen[column] for column in told]
     return _next_to(window.matrix[:, told].toarray().T, multipliers, missing, _entries(window, told, columns=True))
 
@@ -217,7 +217,7 @@ def _entries(window: Window, told: list[int], *, columns: bool) -> dict[tuple[in
     return found
 
 
-def _seen(window: Window, multipliers: list[Fraction]) -> list[Fraction]:
+def _transposed_product(window: Window, multipliers: list[Fraction]) -> list[Fraction]:
     found = [Fraction(0)] * len(window.bar)
     for i, j, entry in _exact_entries(window):
         if multipliers[i]:

@@ -41,11 +41,11 @@ class ObservableSplit:
         """Return the gain ``(n, ny)`` of the whole pair for one of the observable part ``(no, ny)``."""
         return np.asarray(self.units[:, None] * (self.basis[:, : self.order] @ gain))
 
-    def lower(self, matrix: FloatArray) -> FloatArray:
+    def observable_rows(self, matrix: FloatArray) -> FloatArray:
         """Return the observable rows of an input matrix ``(n, *)`` of the whole pair."""
         return np.asarray(self.basis[:, : self.order].T @ (matrix / self.units[:, None]))
 
-    def shown(self, matrix: FloatArray) -> FloatArray:
+    def observable_columns(self, matrix: FloatArray) -> FloatArray:
         """Return the observable columns of an output matrix ``(*, n)`` of the whole pair."""
         return np.asarray((matrix * self.units) @ self.basis[:, : self.order])
 

@@ -366,7 +366,7 @@ def _by_rank(
     """Solve a step in which x may be undetermined, noise may be missing, and earlier directions are unknown."""
     n, columns = H.shape[1], right.shape[1]
     lengths, q1, q2, head, places, free = _by_columns(H, unknown)
-    white, turned, count = _told_by_parity(q2, S, right)
+    white, turned, count = _fixed_by_parity(q2, S, right)
     rotated = q1.T @ S @ turned
     solved = np.zeros((len(lengths), columns + S.shape[1] - count))
     if len(head):
@@ -395,7 +395,7 @@ def _by_rank(
     return SquareRootGaussian(solved[:n, :columns], triangle[:most].T, basis), back
 
 
-def _told_by_parity(q2: FloatArray, S: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray, int]:
+def _fixed_by_parity(q2: FloatArray, S: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray, int]:
     """Return what the parity says of some directions of e, an orthogonal matrix that has these first, their number."""
     if not q2.shape[1]:
         return np.zeros((0, right.shape[1])), np.eye(S.shape[1]), 0

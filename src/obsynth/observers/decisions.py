@@ -105,7 +105,7 @@ def decide(
     >>> decision.alarm.parameter
     'leak'
     """
-    theta, size = _asked(observer, statistic, nominal, false_alarms, change)
+    theta, size = _nominal_and_change(observer, statistic, nominal, false_alarms, change)
     nq, false_alarms = len(theta), float(false_alarms)
     if (estimates.state_names, estimates.parameter_names) != (observer.state_names, observer.fault_names):
         raise SpecError(
@@ -133,7 +133,7 @@ def decide(
     return likelihood_ratio(observer, estimates, gaps, false_alarms)
 
 
-def _asked(
+def _nominal_and_change(
     observer: RecursiveObserver | DAEObserver,
     statistic: str,
     nominal: ArrayLike | None,

@@ -145,7 +145,7 @@ class StepObserver(Observer[Any, Any]):
     def _estimates(self, state: Any, row: Any) -> Estimates:
         """Return the estimates of one sample."""
 
-    def shown(self, row: Any) -> Any:
+    def within_bounds(self, row: Any) -> Any:
         """Return a row as it is shown, within the bounds of the states."""
         return row
 
@@ -156,13 +156,13 @@ class StepObserver(Observer[Any, Any]):
     def advance(self, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
         """Return the next state and what is known at a sample, without checking it (``y (ny,)``, ``u (nu,)``)."""
         after, row = self.timing.advance(self._steps.advance, state, y, u)
-        return after, self.shown(row)
+        return after, self.within_bounds(row)
 
     def accept(self, state: Any, y: FloatArray, u: FloatArray, kept: Kept | None = None) -> tuple[Any, Any]:
         """Return the same as `advance`, where the step is one that can be trusted (``y (ny,)``, ``u (nu,)``); ``kept``
         is called with what each sample, whose values are all of its own time, led from and to: see `Kept`."""
         after, row = self.timing.advance(partial(self._in_order, kept), state, y, u)
-        return after, self.shown(row)
+        return after, self.within_bounds(row)
 
     def _in_order(self, kept: Kept | None, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
         self._allow(state)

@@ -120,7 +120,7 @@ class _ConstantParameters(_DAELinearisation):
             self.own_factor(state),
             np.zeros((self.nx, 0)),
             None,
-            self._lesson(state, np.zeros(0), nothing, np.zeros((0, 0))),
+            self._information(state, np.zeros(0), nothing, np.zeros((0, 0))),
         )
 
     def next(self, node: Node, before: DAEState, after: DAEState, row: DAERow, u: FloatArray) -> Node:
@@ -164,14 +164,16 @@ class _ConstantParameters(_DAELinearisation):
         Sigma = spread @ spread.T + at.R
         weight = at.R if self.steps.settings.weight == "paper" else Sigma
         if not len(Omega):
-            return self._lesson(after, np.zeros(0), Omega, np.zeros((0, 0)))
+            return self._information(after, np.zeros(0), Omega, np.zeros((0, 0)))
         root = np.linalg.cholesky(weight)
         noise = np.linalg.solve(root, np.linalg.cholesky(Sigma))
         v, G = np.linalg.solve(root, at.e + Omega @ at.theta), np.linalg.solve(root, Omega)
-        found = self._lesson(after, v, G, noise)
+        found = self._information(after, v, G, noise)
         return found if found is None else found._replace(is_reset=after.resets > before.resets)
 
-    def _lesson(self, after: DAEState, v: FloatArray, G: FloatArray, noise: FloatArray) -> ParameterInformation | None:
+    def _information(
+        self, after: DAEState, v: FloatArray, G: FloatArray, noise: FloatArray
+    ) -> ParameterInformation | None:
         if not self.nq:
             return None
         theta, S, spread = (self.steps.part(after, name) for name in ("theta", "S", "spread"))
@@ -250,23 +252,25 @@ class _RecursiveLinearisation(StepLinearisation):
         node = Node(origin, start.factor, np.zeros((len(start.x), 0)), None)
         if (step := self.recursion.model.first()) is not None:
             node = self._linked(node, step, start.u, np.zeros(0), u)._replace(back=None)
-        return node._replace(lesson=self._lesson(start, after, row))
+        return node._replace(information=self._information(start, after, row))
 
     def begun(self, state: RecursiveState) -> Node:
         """Return the node of a state from which a chain begins."""
         known, nq = state.parameters, len(state.parameters.theta)
-        lesson = None
+        information = None
         if nq:
-            lesson = ParameterInformation(
+            information = ParameterInformation(
                 known.theta, known.triangle, known.spread, np.zeros(0), np.zeros((0, nq)), np.zeros((0, 0))
             )
-        return Node(np.column_stack((state.x, state.Upsilon)), state.factor, state.diffuse, None, lesson)
+        return Node(np.column_stack((state.x, state.Upsilon)), state.factor, state.diffuse, None, information)
 
     def next(self, node: Node, before: RecursiveState, after: RecursiveState, row: RawEstimate, u: FloatArray) -> Node:
         """Return the node of the next sample."""
         known = taken_inputs(before.inputs, before.u, u, is_first=False)
         step = self.recursion.step_of(before, known)
-        return self._linked(node, step, before.u, row.y, known.u)._replace(lesson=self._lesson(before, after, row))
+        return self._linked(node, step, before.u, row.y, known.u)._replace(
+            information=self._information(before, after, row)
+        )
 
     def _linked(self, node: Node, step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray) -> Node:
         """Take a step from inputs ``before`` to the sample ``y`` with inputs ``u``."""
@@ -279,7 +283,9 @@ class _RecursiveLinearisation(StepLinearisation):
         found, back = joint_step(*(parts if complete else tuple(part[kept] for part in parts)), complete=complete)
         return Node(*found, back)
 
-    def _lesson(self, before: RecursiveState, after: RecursiveState, row: RawEstimate) -> ParameterInformation | None:
+    def _information(
+        self, before: RecursiveState, after: RecursiveState, row: RawEstimate
+    ) -> ParameterInformation | None:
         known = after.parameters
         if not len(known.theta):
             return None

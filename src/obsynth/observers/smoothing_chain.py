@@ -35,7 +35,7 @@ class Node(NamedTuple):
     factor: FloatArray  # ``(n, any)``
     diffuse: FloatArray  # ``(n, r)``
     back: SmootherGain | None  # to the coordinates of the sample before; `None` at the first
-    lesson: ParameterInformation | None = None  # of constant parameters; `None` where there are none
+    information: ParameterInformation | None = None  # of constant parameters; `None` where there are none
 
 
 class Smoothed(NamedTuple):
@@ -49,29 +49,29 @@ class Smoothed(NamedTuple):
     spread: FloatArray
 
 
-def with_information(later: Later, lesson: ParameterInformation, forgetting: float) -> Later:
+def with_information(later: Later, information: ParameterInformation, forgetting: float) -> Later:
     """Return what one more sample says as well, before those that were taken in; weights fall by the factor.
     It is independent of what earlier samples have learnt, and of the errors of the states at given parameters."""
     triangle, noise = later
-    if lesson.is_reset:
+    if information.is_reset:
         # The change lies here: what came later does not hold before it, and it is the later sample that says so.
         return triangle[:0], noise[:, :0]
     nq = len(noise)
-    stacked = np.vstack((triangle, np.column_stack((lesson.G, lesson.v)))) * np.sqrt(forgetting)
+    stacked = np.vstack((triangle, np.column_stack((information.G, information.v)))) * np.sqrt(forgetting)
     triangle = np.asarray(np.linalg.qr(stacked, mode="r")) if len(stacked) > nq + 1 else stacked
-    noise = np.hstack((noise, lesson.G.T @ lesson.noise)) * forgetting
+    noise = np.hstack((noise, information.G.T @ information.noise)) * forgetting
     return triangle, np.asarray(np.linalg.qr(noise.T, mode="r")).T if noise.shape[1] > nq else noise
 
 
-def beside(lesson: ParameterInformation, later: Later) -> tuple[FloatArray, FloatArray]:
+def beside(information: ParameterInformation, later: Later) -> tuple[FloatArray, FloatArray]:
     """Return the parameters, and a square root of their covariance, from both sides."""
     if not len(later[0]):
-        return lesson.theta, lesson.spread
-    nq = len(lesson.theta)
-    stacked = np.vstack((np.column_stack((lesson.triangle, lesson.triangle @ lesson.theta)), later[0]))
+        return information.theta, information.spread
+    nq = len(information.theta)
+    stacked = np.vstack((np.column_stack((information.triangle, information.triangle @ information.theta)), later[0]))
     packed: FloatArray = np.asarray(np.linalg.qr(stacked, mode="r"))
     triangle = packed[:nq, :nq]
-    sums = np.hstack((lesson.triangle.T @ (lesson.triangle @ lesson.spread), later[1]))
+    sums = np.hstack((information.triangle.T @ (information.triangle @ information.spread), later[1]))
     theta: FloatArray = np.asarray(np.linalg.solve(triangle, packed[:nq, nq]))
     return theta, np.asarray(np.linalg.solve(triangle, np.linalg.solve(triangle.T, sums)))
 
@@ -115,7 +115,7 @@ class SmootherHistory:
         """Return the samples from k ``first`` to k ``last`` as those up to ``last`` say, in this order."""
         node = self.nodes[last - self.begin]
         known = nothing_later(node.factor.shape[1], node.diffuse.shape[1], node.origin.shape[1])
-        nq = 0 if node.lesson is None else len(node.lesson.theta)
+        nq = 0 if node.information is None else len(node.information.theta)
         later: Later = (np.zeros((0, nq + 1)), np.zeros((nq, 0)))
         found = []
         for k in range(last, first - 1, -1):
@@ -123,8 +123,8 @@ class SmootherHistory:
             found.append(_smoothed(self.links, node, known, later))
             if k > first and node.back is not None:
                 known = stepped_back(known, node.back)
-                if node.lesson is not None:
-                    later = with_information(later, node.lesson, self.links.forgetting)
+                if node.information is not None:
+                    later = with_information(later, node.information, self.links.forgetting)
         return found[::-1]
 
     def row(self, k: int) -> Any:
@@ -155,12 +155,12 @@ def _smoothed(links: StepLinearisation, node: Node, known: SquareRootGaussian, l
     both = np.hstack((node.factor, node.diffuse))
     x, factor, diffuse = node.origin + both @ known.mean, both @ known.factor, both @ known.diffuse
     theta, spread = np.zeros(0), np.zeros((0, 0))
-    if node.lesson is not None:
-        theta, spread = beside(node.lesson, later)
+    if node.information is not None:
+        theta, spread = beside(node.information, later)
     if x.shape[1] > 1:
         factor = np.hstack((factor, x[:, 1:] @ spread))
     estimate = x[:, 0] + x[:, 1:] @ theta if x.shape[1] > 1 else x[:, 0].copy()
-    if links.lower is not None and links.upper is not None and node.lesson is not None:
+    if links.lower is not None and links.upper is not None and node.information is not None:
         theta = np.clip(theta, links.lower, links.upper)
     elif links.lower is not None and links.upper is not None and len(links.lower):
         walking = slice(len(estimate) - len(links.lower), None)

@@ -100,7 +100,7 @@ class Contraction:
         ball = Ball.exact(columns) if radius is None else Ball(np.asarray(columns, dtype=np.float64), radius)
         return column_norms(Ball.exact(self.Q) @ ball)
 
-    def seen(self, rows: FloatArray, radius: FloatArray | None = None, summed: bool = False) -> float:
+    def row_norm(self, rows: FloatArray, radius: FloatArray | None = None, summed: bool = False) -> float:
         """Return an upper bound on the norm of ``c Q^-1``, c known to ``radius``; ``summed``: a sum over many c."""
         if not rows.size:
             return 0.0

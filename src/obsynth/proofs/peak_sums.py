@@ -74,7 +74,9 @@ def peak_sums(
         done = STEPS_AT_ONCE * len(terms) >= max(most, least)
         if done or (STEPS_AT_ONCE * len(terms) >= least and len(terms) >= looked):
             looked = len(terms) + len(terms) // LOOKS + 1
-            after = contraction.factor * _seen(contraction, powers, _missed(matrix, np.abs(block[-1]), growth), each)
+            after = contraction.factor * _row_norms(
+                contraction, powers, _missed(matrix, np.abs(block[-1]), growth), each
+            )
             after = np.asarray(after * sizes)
             # A column that is nothing but its radius has no terms to compare with.
             if done or np.all((after <= left * total) | idle):
@@ -84,7 +86,7 @@ def peak_sums(
     # Every defect of the rows, and what the columns are off by, in the norm that contracts: sums of norms are at most
     # the sums of all entries.
     defects = rounded_up(_missed(matrix, collected, growth), 3 * n + count)
-    added = contraction.factor * _seen(contraction, np.zeros_like(rows), defects, each, summed=True) * sizes
+    added = contraction.factor * _row_norms(contraction, np.zeros_like(rows), defects, each, summed=True) * sizes
     products = rounded_up(growth * (collected @ np.abs(driven)) + count * n * UNDERFLOW, 3 * n + count)
     known = collected @ columns.radius if columns.radius.any() else np.zeros_like(products)
     products = rounded_up(products + known, n + count)
@@ -108,15 +110,15 @@ def _missed(matrix: Ball, sizes: FloatArray, growth: float) -> FloatArray:
     return np.asarray(growth * (sizes @ np.abs(matrix.midpoint)) + sizes @ matrix.radius + n * UNDERFLOW)
 
 
-def _seen(
+def _row_norms(
     contraction: Contraction, rows: FloatArray, radius: FloatArray, each: bool, *, summed: bool = False
 ) -> FloatArray:
     """Return bounds on ``|c Q^-1|``: of each row as a column, or of all; with ``summed`` those of sums of rows."""
     if each:
-        return np.array([contraction.seen(rows[i : i + 1], radius[i : i + 1], summed) for i in range(len(rows))])[
+        return np.array([contraction.row_norm(rows[i : i + 1], radius[i : i + 1], summed) for i in range(len(rows))])[
             :, None
         ]
-    return np.array(contraction.seen(rows, radius, summed))
+    return np.array(contraction.row_norm(rows, radius, summed))
 
 
 def _norms(sizes: FloatArray) -> FloatArray:

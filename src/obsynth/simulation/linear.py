@@ -122,11 +122,11 @@ class Stepper:
         x = driven(self.transition, self.start, drive)
         _require_finite(x, "shorten the horizon, or set stabilise", "horizon")
 
-        def seen(parts: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
+        def output_of(parts: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
             return np.asarray(x @ parts[0].T + signals @ parts[1].T + noise @ parts[2].T)
 
         fed = np.zeros((*x.shape[:2], 0)) if self.feedback is None else -x @ self.feedback.T
-        return seen(self.state_of), seen(self.output_of), fed
+        return output_of(self.state_of), output_of(self.output_of), fed
 
 
 def make_stepper(

@@ -88,7 +88,7 @@ class Fleet(ResultTable):
     runs: tuple[FleetRun, ...]
 
     @property
-    def _found(self) -> Sequence[FleetRun]:
+    def _results(self) -> Sequence[FleetRun]:
         return self.runs
 
     def rows(self) -> tuple[list[str], list[list[Any]]]:

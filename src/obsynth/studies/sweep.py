@@ -114,7 +114,7 @@ class Sweep(ResultTable):
     results: tuple[SweepResult, ...]
 
     @property
-    def _found(self) -> Sequence[SweepResult]:
+    def _results(self) -> Sequence[SweepResult]:
         return self.results
 
     def rows(self) -> tuple[list[str], list[list[Any]]]:

@@ -304,7 +304,7 @@ def _counted(watched: Monitor, without: Runs, with_one: Runs) -> tuple[float, fl
     """Return the share of false alarms, and the least size of the fault that is found in every run."""
     false = watched.passed_in(without)
 
-    def told(size: float) -> bool:
+    def alarms_at(size: float) -> bool:
         # Plant and observer are linear: what the fault does goes with its size.
         moved = {}
         for name in ("states", "outputs", "inputs", "faults", "rows"):
@@ -316,11 +316,11 @@ def _counted(watched: Monitor, without: Runs, with_one: Runs) -> tuple[float, fl
     level = np.abs(watched.threshold[np.isfinite(watched.threshold)])
     high = float(np.max(level, initial=np.finfo(np.float64).tiny))
     low, most = 0.0, MOST_TIMES * high
-    while not told(high):
+    while not alarms_at(high):
         low, high = high, 2.0 * high
         if high > most:
             return float(false.any(axis=0).mean()), float("inf")
     while high - low > FAULT_SHARE * high:
         middle = (low + high) / 2.0
-        low, high = (low, middle) if told(middle) else (middle, high)
+        low, high = (low, middle) if alarms_at(middle) else (middle, high)
     return float(false.any(axis=0).mean()), high

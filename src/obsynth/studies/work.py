@@ -188,11 +188,11 @@ def _files_in(part: Any) -> Iterator[str]:
 
 
 def _named(stem: str, chosen: Mapping[str, Any]) -> str:
-    said = [f"{path.rpartition('.')[2]} = {_said(value)}" for path, value in chosen.items()]
+    said = [f"{path.rpartition('.')[2]} = {_cell_text(value)}" for path, value in chosen.items()]
     return ", ".join([stem, *said])
 
 
-def _said(value: Any) -> str:
+def _cell_text(value: Any) -> str:
     text = f"{value:g}" if isinstance(value, float) else str(value)
     return text if len(text) <= 40 else f"{text[:36]} ..."
 
@@ -207,16 +207,16 @@ class ResultTable(ABC):
 
     @property
     @abstractmethod
-    def _found(self) -> Sequence[Any]:
+    def _results(self) -> Sequence[Any]:
         """The results, each with a status."""
 
     def __len__(self) -> int:
-        return len(self._found)
+        return len(self._results)
 
     @property
     def counts(self) -> dict[str, int]:
         """Number of results by what they came to."""
-        found = [result.status for result in self._found]
+        found = [result.status for result in self._results]
         return {status: found.count(status) for status in ("run", *WORK_STATUSES.values()) if status in found}
 
     @abstractmethod

@@ -215,9 +215,9 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
         "w": product_but_rounding(rows, np.vstack([plant.Bw, plant.Dw])),
     }
     return DecoupledPlant(
-        E=read_only(_told(found.E) / units.time),
-        A=read_only(_told(found.A)),
-        C=read_only(_told(found.C)),
+        E=read_only(_without_rounding(found.E) / units.time),
+        A=read_only(_without_rounding(found.A)),
+        C=read_only(_without_rounding(found.C)),
         Bu=read_only(parts["u"][:k]),
         By=read_only(parts["y"][:k]),
         F=read_only(parts["f"][:k]),
@@ -252,7 +252,7 @@ def _without_dynamics(rows: FloatArray, e: FloatArray) -> FloatArray:
     return np.asarray(rows - (rows @ span) @ span.T)
 
 
-def _told(matrix: FloatArray) -> FloatArray:
+def _without_rounding(matrix: FloatArray) -> FloatArray:
     """Return a matrix of the balanced plant, in which entries are near one, without what is only rounding."""
     size = ROTATION_ROUNDING * max(1.0, float(np.max(np.abs(matrix), initial=0.0)))
     return np.where(np.abs(matrix) > size, matrix, 0.0)

@@ -102,7 +102,7 @@ def residual_orders(
     scale = largest_singular_value(C)
     for order in range(n + 1):
         new, hidden, terms = _beside(basis, new, scale)
-        shown = _shown(hidden, terms)
+        shown = _present_faults(hidden, terms)
         found = [order if seen and one is None else one for one, seen in zip(found, shown.tolist(), strict=True)]
         if not len(new.z) or all(one is not None for one in found):
             break
@@ -110,7 +110,7 @@ def residual_orders(
     return found
 
 
-def _shown(hidden: FloatArray, terms: FloatArray) -> NDArray[np.bool_]:
+def _present_faults(hidden: FloatArray, terms: FloatArray) -> NDArray[np.bool_]:
     """Return which faults stand in equations, of which these are the fault parts and the sizes of their terms."""
     return np.asarray(np.any(np.linalg.norm(hidden, axis=1) > TRACE_TOLERANCE * np.maximum(terms, 1.0), axis=0))
 
@@ -130,7 +130,7 @@ def _of_degree_zero(
         left, values, _ = full_svd(w)
         rank = int(np.count_nonzero(values > RANK_TOLERANCE * size))
         new, hidden, terms = _beside(free, rows.combined(left[:, rank:].T), scale)
-        alone |= _shown(hidden, terms)
+        alone |= _present_faults(hidden, terms)
         rows, w = rows.combined(left[:, :rank].T), left[:, :rank].T @ w
         if not len(new.z):
             break

@@ -238,7 +238,7 @@ def detectability_conditions(
         detectability.condition_number,
         REFUSE_CONDITION,
         "Wang 2015, Theorem 2 (i)",
-        f"{rank.describe()}, condition number {_told(detectability.condition_number)}, "
+        f"{rank.describe()}, condition number {_significant(detectability.condition_number)}, "
         f"||Upsilon|| = {largest_singular_value(user_units):.3g}"
         + (
             f"; {_names(mixed)} cannot be distinguished at first sight. Leave one out, or measure more."
@@ -250,7 +250,7 @@ def detectability_conditions(
     return finite, independent
 
 
-def _told(condition_number: float) -> str:
+def _significant(condition_number: float) -> str:
     """Return the number to the digits that are not rounding: none beyond what a double holds."""
     most = 1.0 / CANCELLATION_TOLERANCE
     return f"{condition_number:.3g}" if condition_number < most else f"above {most:.0e}"

@@ -61,7 +61,7 @@ def _fault_conditions(
     """Return whether one fault, whose model has these poles, can be estimated, free of others and unknown inputs."""
     name = plant.fault_names[fault]
     asked = question(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
-    seen = _shown(plant, asked, f"{name} detectable", _rest(plant, fault))
+    seen = _visibility(plant, asked, f"{name} detectable", _rest(plant, fault))
     if not asked.visible:
         return (seen,)
     lost = [point for point in points if not asked.shows_at(point)]
@@ -125,11 +125,11 @@ def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int], exactly: 
         blind = [*plant.disturbance_names, *(plant.fault_names[j] for j in removed)]
         without = f" without {', '.join(plant.fault_names[j] for j in removed)}" if removed else ""
         name = f"{plant.fault_names[fault]} detectable{without}"
-        found.append(_shown(plant, asked, name, ", ".join(blind) or "the initial state"))
+        found.append(_visibility(plant, asked, name, ", ".join(blind) or "the initial state"))
     return found
 
 
-def _shown(plant: DescriptorSystem, asked: FaultColumnsQuestion, name: str, rest: str) -> Condition:
+def _visibility(plant: DescriptorSystem, asked: FaultColumnsQuestion, name: str, rest: str) -> Condition:
     """Return the condition of this name that a fault shows, decoupled from the rest."""
     fault, point = plant.fault_names[asked.number], dc_point(plant.dt)
     found = Condition(

@@ -54,7 +54,7 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
         signals=found.states,
     )
     if found.index == 1:
-        told = _told(model, dt) if model.nq else ""
+        told = _unidentified(model, dt) if model.nq else ""
         yield Condition(
             "parameters",
             "the plant has parameters to estimate",
@@ -66,7 +66,7 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
         )
 
 
-def _told(model: DAEModel, dt: float) -> str:
+def _unidentified(model: DAEModel, dt: float) -> str:
     """Return what the outputs do not tell at nominal constant inputs: no condition, since others may excite it."""
     theta = model.nominal_parameters
     y, _, L = DAEFunctions(model).outputs(model.nominal_state, theta)

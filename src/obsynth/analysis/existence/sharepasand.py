@@ -169,7 +169,7 @@ def _zero_failure(
     return replace(found, mode=value, signals=(*states, *disturbances))
 
 
-def _shown_as_given(judge: Evaluator, model: Exosystem, drop: complex) -> bool:
+def _visible_as_given(judge: Evaluator, model: Exosystem, drop: complex) -> bool:
     """Whether the units of the plant as given show a mode that is not stable, where its own hide it.
 
     Along a plant of parts that hardly touch its own units drift apart, and rounding hides what they make small."""
@@ -201,7 +201,7 @@ def _fixed_modes(judge: Evaluator, model: Exosystem) -> tuple[ComplexArray, Cond
     else:
         drops = system_zeros(*pencil, nx=augmented.order).values
         if exact is None:
-            drops = np.array([value for value in drops if not _shown_as_given(judge, model, complex(value))])
+            drops = np.array([value for value in drops if not _visible_as_given(judge, model, complex(value))])
         zeros = units.eigenvalues(drops)
         # Rounding scatters a multiple mode around its mean.  (D2) and (D3) exclude an unstable one: it is none at all.
         bound = 1.0 if plant.dt > 0.0 else 0.0

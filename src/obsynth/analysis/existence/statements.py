@@ -314,7 +314,7 @@ class Evaluator:
         """Return the two matrices of a pencil ``A - s E`` in units of the plant's own."""
         return self._in_own_units(said, *self.pencil(said))
 
-    def seen(self, said: NoZeroOutside) -> SystemFacts:
+    def floating_facts(self, said: NoZeroOutside) -> SystemFacts:
         """Return the facts on a pencil by floating point."""
         pencil = self.own_pencil(said)
         found = system_zeros(*pencil, nx=self.plant.nx) if said.inputs else finite_zeros(*pencil)
@@ -328,7 +328,7 @@ class Evaluator:
         """Return the facts on a pencil."""
         numbers, plant = self.numbers, self.plant
         if numbers is None:
-            return self.seen(said)
+            return self.floating_facts(said)
         if not said.inputs:
             return numbers.system(numbers.zeros(plant.nx, 0), numbers.zeros(plant.ny, 0))
         return numbers.system(*(numbers.columns(str(row[1]), said.kept) for row in said.at_zero.blocks))
@@ -373,7 +373,7 @@ class Evaluator:
             f"the least singular value of the scaled pencil outside is {verdict.least:.1g}: rounding of the data, or "
             "of any gains, is as large."
         )
-        seen = self.seen(said).outside or (() if said.inputs else (point,))
+        seen = self.floating_facts(said).outside or (() if said.inputs else (point,))
         found = replace(found, holds=False, detail=detail)
         if seen:
             found = lost(replace(facts, outside=seen))
@@ -422,7 +422,7 @@ class Evaluator:
     def hidden_modes(self) -> SystemFacts:
         """Return the facts on ``[A - s E; C]``, with the modes that only rounding of the data lets show."""
         said, nx = NoZeroOutside(), self.plant.nx
-        seen, pencil, rate = self.seen(said), self.own_pencil(said), self.units.rate
+        seen, pencil, rate = self.floating_facts(said), self.own_pencil(said), self.units.rate
         if self.numbers is None:
             return seen
         seen = seen.timed(rate)

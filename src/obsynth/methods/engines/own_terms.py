@@ -115,7 +115,7 @@ def filter_by_inequality(
         matrices, claims = dict(made.certificate.matrices), made.certificate.claims
         matrices["tracking"] = np.vstack([matrices["tracking"], zeros])
         made = replace(made, observer=averaged(made.observer, asked.mean), certificate=Certificate(matrices, claims))
-    return _told(made, asked, found, runs, where, free_residual_weight=free)
+    return _recorded(made, asked, found, runs, where, free_residual_weight=free)
 
 
 def pd_by_inequality(plant: DescriptorSystem, asked: PdObserver, *, progress: Callable[[str], None]) -> Synthesis:
@@ -139,7 +139,7 @@ def pd_by_inequality(plant: DescriptorSystem, asked: PdObserver, *, progress: Ca
     _require_inside(np.asarray(np.linalg.solve(np.eye(len(A_o)) + L @ C_o, A_o - J @ C_o)), where)
     progress("building the realisation and its certificate")
     made = pd_from_gains(plant, gains=gains, adaptation_gain=None, decay=decay)
-    return _told(made, asked, found, runs, where, delta=delta, decay=decay)
+    return _recorded(made, asked, found, runs, where, delta=delta, decay=decay)
 
 
 def ui_pi_by_inequality(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callable[[str], None]) -> Synthesis:
@@ -161,7 +161,7 @@ def ui_pi_by_inequality(plant: DescriptorSystem, asked: UiPiObserver, *, progres
     progress("building the realisation and its certificate")
     given = {letter: gains[letter] for letter in "UDKF"}
     made = ui_pi_from_gains(known.plant, **given, fault_model=asked.fault_model)
-    told = _told(made, asked, found, runs, where, **asked.resolved(model, plant.fault_names))
+    told = _recorded(made, asked, found, runs, where, **asked.resolved(model, plant.fault_names))
     return replace(told, transformation=known.transformation)
 
 
@@ -236,7 +236,7 @@ def _solved(found: Conditions, asked: Any) -> dict[str, Any]:
     return record
 
 
-def _told(
+def _recorded(
     made: Synthesis, asked: Any, found: Conditions, runs: list[dict[str, Any]], where: LMIRegion | None, **resolved: Any
 ) -> Synthesis:
     """Return a synthesis from gains as the one that was asked for, with its record."""

@@ -71,8 +71,10 @@ class FilterPart:
 def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, delay: int, mean: int) -> FilterPart:
     """Return the filter of a gain, with a delay in samples; ``shown (rows, p)``: innovations shipped as residuals."""
     sizes = np.sqrt(np.maximum(np.diag(gain.innovation), 0.0))
-    gain = replace(gain, K=_told(gain.K, sizes), lag=tuple(_told(part, sizes) for part in gain.lag))
-    shown = _told(shown, sizes)
+    gain = replace(
+        gain, K=_without_rounding(gain.K, sizes), lag=tuple(_without_rounding(part, sizes) for part in gain.lag)
+    )
+    shown = _without_rounding(shown, sizes)
     parts = (model.A, -model.C), (model.B, model.L), (model.T, model.T0)
     dynamics = OutputRows(*(product_but_rounding(gain.K, fed_back, own) for own, fed_back in parts))
     innovation = OutputRows(-model.C, model.L, model.T0)
@@ -96,7 +98,7 @@ def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, dela
     return FilterPart(dynamics, estimates, innovation.times(shown), model.faults, delay + (mean - 1) // 2)
 
 
-def _told(gain: FloatArray, sizes: FloatArray) -> FloatArray:
+def _without_rounding(gain: FloatArray, sizes: FloatArray) -> FloatArray:
     """Return a gain ``(rows, p)`` of innovations of some sizes without what only rounding put into its rows.
 
     A gain may be any number: of zero the identities of the filter hold exactly, of rounding they hold to all of it.

@@ -25,7 +25,7 @@ from obsynth.methods.guaranteed_test.bank import (
     pairs_of,
     proved_hidden,
 )
-from obsynth.methods.guaranteed_test.existence import conditions, told
+from obsynth.methods.guaranteed_test.existence import conditions, detectability
 from obsynth.methods.guaranteed_test.problem import problem_of
 from obsynth.methods.guaranteed_test.synthesis import TRADE_OFF, chosen_samples, padded, synthesise
 from obsynth.methods.method import Synthesis, silent
@@ -84,7 +84,7 @@ def _smallest(plant: DescriptorSystem, asked: Any, fault: int) -> tuple[tuple[in
         for chosen in candidates:
             group = tuple(sorted((fault, *chosen)))
             own = blind_to(asked, plant, fault, group)
-            condition, lag = told(problem_of(plant, own), own)
+            condition, lag = detectability(problem_of(plant, own), own)
             if not condition.holds:
                 first = first or condition
                 why = why or condition.detail
@@ -119,7 +119,7 @@ def _pairs(plant: DescriptorSystem, asked: Any) -> dict[str, FloatArray]:
     table, proofs = np.zeros((plant.nf, plant.nf)), []
     for one, other in pairs:
         own = blind_to_one(asked, plant, one, other)
-        condition, _ = told(problem_of(plant, own), own)
+        condition, _ = detectability(problem_of(plant, own), own)
         if condition.holds:
             made = synthesise(plant, own, progress=silent)
             table[one, other] = made.certificate.claims["threshold"]

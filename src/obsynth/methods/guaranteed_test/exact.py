@@ -65,7 +65,7 @@ class Programmes:
 
     def __init__(self, window: Window, delay: int) -> None:
         if window.question.closing > delay:
-            # What follows the last known input is not known when the row is told.
+            # What follows the last known input is not known when the row is prescribed.
             window = window_of(window.plant, window.bounds, replace(window.question, closing=delay))
         self.window, self.delay = window, delay
         self._kept: dict[bytes, _Programme] = {}
@@ -126,14 +126,14 @@ class _Programme:
     def __init__(self, window: Window) -> None:
         self.window = window
         matrix = window.matrix
-        told = np.flatnonzero(window.free | (np.arange(len(window.bar)) == 0))
+        prescribed = np.flatnonzero(window.free | (np.arange(len(window.bar)) == 0))
         rows, _ = window.scales
-        self.told, self.bounded = matrix[:, told].T.tocsr(), matrix[:, window.bounded].T.tocsr()
-        self.told_sizes, self.bounded_sizes = abs(self.told), abs(self.bounded)
-        self.wanted = np.eye(1, len(told)).ravel()
+        self.prescribed, self.bounded = matrix[:, prescribed].T.tocsr(), matrix[:, window.bounded].T.tocsr()
+        self.prescribed_sizes, self.bounded_sizes = abs(self.prescribed), abs(self.bounded)
+        self.wanted = np.eye(1, len(prescribed)).ravel()
         # Entries that are products with a whole number have been rounded once.
         self.share = gamma(window.rows + 8) + 2.0 * UNIT_ROUNDOFF
-        dense = self.told.toarray()
+        dense = self.prescribed.toarray()
         self.square = Square.of(dense, 2.0 * UNIT_ROUNDOFF * np.abs(dense), np.ldexp(1.0, rows), rows)
         self.highs, self.bases, self.known = _highs(window), {}, np.zeros(window.rows)
         self.test: tuple[Repaired, float] | None = None
@@ -162,7 +162,7 @@ class _Programme:
             status = self.highs.getModelStatus()
             if status == highspy.HighsModelStatus.kOptimal:
                 multipliers = np.ldexp(np.asarray(self.highs.getSolution().row_dual), rows)
-                scale = float((self.told[[0]] @ multipliers)[0])
+                scale = float((self.prescribed[[0]] @ multipliers)[0])
                 if abs(scale) > 0.0:
                     yield multipliers / scale
                 return
@@ -181,9 +181,9 @@ class _Programme:
             found = repaired_multipliers(self.window, multipliers, refine=True)
             return None if found is None else (found, proved_threshold(self.window, found))
         values = np.array(multipliers)
-        values[self.square.chosen] += self.square.step(self.wanted - self.told @ values)
-        left = np.abs(self.wanted - self.told @ values)
-        left = rounded_up(left + self.share * (self.told_sizes @ np.abs(values) + self.wanted), 4)
+        values[self.square.chosen] += self.square.step(self.wanted - self.prescribed @ values)
+        left = np.abs(self.wanted - self.prescribed @ values)
+        left = rounded_up(left + self.share * (self.prescribed_sizes @ np.abs(values) + self.wanted), 4)
         radius = np.zeros(len(values))
         radius[self.square.chosen] = self.square.bounded_step(left)
         sizes = self.bounded_sizes @ rounded_up(self.share * np.abs(values) + radius, 2)

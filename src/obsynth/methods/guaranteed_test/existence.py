@@ -72,10 +72,10 @@ def conditions(
     # Of a bank: that a fault is told where no other is there; some group then tells it.
     alone = [replace(asked, isolate=False, fault=name, free="none") for name in names]
     each = alone if asked.isolate and isinstance(plant, DescriptorSystem) else [asked]
-    return (*first, *(told(problem_of(plant, own), own)[0] for own in each))
+    return (*first, *(detectability(problem_of(plant, own), own)[0] for own in each))
 
 
-def told(problem: WindowProblem, asked: TestOptions) -> tuple[Condition, int]:
+def detectability(problem: WindowProblem, asked: TestOptions) -> tuple[Condition, int]:
     """Return the condition that some window tells the fault, and the lag with which it does."""
     lags = [problem.question.lag]
     if problem.question.course == "any" and asked.lag is None:
@@ -85,8 +85,8 @@ def told(problem: WindowProblem, asked: TestOptions) -> tuple[Condition, int]:
     for lag in lags:
         for window in _decisive(problem, asked, lag):
             if has_test(window):
-                return told_condition(window, True, ""), lag
-    return told_condition(window, False, _why(problem, asked, window)), lags[-1]
+                return detectability_condition(window, True, ""), lag
+    return detectability_condition(window, False, _why(problem, asked, window)), lags[-1]
 
 
 def _decisive(problem: WindowProblem, asked: TestOptions, lag: int) -> Iterator[Window]:
@@ -139,9 +139,9 @@ def least_multipliers(window: Window) -> FloatArray | None:
     if condensed is not None:
         return condensed.least_weights()
     rows, columns = window.scales
-    told = np.flatnonzero(window.free | (np.arange(len(window.bar)) == 0))
-    matrix = np.ldexp(np.ldexp(window.matrix[:, told].toarray(), columns[told]), rows[:, None]).T
-    wanted = np.zeros(len(told))
+    prescribed = np.flatnonzero(window.free | (np.arange(len(window.bar)) == 0))
+    matrix = np.ldexp(np.ldexp(window.matrix[:, prescribed].toarray(), columns[prescribed]), rows[:, None]).T
+    wanted = np.zeros(len(prescribed))
     wanted[0] = float(np.ldexp(1.0, int(columns[0])))
     found = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
     if np.max(np.abs(matrix @ found - wanted)) > SEEN * wanted[0]:
@@ -149,7 +149,7 @@ def least_multipliers(window: Window) -> FloatArray | None:
     return np.asarray(np.ldexp(found, rows))
 
 
-def told_condition(window: Window, holds: bool, detail: str) -> Condition:
+def detectability_condition(window: Window, holds: bool, detail: str) -> Condition:
     """Return the condition that a window tells the fault, in words."""
     fault = fault_names(window.model.plant)[window.question.fault]
     return Condition(

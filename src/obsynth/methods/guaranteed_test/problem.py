@@ -436,24 +436,24 @@ def observer_of(window: Window, multipliers: FloatArray, beside: LinearObserver 
 
 
 def observer_of_rows(
-    problem: WindowProblem, programmes: WindowProgrammes, told: np.ndarray, multipliers: list[FloatArray]
+    problem: WindowProblem, programmes: WindowProgrammes, tested: np.ndarray, multipliers: list[FloatArray]
 ) -> WindowObserver:
-    """Return the weights of all rows; ``told``: which programmes have a test."""
+    """Return the weights of all rows; ``tested``: which programmes have a test."""
     plant, question = problem.plant, programmes.windows[0].question
     weights = []
-    for window, values, has_test in zip(programmes.windows, multipliers, told, strict=True):
+    for window, values, has_test in zip(programmes.windows, multipliers, tested, strict=True):
         on_y, on_u, _ = window.weights(values)
         both = np.hstack([on_u, on_y]).ravel()
         weights.append(both if has_test else np.zeros_like(both))
     constants = [
         window.constant(values) if has_test else 0.0
-        for window, values, has_test in zip(programmes.windows, multipliers, told, strict=True)
+        for window, values, has_test in zip(programmes.windows, multipliers, tested, strict=True)
     ]
     estimated = question.course != "step"
     name = (problem.fault,)
     return WindowObserver(
         weights=np.array(weights),
-        programmes=np.where(told[programmes.of_row], programmes.of_row, -1).astype(np.float64),
+        programmes=np.where(tested[programmes.of_row], programmes.of_row, -1).astype(np.float64),
         samples=question.samples,
         horizon=problem.horizon,
         dt=plant.dt,

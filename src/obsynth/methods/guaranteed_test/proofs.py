@@ -136,11 +136,11 @@ def _weights(window: Window, multipliers: FloatArray) -> FloatArray:
 
 def exact_multipliers(window: Window, multipliers: FloatArray) -> list[Fraction] | None:
     """Return fractions next to multipliers that see no free column at all; ``None`` where none are found."""
-    told = np.flatnonzero(window.free)
+    prescribed = np.flatnonzero(window.free)
     seen = columns_of(window, multipliers)
     weight = _weights(window, multipliers)
-    dense, _ = _dense(window, told)
-    corrected = _rational_step(dense.T, weight, [-seen[column] for column in told])
+    dense, _ = _dense(window, prescribed)
+    corrected = _rational_step(dense.T, weight, [-seen[column] for column in prescribed])
     if corrected is None:
         return None
     found = [Fraction(float(value)) for value in multipliers]
@@ -272,15 +272,15 @@ def repaired_multipliers(
         found = condensed.multipliers(multipliers, refine=refine, among=among)
         if found is not None:
             return Repaired(*found)
-    # The columns whose products with multipliers are told: 0, or 1 for that of theta.
-    told = [0, *(range(1, len(window.bar)) if exact_zero else np.flatnonzero(window.free).tolist())]
-    wanted = [Fraction(int(column == 0)) for column in told]
+    # The columns whose products with multipliers are prescribed: 0, or 1 for that of theta.
+    prescribed = [0, *(range(1, len(window.bar)) if exact_zero else np.flatnonzero(window.free).tolist())]
+    wanted = [Fraction(int(column == 0)) for column in prescribed]
 
     def missing(values: FloatArray) -> list[Fraction]:
         seen = columns_of(window, values)
-        return [want - seen[column] for want, column in zip(wanted, told, strict=True)]
+        return [want - seen[column] for want, column in zip(wanted, prescribed, strict=True)]
 
-    matrix, radius = _dense(window, np.array(told))
+    matrix, radius = _dense(window, np.array(prescribed))
     rows, _ = window.scales
     weight = _weights(window, multipliers)
     weight = weight if among is None else np.where(among > 0.0, weight, 0.0)
@@ -459,27 +459,27 @@ def proved_ray(window: Window) -> FloatArray | None:
     """
     if window.rows > MOST_ROWS_FOR_A_RAY:
         return None
-    told = np.flatnonzero(window.free)
+    prescribed = np.flatnonzero(window.free)
     _, columns = window.scales
     rows, _ = window.scales
-    matrix, radius = _dense(window, told)
+    matrix, radius = _dense(window, prescribed)
     theta = window.matrix[:, [0]].toarray().ravel()
-    scaled = np.ldexp(np.ldexp(matrix, columns[told]), rows[:, None])
+    scaled = np.ldexp(np.ldexp(matrix, columns[prescribed]), rows[:, None])
     found = np.linalg.lstsq(scaled, -np.ldexp(theta, rows), rcond=None)[0]
     size = 1.0 + float(np.max(np.abs(found), initial=0.0))
     if np.max(np.abs(scaled @ found + np.ldexp(theta, rows)), initial=0.0) > HIDDEN * size:
         return None
     point = np.zeros(len(window.bar))
-    point[0], point[told] = 1.0, np.ldexp(found, columns[told])
+    point[0], point[prescribed] = 1.0, np.ldexp(found, columns[prescribed])
 
     def missing(values: FloatArray) -> list[Fraction]:
         whole = point.copy()
-        whole[told] = values
+        whole[prescribed] = values
         return [-value for value in rows_of(window, whole)]
 
-    weight = np.ldexp(np.maximum(np.abs(found), 1.0), columns[told])
-    repaired = _repaired(matrix, radius, (weight, columns[told]), point[told].copy(), missing, refine=True)
+    weight = np.ldexp(np.maximum(np.abs(found), 1.0), columns[prescribed])
+    repaired = _repaired(matrix, radius, (weight, columns[prescribed]), point[prescribed].copy(), missing, refine=True)
     if repaired is None:
         return None
-    point[told] = repaired.values
+    point[prescribed] = repaired.values
     return point

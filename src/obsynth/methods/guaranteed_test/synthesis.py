@@ -11,7 +11,7 @@ import numpy as np
 from obsynth.analysis.existence.condition import require_all
 from obsynth.errors import ObsynthError, PreconditionError, SolverError
 from obsynth.methods.designing import design
-from obsynth.methods.guaranteed_test.existence import conditions, told
+from obsynth.methods.guaranteed_test.existence import conditions, detectability
 from obsynth.methods.guaranteed_test.options import TestOptions
 from obsynth.methods.guaranteed_test.problem import (
     COURSES,
@@ -92,7 +92,7 @@ def synthesise(
             notes.append(f"There is no threshold over the tolerances: {error}")
     problem = problem_of(plant, asked)
     require_all(conditions(plant, asked, with_windows=False))
-    condition, lag = told(problem, asked)
+    condition, lag = detectability(problem, asked)
     condition.require()
     problem = replace(problem, question=replace(problem.question, lag=lag))
     given = samples_given(asked)

@@ -176,11 +176,11 @@ def kalman_problem(problem: PlacementProblem, weights: Mapping[str, Any]) -> Kal
     return KalmanProblem(
         F=split.F,
         C=split.C,
-        B=split.lower(entering),
+        B=split.observable_rows(entering),
         D=measured,
         drive=split.basis[:, : split.order].T @ np.diag(per_step * size * strength),
         background=INNOVATION_NOISE * size * np.eye(len(problem.C)),
-        estimates=split.shown(faults),
+        estimates=split.observable_columns(faults),
         dt=plant.dt,
     )
 

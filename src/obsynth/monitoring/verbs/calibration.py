@@ -12,7 +12,7 @@ from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.monitoring.verbs.data_arguments import with_input_delay
 from obsynth.plants.noise import offset_state
 from obsynth.report.terminal.arguments import columns_of, numbers_of, pair, refuse_given
-from obsynth.report.terminal.output import answer, gains_to_hand_on, output_file, progress
+from obsynth.report.terminal.output import emit, gains_to_hand_on, output_file, progress
 from obsynth.results.calibration_files import CALIBRATION_KIND, calibration_text
 from obsynth.results.gain_set_writing import plain
 from obsynth.specs.loader import load_model, load_plant
@@ -77,7 +77,7 @@ def run_linearise(options: argparse.Namespace) -> int:
     if target is not None:
         write_atomically(target, plant_document(linear, options.system.name))
     told = linear_plant_text(linear) if found is None else f"{linear_plant_text(linear)}\n{found}"
-    answer(
+    emit(
         options,
         {
             "system": options.system,
@@ -128,7 +128,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
     if written is not None:
         beside = target if target is not None and target.parent == written.parent else None
         write_atomically(written, calibrated_spec(options.system, found, calibration=beside))
-    answer(options, {"file": target, **data}, f"{found}\n  digest of the log: {found.box.digest}")
+    emit(options, {"file": target, **data}, f"{found}\n  digest of the log: {found.box.digest}")
     return 0
 
 
@@ -185,5 +185,5 @@ def run_validate(options: argparse.Namespace) -> int:
         found = validate(
             with_input_delay(design, options), options.data, progress=report_stage, **_log_arguments(options)
         )
-    answer(options, {"gains": options.gains, "data": options.data, **found.to_dict()}, str(found))
+    emit(options, {"gains": options.gains, "data": options.data, **found.to_dict()}, str(found))
     return 0 if found.passed else VerificationError.exit_code

@@ -19,7 +19,7 @@ from obsynth.monitoring.verbs.data_arguments import (
     summary_of_run,
 )
 from obsynth.report.terminal.arguments import STREAM, numbers_of, refuse_given
-from obsynth.report.terminal.output import answer, gains_to_hand_on, output_file, print_json
+from obsynth.report.terminal.output import emit, gains_to_hand_on, output_file, print_json
 from obsynth.report.terminal.pictures import picture_kind, written_picture
 from obsynth.results.registered import registered
 
@@ -93,7 +93,7 @@ def run_prove_alarm(options: argparse.Namespace) -> int:
     target = None if options.out is None else output_file(options.out, CERTIFICATE, options)
     found = proof_of(design, options, options.row, state_bounds=numbers_of(options.state_bound) or None)
     file = str(found.save(target)) if found.proved and target is not None else None
-    answer(
+    emit(
         options,
         {
             "gains": options.gains,
@@ -158,5 +158,5 @@ def run_plot(options: argparse.Namespace) -> int:
     if options.json or not options.quiet:
         told = "\n".join([*([mark] if mark else []), summary_of_run(found, watched)])
         unverified = {"unverified": mark} if mark else {}
-        answer(options, {"gains": options.gains, "file": target, **found.as_dict(), **unverified}, told)
+        emit(options, {"gains": options.gains, "file": target, **found.as_dict(), **unverified}, told)
     return 0

@@ -10,7 +10,7 @@ from obsynth.errors import SpecError
 from obsynth.files.outputs import require_distinct
 from obsynth.monitoring.verbs.data_arguments import protect_inputs, with_input_delay
 from obsynth.report.terminal.arguments import STREAM, columns_of, numbers_of
-from obsynth.report.terminal.output import answer, gains_to_hand_on, output_file
+from obsynth.report.terminal.output import emit, gains_to_hand_on, output_file
 
 
 def run_thresholds(options: argparse.Namespace) -> int:
@@ -53,7 +53,7 @@ def run_thresholds(options: argparse.Namespace) -> int:
             "not at all. Give run a level for the estimate as well (--threshold)."
         )
     lines += found.notes
-    answer(
+    emit(
         options,
         {
             "gains": options.gains,

@@ -156,7 +156,7 @@ class _Update:
     def _is_joint(self) -> bool:
         return self.observer.form == "augmented-kalman"
 
-    def _seen_outputs(self, found: Arrays) -> tuple[Any, Any, Any, Any, Any]:
+    def _received_outputs(self, found: Arrays) -> tuple[Any, Any, Any, Any, Any]:
         """Return H and L as they are, and innovation, H and L with zeros where nothing is seen."""
         predicted, H, L = self.functions.output_function(found["x"], found["theta"])
         mask = ca.diag(self.seen)
@@ -164,7 +164,7 @@ class _Update:
 
     def _innovation(self, found: Arrays) -> Arrays:
         """Step 6, with the square of the innovation in units of its covariance and what it says of the parameters."""
-        _, _, e, H, L = self._seen_outputs(found)
+        _, _, e, H, L = self._received_outputs(found)
         Sigma = H @ found["P"] @ H.T + self.R
         Omega = H @ found["Upsilon"] + L
         if self._is_joint:
@@ -226,7 +226,7 @@ class _Update:
 
     def _corrected(self, found: Arrays) -> Arrays:
         """Step 10: the gain at the updated estimate, the state after the measurement, and its covariance."""
-        full_H, full_L, e, H, _ = self._seen_outputs(found)
+        full_H, full_L, e, H, _ = self._received_outputs(found)
         P = found["P"]
         K = definite_solved(H @ P @ H.T + self.R, H @ P).T @ ca.diag(self.seen)
         kept = ca.DM.eye(self.observer.model.nx) - K @ full_H
@@ -259,5 +259,5 @@ class _Update:
             "K": gain[:nx, :],
             "covariance": whole[:nx, :nx],
         }
-        full_H, full_L, *_ = self._seen_outputs(after)
+        full_H, full_L, *_ = self._received_outputs(after)
         return {**after, "H": full_H, "L": full_L, "posterior": after["x"]}

@@ -129,7 +129,7 @@ class RecursiveObserver(RecursiveSettings):
             rows.append(row)
         return recursive_estimates(self, rows)
 
-    def shown(self, row: RawEstimate) -> RawEstimate:
+    def within_bounds(self, row: RawEstimate) -> RawEstimate:
         """Return a row with its states within their bounds; the recursion goes on without them.
 
         Parameters

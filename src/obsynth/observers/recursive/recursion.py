@@ -182,13 +182,13 @@ class Recursion:
         """Take the step that ends at the sample ``y``; return also innovation and regressor."""
         nq = state.Upsilon.shape[1]
         right = right_side(step, state.x, state.Upsilon, state.u, y, u)
-        found, lesson = None, None
+        found, learned = None, None
         # The product is NaN exactly if a sample is.
         if not (self.literal or state.diffuse.shape[1] or math.isnan(y.dot(y))):
             self._prepared = PreparedStep.of(step, self._prepared)
             found = self._prepared.taken(state.factor, right)
         if found is None:
-            found, lesson = self._careful(state, step, right)
+            found, learned = self._careful(state, step, right)
         v, G = found.innovation[:, 0], -found.innovation[:, 1:]
         parameters, surprises, resets = state.parameters, state.surprises, state.resets
         if nq and self.settings.adaptation is not None:
@@ -200,7 +200,7 @@ class Recursion:
                     # The same estimate, known no better than at the start.
                     parameters, surprises = self.first.parameters._replace(theta=parameters.theta), surprises[:0]
                     resets += 1
-            seen, regressor, noise = lesson or (v, G, None)
+            seen, regressor, noise = learned or (v, G, None)
             parameters, _ = update(
                 parameters,
                 seen,

@@ -106,7 +106,7 @@ def estimate_gains(design: ObserverDesign, *, to: str = "faults") -> EstimateGai
     for name, (b, d) in inputs.items():
         if not b.shape[1]:
             continue
-        states, seen, terms = _seen(plant, b, d, points, to_estimate)
+        states, seen, terms = _responses(plant, b, d, points, to_estimate)
         if to == "states":
             truth = _delayed(observer, points) * states
             seen, terms = seen - truth, terms + _sizes(truth)
@@ -140,14 +140,14 @@ def fault_gains(design: ObserverDesign) -> FaultGains:
         closely = _disturbance_gains(plant, *_at_frequencies(observer, observer.fault_rows, near))
         disturbance_gains = np.maximum(found.max(axis=0), closely.max(axis=0))
     own = [plant.fault_names.index(name) for name in observer.fault_names]
-    _, slowest, _ = _seen(plant, plant.Bf, plant.Df, points, to_estimate)
+    _, slowest, _ = _responses(plant, plant.Bf, plant.Df, points, to_estimate)
     steady = slowest[0].real[np.arange(len(own)), own]
     return FaultGains(disturbance_gains, np.asarray(steady))
 
 
 def _disturbance_gains(plant: DescriptorSystem, points: ComplexArray, to_estimate: ComplexArray) -> FloatArray:
     """Return gains from each unknown input to each fault estimate ``(k, nf, nd)``."""
-    _, found, terms = _seen(plant, plant.Bd, plant.Dd, points, to_estimate)
+    _, found, terms = _responses(plant, plant.Bd, plant.Dd, points, to_estimate)
     return _above_rounding(np.abs(found), terms[:, None, None])
 
 
@@ -165,7 +165,7 @@ def _at_frequencies(
     return points, response(observer.Az, observer.By, observer.Cz[rows], observer.Dy[rows], points)
 
 
-def _seen(
+def _responses(
     plant: DescriptorSystem, b: FloatArray, d: FloatArray, points: ComplexArray, to_estimate: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
     """Return the states that an input drives, what the outputs show of it, and the size of the terms of that."""

@@ -41,18 +41,18 @@ def output_file(path: str | Path, kind: FileKind | None, options: argparse.Names
     return target
 
 
-def answer(options: argparse.Namespace, data: Mapping[str, Any], told: Callable[[], Any] | str = "") -> None:
-    """Print the result of a verb, as JSON or as told, with what was written: the paths under ``file`` or ``files``."""
-    files = [item for item in data.get("files", [data.get("file")]) if isinstance(item, Path)]
+def emit(options: argparse.Namespace, payload: Mapping[str, Any], text: Callable[[], Any] | str = "") -> None:
+    """Print the result of a verb, as JSON or as text, with what was written: the paths under ``file`` or ``files``."""
+    files = [item for item in payload.get("files", [payload.get("file")]) if isinstance(item, Path)]
     if options.json:
-        texts = {name: str(item) for name, item in data.items() if isinstance(item, Path)}
-        several = {"files": [str(item) for item in files]} if "files" in data else {}
-        print_json({"command": options.verb, **data, **texts, **several})
+        texts = {name: str(item) for name, item in payload.items() if isinstance(item, Path)}
+        several = {"files": [str(item) for item in files]} if "files" in payload else {}
+        print_json({"command": options.verb, **payload, **texts, **several})
         return
-    if not isinstance(told, str):
-        told()
-    elif told:
-        print(told)
+    if not isinstance(text, str):
+        text()
+    elif text:
+        print(text)
     if files:
         print(f"Written: {', '.join(map(str, files))}")
 

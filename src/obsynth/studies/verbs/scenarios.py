@@ -13,7 +13,7 @@ from obsynth.monitoring.verbs.arguments import MONITOR_NAMES, stated_settings
 from obsynth.monitoring.verbs.data_arguments import monitor_settings, stated_delay
 from obsynth.plants.transformations.recovery import linear_plant
 from obsynth.report.terminal.arguments import columns_of, flag_of, numbers_of, refuse_given
-from obsynth.report.terminal.output import answer, output_file, progress, stdout_console
+from obsynth.report.terminal.output import emit, output_file, progress, stdout_console
 from obsynth.report.terminal.pictures import picture_kind, written_picture
 from obsynth.report.terminal.specs import prepared
 from obsynth.results.certificate_files import RESULT_FILE
@@ -51,7 +51,7 @@ def _run_tolerances(options: argparse.Namespace) -> int:
         from obsynth.studies.plots.tolerances import plot_tolerances
 
         written_picture(target, 2, lambda axes: plot_tolerances(found, axes=axes))
-    answer(
+    emit(
         options,
         {"spec": spec.path, "file": target, "statement": found.statement, **found.as_dict()},
         f"{found}\n{found.statement}",
@@ -118,7 +118,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
     if watched is not None:
         kind, statement = described(watched)
         told = {"kind": kind, "statement": statement, "final_threshold": final_threshold(watched)}
-    answer(
+    emit(
         options,
         {
             "spec": spec.path,
@@ -170,7 +170,7 @@ def run_compare(options: argparse.Namespace) -> int:
                 write_atomically(options.out, found.page())
     from obsynth.studies.tables import comparison_report
 
-    answer(
+    emit(
         options,
         {"spec": spec.path, "statement": found.statement, **found.to_dict()},
         lambda: comparison_report(found, console=stdout_console(), file=options.out),

@@ -7,7 +7,7 @@ from typing import Any
 
 from obsynth.plants.transformations.recovery import linear_plant
 from obsynth.report.terminal.arguments import refuse_given
-from obsynth.report.terminal.output import answer, progress, stdout_console
+from obsynth.report.terminal.output import emit, progress, stdout_console
 
 
 def run_sensors(options: argparse.Namespace) -> int:
@@ -30,5 +30,5 @@ def run_sensors(options: argparse.Namespace) -> int:
             refuse_given(options, ("below", "sample_time"), "--goal threshold")
             given |= {"faults": None if options.fault is None else [options.fault]}
         found = sensor_sets(plant, progress=report_stage, **given)
-    answer(options, {"spec": spec.path, **found.to_dict()}, lambda: stdout_console().print(str(found), highlight=False))
+    emit(options, {"spec": spec.path, **found.to_dict()}, lambda: stdout_console().print(str(found), highlight=False))
     return 0

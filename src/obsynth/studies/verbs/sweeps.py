@@ -152,7 +152,7 @@ def _tell(options: argparse.Namespace, found: Any, files: tuple[Path, ...], what
         print_json({"command": options.verb, "counts": found.counts, what: cases, "files": [str(f) for f in files]})
         return
     console = stdout_console()
-    shown = _shown_cases if what == "cases" else _shown_runs
+    shown = _printed_cases if what == "cases" else _printed_runs
     console.print(shown(found, console.width))
     console.print(f"Written: {', '.join(map(str, files))}", soft_wrap=True)
 
@@ -218,7 +218,7 @@ def _png_of(plot: Callable[[], Any]) -> bytes | None:
     return picture
 
 
-def _shown(found: Any, header: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> Any:
+def _printed(found: Any, header: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> Any:
     """Return a table for people, below what became of the cases, what is the same in all, and what has no room."""
     from rich.console import Group
     from rich.text import Text
@@ -254,19 +254,19 @@ def _shown(found: Any, header: Sequence[str], rows: Iterable[Sequence[str]], wid
     return Group(*map(Text, lines), Text(), table)
 
 
-def _shown_cases(found: Any, width: int) -> Any:
+def _printed_cases(found: Any, width: int) -> Any:
     """Return the table of a sweep for people: without message and file."""
     header, rows = found.rows()
     kept = [i for i, name in enumerate(header) if name not in ("message", "file")]
     told = ([f"{row[i]:.4g}" if isinstance(row[i], float) else str(row[i]) for i in kept] for row in rows)
-    return _shown(found, [header[i] for i in kept], told, width)
+    return _printed(found, [header[i] for i in kept], told, width)
 
 
-def _shown_runs(found: Any, width: int) -> Any:
+def _printed_runs(found: Any, width: int) -> Any:
     """Return the table of runs for people: the first alarm of each, and why one was not made."""
     rows = []
     for run in found.runs:
         first = min(run.alarms, key=lambda name: run.alarms[name], default="")
         alarm = f"{first} at {run.alarms[first]:g} s" if first else "-"
         rows.append((run.name, run.status, str(run.rows), str(run.statuses.get("ok", 0)), alarm, run.message))
-    return _shown(found, ("run", "status", "rows", "ok", "first alarm", "why not"), rows, width)
+    return _printed(found, ("run", "status", "rows", "ok", "first alarm", "why not"), rows, width)
