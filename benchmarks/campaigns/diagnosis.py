@@ -15,8 +15,8 @@ import numpy as np
 from benchmarks.campaigns.frame import Outcome
 
 from obsynth import DescriptorSystem
-from obsynth.analysis.diagnosis.exact_fault_columns import ExactQuestion
-from obsynth.analysis.diagnosis.fault_columns import FaultColumnsQuestion, Removal
+from obsynth.analysis.diagnosis.exact_fault_columns import ExactDecoupledFault
+from obsynth.analysis.diagnosis.fault_columns import DecoupledFault, Removal
 
 CASES = 500
 LIMIT = 60.0
@@ -30,11 +30,11 @@ def case(seed: int) -> Outcome:
     verdicts, wrong = [], []
     for fault in range(plant.nf):
         for removed in ((), tuple(j for j in range(plant.nf) if j != fault)):
-            exact = ExactQuestion(Removal(plant, removed), fault)
-            pencil = ExactQuestion(Removal(plant, removed), fault, reduced=False)
+            exact = ExactDecoupledFault(Removal(plant, removed), fault)
+            pencil = ExactDecoupledFault(Removal(plant, removed), fault, reduced=False)
             if exact.polynomial not in (pencil.polynomial, -pencil.polynomial):
                 wrong.append(f"{removed}, {fault}: polynomials differ")
-            rounded = FaultColumnsQuestion(Removal(other, removed), fault)
+            rounded = DecoupledFault(Removal(other, removed), fault)
             facts, found = _facts(exact, exact.order), _facts(rounded, rounded.order)
             if facts != found:
                 wrong.append(f"{removed}, {fault}: {facts} exactly, {found} in other units")

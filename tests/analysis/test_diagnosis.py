@@ -10,7 +10,7 @@ from networks import random_network
 
 import obsynth
 from obsynth.analysis.diagnosis.decoupled import decoupled, unknowns_pencil
-from obsynth.analysis.diagnosis.exact_fault_columns import Questions, question
+from obsynth.analysis.diagnosis.exact_fault_columns import DecoupledFaults, decoupled_fault
 from obsynth.analysis.diagnosis.explanations import hidden_motion, hiding_amplitudes
 from obsynth.analysis.diagnosis.without_unknown_inputs import PencilUnits
 from obsynth.numerics.ranks import TRACE_TOLERANCE
@@ -190,7 +190,7 @@ def test_exact_and_rounded_agree_on_random_integer_plants() -> None:
         )  # fmt: skip
         for fault in range(nf):
             removed = tuple(j for j in range(nf) if j != fault)
-            exact, rounded = (question(plant, removed, fault, way) for way in (True, False))
+            exact, rounded = (decoupled_fault(plant, removed, fault, way) for way in (True, False))
             assert exact.visible == rounded.visible
             if exact.visible:
                 assert (len(exact.zeros), len(exact.blocking)) == (len(rounded.zeros), len(rounded.blocking))
@@ -214,7 +214,7 @@ class TestManyFaultsAndStates:
         plant = obsynth.DescriptorSystem(e, a, last, last.T, Bf=last, dt=0.1)
         tracemalloc.start()
         try:
-            found = question(plant, (), 0, exactly)
+            found = decoupled_fault(plant, (), 0, exactly)
             assert found.visible
             assert found.derivatives == 0  # the input and the output are known, and the state before it
             peak = tracemalloc.get_traced_memory()[1]
@@ -229,10 +229,10 @@ class TestManyFaultsAndStates:
         a, bf, c = (rng.integers(-3, 4, size=shape) / 4 for shape in ((nx, nx), (nx, 3), (4, nx)))
         e = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 0.0])
         plant = obsynth.DescriptorSystem(e, a - 2.0 * np.eye(nx), C=c, Bf=bf, Bd=np.eye(nx)[:, :1])
-        together = Questions(plant, exactly)
+        together = DecoupledFaults(plant, exactly)
         for removed in ((), (0,), (2, 1)):
             for number in set(range(3)) - set(removed):
-                one, alone = together.of(removed, number), question(plant, removed, number, exactly)
+                one, alone = together.of(removed, number), decoupled_fault(plant, removed, number, exactly)
                 assert one is together.of(removed[::-1], number)
                 for name in ("visible", "estimable", "shows_at_rest", "derivatives", "residual_order", "order"):
                     assert getattr(one, name) == getattr(alone, name), (removed, number, name)
@@ -302,8 +302,8 @@ def test_no_motion_is_told_that_hides_nothing() -> None:
         assert hiding_amplitudes(hidden, 0, point, []) == {"d": pytest.approx(-1.0)}
 
 
-def question_of(plant: obsynth.DescriptorSystem, *, exactly: bool):
-    return question(plant, [], 0, exactly)
+def fault_of(plant: obsynth.DescriptorSystem, *, exactly: bool):
+    return decoupled_fault(plant, [], 0, exactly)
 
 
 def test_a_fault_is_hidden_at_its_own_complex_zeros() -> None:
@@ -312,7 +312,7 @@ def test_a_fault_is_hidden_at_its_own_complex_zeros() -> None:
         None, [[0, 1, 0], [0, 0, 1], [0, 0, 0]], C=[[0.5, -1.0, 1.0]], Bf=[[0], [0], [1]], dt=1.0
     )
     for exactly in (True, False):
-        asked = question_of(plant, exactly=exactly)
+        asked = fault_of(plant, exactly=exactly)
         assert not asked.shows_at(0.5 + 0.5j)
         assert asked.shows_at(-0.5 + 0.5j)
         assert asked.shows_at_rest  # at one: (1 - 1 + 0.5)
@@ -323,7 +323,7 @@ def test_slow_zeros_of_a_sampled_plant_stay_inside_whatever_the_units_of_s_are()
     for zero, blocking, at_rest in ((2.0, 0, True), (150.0, 1, True), (100.0, 1, False)):
         plant = obsynth.DescriptorSystem(None, [[0.0, 0.01], [0.0, 0.0]], C=[[-zero, 1.0]], Bf=[[0.0], [1.0]], dt=1.0)
         for exactly in (True, False):
-            found = question_of(plant, exactly=exactly)
+            found = fault_of(plant, exactly=exactly)
             assert len(found.blocking) == blocking
             assert found.shows_at_rest == at_rest
             assert found.zeros == pytest.approx([0.01 * zero])
@@ -334,7 +334,7 @@ def test_the_gap_of_a_question_knows_how_small_a_trace_is() -> None:
     plant = obsynth.DescriptorSystem(
         None, [[0.5, 0.1], [0.0, 0.2]], C=np.eye(2), Bf=[[0.0], [1.0]], Bd=[[1e-7], [1.0]], dt=1.0
     )
-    found = question_of(plant, exactly=False)
+    found = fault_of(plant, exactly=False)
     assert found.leaves_trace
     assert found.gap == pytest.approx(found.trace / TRACE_TOLERANCE)
     assert found.gap < found.plant.thinnest.gap

@@ -7,7 +7,7 @@ import pytest
 from flint import fmpq_mat
 
 import obsynth
-from obsynth.analysis.diagnosis.exact_fault_columns import question
+from obsynth.analysis.diagnosis.exact_fault_columns import decoupled_fault
 from obsynth.analysis.diagnosis.residual_orders import exact_residual_order
 
 
@@ -71,12 +71,12 @@ def test_least_order_is_that_of_a_minimal_polynomial_basis(seed: int, *, regular
         for fault in range(plant.nf):
             removed = tuple(j for j in range(plant.nf) if j != fault) if rng.random() < 0.5 else ()
             truth = least_order(plant, removed, fault)
-            exact, rounded = (question(plant, removed, fault, way) for way in (True, False))
+            exact, rounded = (decoupled_fault(plant, removed, fault, way) for way in (True, False))
             assert (exact.visible, exact.residual_order) == (truth is not None, truth)
             assert (rounded.visible, rounded.residual_order) == (truth is not None, truth)
             # The same equations in other units are no numbers as somebody wrote them.
             other = plant.replace(**{name: 0.1 * getattr(plant, name) for name in ("E", "A", "B", "Bd", "Bf")})
-            assert question(other, removed, fault, False).residual_order == truth
+            assert decoupled_fault(other, removed, fault, False).residual_order == truth
 
 
 def mixed_biases(count: int) -> obsynth.DescriptorSystem:
@@ -122,7 +122,7 @@ def test_derivatives_of_exact_constraints_cost_no_order(exactly: bool) -> None:
     ]
     for plant in plants:
         assert least_order(plant, (), 0) == 0
-        assert question(plant, (), 0, exactly).residual_order == 0
+        assert decoupled_fault(plant, (), 0, exactly).residual_order == 0
 
 
 @pytest.mark.parametrize("exactly", [True, False])
@@ -136,8 +136,8 @@ def test_an_equation_of_the_fault_alone_is_a_residual_of_order_zero(exactly: boo
     ]
     for plant in plants:
         assert least_order(plant, (), 0) == 0
-        assert question(plant, (), 0, exactly).residual_order == 0
-        assert question(plant, (), 1, exactly).residual_order is None
+        assert decoupled_fault(plant, (), 0, exactly).residual_order == 0
+        assert decoupled_fault(plant, (), 1, exactly).residual_order is None
 
 
 def test_a_residual_that_sees_two_faults_has_the_larger_of_their_orders() -> None:

@@ -13,7 +13,7 @@ import pytest
 
 import obsynth
 from obsynth.analysis.diagnosis.explanations import state_sensors, with_sensors
-from obsynth.analysis.diagnosis.fault_columns import FaultColumnsQuestion, Removal
+from obsynth.analysis.diagnosis.fault_columns import DecoupledFault, Removal
 from obsynth.analysis.diagnosis.sensor_search import SensorResponses
 from obsynth.specs.loader import load_spec
 
@@ -106,7 +106,7 @@ def test_rank_answers_agree_with_the_decoupled_plant() -> None:
     assert responses is not None
     shown = responses.shows(pairs, 0, (1,))
     for pair, strength in zip(pairs, shown, strict=True):
-        asked = FaultColumnsQuestion(Removal(with_sensors(plant, [sensors[i] for i in pair]), (1,)), 0)
+        asked = DecoupledFault(Removal(with_sensors(plant, [sensors[i] for i in pair]), (1,)), 0)
         assert asked.visible == (strength > 0.0)
 
 
@@ -127,7 +127,7 @@ def test_rank_answers_on_a_network_agree_with_the_decoupled_plant(share: Callabl
     assert not np.any((shown > 0.0) & (shown < 1e-4))
     for number in share(np.random.default_rng(80).choice(len(pairs), 80, replace=False)):
         chosen = with_sensors(bare, [sensors[i] for i in pairs[number]])
-        assert FaultColumnsQuestion(Removal(chosen, ()), 0).visible == (shown[number] > 0.0)
+        assert DecoupledFault(Removal(chosen, ()), 0).visible == (shown[number] > 0.0)
 
 
 def test_no_set_of_the_size_asked_for() -> None:

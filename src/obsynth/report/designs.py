@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from obsynth.analysis.diagnosis.exact_fault_columns import question
+from obsynth.analysis.diagnosis.exact_fault_columns import decoupled_fault
 from obsynth.analysis.diagnosis.fault_columns import dc_point, others
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.automatic import SETTLING_SAMPLES
@@ -339,9 +339,9 @@ def _undetectable(plant: DescriptorSystem, observer: LinearObserver) -> Iterator
     for name in observer.fault_names if plant.nd else ():
         number = plant.fault_names.index(name)
         beside = others(plant, number)
-        asked, among, either = question(plant, (), number), unknown, "either"
+        asked, among, either = decoupled_fault(plant, (), number), unknown, "either"
         if asked.shows_at(rest):
-            if not beside or question(plant, beside, number).shows_at(rest):
+            if not beside or decoupled_fault(plant, beside, number).shows_at(rest):
                 continue
             among = f"{unknown} and {', '.join(plant.fault_names[i] for i in beside)} together"
             either = "any of them"

@@ -12,7 +12,7 @@ import numpy as np
 from annotated_types import Ge
 
 from obsynth.analysis.diagnosis.decoupled import fault_numbers
-from obsynth.analysis.diagnosis.exact_fault_columns import Questions
+from obsynth.analysis.diagnosis.exact_fault_columns import DecoupledFaults
 from obsynth.analysis.diagnosis.explanations import Sensor, state_sensors
 from obsynth.analysis.diagnosis.sensor_search import SensorSearch, Task, reached
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
@@ -22,7 +22,7 @@ from obsynth.numerics.arguments import Count, arguments_checked, is_finite_numbe
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.recovery import Transformation, linear_plant
-from obsynth.studies.threshold_sensors import ThresholdQuestion
+from obsynth.studies.threshold_sensors import ThresholdProblem
 
 #: So many sets are returned at most by default, and so many of them designed for.
 MOST_LISTED_SETS = 24
@@ -293,16 +293,16 @@ def _by_threshold(
     _require_positive(cost, sensors, "cost", whole=False)
     costs = [float(cost.get(sensor.name, 1.0)) for sensor in sensors]
     size = float(below or 0.0)
-    question = ThresholdQuestion(plant, fault, size, sensors, costs, tuple(map(float, times)), test)
+    problem = ThresholdProblem(plant, fault, size, sensors, costs, tuple(map(float, times)), test)
     everything = tuple(range(len(sensors)))
-    if question.best(everything) is None:
+    if problem.best(everything) is None:
         raise PreconditionError(
             f"Not even all {len(sensors)} candidates together suffice for a threshold of {size:g}: the least is "
-            f"{question.least(everything):.4g}. Give other candidates, sample times, or a larger size.",
+            f"{problem.least(everything):.4g}. Give other candidates, sample times, or a larger size.",
             condition="sensors",
             signals=(fault,),
         )
-    found = question.minimal_sets(largest, most)
+    found = problem.minimal_sets(largest, most)
     rows = tuple(
         SensorSet(tuple(sensors[i].name for i in chosen), sum(costs[i] for i in chosen), None, made.threshold,
                   made.samples, made.linear[0].dt)
@@ -388,7 +388,7 @@ def _lost_without(plant: DescriptorSystem, had: Sequence[Task], outputs: Sequenc
     Outputs that may fail together may fail alone: halves are asked about before what is in them."""
     if not had or not outputs:
         return {}
-    asked = Questions(_without(plant, outputs), exactly=False)
+    asked = DecoupledFaults(_without(plant, outputs), exactly=False)
     if len(outputs) == 1:
         lost = (plant.fault_names[task.fault] for task in had if not reached(asked, task))
         return {plant.output_names[outputs[0]]: tuple(dict.fromkeys(lost))}

@@ -19,7 +19,7 @@ MOST_TRIED_SETS = 4096
 
 
 @dataclass(frozen=True, eq=False)
-class ThresholdQuestion:
+class ThresholdProblem:
     """What must be found: a fault whose least threshold is at most ``below``; ``test``: options of the test."""
 
     plant: DescriptorSystem

@@ -1,4 +1,4 @@
-"""A plant without its unknown inputs: what all questions of diagnosis are asked of, and what filters are built on."""
+"""A plant without its unknown inputs: diagnosis decides on it, and filters are built on it."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.diagnosis.exact_fault_columns import Questions, decided_exactly
+from obsynth.analysis.diagnosis.exact_fault_columns import DecoupledFaults, decided_exactly
 from obsynth.analysis.diagnosis.explanations import (
     MOST_STATES_FOR_SENSOR_PAIRS,
     MOST_STATES_FOR_SENSORS,
@@ -20,7 +20,7 @@ from obsynth.analysis.diagnosis.explanations import (
     listed_sets,
     state_sensors,
 )
-from obsynth.analysis.diagnosis.fault_columns import FaultColumnsQuestion, Removal, dc_point, others
+from obsynth.analysis.diagnosis.fault_columns import DecoupledFault, Removal, dc_point, others
 from obsynth.analysis.diagnosis.sensor_search import SensorResponses
 from obsynth.analysis.diagnosis.verdicts import MOST_PATTERN_FAULTS, Diagnosis, FaultDiagnosis, residual_bank
 from obsynth.errors import SpecError
@@ -124,16 +124,16 @@ def diagnose(
     report_stage = progress or (lambda _: None)
     exactly = decided_exactly(plant)
     report_stage("deciding which faults are detectable")
-    asked, candidates = Questions(plant, exactly), _Candidates(plant) if suggest else None
-    shown = [asked.of((), i) for i in range(plant.nf)]
-    free = [asked.of(others(plant, i), i) for i in range(plant.nf)]
+    decoupled, candidates = DecoupledFaults(plant, exactly), _Candidates(plant) if suggest else None
+    shown = [decoupled.of((), i) for i in range(plant.nf)]
+    free = [decoupled.of(others(plant, i), i) for i in range(plant.nf)]
     faults = tuple(
         _verdict(plant, own, alone, frequencies, model_points(model, i), candidates)
         for i, (own, alone) in enumerate(zip(shown, free, strict=True))
     )
     report_stage("deciding which faults can be isolated")
-    weak, strong, pairs = _isolability(plant, shown, asked)
-    bank = residual_bank(asked, whole_bank)
+    weak, strong, pairs = _isolability(plant, shown, decoupled)
+    bank = residual_bank(decoupled, whole_bank)
     part = () if whole_bank or plant.nf <= MOST_PATTERN_FAULTS else (_PART_OF_THE_BANK.format(count=plant.nf),)
     return Diagnosis(
         faults,
@@ -158,8 +158,8 @@ def model_points(model: Exosystem, fault: int) -> list[complex]:
 
 def _verdict(
     plant: DescriptorSystem,
-    shown: FaultColumnsQuestion,
-    free: FaultColumnsQuestion,
+    shown: DecoupledFault,
+    free: DecoupledFault,
     frequencies: Sequence[float],
     modes: Sequence[complex],
     candidates: _Candidates | None,
@@ -185,7 +185,7 @@ def _verdict(
 
 
 def _sentences(
-    plant: DescriptorSystem, shown: FaultColumnsQuestion, free: FaultColumnsQuestion, candidates: _Candidates | None
+    plant: DescriptorSystem, shown: DecoupledFault, free: DecoupledFault, candidates: _Candidates | None
 ) -> list[str]:
     """Return what hides a fault, at which point, and what would help."""
     name, rest = plant.fault_names[shown.number], dc_point(plant.dt)
@@ -259,15 +259,15 @@ class _Candidates:
         return least_additions(self.plant, self.sensors, reached, promising=promising)
 
 
-def _suggestion(candidates: _Candidates, name: str, shown: FaultColumnsQuestion, *, step: bool) -> list[str]:
+def _suggestion(candidates: _Candidates, name: str, shown: DecoupledFault, *, step: bool) -> list[str]:
     """Return which states to measure, computed; and those that would only show the fault."""
     plant, fault = candidates.plant, shown.number
     rest = others(plant, fault)
-    answered: dict[tuple[str, ...], FaultColumnsQuestion] = {}
+    answered: dict[tuple[str, ...], DecoupledFault] = {}
 
-    def free(changed: DescriptorSystem) -> FaultColumnsQuestion:
+    def free(changed: DescriptorSystem) -> DecoupledFault:
         added = changed.output_names[plant.ny :]
-        return answered.setdefault(added, FaultColumnsQuestion(Removal(changed, rest), fault))
+        return answered.setdefault(added, DecoupledFault(Removal(changed, rest), fault))
 
     full = candidates.additions(fault, rest, lambda changed: free(changed).estimable)
     constant = () if step else candidates.additions(fault, rest, lambda changed: free(changed).shows_at_rest)
@@ -277,9 +277,7 @@ def _suggestion(candidates: _Candidates, name: str, shown: FaultColumnsQuestion,
     elif constant:
         texts.append(f"{name}: Measure one of: {listed_sets(constant)} (then a step of it can be estimated).")
     if not shown.visible:
-        showing = candidates.additions(
-            fault, (), lambda changed: FaultColumnsQuestion(Removal(changed, ()), fault).visible
-        )
+        showing = candidates.additions(fault, (), lambda changed: DecoupledFault(Removal(changed, ()), fault).visible)
         more = [names for names in showing if names not in (*full, *constant)]
         if more:
             texts.append(f"{name}: {listed_sets(more)} would make it detectable, but not estimable.")
@@ -291,25 +289,25 @@ def _suggestion(candidates: _Candidates, name: str, shown: FaultColumnsQuestion,
 
 
 def _isolability(
-    plant: DescriptorSystem, shown: Sequence[FaultColumnsQuestion], questions: Questions
-) -> tuple[np.ndarray, np.ndarray, list[FaultColumnsQuestion]]:
+    plant: DescriptorSystem, shown: Sequence[DecoupledFault], faults: DecoupledFaults
+) -> tuple[np.ndarray, np.ndarray, list[DecoupledFault]]:
     weak, strong = np.zeros((2, plant.nf, plant.nf), dtype=bool)
-    asked = {(i, j): questions.of((j,), i) for i in range(plant.nf) for j in others(plant, i)}
+    asked = {(i, j): faults.of((j,), i) for i in range(plant.nf) for j in others(plant, i)}
     for place, pair in {**asked, **{(i, i): own for i, own in enumerate(shown)}}.items():
         weak[place], strong[place] = pair.visible, pair.shows_at_rest
     return read_only(weak, bool), read_only(strong, bool), list(asked.values())
 
 
-def _warnings(plant: DescriptorSystem, asked: Sequence[FaultColumnsQuestion]) -> tuple[str, ...]:
+def _warnings(plant: DescriptorSystem, asked: Sequence[DecoupledFault]) -> tuple[str, ...]:
     texts = []
     if not structure_of(plant).regular:
         texts.append(
             "sE - A is not regular: the equations leave states open or bind the inputs. The verdicts are about all "
             "trajectories that satisfy them."
         )
-    thin = [question for question in asked if not question.clear]
+    thin = [one for one in asked if not one.clear]
     if thin:
-        worst = min(thin, key=lambda question: question.gap)
+        worst = min(thin, key=lambda one: one.gap)
         texts.append(
             f"{plant.fault_names[worst.number]}: the least clear decision has a gap of {worst.gap:.1e} only; orders, "
             "and in the worst case a verdict, may depend on the last digits of the data."

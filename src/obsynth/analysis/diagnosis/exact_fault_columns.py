@@ -1,4 +1,4 @@
-"""The same questions decided exactly, for plants whose numbers are as somebody wrote them.
+"""Detectability of a fault over the rational numbers, for plants whose numbers are as somebody wrote them.
 
 The reduction of `obsynth.analysis.diagnosis.reduction` over the rational numbers: no tolerance, so no gap.
 """
@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 
-from obsynth.analysis.diagnosis.fault_columns import FaultColumnsQuestion, Removal, reduced_values
+from obsynth.analysis.diagnosis.fault_columns import DecoupledFault, Removal, reduced_values
 from obsynth.analysis.diagnosis.residual_orders import exact_residual_order
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.plants.descriptor import DescriptorSystem
@@ -41,8 +41,8 @@ MOST_EXACT_UNKNOWNS = 70
 
 
 @dataclass(frozen=True, eq=False)
-class ExactQuestion(FaultColumnsQuestion):
-    """The same over the rational numbers: no tolerance, so no gap.
+class ExactDecoupledFault(DecoupledFault):
+    """A fault, with others out of sight, over the rational numbers: no tolerance, so no gap.
 
     ``reduced``: on the plant without its unknown inputs; otherwise by the fault polynomial alone, and orders are those
     of floating point.
@@ -150,33 +150,33 @@ def decided_exactly(plant: DescriptorSystem) -> bool:
     return plant.nx + plant.nd + plant.nf <= MOST_EXACT_UNKNOWNS and not any(map(holds_computed, matrices))
 
 
-def question(
+def decoupled_fault(
     plant: DescriptorSystem, removed: Sequence[int], number: int, exactly: bool | None = None
-) -> FaultColumnsQuestion:
-    """Return a question about a fault; exact (unless it is said) where the plant is decided exactly."""
-    return Questions(plant, decided_exactly(plant) if exactly is None else exactly).of(removed, number)
+) -> DecoupledFault:
+    r"""Return a fault with others out of sight; exact \(unless it is said\) where the plant is decided exactly."""
+    return DecoupledFaults(plant, decided_exactly(plant) if exactly is None else exactly).of(removed, number)
 
 
 @dataclass(frozen=True, eq=False)
-class Questions:
-    """Questions about the faults of one plant: what several of them rest on is computed once."""
+class DecoupledFaults:
+    """The faults of one plant: what several of them rest on is computed once."""
 
     source: DescriptorSystem
     exactly: bool
     _removals: dict[tuple[int, ...], Removal] = field(default_factory=dict, repr=False)
     _pencils: dict[tuple[int, ...], ExactPencil] = field(default_factory=dict, repr=False)
-    _asked: dict[tuple[tuple[int, ...], int], FaultColumnsQuestion] = field(default_factory=dict, repr=False)
+    _faults: dict[tuple[tuple[int, ...], int], DecoupledFault] = field(default_factory=dict, repr=False)
 
-    def of(self, removed: Sequence[int], number: int) -> FaultColumnsQuestion:
-        """Return the question about a fault, with others removed."""
+    def of(self, removed: Sequence[int], number: int) -> DecoupledFault:
+        """Return a fault, with others removed."""
         gone = tuple(sorted(removed))
-        if (gone, number) not in self._asked:
+        if (gone, number) not in self._faults:
             if gone not in self._removals:
                 self._removals[gone] = Removal(self.source, gone, self._pencils)
             removal, small = self._removals[gone], self.source.nx + self.source.ny <= MOST_REDUCED
-            exact = ExactQuestion(removal, number, small) if self.exactly else None
-            self._asked[gone, number] = exact or FaultColumnsQuestion(removal, number)
-        return self._asked[gone, number]
+            exact = ExactDecoupledFault(removal, number, small) if self.exactly else None
+            self._faults[gone, number] = exact or DecoupledFault(removal, number)
+        return self._faults[gone, number]
 
 
 def _is_zero(matrix: fmpq_mat) -> bool:

@@ -109,7 +109,7 @@ class Removal:
 
 
 @dataclass(frozen=True, eq=False)
-class FaultColumnsQuestion:
+class DecoupledFault:
     """A fault of a plant, with the faults ``removed`` and every unknown input out of sight, in floating point."""
 
     removal: Removal

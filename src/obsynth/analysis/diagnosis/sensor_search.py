@@ -16,7 +16,7 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.diagnosis.exact_fault_columns import Questions
+from obsynth.analysis.diagnosis.exact_fault_columns import DecoupledFaults
 from obsynth.analysis.diagnosis.explanations import Sensor, with_sensors
 from obsynth.analysis.diagnosis.fault_columns import others
 from obsynth.analysis.diagnosis.without_unknown_inputs import PencilUnits
@@ -152,12 +152,12 @@ class SensorSearch:
         return [task for task in self.tasks(self.plant, self.faults) if reached(self._bare, task)]
 
     @cached_property
-    def _bare(self) -> Questions:
-        return Questions(self.plant, exactly=False)
+    def _bare(self) -> DecoupledFaults:
+        return DecoupledFaults(self.plant, exactly=False)
 
     def reachable(self) -> list[Task]:
         """Return the tasks that all candidates together reach: no set can do more, and no sensor takes one away."""
-        whole, had = Questions(with_sensors(self.plant, self.sensors), exactly=False), set(self.had)
+        whole, had = DecoupledFaults(with_sensors(self.plant, self.sensors), exactly=False), set(self.had)
         return [task for task in self.tasks(self.plant, self.faults) if task in had or reached(whole, task)]
 
     def equipped(self, chosen: Sequence[int]) -> DescriptorSystem:
@@ -183,7 +183,7 @@ class SensorSearch:
         if not chosen:
             return set(wanted) <= set(self.had)
         plant = self.equipped(chosen)
-        asked = Questions(plant, exactly=False)
+        asked = DecoupledFaults(plant, exactly=False)
         if not all(reached(asked, task) for task in wanted):
             return False
         if not self.may_fail:
@@ -244,16 +244,16 @@ class SensorSearch:
     def _score(self, chosen: Sequence[int], wanted: Sequence[Task]) -> float:
         responses = self.responses
         if responses is None:
-            asked = Questions(self.equipped(chosen), exactly=False)
+            asked = DecoupledFaults(self.equipped(chosen), exactly=False)
             return float(sum(reached(asked, task) for task in wanted))
         table = np.array([chosen], dtype=np.int64)
         shown = [float(responses.shows(table, task.fault, task.beside)[0]) for task in wanted]
         return sum(value > 0.0 for value in shown) + min([value for value in shown if value > 0.0], default=0.0) / 2.0
 
 
-def reached(questions: Questions, task: Task) -> bool:
+def reached(faults: DecoupledFaults, task: Task) -> bool:
     """Whether a plant reaches a task, decided by taking out what must not show: once for all faults that stay."""
-    asked = questions.of(task.beside, task.fault)
+    asked = faults.of(task.beside, task.fault)
     if task.goal == "estimate":
         return asked.estimable
     return asked.shows_at_rest if task.goal == "estimate-step" else asked.visible

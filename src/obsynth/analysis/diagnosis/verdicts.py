@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.diagnosis.exact_fault_columns import Questions
+from obsynth.analysis.diagnosis.exact_fault_columns import DecoupledFaults
 from obsynth.files.tables import html_table, text_table
 from obsynth.numerics.arrays import ComplexArray
 
@@ -41,12 +41,12 @@ class StructuredResidual:
     order: int | None
 
 
-def residual_bank(questions: Questions, whole: bool = False) -> tuple[StructuredResidual, ...]:
+def residual_bank(faults: DecoupledFaults, whole: bool = False) -> tuple[StructuredResidual, ...]:
     """Return the structured residuals that exist, those that see least first: all, or those of `_sets`."""
-    found, plant = [], questions.source
+    found, plant = [], faults.source
     for removed in _sets(plant.nf, whole):
         kept = [i for i in range(plant.nf) if i not in removed]
-        asked = [questions.of(removed, i) for i in kept]
+        asked = [faults.of(removed, i) for i in kept]
         if not all(one.visible for one in asked):
             continue
         orders = [one.residual_order for one in asked]

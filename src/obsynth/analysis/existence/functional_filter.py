@@ -10,9 +10,9 @@ import numpy as np
 
 from obsynth.analysis.diagnosis.decoupled import fault_numbers
 from obsynth.analysis.diagnosis.diagnosing import model_points
-from obsynth.analysis.diagnosis.exact_fault_columns import question
+from obsynth.analysis.diagnosis.exact_fault_columns import decoupled_fault
 from obsynth.analysis.diagnosis.explanations import hidden_motion
-from obsynth.analysis.diagnosis.fault_columns import FaultColumnsQuestion, dc_point
+from obsynth.analysis.diagnosis.fault_columns import DecoupledFault, dc_point
 from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
 from obsynth.analysis.existence.distance import ROUNDING_LEVEL
 from obsynth.analysis.existence.named_pencils import NamedPencil
@@ -60,7 +60,7 @@ def _fault_conditions(
 ) -> tuple[Condition, ...]:
     """Return whether one fault, whose model has these poles, can be estimated, free of others and unknown inputs."""
     name = plant.fault_names[fault]
-    asked = question(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
+    asked = decoupled_fault(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
     seen = _visibility(plant, asked, f"{name} detectable", _rest(plant, fault))
     if not asked.visible:
         return (seen,)
@@ -86,7 +86,7 @@ def _fault_conditions(
     return seen, _in_doubt(kept, plant, asked, least) if at_rounding_level else kept
 
 
-def _may_show(asked: FaultColumnsQuestion, point: complex | None = None) -> bool:
+def _may_show(asked: DecoupledFault, point: complex | None = None) -> bool:
     """Whether a fault that floating point does not see shows on paper (at a point), or may for all that can be
     isolated."""
     if asked.exactly:
@@ -96,17 +96,17 @@ def _may_show(asked: FaultColumnsQuestion, point: complex | None = None) -> bool
     plant = asked.source
     if plant.nx + plant.nd + plant.nf > COMPUTED_STATES or plant.exact is not None:
         return False
-    exact = question(plant, asked.removed, asked.number, True)
+    exact = decoupled_fault(plant, asked.removed, asked.number, True)
     return exact.visible if point is None else exact.shows_at(point)
 
 
-def _named(plant: DescriptorSystem, asked: FaultColumnsQuestion) -> NamedPencil:
+def _named(plant: DescriptorSystem, asked: DecoupledFault) -> NamedPencil:
     """Return what the fault must not be a combination of, and the fault itself in the last column."""
     kept = {name: [*asked.removed, asked.number] for name in ("Bf", "Df")}
     return Evaluator(plant).named(FullRank([["A", "Bd", "Bf"], ["C", "Dd", "Df"]], kept))
 
 
-def _in_doubt(condition: Condition, plant: DescriptorSystem, asked: FaultColumnsQuestion, point: complex) -> Condition:
+def _in_doubt(condition: Condition, plant: DescriptorSystem, asked: DecoupledFault, point: complex) -> Condition:
     """Return the condition as one that rounding of the data could change."""
     named, name = _named(plant, asked), plant.fault_names[asked.number]
     share = named.last_share(point)
@@ -121,7 +121,7 @@ def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int], exactly: 
     removed = [j for j in range(plant.nf) if j not in seen]
     found = []
     for fault in seen:
-        asked = question(plant, removed, fault, exactly)
+        asked = decoupled_fault(plant, removed, fault, exactly)
         blind = [*plant.disturbance_names, *(plant.fault_names[j] for j in removed)]
         without = f" without {', '.join(plant.fault_names[j] for j in removed)}" if removed else ""
         name = f"{plant.fault_names[fault]} detectable{without}"
@@ -129,7 +129,7 @@ def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int], exactly: 
     return found
 
 
-def _visibility(plant: DescriptorSystem, asked: FaultColumnsQuestion, name: str, rest: str) -> Condition:
+def _visibility(plant: DescriptorSystem, asked: DecoupledFault, name: str, rest: str) -> Condition:
     """Return the condition of this name that a fault shows, decoupled from the rest."""
     fault, point = plant.fault_names[asked.number], dc_point(plant.dt)
     found = Condition(
@@ -150,11 +150,11 @@ def _rest(plant: DescriptorSystem, fault: int) -> str:
     return ", ".join(names) or "the initial state"
 
 
-def _gap(asked: FaultColumnsQuestion) -> str:
+def _gap(asked: DecoupledFault) -> str:
     return "decided exactly" if np.isinf(asked.gap) else f"gap {asked.gap:.1e}"
 
 
-def _hidden(plant: DescriptorSystem, asked: FaultColumnsQuestion, point: complex) -> str:
+def _hidden(plant: DescriptorSystem, asked: DecoupledFault, point: complex) -> str:
     motion = hidden_motion(plant, asked.number, point, asked.removed)
     if motion is None:
         return "no output responds to it."
