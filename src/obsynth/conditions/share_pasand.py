@@ -37,6 +37,7 @@ from obsynth.conditions.augmented_plant import (
     with_faults,
 )
 from obsynth.conditions.problem import Conditions, Values, design_of, require_data
+from obsynth.conditions.share_pasand_over_region import share_pasand_over_region
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, as_matrix
@@ -46,6 +47,7 @@ from obsynth.numerics.matrix_equations import continuous_solution, discrete_solu
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.recovery import Transformation, linear_plant
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.results.design import ObserverDesign
@@ -59,7 +61,7 @@ _REAL_RATES, _REAL_NUMBERS = -np.logspace(-6, 9, 151), np.linspace(-1.0, 1.0, 40
 
 @arguments_checked
 def sharepasand(
-    plant: DescriptorSystem | Transformation,
+    plant: DescriptorSystem | Transformation | PolytopicSystem,
     *,
     fault_model: Any = "step",
     region: LMIRegion | None = None,
@@ -73,8 +75,10 @@ def sharepasand(
 
     Parameters
     ----------
-    plant : DescriptorSystem or Transformation
-        ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; na = nx + nw below.
+    plant : DescriptorSystem, Transformation or PolytopicSystem
+        ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; na = nx + nw below.  For a PolytopicSystem
+        the inequalities are those at every vertex, in one P and a Y for each, for the least gain from what drives
+        states, fault models and outputs to the errors, in units of the plant's own; gains ``K_a[1]``, ...
     fault_model : optional
         As for `obsynth.ui_pi_observer`.
     region : LMIRegion, optional
@@ -117,6 +121,12 @@ def sharepasand(
     >>> paper.problem.status
     'optimal'
     """
+    if isinstance(plant, PolytopicSystem):
+        given = {"region": region, "poles": poles, "E_sharp": E_sharp, "C_sharp": C_sharp, "G": G}
+        for name, value in given.items():
+            if value is not None:
+                raise SpecError(f"Over a region there is no {name}: leave it out.", path=name)
+        return share_pasand_over_region(plant, fault_model=fault_model, margin=margin)
     if poles is not None and region is not None:
         raise SpecError("poles and region are given: use one of them.", path="poles")
     own = linear_plant(plant).dense()

@@ -247,6 +247,12 @@ def _write_scheduled(
         raise SpecError(
             f"A design over a region is exported as C (.c): {suffix} files hold constant matrices.", path="path"
         )
+    if design.scheduled[1].dt == 0.0:
+        raise SpecError(
+            "The observer over a region is continuous in time, and solves linear equations at each row: it runs on "
+            "logs (obsynth.run_on_data), and C is written of those for plants in discrete time (dt).",
+            path="path",
+        )
     if monitor is not None or thresholds or warm_up is not None or sample_time is not None or numbers != "double":
         raise SpecError(
             "C of a design over a region holds the observer alone, in doubles: leave monitor, thresholds, warm-up, "

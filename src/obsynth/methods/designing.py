@@ -121,11 +121,20 @@ def design(
 
         report_stage("designing by every method that exists")
         if kind_of(own) == "polytopic":
-            return made(own, methods_for("polytopic")[0], options, advise=True)
+            return made(own, _for_region(own, options), options, advise=True)
         with failed_computations(), one_thread_if_small(own.nx):
             own, recovery, _ = _with_arrays(own, recovery, report_stage)
             return automatic_design(own, options, made, partial(made, advise=True))
     return made(own, method, options, advise=True)
+
+
+def _for_region(plant: Plant, options: Mapping[str, Any]) -> str:
+    """Return the first method that exists over the region of a polytopic plant with these options."""
+    taking = [method for method in methods_for("polytopic") if set(options) <= set(field_types(method_class(method)))]
+    for method in taking:
+        if all(condition.holds for condition in method_class(method).of(options).existence(plant)):
+            return method
+    return (taking or list(methods_for("polytopic")))[0]
 
 
 def _designed(

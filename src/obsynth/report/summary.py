@@ -229,6 +229,8 @@ def _dynamics(design: ObserverDesign) -> str:
         return f"{settling}; observer of order {design.observer.order}"
     if isinstance(design.observer, ScheduledObserver):
         decay = design.certificate.claims.get("region_decay", math.nan)
+        if design.observer.dt == 0.0:
+            return f"errors decay by {number(decay)} 1/s at least; observer of order {design.observer.order}"
         return (
             f"errors shrink to {number(100.0 * decay)} % a sample at least; observer of order {design.observer.order}"
         )

@@ -14,7 +14,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.scheduled.observer import ScheduledObserver
+from obsynth.observers.scheduled.observer import FORGOTTEN_SHARE, ScheduledObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.scheduling import Scheduling
@@ -27,16 +27,20 @@ from obsynth.verification.identities import equality, tracking_identities, worst
 
 #: Names of the rows.
 GAIN_ROW, DECAY_ROW, DECOUPLING_ROW = "LMI", "decay over the region", "fault decoupled for every scheduling"
+REGION_GAIN_ROW = "gain over the region"
 #: Lyapunov matrices and slacks of a certificate over a region, each ``(1 or N, n, n)``.
 WITNESSES = ("P_region", "G_region")
+#: The same of a gain, where it has its own.
+GAIN_WITNESSES = ("P_gain", "G_gain")
 #: The courses that are tried for the row that informs: a search of a tenth of a second.
 SWITCHING_HORIZON, SWITCHING_STARTS = 16, 1
 #: With more vertices or errors only courses that stay at a vertex are tried.
 MOST_SWITCHED = 8
-#: How much of an error is left when a row counts as claimed again.
-FORGOTTEN_SHARE = 0.01
 #: Rows without a claim are not counted further.
 MOST_UNCLAIMED_ROWS = 100_000
+MOST_UNCLAIMED_SECONDS = 1e9
+#: What a logarithm and a quotient may be rounded by.
+_ROUNDING = 4.0 * float(np.finfo(np.float64).eps)
 
 
 def courses(scheduling: Scheduling, steps: float | None) -> str:
@@ -109,14 +113,25 @@ def fault_error_vertices(
     return [vertex_of(plant, observer) for plant, observer in zip(plants, observers, strict=True)]
 
 
-def witness_of_certificate(matrices: Mapping[str, FloatArray], pairs: Sequence[Pair] | None) -> Witness | None:
-    """Return the Lyapunov matrices in a certificate, those of `WITNESSES`; ``None`` without any."""
-    P, G = (matrices.get(name) for name in WITNESSES)
+def witness_of_certificate(
+    matrices: Mapping[str, FloatArray], pairs: Sequence[Pair] | None, names: tuple[str, str] = WITNESSES
+) -> Witness | None:
+    """Return the Lyapunov matrices in a certificate, by their names; ``None`` without any."""
+    P, G = (matrices.get(name) for name in names)
     if P is None or any(each is not None and (each.ndim != 3 or each.shape[1:] != P.shape[1:]) for each in (P, G)):
         return None
     if not len(P) or P.shape[1] != P.shape[2]:
         return None
     return Witness(list(P), None if G is None else list(G), None if G is None else pairs)
+
+
+def region_gain_row(
+    name: str, claim: str, vertices: Sequence[Vertex], witness: Witness | None, level: float, *, discrete: bool
+) -> Check:
+    """Return the row that a gain over the region is below ``level``, with words of its own."""
+    sound = witness is not None and np.isfinite(level) and level > 0.0
+    proof = prove_gain(vertices, witness, level, discrete=discrete) if sound and witness else _no_certificate()
+    return _proof_row(name, claim, level, proof)
 
 
 def gain_row(
@@ -225,3 +240,25 @@ def rows_to_forget(decay: float) -> int:
         return 1 if decay == 0.0 else MOST_UNCLAIMED_ROWS
     count = np.log(FORGOTTEN_SHARE) / np.log(decay)
     return 1 + int(min(np.ceil(count), MOST_UNCLAIMED_ROWS))
+
+
+def seconds_to_forget(rate: float) -> float:
+    """Return after how many seconds a hundredth of an error is left at most, for a decay in 1/s."""
+    return float(-np.log(FORGOTTEN_SHARE) / rate) * (1.0 + _ROUNDING) if rate > 0.0 else float(MOST_UNCLAIMED_SECONDS)
+
+
+def forgetting_of(decay: float, *, discrete: bool) -> float:
+    """Return for how long nothing is claimed after a row outside the region: rows, or seconds."""
+    return rows_to_forget(decay) if discrete else seconds_to_forget(decay)
+
+
+def forgetting_row(decay: float, forgetting: float, *, discrete: bool) -> Check:
+    """Return the row that an observer waits long enough after a row outside the region."""
+    return upper_bound_check(
+        "rows without a claim",
+        "after a row outside the region nothing is claimed until a hundredth of its error is left"
+        + ("" if discrete else " (seconds)"),
+        float(rows_to_forget(decay) if discrete else seconds_to_forget(decay) * (1.0 - _ROUNDING)),
+        float(forgetting),
+        source="decay over the region",
+    )

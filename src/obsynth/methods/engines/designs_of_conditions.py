@@ -34,6 +34,7 @@ def design_of(source: str, plant: Any, *given: Any) -> ObserverDesign:
         "sharepasand": _sharepasand,
         "kalman": _kalman,
         "wang over region": _wang_over_region,
+        "sharepasand over region": _sharepasand_over_region,
     }
     return makers[source](plant, *given)
 
@@ -62,6 +63,17 @@ def _wang_over_region(plant: PolytopicSystem, gains: dict[str, FloatArray], name
 
     made = synthesis_of_gains(plant, [gains[f"R[{i + 1}]"] for i in range(plant.count)])
     draft = draft_of(plant, "fault-estimation-filter", made, name=name)
+    return draft.replace(report=verify(draft))
+
+
+def _sharepasand_over_region(
+    plant: PolytopicSystem, fault_model: Any, gains: dict[str, FloatArray], name: str
+) -> ObserverDesign:
+    """Return the scheduled observer of gains, with what can be proved for them."""
+    from obsynth.methods.ui_pi_observer.over_region import synthesis_of_gains
+
+    made = synthesis_of_gains(plant, [gains[f"K_a[{i + 1}]"] for i in range(plant.count)], fault_model)
+    draft = draft_of(plant, "ui-pi-observer", made, name=name)
     return draft.replace(report=verify(draft))
 
 

@@ -26,8 +26,8 @@ from obsynth.verification.over_region import (
     courses,
     decay_row,
     fault_error_vertices,
+    forgetting_row,
     gain_row,
-    rows_to_forget,
     same_scheduling_row,
     switching_row,
     tracking_rows,
@@ -150,13 +150,7 @@ def _proved_rows(
             )
     decay = claimed(claims, "region_decay")
     yield decay_row(vertices, witness, decay, discrete=True, words=words)
-    yield upper_bound_check(
-        "rows without a claim",
-        "after a row outside the region nothing is claimed until a hundredth of its error is left",
-        float(rows_to_forget(decay)),
-        float(observer.forgetting),
-        source="decay over the region",
-    )
+    yield forgetting_row(decay, observer.forgetting, discrete=True)
 
 
 def _effectiveness(plant: PolytopicSystem, observer: ScheduledObserver) -> tuple[Check, float]:

@@ -16,9 +16,11 @@ from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, problem
 from obsynth.numerics.spectra import decay_rates
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import STATED_BY_SEARCH
 from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.over_region import DECAY_ROW, GAIN_WITNESSES, REGION_GAIN_ROW, WITNESSES
 
 if TYPE_CHECKING:
     from obsynth.methods.engines.region import Region
@@ -39,9 +41,11 @@ class UiPiObserver(Method):
 
     Parameters
     ----------
-    plant : DescriptorSystem or Transformation
+    plant : DescriptorSystem, PolytopicSystem or Transformation
         Either time, ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``, ``Df, Dd, D`` allowed; it need
-        be neither regular nor of index 1.
+        be neither regular nor of index 1.  Over the region of a PolytopicSystem a scheduled observer is designed, with
+        proofs for every course of the parameters: outputs constant, faults and unknown inputs as they like; options
+        fault_model, decay, noise, solver and solver_options.
     fault_model : str, mapping or FaultModel, optional
         How faults run: ``"step"``, ``"ramp"``, ``"parabola"``, ``{"polynomial": order}``, ``{"sinusoid": rad/s}``,
         ``{"exponential": 1/s}``, ``{"Phi": ..., "Cw": ...}``, ``{"sum": [...]}``; one for all, or by fault name.
@@ -117,7 +121,7 @@ class UiPiObserver(Method):
     """
 
     id: ClassVar[str] = "ui-pi-observer"
-    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant",)
+    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant", "polytopic")
     time: ClassVar[str] = "both"
     summary: ClassVar[str] = "estimates of the state and the faults, decoupled from every unknown input"
     source: ClassVar[str] = "Share Pasand, Aliyari, Taghirad"
@@ -135,8 +139,16 @@ class UiPiObserver(Method):
             "stable with the claimed digits",
         ),
         "condition": ClaimMeaning("", "condition number of the (generalised) eigenvectors", STATED_BY_SEARCH),
+        "region_decay": ClaimMeaning(
+            "", "decay of the errors over a region: a factor a sample, or a rate in 1/s", DECAY_ROW
+        ),
+        "region_gain": ClaimMeaning(
+            "", "l2 gain over a region from what drives the fault models to the fault errors", REGION_GAIN_ROW
+        ),
     }
-    witnesses: ClassVar[frozenset[str]] = frozenset({"tracking", "Phi", "Cw", "poles", "stability"})
+    witnesses: ClassVar[frozenset[str]] = frozenset(
+        {"tracking", "Phi", "Cw", "poles", "stability", *WITNESSES, *GAIN_WITNESSES}
+    )
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults", "state despite unknown inputs"})
 
     fault_model: Annotated[Any, WrittenAs("fault model")] = "step"
@@ -244,11 +256,15 @@ class UiPiObserver(Method):
             "poles": None if listed is None else [[pole.real, pole.imag] for pole in listed],
         }
 
-    def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
+    def existence(self, plant: DescriptorSystem | PolytopicSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, decided exactly or in floating point; several may fail."""
         from obsynth.analysis.existence.sharepasand import existence
+        from obsynth.analysis.existence.sharepasand_over_region import pi_conditions_over_region
 
-        return existence(plant, exosystem(self.fault_model, plant.fault_names, plant.dt), exactly=exactly).conditions
+        model = exosystem(self.fault_model, plant.fault_names, plant.dt)
+        if isinstance(plant, PolytopicSystem):
+            return pi_conditions_over_region(plant, model, exactly=exactly)
+        return existence(plant, model, exactly=exactly).conditions
 
     @classmethod
     def from_gains(  # type: ignore[override]
@@ -262,6 +278,8 @@ class UiPiObserver(Method):
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel | None:
         """Return the plant with the fault model, decoupled from the disturbances; ``None`` without a tracking map."""
+        if isinstance(design.plant, PolytopicSystem):
+            return None  # one for each vertex: its checks have them
         (plant, observer), matrices = design.linear, design.certificate.matrices
         if "tracking" not in matrices:
             return None

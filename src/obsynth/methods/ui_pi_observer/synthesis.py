@@ -33,6 +33,7 @@ from obsynth.numerics.ranks import NEGLIGIBLE_MODE
 from obsynth.numerics.spectra import decay_rates
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import exosystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.redundant_outputs import merged_outputs
 
 #: A default this many times slower than the plant itself is worth a note.
@@ -84,8 +85,14 @@ def notes(
         )
 
 
-def synthesise(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callable[[str], None]) -> Synthesis:
+def synthesise(
+    plant: DescriptorSystem | PolytopicSystem, asked: UiPiObserver, *, progress: Callable[[str], None]
+) -> Synthesis:
     """Design the observer; see `obsynth.ui_pi_observer` for the options, results and errors."""
+    if isinstance(plant, PolytopicSystem):
+        from obsynth.methods.ui_pi_observer.over_region import synthesise_over_region
+
+        return synthesise_over_region(plant, asked, progress=progress)
     solver = chosen_solver(asked.solver, asked.solver_options)
     if own_terms(asked):
         from obsynth.methods.engines.own_terms import ui_pi_by_inequality

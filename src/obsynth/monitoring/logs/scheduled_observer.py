@@ -24,7 +24,7 @@ class ScheduledLogObserver(LogObserver):
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None) -> None:
         plant, observer = design.scheduled
-        super().__init__(observer, warm_up, observer.forgetting * observer.dt)
+        super().__init__(observer, warm_up, observer.forgetting * (observer.dt or 1.0))
         self.observer, self.columns = observer, observer.row_names
         self.input_names, self.output_names = observer.input_names, observer.output_names
         self.point, self.scales, self.input_delay = plant.operating_point, plant.scales, design.input_delay
@@ -41,16 +41,16 @@ class ScheduledLogObserver(LogObserver):
         if not self.begun and not whole:
             return Row(GAP, np.full(len(self.columns), np.nan), missing)
         if missing or not self.begun:
-            self.state, self.begun = self.observer.init(), True
+            self.state, self.begun, seconds = self.observer.init(), True, 0.0
             self.settled_at, self.phase = self._after(time, self.warm_up), WARM_UP
         taken = np.where(known, values, self.held)
         taken[parameters] = np.where(known[parameters], values[parameters], np.nan)
         self.held = np.where(needed, taken, 0.0)
         with np.errstate(over="ignore", invalid="ignore"):
-            self.state, row = self.observer.advance(self.state, taken[nu:], taken[:nu])
+            self.state, row = self.observer.advance(self.state, taken[nu:], taken[:nu], seconds)
         if not whole:
             # Warm-up goes on where it had not ended: nothing was known before.
-            settled = self._after(time, self.observer.forgetting * self.dt)
+            settled = self._after(time, self.observer.forgetting * (self.dt or 1.0))
             self.phase = self.phase if self.phase == WARM_UP else RECOVERING
             self.settled_at = max(self.settled_at, settled)
         status = self._status(time, whole=whole)

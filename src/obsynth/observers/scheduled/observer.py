@@ -8,6 +8,15 @@ with the weights of the sample itself, but for the effectiveness :math:`\Delta` 
 a sample belongs to the parameters of the sample before.  Scheduling parameters are read after the known inputs.  A
 missing one keeps its last value, one outside its range is moved to the nearest end; from then on, until the error has
 decayed again, a row is marked: nothing is claimed there.
+
+In continuous time (``dt = 0``) the matrices are those of z', and a row that comes h seconds after the one before is
+taken by a step of implicit Euler, with the weights at its end:
+
+.. math::
+    z_k = (I - h A_z(\mu_k))^{-1} (z_{k-1} + h B_u(\mu_k) u_k + h B_y(\mu_k) y_k)
+
+Errors that obey :math:`e' = A_z(\mu) e` and decay like :math:`e^{-a t}` in the norm of a matrix P for every course then
+shrink in the same norm by :math:`(1 + 2 a h)^{-1/2}`, however long the step is.
 """
 
 from __future__ import annotations
@@ -32,6 +41,8 @@ from obsynth.plants.scheduling import RATE_TOLERANCE, Scheduling
 #: The matrices that have a value at each vertex; of the others there is one.
 SCHEDULED = ("Az", "Bu", "By")
 FIXED = ("Cz", "Du", "Dy")
+#: How much of an error is left when a row counts as claimed again.
+FORGOTTEN_SHARE = 0.01
 
 
 class ScheduledState(NamedTuple):
@@ -40,12 +51,12 @@ class ScheduledState(NamedTuple):
     z: FloatArray  # ``(nz,)``, before the next sample
     weights: FloatArray  # ``(N,)``, of the sample before
     parameters: FloatArray  # ``(p,)``, of the sample before, within their ranges; NaN before the first
-    unclaimed: int  # rows for which nothing is claimed yet
+    unclaimed: float  # rows (continuous time: seconds) for which nothing is claimed yet
 
 
 @dataclass(frozen=True, eq=False)
 class ScheduledObserver(Observer[ScheduledState, FloatArray]):
-    """An observer in discrete time whose matrices change with measured parameters.
+    """An observer whose matrices change with measured parameters.
 
     Parameters
     ----------
@@ -57,10 +68,11 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
         ``(N, nf, nf)``: what the fault rows are divided by, with the weights of the sample before.
     scheduling : Scheduling
         Parameters, ranges, and the weights that follow from them.
-    forgetting : int
-        Rows for which nothing is claimed after a parameter was missing or outside its range.
+    forgetting : int or float
+        For how long nothing is claimed after a parameter was missing or outside its range: rows, or in continuous time
+        seconds.
     dt : float
-        Seconds between samples.
+        Seconds between samples; 0 in continuous time.
     input_names : tuple of str
         Known inputs, then scheduling parameters (the columns that hold them).
     output_names, state_names, fault_names, residual_names : tuple of str
@@ -82,7 +94,7 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
     Dy: FloatArray
     effectiveness: FloatArray
     scheduling: Scheduling
-    forgetting: int
+    forgetting: float
     dt: float
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
@@ -115,10 +127,16 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
             if matrix.shape != shape or not np.isfinite(matrix).all():
                 raise SpecError(f"{name} of the observer is {matrix.shape}, finite {shape} is needed.", path=name)
             object.__setattr__(self, name, read_only(matrix))
-        if not (is_finite_number(self.dt) and self.dt > 0.0):
-            raise SpecError(f"dt of a scheduled observer is {shown(self.dt)}: give positive seconds.", path="dt")
-        if not is_whole(self.forgetting) or self.forgetting < 0:
-            raise SpecError("forgetting must be a whole number of rows, 0 or more.", path="forgetting")
+        if not (is_finite_number(self.dt) and self.dt >= 0.0):
+            raise SpecError(
+                f"dt of a scheduled observer is {shown(self.dt)}: give positive seconds, or 0 for continuous time.",
+                path="dt",
+            )
+        counted = is_whole(self.forgetting) if self.dt > 0.0 else is_finite_number(self.forgetting)
+        if not counted or self.forgetting < 0:
+            raise SpecError("forgetting must be a whole number of rows (or seconds), 0 or more.", path="forgetting")
+        if self.dt == 0.0 and not self.effectiveness_is_one:
+            raise SpecError("effectiveness is for discrete time: leave it one.", path="effectiveness")
         for names, delays in ((self.state_names, self.state_delays), (self.fault_names, self.fault_delays)):
             if len(names) != len(delays) or not all(is_whole(delay) and delay >= 0 for delay in delays):
                 raise SpecError("The observer needs one delay >= 0, in samples, for each signal.", path="delays")
@@ -234,7 +252,9 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
         rates = [np.inf if rate is None else rate for rate in self.scheduling.rates]
         return np.array(rates) * self.dt * (1.0 + RATE_TOLERANCE)
 
-    def advance(self, state: ScheduledState, y: FloatArray, u: FloatArray) -> tuple[ScheduledState, FloatArray]:
+    def advance(
+        self, state: ScheduledState, y: FloatArray, u: FloatArray, seconds: float = 0.0
+    ) -> tuple[ScheduledState, FloatArray]:
         """Return the next state and the row ``[xhat, fhat, r]``, without checking the sample.
 
         Parameters
@@ -243,7 +263,11 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
             Before the sample.
         y, u : FloatArray
             ``(ny,)`` and ``(nu + p,)``: known inputs, then parameters, of which NaN is a missing one.
+        seconds : float, optional
+            In continuous time how long ago the sample before was; 0 for the first.
         """
+        if self.dt == 0.0:
+            return self._moved(state, y, u, seconds)
         inputs, given = u[: self.inputs], u[self.inputs :]
         before = np.where(np.isnan(state.parameters), self.middle, state.parameters)
         parameters = np.where(np.isnan(given), before, self.scheduling.nearest(given))
@@ -262,7 +286,35 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
         unclaimed = max(state.unclaimed - 1, 0) if inside else self.forgetting
         return ScheduledState(after, weights, parameters, unclaimed), row
 
-    def step(self, state: ScheduledState, y: ArrayLike, u: ArrayLike = ()) -> tuple[ScheduledState, Estimates]:
+    def _moved(
+        self, state: ScheduledState, y: FloatArray, u: FloatArray, seconds: float
+    ) -> tuple[ScheduledState, FloatArray]:
+        """Return the state after a step of implicit Euler in continuous time, and the row at its end."""
+        inputs, given = u[: self.inputs], u[self.inputs :]
+        before = np.where(np.isnan(state.parameters), self.middle, state.parameters)
+        parameters = np.where(np.isnan(given), before, self.scheduling.nearest(given))
+        weights = self.scheduling.weights(parameters)
+        Az, Bu, By = (np.tensordot(weights, matrix, 1) for matrix in (self.Az, self.Bu, self.By))
+        driven = state.z + seconds * (Bu @ inputs + By @ y)
+        z = np.asarray(np.linalg.solve(np.eye(self.order) - seconds * Az, driven)) if seconds > 0.0 else state.z
+        row = self.Cz @ z + self.Du @ inputs + self.Dy @ y
+        rates = np.array([np.inf if rate is None else rate for rate in self.scheduling.rates])
+        far = rates * (seconds if seconds > 0.0 else np.inf) * (1.0 + RATE_TOLERANCE)
+        slow = not bool((np.abs(given - state.parameters) > far).any())
+        inside = slow and self.scheduling.is_inside(given)
+        left = max(state.unclaimed - self._forgotten(seconds), 0.0) if inside else self.forgetting
+        return ScheduledState(z, weights, parameters, left), row
+
+    def _forgotten(self, seconds: float) -> float:
+        """Return the seconds of the exact observer in which an error shrinks as it does in one step of these."""
+        if self.forgetting == 0.0:
+            return 0.0
+        rate = -np.log(FORGOTTEN_SHARE) / self.forgetting
+        return float(0.5 * np.log1p(2.0 * rate * seconds) / rate)
+
+    def step(
+        self, state: ScheduledState, y: ArrayLike, u: ArrayLike = (), *, seconds: float | None = None
+    ) -> tuple[ScheduledState, Estimates]:
         """Return the state after a sample, and the estimates at it.
 
         Parameters
@@ -273,22 +325,38 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
             Outputs ``(ny,)``.
         u : array_like
             Known inputs, then scheduling parameters, ``(nu + p,)``; NaN marks a missing parameter.
+        seconds : float, optional
+            In continuous time how long ago the sample before was; 0 for the first.
 
         Raises
         ------
         SpecError
-            A sample has the wrong length, or something but a parameter is not finite.
+            A sample has the wrong length, or something but a parameter is not finite; in continuous time ``seconds``
+            are missing, in discrete time they are given.
         """
+        elapsed = self._elapsed(seconds, "seconds")
         require_kind(state, ScheduledState, "state", "what init() or the step before returned")
         outputs = checked_sample(y, len(self.output_names), "y")
         known = np.asarray(u, dtype=np.float64).ravel()
         if known.shape != (len(self.input_names),):
             raise SpecError(f"u needs {len(self.input_names)} numbers: {', '.join(self.input_names)}.", path="u")
         checked_sample(known[: self.inputs], self.inputs, "u")
-        after, row = self.advance(state, outputs, known)
+        after, row = self.advance(state, outputs, known, elapsed)
         return after, self.split(row[None, :])
 
-    def run(self, y: ArrayLike, u: ArrayLike) -> Estimates:
+    def _elapsed(self, seconds: float | None, name: str) -> float:
+        """Return the seconds between samples of a continuous observer, checked; 0 for the others."""
+        if self.dt > 0.0:
+            if seconds is not None:
+                raise SpecError(f"{name} is for continuous time: this observer has dt {self.dt:g} s.", path=name)
+            return 0.0
+        if seconds is None:
+            raise SpecError(f"The observer is continuous in time: give {name}, between its samples.", path=name)
+        if not (is_finite_number(seconds) and seconds >= 0.0):
+            raise SpecError(f"{name} is {shown(seconds)}: give a finite number, 0 or more.", path=name)
+        return float(seconds)
+
+    def run(self, y: ArrayLike, u: ArrayLike, *, sample_time: float | None = None) -> Estimates:
         """Run over a whole record.
 
         Parameters
@@ -297,23 +365,30 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
             Outputs ``(samples, ny)``.
         u : array_like
             Known inputs, then scheduling parameters, ``(samples, nu + p)``.
+        sample_time : float, optional
+            Seconds between samples of a continuous observer.
 
         Raises
         ------
         SpecError
-            Shapes do not fit, or a number is not finite.
+            Shapes do not fit, or a number is not finite; in continuous time ``sample_time`` is missing.
         """
-        rows, _ = self.record(y, u)
+        rows, _ = self.record(y, u, sample_time=sample_time)
         return self.split(rows)
 
-    def record(self, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, NDArray[np.bool_]]:
+    def record(
+        self, y: ArrayLike, u: ArrayLike, *, sample_time: float | None = None
+    ) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Return the rows of a record ``(samples, nx + nf + nr)``, and at which of them something is claimed.
 
         Parameters
         ----------
         y, u : array_like
             As for `run`; NaN marks a missing parameter.
+        sample_time : float, optional
+            As for `run`.
         """
+        elapsed = self._elapsed(sample_time, "sample_time")
         known = np.asarray(u, dtype=np.float64)
         filled = np.where(np.isnan(known), 0.0, known) if known.ndim == 2 else known
         if known.ndim == 2 and known.shape[1] == len(self.input_names):
@@ -322,7 +397,7 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
         state = self.init()
         rows, claimed = np.empty((len(outputs), len(self.Cz))), np.empty(len(outputs), dtype=bool)
         for k, (y_k, u_k) in enumerate(zip(outputs, known, strict=True)):
-            state, rows[k] = self.advance(state, y_k, u_k)
+            state, rows[k] = self.advance(state, y_k, u_k, elapsed if k else 0.0)
             claimed[k] = not state.unclaimed
         return rows, claimed
 

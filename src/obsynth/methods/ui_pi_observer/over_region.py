@@ -1,0 +1,228 @@
+"""The unknown-input PI observer over the region of a polytopic plant: gains at the vertices, proofs for every course.
+
+Gains by the inequalities at the vertices (`obsynth.conditions.sharepasand`), for a small gain from what drives the
+fault models, the states and the noise to the errors; then what is claimed of the shipped numbers, each with a Lyapunov
+matrix of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.existence.sharepasand_over_region import pi_conditions_over_region
+from obsynth.conditions.augmented_plant import combinations_seen, realise
+from obsynth.conditions.lmi import chosen_solver
+from obsynth.conditions.share_pasand_over_region import PiOverRegion, checked_free_gains, pi_over_region
+from obsynth.errors import SpecError
+from obsynth.methods.engines.vertex_certificates import VertexCertificate, certified, proved_decay
+from obsynth.methods.method import Synthesis
+from obsynth.methods.refusals import require_all_conditions
+from obsynth.methods.ui_pi_observer.method import UiPiObserver
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver
+from obsynth.plants.faults import Exosystem, exosystem
+from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.proofs.vertex_inequalities import Witness
+from obsynth.results.design import Certificate
+from obsynth.verification.error_polytope import ErrorPolytope
+from obsynth.verification.over_region import GAIN_WITNESSES, WITNESSES, forgetting_of
+
+#: Options of the observer of a constant plant that the one over a region does not have.
+NOT_OVER_REGION = ("poles", "region", "joint", "E_sharp", "C_sharp", "G", "constraints")
+#: Distance to the least gain, which buys small gains: the bare optimum is badly conditioned.
+DESIGN_MARGIN = 0.1
+#: The same where gains are given, and nothing but the number is sought.
+ANALYSIS_MARGIN = 1e-3
+
+
+def synthesise_over_region(
+    plant: PolytopicSystem, asked: UiPiObserver, *, progress: Callable[[str], None]
+) -> Synthesis:
+    """Return a scheduled observer with its certificates; see `obsynth.ui_pi_observer`."""
+    _require_options(asked)
+    solver = chosen_solver(asked.solver, asked.solver_options)
+    model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
+    noise = asked.checked_noise(plant.output_names)
+    progress("checking the existence conditions over the region")
+    require_all_conditions(pi_conditions_over_region(plant, model))
+    parts = pi_over_region(plant, model, noise=noise)
+    steps = _steps(plant)
+    progress("solving the inequalities at the vertices")
+    found = certified(
+        parts.errors,
+        margin=DESIGN_MARGIN,
+        decay=_scaled_decay(asked.decay, parts, plant.dt),
+        lyapunov="common" if steps is None else "vertex",
+        steps=steps,
+        solver=solver,
+        settings=asked.solver_options,
+    )
+    progress("building the realisation and its certificates")
+    made = _synthesis(plant, model, parts, found, steps, decay=asked.decay)
+    return replace(made, options=asked.resolved(model, plant.fault_names))
+
+
+def synthesis_of_gains(plant: PolytopicSystem, K_a: Sequence[FloatArray], fault_model: Any) -> Synthesis:
+    """Return the observer of gains ``K_a (na, ny)`` at each vertex, with certificates that are found for them."""
+    model = exosystem(fault_model, plant.fault_names, plant.dt)
+    require_all_conditions(pi_conditions_over_region(plant, model))
+    parts = pi_over_region(plant, model)
+    found = certified(parts.errors, margin=ANALYSIS_MARGIN, gains=checked_free_gains(parts, list(K_a)))
+    asked = UiPiObserver(fault_model=fault_model)
+    made = _synthesis(plant, model, parts, found, None, decay=None)
+    return replace(made, options=asked.resolved(model, plant.fault_names))
+
+
+def _require_options(asked: UiPiObserver) -> None:
+    plain = UiPiObserver()
+    given = [name for name in NOT_OVER_REGION if getattr(asked, name) is not getattr(plain, name)]
+    given += ["objective"] if asked.objective != plain.objective else []
+    if given:
+        raise SpecError(
+            f"An observer over a region has no {', '.join(given)}: leave it out. It takes fault_model, decay, noise, "
+            "solver and solver_options; for another objective change obsynth.conditions.sharepasand(plant).",
+            path=f"method.options.{given[0]}",
+        )
+
+
+def _steps(plant: PolytopicSystem) -> float | None:
+    """Return how far the weight may move in a sample, where the certificate is to use it."""
+    steps = plant.scheduling.step_of(plant.dt) if plant.is_discrete else None
+    return steps if steps is not None and steps < 1.0 else None
+
+
+def _scaled_decay(decay: float | None, parts: PiOverRegion, dt: float) -> float | None:
+    """Return a decay in 1/s as a factor a sample, or in scaled time."""
+    if not decay:
+        return None
+    return float(np.exp(-decay * dt)) if dt > 0.0 else decay * parts.units.time
+
+
+def _synthesis(
+    plant: PolytopicSystem,
+    model: Exosystem,
+    parts: PiOverRegion,
+    found: VertexCertificate,
+    steps: float | None,
+    *,
+    decay: float | None,
+) -> Synthesis:
+    U_a, D_a, K_a = parts.letters(found.gains)
+    seen = combinations_seen(plant.center)
+    made = [realise(vertex, model, (U_a, D_a, K), seen)[0] for vertex, K in zip(plant.vertices, K_a, strict=True)]
+    shipped = _Shipped.of(made, U_a, plant.nx)
+    states = parts.units.augmented_states
+    witness = replace(
+        found.witness,
+        P=[_symmetric(P / states / states[:, None]) for P in found.witness.P],
+        G=None if found.witness.G is None else [G / states / states[:, None] for G in found.witness.G],
+    )
+    wanted = None if not decay else float(np.exp(-decay * plant.dt)) if plant.dt > 0.0 else decay
+    rate = proved_decay(shipped.errors, shipped.none, witness, wanted=wanted)
+    matrices: dict[str, FloatArray] = {"tracking": U_a, "Phi": model.Phi, "Cw": model.Cw}
+    matrices |= _stored(witness, WITNESSES)
+    claims, runs = {"region_decay": rate}, list(found.runs)
+    if plant.nf:
+        lyapunov = "common" if steps is None else "vertex"
+        gain = certified(shipped.errors, margin=ANALYSIS_MARGIN, gains=shipped.none, lyapunov=lyapunov, steps=steps)
+        matrices |= _stored(gain.witness, GAIN_WITNESSES)
+        claims["region_gain"] = gain.level
+        runs += gain.runs
+    letters = {"U_a": U_a, "D_a": D_a, "Phi": model.Phi, "Cw": model.Cw}
+    letters |= {f"K_a[{i + 1}]": K for i, K in enumerate(K_a)}
+    return Synthesis(
+        {},
+        letters,
+        _observer(plant, made, rate),
+        Certificate(matrices, claims),
+        {"engine": "lmi", "runs": runs},
+        _notes(plant, rate, steps, constant=len(found.gains) == 1),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Shipped:
+    """The error system of shipped observers, driven by what drives the fault models."""
+
+    errors: ErrorPolytope
+    none: list[FloatArray]  # no gains: the errors are closed already
+
+    @classmethod
+    def of(cls, made: Sequence[LinearObserver], tracking: FloatArray, nx: int) -> _Shipped:
+        n, first = len(made[0].Az), made[0]
+        errors = ErrorPolytope(
+            [observer.Az for observer in made],
+            np.zeros((0, n)),
+            B=tracking[:, nx:],
+            D=np.zeros((0, n - nx)),
+            Cz=first.Cz[first.fault_rows],
+            dt=first.dt,
+        )
+        return cls(errors, [np.zeros((n, 0))])
+
+
+def _symmetric(matrix: FloatArray) -> FloatArray:
+    """Return the symmetric part: rounding of a product is not the same on both sides."""
+    return np.asarray(0.5 * (matrix + matrix.T))
+
+
+def _stored(witness: Witness, names: tuple[str, str]) -> dict[str, FloatArray]:
+    found = {names[0]: np.array(witness.P)}
+    return found if witness.G is None else {**found, names[1]: np.array(witness.G)}
+
+
+def _observer(plant: PolytopicSystem, made: Sequence[LinearObserver], rate: float) -> ScheduledObserver:
+    first = made[0]
+    read = tuple(plant.scheduling.columns.get(name, name) for name in plant.scheduling.names)
+    each: dict[str, Any] = {
+        name: np.array([getattr(observer, name) for observer in made]) for name in ("Az", "Bu", "By")
+    }
+    return ScheduledObserver(
+        **each,
+        Cz=first.Cz,
+        Du=first.Du,
+        Dy=first.Dy,
+        effectiveness=np.array([np.eye(plant.nf)] * plant.count).reshape(plant.count, plant.nf, plant.nf),
+        scheduling=plant.scheduling,
+        forgetting=forgetting_of(rate, discrete=plant.is_discrete),
+        dt=plant.dt,
+        input_names=(*plant.input_names, *read),
+        output_names=plant.output_names,
+        state_names=plant.state_names,
+        fault_names=plant.fault_names,
+        residual_names=first.residual_names,
+        state_delays=first.state_delays,
+        fault_delays=first.fault_delays,
+    )
+
+
+def _notes(plant: PolytopicSystem, rate: float, steps: float | None, *, constant: bool) -> tuple[str, ...]:
+    left = forgetting_of(rate, discrete=plant.is_discrete)
+    for_how_long = f"{left} rows" if plant.is_discrete else f"{left:.4g} s"
+    notes = [
+        f"One certificate at {plant.count} vertices, for the region {plant.scheduling.sentence()}. A row with a "
+        "parameter outside or missing is out: the parameter is moved into its range, and nothing is claimed for "
+        f"{for_how_long} from the last such row on."
+    ]
+    if constant and plant.count > 1:
+        notes.append("The gain is the same at all vertices: in continuous time one that changes would be no better.")
+    if not plant.is_discrete:
+        notes.append(
+            "Between the rows of a log the observer takes a step of implicit Euler, along which errors decay in the "
+            "norm of the same certificate however long the step is; what such a step misses of the plant's own motion "
+            "acts as a disturbance. Rows that are close beside the plant's time constants keep it small."
+        )
+    rated = [
+        name for name, known in zip(plant.scheduling.names, plant.scheduling.rates, strict=True) if known is not None
+    ]
+    if rated and steps is None:
+        notes.append(
+            f"The rate of {', '.join(rated)} is not used: the certificate is for every course. One with a rate is "
+            "sought in discrete time, for one parameter that enters linearly and cannot cross its range in a sample."
+        )
+    return tuple(notes)
