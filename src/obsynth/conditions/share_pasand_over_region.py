@@ -26,6 +26,7 @@ from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.registered import registered
 from obsynth.verification.error_polytope import ErrorPolytope
+from obsynth.verification.identities import EQUALITY_TOLERANCE
 
 #: How strongly states are driven by default, beside fault models: a plant is better known than the course of a fault.
 PROCESS_SHARE = 0.1
@@ -157,7 +158,8 @@ def checked_free_gains(parts: PiOverRegion, K_a: list[FloatArray]) -> list[Float
     for K, injected in zip(K_a, parts.injected, strict=True):
         scaled = K / units.augmented_states[:, None] / units.outputs * units.rate
         free = (scaled - injected) @ seen.T
-        if not np.allclose(free @ seen + injected, scaled, rtol=1e-9, atol=1e-9 * (1.0 + np.abs(scaled).max())):
+        miss = float(np.abs(free @ seen + injected - scaled).max())
+        if not miss <= EQUALITY_TOLERANCE * (1.0 + float(np.abs(scaled).max())):
             raise SpecError("K_a does not decouple the unknown inputs.", path="K_a")
         found.append(free)
     return found

@@ -11,9 +11,9 @@ from __future__ import annotations
 import heapq
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -26,6 +26,10 @@ from obsynth.proofs.affine_numbers import FUNCTION_ROUNDINGS
 RANGE_SHARE = 1e-3
 #: Boxes that are tried for one range: a function of two parameters takes some hundreds for one part in a thousand.
 MOST_BOXES = 4096
+
+
+#: A box: least and largest value of each argument.
+Part: TypeAlias = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,9 @@ class Interval:
         exponent = Interval.of(other)
         if exponent.is_point and exponent.low.is_integer():
             return self._whole_power(int(exponent.low))
+        if self.low >= 0.0 and exponent.is_point and exponent.low > 0.0:
+            found = Interval.outward(self.low**exponent.low, self.high**exponent.low, FUNCTION_ROUNDINGS)
+            return Interval(max(found.low, 0.0), found.high)
         if not self.low > 0.0:
             raise _unbounded(
                 f"the base of a power lies between {self.low:.4g} and {self.high:.4g}: it must be positive"
@@ -130,36 +137,67 @@ class Range:
 def range_over(expression: Expression, box: Mapping[str, tuple[float, float]]) -> Range:
     """Return the range of an expression over a box of its names.
 
-        Parameters
-        ----------
-        expression : Expression
-            Of names that are all in the box.
-        box : mapping of str to pair of float
-            Least and largest value.
+    Parameters
+    ----------
+    expression : Expression
+        Of names that are all in the box.
+    box : mapping of str to pair of float
+        Least and largest value.
 
-        Raises
-        ------
-        PreconditionError
-            The expression is not finite on the box, or jumps there.
+    Raises
+    ------
+    PreconditionError
+        The expression is not finite on the box, or jumps there.
 
-        Examples
-        --------
-        >>> from obsynth.numerics.arrays import SMALLEST
-    from obsynth.numerics.expressions import parse_expression
-        >>> found = range_over(parse_expression("x**2 - x"), {"x": (0.0, 1.0)})
-        >>> -0.2505 < found.low <= -0.25, 0.0 <= found.high < 1e-3
-        (True, True)
+    Examples
+    --------
+    >>> from obsynth.numerics.expressions import parse_expression
+    >>> found = range_over(parse_expression("x**2 - x"), {"x": (0.0, 1.0)})
+    >>> -0.2505 < found.low <= -0.25, 0.0 <= found.high < 1e-3
+    (True, True)
     """
     names = sorted(expression.names)
-    start = tuple((float(box[name][0]), float(box[name][1])) for name in names)
-    ends = [dict(zip(names, corner, strict=True)) for corner in itertools.product(*start)]
-    middle = {name: 0.5 * (low + high) for name, (low, high) in zip(names, start, strict=True)}
-    known = [float(expression(point)) for point in (*ends[:MOST_BOXES], middle)]
-    attained_low, attained_high, boxes = min(known), max(known), 1
+    start = [(float(box[name][0]), float(box[name][1])) for name in names]
+
+    def by_name(values: Sequence[Any]) -> dict[str, Any]:
+        return dict(zip(names, values, strict=True))
+
+    return enclosed_range(
+        lambda part: interval_of(expression, by_name(part)), lambda point: float(expression(by_name(point))), start
+    )
+
+
+def enclosed_range(
+    enclosure: Callable[[Part], Interval],
+    value: Callable[[Sequence[float]], float],
+    box: Sequence[tuple[float, float]],
+) -> Range:
+    """Return the range of a function over a box, halving parts of it best first.
+
+    Parameters
+    ----------
+    enclosure : callable
+        From a part of the box to an interval that holds all values there; `PreconditionError` where it has none.
+    value : callable
+        From a point to a value near the function's.
+    box : sequence of pair of float
+        Least and largest value of each argument.
+
+    Raises
+    ------
+    PreconditionError
+        The function is not bounded on the box, as far as halving tells.
+    """
+    start = tuple(box)
+    middle = [0.5 * (low + high) for low, high in start]
+    corners = itertools.islice(itertools.product(*start), MOST_BOXES)
+    known = [found for point in (*corners, middle) if math.isfinite(found := value(point))]
+    attained_low, attained_high, boxes = min(known, default=math.inf), max(known, default=-math.inf), 1
+    width = max(attained_high - attained_low, 0.0)
     found = {}
     for sign in (1.0, -1.0):
         best = attained_low if sign > 0.0 else -attained_high
-        count, bound, best = _least(expression, names, start, sign, best, attained_high - attained_low)
+        count, bound, best = _least(enclosure, value, start, sign, best, width)
         boxes += count
         found[sign] = bound
         if sign > 0.0:
@@ -181,17 +219,17 @@ def interval_of(expression: Expression, box: Mapping[str, tuple[float, float]]) 
 
 
 def _least(
-    expression: Expression,
-    names: list[str],
-    start: tuple[tuple[float, float], ...],
+    enclosure: Callable[[Part], Interval],
+    value: Callable[[Sequence[float]], float],
+    start: Part,
     sign: float,
     best: float,
     width: float,
 ) -> tuple[int, float, float]:
-    """Return how many boxes were tried, a lower bound of ``sign`` times the expression, and a value that it takes."""
+    """Return how many boxes were tried, a lower bound of ``sign`` times the function, and a value that it takes."""
 
-    def bound(part: tuple[tuple[float, float], ...]) -> float:
-        found = interval_of(expression, dict(zip(names, part, strict=True)))
+    def bound(part: Part) -> float:
+        found = enclosure(part)
         return found.low if sign > 0.0 else -found.high
 
     trouble: PreconditionError | None = None
@@ -203,7 +241,7 @@ def _least(
     count, done = 0, math.inf
     while waiting and count < MOST_BOXES:
         low, part = waiting[0]
-        if best - low <= RANGE_SHARE * width or not names:
+        if best - low <= RANGE_SHARE * width or not start:
             break
         heapq.heappop(waiting)
         shares = [(b - a) / max(last - first, SMALLEST) for (a, b), (first, last) in zip(part, start, strict=True)]
@@ -212,8 +250,8 @@ def _least(
         if not part[place][0] < middle < part[place][1]:
             done = min(done, low)
             continue
-        point = [0.5 * (a + b) for a, b in part]
-        best = min(best, sign * float(expression(dict(zip(names, point, strict=True)))))
+        taken = value([0.5 * (a + b) for a, b in part])
+        best = min(best, sign * taken) if math.isfinite(taken) else best
         for ends in ((part[place][0], middle), (middle, part[place][1])):
             child = (*part[:place], ends, *part[place + 1 :])
             count += 1
