@@ -194,17 +194,17 @@ def enclosed_range(
     known = [found for point in (*corners, middle) if math.isfinite(found := value(point))]
     attained_low, attained_high, boxes = min(known, default=math.inf), max(known, default=-math.inf), 1
     width = max(attained_high - attained_low, 0.0)
-    found = {}
+    ends: dict[float, float] = {}
     for sign in (1.0, -1.0):
         best = attained_low if sign > 0.0 else -attained_high
         count, bound, best = _least(enclosure, value, start, sign, best, width)
         boxes += count
-        found[sign] = bound
+        ends[sign] = bound
         if sign > 0.0:
             attained_low = best
         else:
             attained_high = -best
-    return Range(found[1.0], -found[-1.0], attained_low, attained_high, boxes)
+    return Range(ends[1.0], -ends[-1.0], attained_low, attained_high, boxes)
 
 
 def interval_of(expression: Expression, box: Mapping[str, tuple[float, float]]) -> Interval:

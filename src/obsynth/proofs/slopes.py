@@ -96,7 +96,8 @@ def _operation(operation: Callable[..., Any]) -> Callable[..., Any]:
         if all(part.slope == _ZERO for part in parts):
             return _Dual(value, _ZERO)
         if operation in _TWO:
-            return _Dual(value, _TWO[operation](*parts, value))
+            one, other = parts
+            return _Dual(value, _TWO[operation](one, other, value))
         return _Dual(value, _ONES[operation](parts[0].value, value) * parts[0].slope)
 
     return done
@@ -112,7 +113,7 @@ def _power(base: _Dual, exponent: _Dual, value: Interval) -> Interval:
         if n == 0.0:
             return _ZERO
         return exponent.value * base.value ** Interval.of(n - 1.0) * base.slope if n != 1.0 else base.slope
-    logarithm = interval_operation(np.log)(base.value)
+    logarithm = _function(np.log)(base.value)
     return value * (exponent.slope * logarithm + exponent.value * base.slope / base.value)
 
 
