@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.sparse as sp
+from scipy.linalg import block_diag
 from scipy.sparse.csgraph import structural_rank
 
 import obsynth
@@ -159,11 +160,40 @@ class TestIdleVariables:
         np.testing.assert_allclose(found.recovery.from_state[:, 0], [1.0, 1.0, 0.5])
 
     @pytest.mark.parametrize("make", FORMATS)
-    def test_not_where_it_is_measured_or_acts(self, make):
+    def test_where_it_is_measured_or_acts_it_follows_from_the_states(self, make):
         acting = self.A.copy()
-        acting[0, 3] = 1.0
+        acting[0, 3] = 0.5
+        # x4 = x1': -x1, and with 0.5 x4 in the equation of x1 x1' = -2 x1.
+        for a, c, rate, shown in ((self.A, [[1, 0, 0, 1]], -1.0, 0.0), (acting, [[1, 0, 0, 0]], -2.0, 1.0)):
+            found = obsynth.eliminate_algebraic_states(obsynth.DescriptorSystem(make(self.E), make(a), C=c))
+            assert found.dropped == ()
+            np.testing.assert_array_equal(found.plant.A, [[rate]])
+            np.testing.assert_array_equal(found.plant.C, [[shown]])
+            np.testing.assert_array_equal(found.recovery.from_state, [[1], [1], [0.5], [rate]])
+
+    @pytest.mark.parametrize("make", FORMATS)
+    def test_not_where_what_is_measured_needs_the_derivative_of_a_signal(self, make):
+        # 0 = x1 - x2 + f: x4 = x1' + f'.
+        plant = obsynth.DescriptorSystem(
+            make(self.E), make(self.A), C=[[1, 0, 0, 0], [0, 0, 0, 1]], Bf=[[0], [0], [1], [0]], output_names=["a", "b"]
+        )
+        with pytest.raises(obsynth.PreconditionError, match="output b needs the derivative of f1") as caught:
+            obsynth.eliminate_algebraic_states(plant)
+        assert caught.value.condition == "index"
+        assert caught.value.signals == ("b", "f1")
+        found = obsynth.eliminate_algebraic_states(plant.replace(C=[[1, 0, 0, 0], [0, 1, 0, 0]]))
+        assert found.dropped == ("x4",)
+        np.testing.assert_array_equal(found.plant.Df, [[0], [1]])
+
+    @pytest.mark.parametrize("make", FORMATS)
+    def test_a_large_plant_whose_variable_acts_is_refused(self, make):
+        acting = self.A.copy()
+        acting[0, 3] = 0.5
+        more = -np.eye(64)
         for a, c in ((self.A, [[1, 0, 0, 1]]), (acting, [[1, 0, 0, 0]])):
-            plant = obsynth.DescriptorSystem(make(self.E), make(a), C=c)
+            plant = obsynth.DescriptorSystem(
+                make(block_diag(self.E, np.eye(64))), make(block_diag(a, more)), C=np.pad(c, ((0, 0), (0, 64)))
+            )
             with pytest.raises(obsynth.PreconditionError, match="index") as caught:
                 obsynth.eliminate_algebraic_states(plant)
             assert "x4" in caught.value.signals
@@ -214,8 +244,10 @@ class TestIdleVariables:
         found = obsynth.eliminate_algebraic_states(plant)
         assert found.dropped == ("x4", "x5")
         np.testing.assert_allclose(found.plant.A, [[-1.0]])
-        with pytest.raises(obsynth.PreconditionError, match="index 2"):
-            obsynth.eliminate_algebraic_states(plant.replace(C=[[1, 0, 0, 0, 1]]))
+        # Measured it stays, as a lag of -x1.
+        found = obsynth.eliminate_algebraic_states(plant.replace(C=[[1, 0, 0, 0, 1]]))
+        assert found.dropped == ()
+        np.testing.assert_allclose(found.plant.A, [[-1.0, 0], [-10, -10]])
 
     @pytest.mark.parametrize("make", FORMATS)
     def test_a_derivative_of_a_state_is_kept(self, make):
@@ -228,11 +260,12 @@ class TestIdleVariables:
     @pytest.mark.parametrize("make", [sp.csr_array, np.array])
     def test_numbers_are_those_of_the_plant_as_given(self, make):
         # The first variable and the second equation are left out; measured x5 asks for a derivative.
-        e, a = np.zeros((6, 6)), np.zeros((6, 6))
-        e[1, 1], e[2, 2], e[5, 5], a[5, 5] = 1.0, 1.0, 1.0, -1.0
+        # (Smaller plants are solved with all derivatives.)
+        e, a = np.zeros((70, 70)), np.zeros((70, 70))
+        e[1, 1], e[2, 2], e[5:, 5:], a[5:, 5:] = 1.0, 1.0, np.eye(65), -np.eye(65)
         a[0, 2], a[0, 1], a[1, 0], a[2, 2], a[2, 4] = 1, -1, 1, -1, 1
         a[3, 2], a[3, 3], a[4, 2], a[4, 3] = 1, -1, 3, -2
-        plant = obsynth.DescriptorSystem(make(e), make(a), C=[[0, 0, 0, 0, 1, 1]])
+        plant = obsynth.DescriptorSystem(make(e), make(a), C=[[0, 0, 0, 0, *np.ones(66)]])
         with pytest.raises(obsynth.PreconditionError, match=r"5 \(of 'x5'\).* not determine 'x5'") as caught:
             obsynth.eliminate_algebraic_states(plant)
         assert caught.value.condition == "index"

@@ -17,6 +17,7 @@ from obsynth.methods.method import Method, Synthesis, silent
 from obsynth.methods.refusals import require_above_rounding, with_advice
 from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_class, methods_for
 from obsynth.methods.verifying import verify
+from obsynth.methods.working_plants import working_plant
 from obsynth.numerics.arguments import arguments_checked, field_types
 from obsynth.numerics.libraries import failed_computations, failure_of, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
@@ -123,8 +124,10 @@ def design(
         if kind_of(own) == "polytopic":
             return made(own, _for_region(own, options), options, advise=True)
         with failed_computations(), one_thread_if_small(own.nx):
-            own, recovery, _ = _with_arrays(own, recovery, report_stage)
-            return automatic_design(own, options, made, partial(made, advise=True))
+            working = working_plant(own, recovery, report_stage, None)
+            own, recovery = working.plant, working.recovery
+            found = automatic_design(own, options, made, partial(made, advise=True))
+            return found.replace(notes=(*working.notes, *found.notes)) if working.reduced else found
     return made(own, method, options, advise=True)
 
 
@@ -154,7 +157,8 @@ def _designed(
     for condition in kind_conditions(plant, type(asked)):
         condition.require()
     with failed_computations(), one_thread_if_small(plant.nx):
-        plant, recovery, notes = _with_arrays(plant, recovery, progress)
+        working = working_plant(plant, recovery, progress, asked)
+        plant, recovery, notes = working.plant, working.recovery, working.notes
         try:
             found = asked.synthesise(plant, progress=progress, **more)
         except PreconditionError as error:
@@ -166,20 +170,6 @@ def _designed(
             found = replace(found, notes=(*notes, *found.notes))
         progress("verifying the shipped realisation")
         return verified(plant, asked.id, found, name=name, recovery=recovery)
-
-
-def _with_arrays(
-    plant: Plant, recovery: StateRecovery | None, progress: Callable[[str], None]
-) -> tuple[Plant, StateRecovery | None, tuple[str, ...]]:
-    """Return the plant that methods work on, the way back from it, and what a user should know about it."""
-    if not isinstance(plant, DescriptorSystem) or not plant.is_sparse:
-        return plant, recovery, ()
-    if plant.nx < MANY_VARIABLES:
-        return plant.dense(), recovery, ()
-    progress("eliminating the algebraic states")
-    found = eliminate_algebraic_states(plant)
-    through = found.recovery if recovery is None else recovery.then(found.recovery)
-    return found.plant, through, found.notes
 
 
 @arguments_checked
@@ -223,7 +213,9 @@ def check(
     kind_of(own)
     try:
         with failed_computations(), one_thread_if_small(own.nx):
-            return _checked(_with_arrays(own, None, silent)[0], options or {})
+            if isinstance(own, DescriptorSystem) and own.nx >= MANY_VARIABLES:
+                own = working_plant(own, None, silent, None).plant
+            return _checked(own, options or {})
     except PreconditionError as error:
         # The sparse plant as written has no reduced form for any method.
         row = Condition(
@@ -239,20 +231,23 @@ def check(
         return {method: VerificationReport.of(condition_rows((row,))) for method in REGISTRY}
 
 
-def _checked(plant: Plant, options: Mapping[str, Mapping[str, Any]]) -> dict[str, VerificationReport]:
+def _checked(given: Plant, options: Mapping[str, Mapping[str, Any]]) -> dict[str, VerificationReport]:
     found = {}
     for method in REGISTRY:
         known = method_class(method)
-        given = options.get(method, known.placeholders)
+        stated = options.get(method, known.placeholders)
         by_default = AUTO in options and set(options[AUTO]) <= set(field_types(known))
         conditions: Sequence[Condition]
         try:
-            asked = known.of(options[AUTO] if by_default else given)
-            conditions = kind_conditions(plant, known) or _existence(plant, asked)
+            asked = known.of(options[AUTO] if by_default else stated)
+            conditions = kind_conditions(given, known)
+            if not conditions:
+                working = working_plant(given, None, silent, asked)
+                conditions = (*working.conditions(), *_existence(working.plant, asked))
         except SpecError as error:
             if not by_default:
                 raise
-            conditions = kind_conditions(plant, known) or (_not_stated(error, method),)
+            conditions = kind_conditions(given, known) or (_not_stated(error, method),)
         found[method] = VerificationReport.of(condition_rows(conditions))
     return found
 

@@ -132,6 +132,10 @@ class Method(ABC):
         """Raise an error where a design needs what neither the plant nor the options state."""
         return None
 
+    def is_for_states_as_written(self, plant: DescriptorSystem) -> bool:
+        """Whether options are about the states of a plant of index 2 or more as written: it is not reduced then."""
+        return False
+
     def for_plant(self, plant: DescriptorSystem) -> Self:
         """Return the method without what a plant of fewer faults makes void."""
         return self

@@ -179,6 +179,10 @@ class FaultEstimationFilter(Method):
     prove_least: bool = False
     mean: Annotated[FewSamples, Ge(1)] = 1
 
+    def is_for_states_as_written(self, plant: DescriptorSystem) -> bool:
+        """Whether the free matrix of the paper is given."""
+        return self.S is not None
+
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""
         if self.residual_weight_limit is not None and self.free_residual_weight is False:

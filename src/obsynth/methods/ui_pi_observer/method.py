@@ -182,6 +182,12 @@ class UiPiObserver(Method):
             yield f"objective is {shown(self.objective)}: use one of {listed}, or a function of the variables."
         yield from own_term_conflicts(self, beside=("poles", "noise", "joint"))
 
+    def is_for_states_as_written(self, plant: DescriptorSystem) -> bool:
+        """Whether the paper's matrices are given, or as many poles as the observer of the plant as written has."""
+        if self.G is not None:
+            return True
+        return self.poles is not None and all(condition.holds for condition in self.existence(plant))
+
     def given_decoupling(self) -> dict[str, Any] | None:
         """Return the paper's matrices, or ``None`` for our own decoupling."""
         if self.G is None:

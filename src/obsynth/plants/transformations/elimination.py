@@ -1,4 +1,4 @@
-"""Solving the algebraic equations of an index-1 plant."""
+"""Solving the algebraic equations of a plant: at index 1 as they are, above it by `index_reduction`."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from obsynth.plants.transformations.idle_variables import (
     everything_active,
     settled_basis,
 )
+from obsynth.plants.transformations.index_reduction import reduced_index
 from obsynth.plants.transformations.recovery import (
     StateRecovery,
     Transformation,
@@ -44,12 +45,13 @@ SPARSE_PENCIL_SHARE = 0.05
 
 @arguments_checked
 def eliminate_algebraic_states(plant: DescriptorSystem | Transformation) -> Transformation:
-    """Solve the algebraic equations of an index-1 plant, so that ``E = I``.
+    """Solve the algebraic equations of a plant, so that ``E = I``.
 
     Parameters
     ----------
     plant : DescriptorSystem or Transformation
-        Regular, index 0 or 1, either time, but for variables that act on no state and no output.
+        Regular, either time.  Of a plant of index 2 or more (a mechanism with its constraints at position level) the
+        minimal proper form is taken, of up to 64 states: nothing need be differentiated by hand.
 
     Returns
     -------
@@ -62,7 +64,8 @@ def eliminate_algebraic_states(plant: DescriptorSystem | Transformation) -> Tran
     Raises
     ------
     PreconditionError
-        Not regular, index 2 or more (equations and variables are named), or no dynamic state at all.
+        Not regular, no dynamic state at all, or an output needs the derivative of a signal, which is named (beyond 64
+        states: index 2 or more).
 
     Notes
     -----
@@ -88,7 +91,7 @@ def eliminate_algebraic_states(plant: DescriptorSystem | Transformation) -> Tran
             return eliminated_by_sparsity(plant)
         arrays = plant.dense()
         found = eliminated_exactly(arrays) or _eliminated_in_floating_point(arrays)
-    if not found.dropped:
+    if not found.dropped and not found.is_of_lower_index:
         found = found.with_tolerances(ELIMINATED)
     note_source(arrays, found.plant)
     return found if arrays is plant else replace(found, source=plant)
@@ -192,7 +195,13 @@ def _eliminated_in_floating_point(plant: DescriptorSystem) -> Transformation:
     except PreconditionError as error:
         if error.condition == "dynamic states":
             raise
-        return _without_idle_variables(plant, error)
+        try:
+            return _without_idle_variables(plant, error)
+        except PreconditionError as refusal:
+            found = reduced_index(plant) if refusal.condition == "index" else None
+            if found is None:
+                raise
+            return found
     return _eliminated_densely(plant, count)
 
 

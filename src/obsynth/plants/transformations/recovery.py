@@ -97,7 +97,8 @@ class StateRecovery:
 
 @dataclass(frozen=True, eq=False)
 class Transformation:
-    """A plant made from another; ``dropped`` states are not recovered; ``bounds``: of sparse solutions."""
+    """A plant made from another; ``dropped`` states are not recovered; ``bounds``: of sparse solutions;
+    ``is_of_lower_index``: constraints were solved with their derivatives, which tolerances do not follow."""
 
     source: DescriptorSystem
     plant: DescriptorSystem
@@ -106,6 +107,7 @@ class Transformation:
     dropped: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     bounds: SolutionBounds | None = None
+    is_of_lower_index: bool = False
 
     def with_tolerances(self, kind: str, size: float = 0.0) -> Transformation:
         """Return the step with the tolerances of its source carried on to its plant."""
@@ -126,6 +128,7 @@ class Transformation:
             self.dropped + later.dropped,
             self.notes + later.notes,
             self.bounds or later.bounds,
+            self.is_of_lower_index or later.is_of_lower_index,
         )
 
 

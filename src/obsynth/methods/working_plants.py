@@ -1,0 +1,102 @@
+"""The plant that a method works on: arrays, without the algebraic states of large plants, of index 1 at most."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from obsynth.analysis.existence.condition import Condition
+from obsynth.errors import PreconditionError
+from obsynth.methods.method import Method
+from obsynth.methods.registry import Plant
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.pencil import structure_of
+from obsynth.plants.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
+from obsynth.plants.transformations.exact_elimination import MOST_STATES_EXACTLY
+from obsynth.plants.transformations.index_reduction import improper_outputs
+from obsynth.plants.transformations.recovery import StateRecovery, Transformation
+
+
+@dataclass(frozen=True, eq=False)
+class WorkingPlant:
+    """A plant with the way back to the one as written, and what a user should know; ``reduced``: what was done to a
+    plant of index 2 or more."""
+
+    plant: Plant
+    recovery: StateRecovery | None
+    notes: tuple[str, ...] = ()
+    reduced: str = ""
+
+    def conditions(self) -> tuple[Condition, ...]:
+        """Return the condition that says how the index was reduced; none where it was not."""
+        if not self.reduced:
+            return ()
+        source = "Dai 1989, section 1.2"
+        return (Condition("proper form", "a proper form of the plant", True, 1.0, 1.0, source, self.reduced),)
+
+
+def working_plant(
+    plant: Plant, recovery: StateRecovery | None, progress: Callable[[str], None], asked: Method | None
+) -> WorkingPlant:
+    """Return the plant that a method works on; ``asked`` decides, with its options, whether the index is reduced."""
+    if not isinstance(plant, DescriptorSystem):
+        return WorkingPlant(plant, recovery)
+    if plant.nx < MANY_VARIABLES:
+        plant = plant.dense()
+        found, notes = _of_low_index(plant, asked)
+        if found is None:
+            return WorkingPlant(plant, recovery)
+        progress("reducing the index")
+        notes = (f"The plant has index 2 or more: {found.description}.", *notes)
+        return WorkingPlant(found.plant, _through(recovery, found), notes, " ".join(notes))
+    if not plant.is_sparse:
+        return WorkingPlant(plant, recovery)
+    progress("eliminating the algebraic states")
+    found = eliminate_algebraic_states(plant)
+    return WorkingPlant(found.plant, _through(recovery, found), found.notes)
+
+
+def _through(recovery: StateRecovery | None, found: Transformation) -> StateRecovery:
+    return found.recovery if recovery is None else recovery.then(found.recovery)
+
+
+def _of_low_index(plant: DescriptorSystem, asked: Method | None) -> tuple[Transformation | None, tuple[str, ...]]:
+    """Return the minimal proper form of a plant of index 2 or more, and what was left out for it; ``None`` for any
+    other plant, or where the method takes it as written."""
+    if plant.nx > MOST_STATES_EXACTLY or (structure_of(plant).index or 0) < 2:
+        return None, ()
+    if asked is not None and asked.is_for_states_as_written(plant):
+        return None, ()
+    try:
+        return eliminate_algebraic_states(plant), ()
+    except PreconditionError as error:
+        if error.condition != "index" or asked is None or _exists(plant, asked):
+            return None, ()
+    return _without_improper_outputs(plant)
+
+
+def _exists(plant: DescriptorSystem, asked: Method) -> bool:
+    try:
+        return all(condition.holds for condition in asked.existence(plant))
+    except PreconditionError:
+        return False
+
+
+def _without_improper_outputs(plant: DescriptorSystem) -> tuple[Transformation | None, tuple[str, ...]]:
+    """Return the proper form of a plant without the outputs that need derivatives, where others are left."""
+    outputs, signals = improper_outputs(plant)
+    kept = [row for row, name in enumerate(plant.output_names) if name not in outputs]
+    if not outputs or not kept:
+        return None, ()
+    rows = {name: getattr(plant, name)[kept] for name in ("C", "D", "Df", "Dd", "Dw")}
+    fewer = plant.replace(output_names=[plant.output_names[row] for row in kept], **rows)
+    needs = f"a later sample of {', '.join(signals)}" if plant.dt else f"the derivative of {', '.join(signals)}"
+    one = len(outputs) == 1
+    note = (
+        f"The output{'' if one else 's'} {', '.join(outputs)} need{'s' if one else ''} {needs}: "
+        f"{'it is' if one else 'they are'} left out, and the design is for the others."
+    )
+    try:
+        return eliminate_algebraic_states(fewer), (note,)
+    except PreconditionError:
+        return None, ()

@@ -1,0 +1,141 @@
+"""The minimal proper form of plants of index 0 to 4, against forms that are known by construction."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import obsynth
+from obsynth.plants.transformations.index_reduction import reduced_index
+
+
+def transfer(plant, s, kind):
+    b, d = {"u": (plant.B, plant.D), "f": (plant.Bf, plant.Df), "d": (plant.Bd, plant.Dd)}[kind]
+    return plant.C @ np.linalg.solve(s * plant.E - plant.A, b) + d
+
+
+def integer(rng, *shape):
+    return rng.integers(-3, 4, shape).astype(float)
+
+
+def regular(rng, n):
+    """A product of unit triangular matrices of whole numbers: its inverse holds whole numbers as well."""
+    lower, upper = np.tril(rng.integers(-1, 2, (n, n)), -1), np.triu(rng.integers(-1, 2, (n, n)), 1)
+    return (lower + np.eye(n)) @ (upper + np.eye(n))
+
+
+def scrambled(rng, index, *, in_constraints):
+    """A plant in Weierstrass form with blocks of this index, in coordinates and equations that are mixed; its minimal
+    form ``A, [B Bf], C, [D Df]``. Signals enter the last row of a nilpotent block only (no derivative) or none."""
+    n, ny = int(rng.integers(1, 4)), 2
+    a, b, c = integer(rng, n, n) - 4 * np.eye(n), integer(rng, n, 2), integer(rng, ny, n)
+    nilpotent = np.eye(max(index, 0), k=1)
+    m = len(nilpotent)
+    into, seen = np.zeros((m, 2)), integer(rng, ny, m)
+    if in_constraints and m:
+        into[0] = integer(rng, 2)
+    e0 = np.block([[np.eye(n), np.zeros((n, m))], [np.zeros((m, n)), nilpotent]])
+    a0 = np.block([[a, np.zeros((n, m))], [np.zeros((m, n)), np.eye(m)]])
+    left, right = regular(rng, n + m), regular(rng, n + m)
+    whole = left @ np.vstack([b, into])
+    plant = obsynth.DescriptorSystem(
+        E=left @ e0 @ right, A=left @ a0 @ right, B=whole[:, :1], Bf=whole[:, 1:], C=np.hstack([c, seen]) @ right
+    )
+    # N v' = v + c q with N c = 0: v = -c q.
+    return plant, (a, b, c, -seen @ into)
+
+
+@pytest.mark.parametrize("in_constraints", [False, True])
+@pytest.mark.parametrize("index", [0, 1, 2, 3, 4])
+@pytest.mark.parametrize("seed", range(6))
+def test_the_minimal_form_is_that_of_the_construction(index, in_constraints, seed):
+    rng = np.random.default_rng([seed, index, in_constraints])
+    plant, (a, b, c, d) = scrambled(rng, index, in_constraints=in_constraints)
+    assert obsynth.analyse_structure(plant).index == index
+    found = reduced_index(plant)
+    assert found.plant.nx == len(a)
+    for s in (0.7, 1.0 + 2.0j, -0.3 + 5.0j):
+        wanted = c @ np.linalg.solve(s * np.eye(len(a)) - a, b) + d
+        assert np.allclose(transfer(found.plant, s, "u"), wanted[:, :1], rtol=1e-9, atol=1e-9)
+        assert np.allclose(transfer(found.plant, s, "f"), wanted[:, 1:], rtol=1e-9, atol=1e-9)
+    # All states of the plant come back: E x' = A x + B u holds along the reduced plant.
+    x, u, f, rate = rng.standard_normal(found.plant.nx), *rng.standard_normal((2, 1)), np.zeros(1)
+    back, new = found.recovery, found.plant
+    states = back.from_state @ x + back.from_input @ u + back.from_fault @ f
+    speed = back.from_state @ (new.A @ x + new.B @ u + new.Bf @ f)
+    assert np.allclose(plant.E @ (speed + back.from_input @ rate), plant.A @ states + plant.B @ u + plant.Bf @ f)
+
+
+def test_an_output_that_needs_a_derivative_names_the_signal():
+    """The speed is measured of a mass whose position is moved by an unknown signal."""
+    plant = obsynth.DescriptorSystem(
+        E=np.diag([1.0, 1.0, 0.0]), A=[[0, 1, 0], [-2, -1, 1], [1, 0, 0]], C=[[0, 1, 0]], Bf=[[0], [0], [-1]],
+        fault_names=["stroke"], output_names=["speed"],
+    )  # fmt: skip
+    with pytest.raises(obsynth.PreconditionError, match="output speed needs the derivative of stroke") as caught:
+        obsynth.eliminate_algebraic_states(plant)
+    assert caught.value.signals == ("speed", "stroke")
+
+
+def test_an_output_that_needs_a_derivative_of_an_unknown_input_is_left_out_and_the_rest_works():
+    e, a = np.diag([1.0, 1.0, 0.0, 1.0]), np.array([[0.0, 1, 0, 0], [-2, -1, 1, 0], [1, 0, 0, 0], [0, 0, 0, -1]])
+    plant = obsynth.DescriptorSystem(
+        e, a, C=[[0, 1, 0, 0], [1, 0, 0, 1]], Bf=[[0], [0], [0], [1]], Bd=[[0], [0], [-1], [0]], Dd=[[0], [-1]],
+        fault_names=["f"], output_names=["speed", "sum"], disturbance_names=["stroke"],
+    )  # fmt: skip
+    design = obsynth.pd_observer(plant)
+    assert design.plant.output_names == ("sum",)
+    assert any("The output speed needs the derivative of stroke: it is left out" in note for note in design.notes)
+    (row,) = (row for row in obsynth.check(plant)["pd-observer"].checks if row.name == "exists: proper form")
+    assert "speed needs the derivative of stroke" in row.detail
+    # This one takes the plant as it is.
+    assert obsynth.functional_filter(plant).plant.output_names == ("speed", "sum")
+
+
+def test_tolerances_do_not_follow_a_reduced_index():
+    given = bar("position")
+    rows = given.A.tolist()
+    rows[2][0] = "-k"
+    plant = obsynth.uncertain_system(
+        {"E": given.E, "A": rows, "C": given.C, "Bf": given.Bf}, {"k": {"nominal": 2.0, "range": [1.9, 2.1]}}
+    )
+    found = obsynth.eliminate_algebraic_states(plant).plant
+    assert found.uncertainty.lost == "its index was reduced"
+    assert any("not carried over" in note for note in obsynth.ui_pi_observer(plant).notes)
+
+
+def bar(level, **more):
+    """Two masses joined by a rigid bar; a force on the first is a fault."""
+    e, a = np.diag([1.0, 1, 1, 1, 0]), np.zeros((5, 5))
+    a[0, 2] = a[1, 3] = 1
+    a[2], a[3] = [-2, 0, -0.5, 0, -1], [0, -2, 0, -0.5, 1]
+    a[4, {"position": 0, "speed": 2}[level]], a[4, {"position": 1, "speed": 3}[level]] = 1, -1
+    names = {"state_names": ["q1", "q2", "v1", "v2", "lambda"], "fault_names": ["force"]}
+    return obsynth.DescriptorSystem(E=e, A=a, C=np.eye(5)[:1], Bf=np.eye(5)[:, 2:3], **names, **more)
+
+
+def test_a_rigid_bar_has_the_minimal_form_of_one_mass():
+    found = obsynth.eliminate_algebraic_states(bar("position"))
+    assert found.plant.state_names == ("q1", "v1")
+    assert np.array_equal(found.plant.A, [[0, 1], [-2, -0.5]])
+    assert np.array_equal(found.plant.Bf, [[0], [0.5]])
+    # The force in the bar is half of that on the first mass, as the other half moves it.
+    assert np.array_equal(found.recovery.from_state, [[1, 0], [1, 0], [0, 1], [0, 1], [0, 0]])
+    assert np.array_equal(found.recovery.from_fault, [[0], [0], [0], [0], [0.5]])
+    assert found.dropped == ()
+
+
+@pytest.mark.parametrize("method", ["ui-pi-observer", "pd-observer", "functional-filter"])
+def test_methods_take_a_mechanism_at_position_level_as_its_minimal_form(method):
+    own = obsynth.design(bar("position"), method)
+    minimal = obsynth.design(
+        obsynth.DescriptorSystem(
+            A=[[0, 1], [-2, -0.5]], C=[[1, 0]], Bf=[[0], [0.5]], state_names=["q1", "v1"], fault_names=["force"]
+        ),
+        method,
+    )
+    assert own.report.passed
+    assert own.recovery.names == ("q1", "q2", "v1", "v2", "lambda")
+    for claim, value in minimal.certificate.claims.items():
+        assert np.isclose(own.certificate.claims[claim], value, rtol=1e-6)
+    assert obsynth.check(bar("position"))[method].passed
