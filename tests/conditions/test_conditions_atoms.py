@@ -139,6 +139,76 @@ def test_admissible_pairs(dt, case):
     assert (problem.status == "optimal") is (case == "stable")
 
 
+def hidden_mode(seed: int, outside: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return A and Cy with a mode that no output sees: outside of the unit disk, or inside; the others anywhere."""
+    rng = np.random.default_rng([46, 7, seed])
+    n = int(rng.integers(2, 5))
+    mode = rng.uniform(1.05, 2.5) if outside else rng.uniform(0.0, 0.9)
+    change = np.eye(n) + 0.3 * rng.standard_normal((n, n))
+    blocks = np.diag([float(rng.choice([-1.0, 1.0])) * mode, *rng.uniform(-2.0, 2.0, n - 1)])
+    blocks[1:, 0] = 0.0
+    seen = np.hstack([np.zeros((1, 1)), rng.standard_normal((1, n - 1))])
+    return change @ blocks @ np.linalg.inv(change), seen @ np.linalg.inv(change)
+
+
+#: A solver may find it hard to say no; what it may not say is yes.
+HARD = pytest.mark.filterwarnings("ignore:Solution may be inaccurate:UserWarning")
+NO = ("infeasible", "infeasible_inaccurate")
+
+
+@HARD
+@pytest.mark.parametrize("seed", range(12))
+def test_no_gain_moves_what_no_output_sees(seed):
+    """The scale of P is free: without a margin of its size, P = 0 would be a solution within any tolerance."""
+    for outside in (True, False):
+        a, cy = hidden_mode(seed, outside)
+        p, y = cp.Variable(a.shape, symmetric=True), cp.Variable((len(a), 1))
+        found = conditions.region(a, p, conditions.disk(0.0, 1.0), Y=y, Cy=cy)
+        problem = cp.Problem(cp.Minimize(0), found)
+        problem.solve(solver="CLARABEL")
+        assert (problem.status in NO) if outside else (problem.status == "optimal")
+        if not outside:
+            gain = np.linalg.solve(p.value, y.value)
+            assert np.max(np.abs(np.linalg.eigvals(a - gain @ cy))) < 1.0
+
+
+@HARD
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+@pytest.mark.parametrize("seed", range(8))
+def test_pairs_that_are_unstable_or_impulsive_are_not_admissible(seed, dt):
+    rng = np.random.default_rng([46, 8, seed])
+    slow = rng.uniform(-0.8, 0.8) if dt else -rng.uniform(0.2, 2.0)
+    fast = rng.uniform(1.1, 3.0) if dt else rng.uniform(0.1, 3.0)
+    left, right = (np.eye(3) + 0.3 * rng.standard_normal((3, 3)) for _ in range(2))
+    impulsive = np.array([[slow, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    for e, a, good in (
+        (np.diag([1.0, 1.0, 0.0]), np.diag([slow, 0.5 * slow, 1.0]), True),
+        (np.diag([1.0, 1.0, 0.0]), np.diag([slow, fast, 1.0]), False),
+        (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]), impulsive, False),
+    ):
+        p = cp.Variable((3, 3), symmetric=bool(dt))
+        problem = cp.Problem(cp.Minimize(0), conditions.admissible(left @ e @ right, left @ a @ right, p, dt))
+        problem.solve(solver="CLARABEL")
+        assert (problem.status == "optimal") if good else (problem.status in NO)
+
+
+def test_a_gain_and_what_it_multiplies_belong_together():
+    a, b, c, d = a_system(1.0)
+    p, z, y = cp.Variable((3, 3), symmetric=True), cp.Variable((2, 2), symmetric=True), cp.Variable((3, 2))
+    disk = conditions.disk(0.0, 1.0)
+    for given in ({"Y": y}, {"Cy": c}):
+        for make in (
+            lambda given: conditions.region(a, p, disk, **given),
+            lambda given: conditions.admissible(np.eye(3), a, p, 0.0, **given),
+            lambda given: conditions.bounded_real(a, b, c, d, p, 1.0, 1.0, **given),
+            lambda given: conditions.h2(a, b, c, d, p, z, 1.0, **given),
+        ):
+            with pytest.raises(TypeError, match="give both or neither"):
+                make(given)
+    with pytest.raises(TypeError, match="give both or neither"):
+        conditions.bounded_real(a, b, c, d, p, 1.0, 1.0, Dy=d)
+
+
 P = cp.Variable((3, 3), symmetric=True)
 Z = cp.Variable((2, 2), symmetric=True)
 BAD = {

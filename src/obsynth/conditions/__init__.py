@@ -3,7 +3,7 @@
 ``wang2015``, ``filasova_theorem1``, ``filasova_theorem2``, ``sharepasand`` and ``kalman`` return `Conditions`;
 ``vertex_inequalities`` returns those of an `ErrorPolytope`, whose matrices lie in the hull of vertices;
 ``bounded_real``, ``h2``, ``region`` and ``admissible`` return constraints; ``disk``, ``half_plane`` and ``sector`` are
-regions for the eigenvalues.
+regions for the eigenvalues.  ``Conditions.bisect`` returns a `Bisection` over a parameter.
 """
 
 from importlib import import_module
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from obsynth.conditions.atoms import admissible, bounded_real, h2, region
+    from obsynth.conditions.bisection import Bisection
     from obsynth.conditions.filasova import filasova_theorem1, filasova_theorem2
     from obsynth.conditions.kalman_gain import kalman
     from obsynth.conditions.polytope import vertex_inequalities
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from obsynth.verification.error_polytope import ErrorPolytope
 
 __all__ = [
+    "Bisection",
     "Conditions",
     "ErrorPolytope",
     "LMIRegion",
@@ -44,6 +46,7 @@ _HOMES = {
     name: f"obsynth.{module}"
     for module, names in {
         "conditions.atoms": "admissible bounded_real h2 region",
+        "conditions.bisection": "Bisection",
         "conditions.filasova": "filasova_theorem1 filasova_theorem2",
         "conditions.kalman_gain": "kalman",
         "conditions.polytope": "vertex_inequalities",

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 #: How far inside the cone the inequalities hold by default.
 MARGIN = 1e-9
 
+#: The same of inequalities that are homogeneous in P, whose scale is free: a margin below the tolerances of solvers
+#: keeps nothing, and a feasible P can be as large as one likes.
+HOMOGENEOUS_MARGIN = 1.0
+
 
 @arguments_checked
 def bounded_real(
@@ -96,6 +100,7 @@ def bounded_real(
     >>> round(float(gamma_squared.value) ** 0.5, 2)  # the largest gain of 1 / (z - 0.5)
     2.0
     """
+    _require_measured(Y, Cy, Dy)
     n, nw, nz = _sizes(A, B, C, D, P)
     pa, pb = _moved(A, P, Y, Cy), _moved(B, P, Y, Dy)
     level = _square(gamma) if gamma_squared is None else _scalar(gamma_squared, "gamma_squared")
@@ -179,6 +184,7 @@ def h2(
     >>> round(float(Z.value[0, 0]), 3)  # the sum of 0.25 ** k
     1.333
     """
+    _require_measured(Y, Cy, Dy)
     n, nw, nz = _sizes(A, B, C, D, P)
     require_shape(_shape(Z), (nw, nw), "Z")
     pa, pb = _moved(A, P, Y, Cy), _moved(B, P, Y, Dy)
@@ -195,7 +201,7 @@ def h2(
 
 @arguments_checked
 def region(
-    A: Any, P: Any, where: LMIRegion, *, Y: Any = None, Cy: Any = None, margin: float = MARGIN
+    A: Any, P: Any, where: LMIRegion, *, Y: Any = None, Cy: Any = None, margin: float = HOMOGENEOUS_MARGIN
 ) -> list[cvxpy.Constraint]:
     r"""Return the inequality that puts every eigenvalue of A into a region: ``L x P + M x (PA) + M' x (PA)' < 0``.
 
@@ -212,7 +218,8 @@ def region(
     Y, Cy : optional
         ``(n, ny)``, ``(ny, n)``: the gain that is still to be found, ``Y = P L``.
     margin : float, optional
-        What is kept to the boundary of the cone.
+        What is kept to the boundary of the cone: by default the identity, as the scale of P is free.  Beside an
+        inequality that fixes it (`bounded_real`, `h2`) give a small one.
 
     Returns
     -------
@@ -241,6 +248,7 @@ def region(
     """
     where = checked_region(where, "where")
     _square_matrix(A, P)
+    _require_measured(Y, Cy)
     pa = _moved(A, P, Y, Cy)
     k = len(where.L)
     blocks = [[where.L[i, j] * P + where.M[i, j] * pa + where.M[j, i] * pa.T for j in range(i + 1)] for i in range(k)]
@@ -249,7 +257,7 @@ def region(
 
 @arguments_checked
 def admissible(
-    E: Any, A: Any, P: Any, dt: float, *, Y: Any = None, Cy: Any = None, margin: float = MARGIN
+    E: Any, A: Any, P: Any, dt: float, *, Y: Any = None, Cy: Any = None, margin: float = HOMOGENEOUS_MARGIN
 ) -> list[cvxpy.Constraint]:
     r"""Return the inequality that makes a pair regular, impulse-free and stable.
 
@@ -268,7 +276,7 @@ def admissible(
     Y, Cy : optional
         ``(n, ny)``, ``(ny, n)``: the gain that is still to be found, ``Y = P' L``; continuous time only.
     margin : float, optional
-        What is kept to the boundary of the cone, in the strict inequality.
+        What is kept to the boundary of the cone, in the strict inequality; see `region`.
 
     Returns
     -------
@@ -296,6 +304,7 @@ def admissible(
     >>> problem.status
     'optimal'
     """
+    _require_measured(Y, Cy)
     _square_matrix(A, P)
     require_shape(_shape(E), _shape(A), "E")
     e, a = np.asarray(E, dtype=np.float64), A
@@ -316,6 +325,12 @@ def _moved(matrix: Any, P: Any, Y: Any, measured: Any) -> Any:
         return P @ matrix
     require_shape(_shape(Y), (_shape(P)[0], _shape(measured)[0]), "Y")
     return P @ matrix - Y @ measured
+
+
+def _require_measured(Y: Any, Cy: Any, Dy: Any = None) -> None:
+    """Raise `TypeError` for a gain without the outputs that it multiplies, or outputs without a gain."""
+    if (Y is None) != (Cy is None) or (Y is None and Dy is not None):
+        raise TypeError("Y, the gain, belongs to Cy (and Dy), the outputs that it multiplies: give both or neither.")
 
 
 def _square(gamma: Any) -> float:

@@ -12,8 +12,9 @@ import numpy as np
 
 from obsynth.analysis.existence.condition import Condition
 from obsynth.conditions import lazy_cvxpy as cp
+from obsynth.conditions.bisection import Answer, Bisection, bisected
 from obsynth.errors import SolverError, SpecError, VerificationError, a_kind
-from obsynth.numerics.arguments import require_kind, shown
+from obsynth.numerics.arguments import arguments_checked, real_number, require_kind, shown
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.results.design import ObserverDesign
 from obsynth.results.registered import registered
@@ -23,6 +24,9 @@ from obsynth.verification.plant import condition_rows
 if TYPE_CHECKING:
     import cvxpy
 
+
+#: Values satisfy a constraint that they violate by no more than this share of their own size: solvers stop at 1e-8.
+VIOLATION_SHARE = 1e-6
 
 #: Numbers by name, such as the values of variables.
 Values = Mapping[str, FloatArray]
@@ -141,6 +145,103 @@ class Conditions:
             raise SolverError(
                 f"{solver} failed while solving {self.source} ({error}): the result is inconclusive."
             ) from error
+
+    @arguments_checked
+    def bisect(
+        self,
+        parameter: str,
+        feasible: float,
+        infeasible: float,
+        *,
+        solver: str = "CLARABEL",
+        settings: Mapping[str, Any] | None = None,
+        tolerance: float = 1e-3,
+    ) -> Bisection:
+        """Return at which value of a parameter the conditions change from feasible to infeasible.
+
+        A solver that fails says nothing of a level: such levels are listed as unknown, and others near them are tried.
+        Values count only where they satisfy the constraints.
+
+        Parameters
+        ----------
+        parameter : str
+            Name of a parameter, such as ``"gamma_squared"`` of ``wang2015(plant, gamma=1.0)``.
+        feasible : float
+            A level at which there is a solution.
+        infeasible : float
+            The other end of the interval, above or below.
+        solver : str, optional
+            One of ``cvxpy.installed_solvers()``.
+        settings : mapping, optional
+            Its settings by its own names.
+        tolerance : float, optional
+            Ends where the interval is below this share of the feasible level.
+
+        Returns
+        -------
+        Bisection
+            ``feasible`` (the variables have its values), ``infeasible`` and the levels that are ``unknown``.
+
+        Raises
+        ------
+        SpecError
+            There is no such parameter, or the solver calls the level that is given as feasible infeasible.
+        SolverError
+            The solver has no answer there: inconclusive.
+
+        Examples
+        --------
+        >>> import obsynth
+        >>> plant = obsynth.DescriptorSystem(
+        ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0.1], [1]], dt=1.0
+        ... )
+        >>> paper = obsynth.conditions.wang2015(plant, gamma=10.0)
+        >>> found = paper.bisect("gamma_squared", 100.0, 0.0)
+        >>> found.infeasible < found.feasible, found.unknown
+        (True, ())
+        """
+        if parameter not in self.parameters:
+            listed = ", ".join(map(repr, self.parameters)) or "none: give wang2015 a gamma, for one"
+            raise SpecError(f"There is no parameter {parameter!r}; there are: {listed}.", path="parameter")
+        first, last = real_number(feasible, "feasible", "a number"), real_number(infeasible, "infeasible", "a number")
+        share = real_number(tolerance, "tolerance", "a positive number", above=0.0)
+
+        def answer(level: float) -> Answer:
+            return self._answer(parameter, level, solver, settings or {})
+
+        start = answer(first)
+        if start == "infeasible":
+            raise SpecError(
+                f"feasible is {first:g}, which {solver} calls infeasible: give a level of {parameter} with a solution.",
+                path="feasible",
+            )
+        if start == "unknown":
+            raise SolverError(
+                f"{solver} has no answer at {parameter} = {first:g} (status {self.problem.status}): the result is "
+                "inconclusive. Give a level further inside."
+            )
+        found = bisected(answer, first, last, share)
+        # The variables have the values of whatever was tried last.
+        answer(found.feasible)
+        return found
+
+    def _answer(self, parameter: str, level: float, solver: str, settings: Mapping[str, Any]) -> Answer:
+        """Return what a solver finds at a level; whatever is neither a solution nor a plain no is unknown."""
+        self.parameters[parameter].value = level
+        try:
+            self.solve(solver, settings)
+        except SolverError:
+            return "unknown"
+        if self.problem.status == "infeasible":
+            return "infeasible"
+        if self.problem.status != "optimal":
+            return "unknown"
+        values = [variable.value for variable in self.problem.variables()]
+        if any(value is None or not np.all(np.isfinite(value)) for value in values):
+            return "unknown"
+        size = max((float(np.max(np.abs(value), initial=1.0)) for value in values), default=1.0)
+        worst = max((float(np.max(one.violation(), initial=0.0)) for one in self.problem.constraints), default=0.0)
+        return "feasible" if worst <= VIOLATION_SHARE * size else "unknown"
 
     def letters(self) -> Letters:
         """Return variables and data by their letters in the paper, as functions of them (``constraints=``) get them.

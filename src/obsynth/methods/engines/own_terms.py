@@ -77,7 +77,7 @@ def filter_by_inequality(
                 condition="region",
                 mode=0j,
             )
-        added["region"] = atoms.region(found.data["A1"], P, where, Y=Y, Cy=found.data["C1"])[1]
+        added["region"] = atoms.region(found.data["A1"], P, where, Y=Y, Cy=found.data["C1"], margin=atoms.MARGIN)[1]
     if asked.gamma is not None:
         added["gamma"] = squared <= asked.gamma**2
     goal: Any = None
