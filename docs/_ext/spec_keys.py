@@ -18,6 +18,12 @@ _SIGNALS = {
     "scales": ("unit / unit", "Factor from the unit of a log to the unit of the signal.", "{speed: 0.1047}"),
     "units": ("", "Unit of each signal, as text: it is printed, and nothing is converted.", "{cell: degC, heater: W}"),
 }
+_DELAYS = (
+    "s",
+    "Dead times of inputs and outputs: seconds, or texts with a unit (us, ms, s, min, h, d). See "
+    "[dead time](../howto/dead_time).",
+    "{valve: 2.5 s, analyser: 3 min}",
+)
 _NAMES = {
     f"{kind}_names": ("", f"Names of the {what}, in the order of the {where}.", example)
     for kind, what, where, example in (
@@ -112,6 +118,7 @@ KEYS: Keys = {
         ),
         **{name: text for name, text in _NAMES.items() if name != "parameter_names"},
         **_SIGNALS,
+        "delays": _DELAYS,
         **_NOISE,
         **_TOLERANCES,
         "scheduling": (
@@ -142,6 +149,7 @@ KEYS: Keys = {
         "sensor_faults": ("", "Outputs to which a bias is added.", "[y1]"),
         "sensor_noise": ("of the output", "Standard deviation of the noise of each output, per sample.", "{y1: 0.1}"),
         **_SIGNALS,
+        "delays": _DELAYS,
     },
     "TimeVaryingSection": {
         "kind": ("", "Says that matrices change with k.", "time-varying"),
@@ -197,7 +205,12 @@ KEYS: Keys = {
     "TransformSection": {
         "linearise": ("", "Where equations are linearised, see below.", "{given: {level: 4.0}}"),
         "eliminate_algebraic_states": ("", "Solve the algebraic equations first; needs index 1.", "true"),
-        "sample_time": ("s", "Sample the plant with a zero-order hold.", "10"),
+        "pade": (
+            "",
+            "Replace the delays of a continuous plant by Pade approximations of this order; claims are then for that model.",
+            "3",
+        ),
+        "sample_time": ("s", "Sample the plant with a zero-order hold; exact for delays of any length.", "10"),
     },
     "LineariseSection": {
         "at": ("", "Linearise where nothing moves, or at the point that `given` states.", "equilibrium"),

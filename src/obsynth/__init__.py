@@ -79,6 +79,7 @@ _PUBLIC_NAMES = {
     "plants.importing.python_objects": "from_control from_pandas from_scipy from_sympy",
     "plants.polytopic": "PolytopicSystem",
     "plants.time_varying": "TimeVaryingDescriptorSystem",
+    "plants.transformations.delays": "absorb_delays",
     "plants.transformations.elimination": "eliminate_algebraic_states",
     "plants.transformations.linearisation": "linearise",
     "plants.transformations.noise_states": "with_noise",

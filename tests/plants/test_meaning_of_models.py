@@ -48,13 +48,6 @@ def test_a_sampled_model_without_its_sampling_time_takes_the_one_that_is_given(t
         obsynth.from_matlab(written(tmp_path, Ts=0.2), dt=0.1)
 
 
-@pytest.mark.parametrize("field", ["InputDelay", "OutputDelay", "InternalDelay"])
-def test_delays_of_a_model_are_refused_by_name_and_zeros_are_none(tmp_path, field):
-    with pytest.raises(obsynth.SpecError, match=field):
-        obsynth.from_matlab(written(tmp_path, Ts=0.0, **{field: [[0.5]]}))
-    assert obsynth.from_matlab(written(tmp_path, Ts=0.0, **{field: [[0.0]]})).nx == 1
-
-
 def test_units_of_signals_are_read_and_an_unknown_field_is_named(tmp_path):
     fields = {"Ts": 0.0, "OutputUnit": np.array(["V"], dtype=object), "OutputName": np.array(["gauge"], dtype=object)}
     assert obsynth.from_matlab(written(tmp_path, **fields, Notes="")).units == {"gauge": "V"}

@@ -19,7 +19,8 @@ from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import structure_of
 from obsynth.plants.signal_names import listed
-from obsynth.plants.transformations.recovery import Transformation, linear_plant
+from obsynth.plants.transformations.delays import linear_plant
+from obsynth.plants.transformations.recovery import Transformation
 
 #: A sampled plant with an eigenvalue this far from zero grows so fast that it is hardly one.
 _FAR_EIGENVALUE = 3.0

@@ -13,6 +13,7 @@ from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.delays import without_delays
 from obsynth.plants.transformations.recovery import Transformation
 
 #: Steps that are looked at where the plant has no horizon.
@@ -97,6 +98,7 @@ def as_time_varying(
     plant: DescriptorSystem | TimeVaryingDescriptorSystem | Transformation,
 ) -> TimeVaryingDescriptorSystem:
     """Return a plant as the recursive methods take it."""
+    plant = without_delays(plant)
     plant = plant.plant if isinstance(plant, Transformation) else plant
     if isinstance(plant, TimeVaryingDescriptorSystem):
         return plant

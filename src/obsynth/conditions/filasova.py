@@ -35,7 +35,8 @@ from obsynth.numerics.arguments import arguments_checked, chosen, is_finite_numb
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.regions import LMIRegion, checked_region
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.transformations.recovery import Transformation, linear_plant
+from obsynth.plants.transformations.delays import linear_plant
+from obsynth.plants.transformations.recovery import Transformation
 
 #: Conditions whose failure leaves an inequality that no matrices satisfy.
 LEFT_TO_THE_PD_INEQUALITY = ("nf <= ny", "rank F", "detectability", "rank [A F; C Df]")

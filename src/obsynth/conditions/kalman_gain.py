@@ -33,7 +33,8 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, covariance_factor
 from obsynth.observers.recursive.steady_filter import steady_state_filter
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.plants.transformations.recovery import Transformation, linear_plant
+from obsynth.plants.transformations.delays import linear_plant
+from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.design import ObserverDesign
 
 

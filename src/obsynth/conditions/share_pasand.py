@@ -48,7 +48,8 @@ from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.plants.polytopic import PolytopicSystem
-from obsynth.plants.transformations.recovery import Transformation, linear_plant
+from obsynth.plants.transformations.delays import linear_plant
+from obsynth.plants.transformations.recovery import Transformation
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.results.design import ObserverDesign
 

@@ -22,8 +22,10 @@ from obsynth.numerics.arguments import arguments_checked, field_types
 from obsynth.numerics.libraries import failed_computations, failure_of, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.delays import continuous_with_delays, plant_and_recovery, sample_time_of_delays
 from obsynth.plants.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
-from obsynth.plants.transformations.recovery import StateRecovery, Transformation, plant_and_recovery
+from obsynth.plants.transformations.recovery import StateRecovery, Transformation
+from obsynth.plants.transformations.sampling import discretise
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.plant_source import source_of
@@ -107,6 +109,8 @@ def design(
     """
     report_stage = progress or silent
     own: Plant
+    _require_sampled_delays(plant, method, options)
+    notes = plant.notes if isinstance(plant, Transformation) else ()
     own, recovery = plant_and_recovery(plant, recovery)
 
     def made(plant: Plant, method: str, options: Mapping[str, Any], *, advise: bool = False) -> ObserverDesign:
@@ -115,7 +119,8 @@ def design(
         uncertain = plant.uncertainty if isinstance(plant, DescriptorSystem) else None
         if asked.over_scenario and scenario is not None and uncertain is not None and uncertain.box.names:
             each = partial(each, more={"scenario": scenario})
-        return each(plant, asked)
+        found: ObserverDesign = each(plant, asked)
+        return found.replace(notes=(*notes, *found.notes)) if notes else found
 
     if method == AUTO:
         from obsynth.methods.automatic import automatic_design
@@ -138,6 +143,26 @@ def _for_region(plant: Plant, options: Mapping[str, Any]) -> str:
         if all(condition.holds for condition in method_class(method).of(options).existence(plant)):
             return method
     return (taking or list(methods_for("polytopic")))[0]
+
+
+def _require_sampled_delays(plant: Any, method: str, options: Mapping[str, Any]) -> None:
+    """Refuse a continuous plant with delays; which methods exist for it on samples is tried before it is said."""
+    given = plant.plant if isinstance(plant, Transformation) else plant
+    if not isinstance(given, DescriptorSystem) or not given.delays or given.is_discrete:
+        return
+    try:
+        sampled = discretise(plant, sample_time_of_delays(given))
+        reports = check(sampled, {} if method == AUTO else {method: options})
+    except (SpecError, PreconditionError, SolverError):
+        raise continuous_with_delays(given) from None
+    exist = [name for name, report in reports.items() if report.passed]
+    if method in exist:
+        tried = f" {method} exists for that."
+    elif exist:
+        tried = f" For that exist: {', '.join(exist)}."
+    else:
+        tried = " No method exists for that as it is, either: obsynth.check says why."
+    raise continuous_with_delays(given, tried)
 
 
 def _designed(

@@ -19,6 +19,7 @@ from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.quantities import in_unit
 from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse, same_matrix
+from obsynth.plants.dead_times import checked_delays, delays_in_words
 from obsynth.plants.signal_names import (
     COUNTED_BY,
     Problems,
@@ -189,7 +190,7 @@ def note_source(source: DescriptorSystem, new: DescriptorSystem, *, sample_time:
 def carry_source(old: DescriptorSystem, new: DescriptorSystem) -> None:
     """Note on a changed plant which plant, as written, the old one comes from, if nothing has changed that matters."""
     made = getattr(old, "_made_from", None)
-    unchanged = old.dt == new.dt and all(
+    unchanged = (old.dt, old.delays) == (new.dt, new.delays) and all(
         same_matrix(getattr(old, name), getattr(new, name)) for name in (*DECISIVE, "B", "D")
     )
     if made is not None and unchanged:
@@ -248,6 +249,7 @@ def plant_fields(
     operating_point: Any,
     scales: Any,
     units: Any,
+    delays: Any,
     sensor_noise: Any,
 ) -> dict[str, Any]:
     """Return every field of a `DescriptorSystem`; raise one `SpecError` with all problems."""
@@ -300,6 +302,7 @@ def plant_fields(
     known, measured = {name for field in _FIELDS.values() for name in values[field]}, set(values["input_names"])
     measured |= set(values["output_names"])
     values |= checked_labels(problems, known, measured, operating_point=operating_point, scales=scales, units=units)
+    values["delays"] = problems.collect(lambda: checked_delays(delays, values["input_names"], values["output_names"]))
     problems.raise_if_any()
     return values
 
@@ -440,7 +443,10 @@ class DescriptorSystem:
         Factor of named inputs and outputs: what a log holds, times the factor, is in the signal's unit.
     units : mapping, optional
         Unit of named signals, as text.
-
+    delays : mapping, optional
+        Dead times of named inputs and outputs: seconds, or texts such as ``"300 ms"``.  A delayed input acts late
+        wherever it acts; a delayed output shows late what ``C x + D u + Dd d + Df f`` was (``Dw`` is noise of the
+        reading, and is not delayed).  Methods take the plant that `discretise` or `absorb_delays` makes of it.
     sensor_noise : mapping, optional
         Standard deviation of the noise of named outputs, per sample: adds a column to ``Dw`` for each.
     uncertainty : Uncertainty, optional
@@ -483,6 +489,7 @@ class DescriptorSystem:
     operating_point: Mapping[str, float]
     scales: Mapping[str, float]
     units: Mapping[str, str]
+    delays: Mapping[str, float]
     uncertainty: Uncertainty | None
     exact: ExactNumbers | None
 
@@ -510,6 +517,7 @@ class DescriptorSystem:
         operating_point: Mapping[str, float] | None = None,
         scales: Mapping[str, float] | None = None,
         units: Mapping[str, str] | None = None,
+        delays: Mapping[str, Any] | None = None,
         sensor_noise: Mapping[str, float] | None = None,
         uncertainty: Uncertainty | Mapping[str, Any] | None = None,
         exact: ExactNumbers | Mapping[str, Any] | None = None,
@@ -527,7 +535,14 @@ class DescriptorSystem:
         }
         point, noise = _in_stated_units(units, operating_point=operating_point, sensor_noise=sensor_noise)
         values = plant_fields(
-            asked, names, dt=dt, operating_point=point, scales=scales, units=units, sensor_noise=noise
+            asked,
+            names,
+            dt=dt,
+            operating_point=point,
+            scales=scales,
+            units=units,
+            delays=delays,
+            sensor_noise=noise,
         )
         values["uncertainty"] = uncertainty_of(uncertainty)
         values["exact"] = exact_numbers(exact)
@@ -589,8 +604,11 @@ class DescriptorSystem:
         return self.dt > 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """Return every field, as the constructor takes it; `uncertainty` and `exact` only where there are such."""
+        """Return every field, as the constructor takes it; `delays`, `uncertainty` and `exact` only where there are
+        such."""
         found = {field.name: getattr(self, field.name) for field in fields(self)}
+        if not self.delays:
+            found.pop("delays")
         records = {name: found.pop(name) for name in ("uncertainty", "exact")}
         return found | {name: record.as_dict() for name, record in records.items() if record is not None}
 
@@ -609,7 +627,7 @@ class DescriptorSystem:
         kept = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "exact"}
         gone = {name for field in SIGNAL_NAMES if field in changes for name in getattr(self, field)}
         gone -= {name for field in SIGNAL_NAMES for name in (changes[field] or () if field in changes else kept[field])}
-        for label in ("operating_point", "scales", "units"):
+        for label in ("operating_point", "scales", "units", "delays"):
             kept[label] = {name: value for name, value in kept[label].items() if name not in gone}
         new = DescriptorSystem(**{**kept, **changes})
         if self.uncertainty is not None and "uncertainty" not in changes:
@@ -631,5 +649,5 @@ class DescriptorSystem:
         time = f"dt={self.dt:g} s" if self.is_discrete else "continuous"
         return (
             f"DescriptorSystem(nx={self.nx}, nu={self.nu}, ny={self.ny}, nf={self.nf}, nd={self.nd}, "
-            f"nw={self.nw}, {time})"
+            f"nw={self.nw}, {time}{f', delays: {delays_in_words(self.delays)}' if self.delays else ''})"
         )

@@ -11,6 +11,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.delays import absorb_delays
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.plants.transformations.recovery import Transformation
 from obsynth.plants.transformations.sampling import discretise
@@ -30,7 +31,7 @@ class PlantSource:
     def derived(self) -> Transformation:
         """The elimination, and the sampling where there was one, done again; once for all checks."""
         if self.sample_time is None:
-            return eliminate_algebraic_states(self.plant)
+            return absorb_delays(self.plant) if self.plant.delays else eliminate_algebraic_states(self.plant)
         return discretise(self.plant, self.sample_time)
 
     @cached_property

@@ -7,7 +7,7 @@ constant or linear between samples.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -23,6 +23,7 @@ from obsynth.numerics.matrix_equations import continuous_riccati, discrete_ricca
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.delays import absorb_delays
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.plants.transformations.recovery import StateRecovery
 from obsynth.plants.transformations.sampling import discretise
@@ -54,6 +55,8 @@ def simulate_plant(
     given = {"u": u, "f": f, "d": d, "w": w}
     signals = {name: signal_of(given[name], name, (steps, size)) for name, size in sizes.items()}
     start = np.zeros(plant.nx) if initial_state is None else real_vector(initial_state, plant.nx, "initial_state")
+    if plant.delays:
+        return _with_delays(plant, steps, signals, start)
     elimination = eliminate_algebraic_states(plant)
     reduced, recovery = elimination.plant, elimination.recovery
     drive = _sum_of(signals, {"u": reduced.B, "f": reduced.Bf, "d": reduced.Bd, "w": reduced.Bw})
@@ -73,6 +76,19 @@ def simulate_plant(
         time=plant.dt * np.arange(steps, dtype=np.float64),
         inconsistency=inconsistency,
     )
+
+
+def _with_delays(plant: DescriptorSystem, steps: int, signals: dict[str, FloatArray], start: FloatArray) -> Trajectory:
+    """Return what a plant with delays does; nothing is on its way at the start."""
+    absorbed, elimination = absorb_delays(plant), eliminate_algebraic_states(plant)
+    moving = dynamic_part(plant, elimination.recovery, start)
+    whole, way = absorbed.plant, absorbed.recovery
+    first = np.concatenate([moving, np.zeros(whole.nx - len(moving))])
+    run = simulate_plant(whole, steps=steps, initial_state=first, **signals)
+    following = {"u": way.from_input, "f": way.from_fault, "d": way.from_disturbance, "w": way.from_noise}
+    states = run.states @ way.from_state.T + _sum_of(signals, following)
+    inconsistency = float(np.linalg.norm(states[0] - start)) if np.any(start) else 0.0
+    return replace(run, states=states, inconsistency=inconsistency)
 
 
 def _sum_of(signals: dict[str, FloatArray], matrices: dict[str, FloatArray]) -> FloatArray:

@@ -21,7 +21,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.plants.transformations.recovery import Transformation, plant_and_recovery
+from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.benches import bench_of
 from obsynth.simulation.dae import simulate_dae
@@ -253,7 +253,7 @@ def simulate(
     >>> run.estimates.faults[-1].round(3).tolist()
     [1.0]
     """
-    design, _ = plant_and_recovery(design)
+    design = design.plant if isinstance(design, Transformation) else design
     for kind, plant_alone in _PLANT_SIMULATIONS.items():
         if isinstance(design, kind) and scenario is None:
             found: Trajectory = plant_alone(design, **signals)

@@ -16,6 +16,7 @@ from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.delays import absorb_delays
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.plants.transformations.recovery import Transformation
 from obsynth.plants.transformations.sampling import discretise
@@ -245,7 +246,7 @@ def spec_of(
         if states and model is None:
             noisy, more = _placed_noise(plant, noise, plant_source, prefix)
             transformation, plant = noisy, noisy.plant
-        if asked[0] is not None:
+        if asked[0] is not None or plant.delays:
             with one_thread_if_small(plant.nx):
                 later = _transformed(asked[0], plant, *asked[1:])
             if later is not None:
@@ -393,8 +394,9 @@ def _transformed(
     wanted: TransformSection | None, plant: DescriptorSystem, source: Path, prefix: str
 ) -> Transformation | None:
     """Return a plant without its algebraic states, sampled, or both, as asked; ``None`` where nothing is."""
-    if wanted is None or not (wanted.eliminate_algebraic_states or wanted.sample_time is not None):
-        return None
+    late = plant.is_discrete and bool(plant.delays)
+    if wanted is None or not (wanted.eliminate_algebraic_states or wanted.sample_time is not None or wanted.pade):
+        return absorb_delays(plant) if late else None
     where = joined(prefix, "transform")
     if wanted.sample_time is not None and plant.is_discrete:
         raise SpecError(
@@ -403,13 +405,20 @@ def _transformed(
             path=f"{where}.sample_time",
         )
 
+    if wanted.pade and (wanted.sample_time is not None or not plant.delays):
+        why = "the delays of a plant on samples are exact" if plant.delays else "the plant has no delays"
+        raise SpecError(f"{source}: {where}.pade is given, but {why}: remove it.", path=f"{where}.pade")
     try:
+        if late:
+            return absorb_delays(plant, wanted.pade)
+        if wanted.pade:
+            made = absorb_delays(plant, wanted.pade)
+            return eliminate_algebraic_states(made) if wanted.eliminate_algebraic_states else made
         if wanted.sample_time is None:
             return eliminate_algebraic_states(plant)
         if not wanted.eliminate_algebraic_states:
             return discretise(plant, wanted.sample_time)
-        reduced = eliminate_algebraic_states(plant)
-        return reduced.then(discretise(reduced.plant, wanted.sample_time))
+        return discretise(eliminate_algebraic_states(plant), wanted.sample_time)
     except SpecError as error:
         raise SpecError(f"{source}: {where}: {error}", path=where) from error
 

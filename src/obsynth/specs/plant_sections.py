@@ -169,7 +169,7 @@ def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel
 def _polytopic_plant(section: PlantSection, source: Path, prefix: str) -> PolytopicSystem:
     """Return the plant of a section with scheduling parameters."""
     arguments = _read(section, source, prefix, ("dt", "sensor_noise", *_LABELS), ALL_MATRICES, SIGNAL_NAMES)
-    for name in ("tolerance", "variation", "box", "transform"):
+    for name in ("tolerance", "variation", "box", "transform", "delays"):
         if getattr(section, name) is not None:
             raise SpecError(f"{source}: {name} is for plants without scheduling: remove it.", path=joined(prefix, name))
     if noise_needs_states(noise_model_of(section)):
@@ -200,7 +200,13 @@ def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> Descri
     if section.scheduling is not None:
         return _polytopic_plant(section, source, prefix)
     arguments = _read(
-        section, source, prefix, ("dt", "sensor_noise", *_LABELS), ALL_MATRICES, SIGNAL_NAMES, keep_sparse=True
+        section,
+        source,
+        prefix,
+        ("dt", "sensor_noise", "delays", *_LABELS),
+        ALL_MATRICES,
+        SIGNAL_NAMES,
+        keep_sparse=True,
     )
     if noise_needs_states(noise_model_of(section)):
         arguments["sensor_noise"] = None

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from obsynth.numerics.arguments import Positive
+from obsynth.numerics.arguments import NonNegative, Positive
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, expressions_in
 from obsynth.specs.schema_values import (
     FILE_TAG,
@@ -59,6 +59,7 @@ class TransformSection(Section):
 
     linearise: LineariseSection | None = None
     eliminate_algebraic_states: bool = False
+    pade: Annotated[int, Field(ge=1, le=8)] | None = None
     sample_time: Positive | None = None
 
 
@@ -130,6 +131,7 @@ class PlantSection(Section):
     operating_point: dict[Text, float] | None = None
     scales: dict[Text, float] | None = None
     units: dict[Text, str] | None = None
+    delays: dict[Text, NonNegative | Text] | None = None
     sensor_noise: SensorNoises | None = None
     offset: Sizes | None = None
     walks: Sizes | None = None
@@ -180,3 +182,4 @@ class PlantReference(Section):
     operating_point: dict[Text, float] | None = None
     scales: dict[Text, float] | None = None
     units: dict[Text, str] | None = None
+    delays: dict[Text, NonNegative | Text] | None = None

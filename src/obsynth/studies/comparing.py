@@ -37,7 +37,8 @@ from obsynth.numerics.continuous import driven
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.transformations.recovery import Transformation, linear_plant
+from obsynth.plants.transformations.delays import linear_plant
+from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import duration
 from obsynth.simulation.profiles import Sine, Step

@@ -21,7 +21,8 @@ from obsynth.methods.functions import functional_filter
 from obsynth.numerics.arguments import Count, arguments_checked, is_finite_number, real_vector
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.transformations.recovery import Transformation, linear_plant
+from obsynth.plants.transformations.delays import linear_plant
+from obsynth.plants.transformations.recovery import Transformation
 from obsynth.studies.threshold_sensors import ThresholdProblem
 
 #: So many sets are returned at most by default, and so many of them designed for.

@@ -215,7 +215,7 @@ def _sampling_rows(
         source="zero-order hold",
         detail=f"delays {delays}",
     )
-    if not plant.nd:
+    if not plant.nd or smooth.delays:
         return
     t = model.own
     rows = observer.fault_rows

@@ -15,7 +15,8 @@ from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.pencil_points import full_svd
 from obsynth.numerics.ranks import RankDecision, product_but_rounding, rank_from
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.transformations.recovery import Transformation, linear_plant
+from obsynth.plants.transformations.delays import linear_plant
+from obsynth.plants.transformations.recovery import Transformation
 
 #: Entries of unit rows below this are rounding of the orthogonal transformations that made them.
 ROTATION_ROUNDING = 1e-14

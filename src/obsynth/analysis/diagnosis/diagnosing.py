@@ -31,7 +31,8 @@ from obsynth.numerics.ranks import REST_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem, stated_eigenvalues
 from obsynth.plants.pencil import structure_of
-from obsynth.plants.transformations.recovery import Transformation, linear_plant
+from obsynth.plants.transformations.delays import linear_plant
+from obsynth.plants.transformations.recovery import Transformation
 
 #: Of more faults the whole bank is refused: 4095 sets are asked about for this many.
 MOST_FAULTS_OF_WHOLE_BANK = 12

@@ -18,7 +18,8 @@ from obsynth.observers.recursive.steady_filter import steady_state_filter
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.plants.transformations.recovery import Transformation, linear_plant
+from obsynth.plants.transformations.delays import linear_plant
+from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.design import ObserverDesign
 
 #: A gain of the inequality is that of the recursion when they differ by at most this share of their size: the minimum

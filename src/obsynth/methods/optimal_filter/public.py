@@ -14,6 +14,8 @@ from obsynth.numerics.arrays import as_matrix
 from obsynth.numerics.optimal_estimation import NoStableFilterError, optimal_estimator
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.delays import without_delays
+from obsynth.plants.transformations.recovery import Transformation
 
 #: ``delay="auto"`` takes the first delay whose gain is within this share of that of the longest one looked at.
 WORTH_WAITING = 0.05
@@ -152,6 +154,8 @@ def optimal_filter(
     >>> print(f"{obsynth.optimal_filter(plant, delay=0).gain:.6f}")
     0.707107
     """
+    made = without_delays(plant)
+    plant = made.plant if isinstance(made, Transformation) else made
     model = _checked(plant, delay, reference, norm, exact, decoupled)
     inputs = _inputs(plant, decoupled)
     if model is not None or delay != "auto":

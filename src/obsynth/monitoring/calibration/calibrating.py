@@ -34,6 +34,7 @@ from obsynth.numerics.arrays import read_only
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.delays import require_no_delays
 
 #: How often samples that stand out are left out: each time the others are known better.
 OUTLIER_ROUNDS = 3
@@ -434,6 +435,7 @@ def require_plant(given: Any) -> DAEModel | DescriptorSystem | TimeVaryingDescri
             f"model is {type(given).__name__}: give a DAEModel, a DescriptorSystem or a TimeVaryingDescriptorSystem.",
             path="model",
         )
+    require_no_delays(plant, "A calibration")
     return plant
 
 

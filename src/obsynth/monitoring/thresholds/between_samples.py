@@ -16,6 +16,7 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold, peak_gain
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.dead_times import delays_in_words, in_samples
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.proofs.balls import Ball, rounded_up
@@ -112,6 +113,9 @@ class IntersampleErrorSystem:
     ) -> IntersampleErrorSystem:
         """Return a design for a sampled plant, with states of ``written``: ``eps+ = Az eps - T q + By Dd d``."""
         smooth = eliminate_algebraic_states(written).plant
+        _require_readings_at_samples(smooth, plant.dt)
+        # Samples of delayed signals are states that a disturbance reaches a sample later.
+        tracking = tracking[:, : smooth.nx]
         n, nz, exact = smooth.nx, observer.order, Ball.exact
         m = block([[exact(np.zeros((n, n))), exact(np.zeros((n, nz)))], [exact(np.zeros((nz, n))), exact(observer.Az)]])
         shown = np.hstack([np.zeros((len(observer.Cz[rows]), n)), observer.Cz[rows]])
@@ -302,3 +306,18 @@ def _split(
     driven = np.zeros_like(sizes) if contraction is None else contraction.gain(shown, rest.midpoint, rest.radius)
     left = float(np.linalg.norm(np.sum(rounded_up(driven + sizes, 4), axis=1)))
     return m, shown, contraction, block([[projector], [into]]), left
+
+
+def _require_readings_at_samples(smooth: DescriptorSystem, step: float) -> None:
+    """Raise `SpecError` where a disturbance between samples reaches the reading of a delayed output at once."""
+    late = {name: delay for name, delay in smooth.delays.items() if name in smooth.output_names}
+    rows = [smooth.output_names.index(name) for name in late]
+    broken = {name: delay for name, delay in late.items() if in_samples(delay, step)[1]}
+    if broken or np.any(smooth.Dd[rows]):
+        why = "is no whole number of samples" if broken else "is of a reading that an unknown input reaches directly"
+        raise SpecError(
+            f"No threshold is known for disturbances that move between samples where a delay {why} "
+            f"({delays_in_words(broken or late)}): choose a sample_time of which the delays are multiples, or measure "
+            "something else.",
+            path="delays",
+        )

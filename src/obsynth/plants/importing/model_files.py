@@ -40,8 +40,11 @@ _UNSAID = -1.0
 #: Sampling times that differ by less were rounded.
 _SAME_TIME = 1e-12
 
-#: Delays in a file; zero in all of them is no delay.
-_DELAYS = ("InternalDelay", "InputDelay", "OutputDelay", "IODelay")
+#: Delays of inputs and of outputs, in the TimeUnit, or in samples.
+_DELAYS_OF = {"InputDelay": "input_names", "OutputDelay": "output_names"}
+
+#: Delays inside a model, which belong to no signal of it; zero in all of them is no delay.
+_INNER_DELAYS = ("InternalDelay", "IODelay", "ioDelay")
 
 #: Fields with an operating point, and with units: what they are of.
 _POINTS = {"x0": "state_names", "u0": "input_names", "y0": "output_names"}
@@ -124,14 +127,14 @@ def from_matlab(
     Returns
     -------
     DescriptorSystem
-        With the names and units in the file, in seconds whatever the ``TimeUnit``, and with ``x0, u0, y0`` as operating
-        point.
+        With the names and units in the file, in seconds whatever the ``TimeUnit``, with ``x0, u0, y0`` as operating
+        point, and with ``InputDelay`` and ``OutputDelay`` as delays.
 
     Raises
     ------
     SpecError
-        The file cannot be read, holds no such struct, its matrices do not fit together, or it has a delay or a field
-        that is not read and may change what the matrices mean.
+        The file cannot be read, holds no such struct, its matrices do not fit together, or it has an inner delay
+        (``InternalDelay``) or a field that is not read and may change what the matrices mean.
 
     Examples
     --------
@@ -165,6 +168,7 @@ def from_matlab(
         dt=step,
         point=_point(fields, labels),
         units=_units(fields, labels),
+        delays=_delays(fields, labels, given, step or unit, source),
     )
 
 
@@ -224,14 +228,15 @@ def _as_matlab_names(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 def _require_understood(fields: Mapping[str, Any], source: Path, *, is_struct: bool) -> None:
     """Refuse, by name, what would change the meaning of the matrices and is not read."""
-    for name in _DELAYS:
+    for name in _INNER_DELAYS:
         if name in fields and np.any(_numbers_in(fields[name])):
             raise SpecError(
-                f"{source} has a delay ({name}), which is not read: give a model without it (pade or absorbDelay of "
-                "MATLAB), or set it to zero and delay the columns of the log.",
+                f"{source} has {name}, a delay inside the model, which is not read (InputDelay and OutputDelay are): "
+                "give a model without it (pade or absorbDelay of MATLAB), or with delays at its inputs and outputs.",
                 path=str(source),
             )
-    known = {*_MODEL_MATRICES, *_MORE, *_MATLAB_NAMES, *_SAMPLE_TIME_NAMES, *_DELAYS, *_POINTS, *_UNIT_FIELDS}
+    delays = (*_INNER_DELAYS, *_DELAYS_OF)
+    known = {*_MODEL_MATRICES, *_MORE, *_MATLAB_NAMES, *_SAMPLE_TIME_NAMES, *delays, *_POINTS, *_UNIT_FIELDS}
     unknown = [
         name
         for name, value in fields.items()
@@ -327,6 +332,28 @@ def _units(fields: Mapping[str, Any], labels: Mapping[str, Any]) -> dict[str, st
         name: str(np.squeeze(cell)) for name, cell in _labelled(fields, labels, _UNIT_FIELDS, "xuy") if np.size(cell)
     }
     return {name: unit.strip() for name, unit in found.items() if unit.strip()}
+
+
+def _delays(
+    fields: Mapping[str, Any], labels: Mapping[str, Any], given: Mapping[str, Any], unit: float, source: Path
+) -> dict[str, float]:
+    """Return delays in s by input or output; ``unit``: seconds in what the file counts them in, samples or TimeUnit."""
+    sizes = {"input_names": next((np.shape(given[name])[-1] for name in "BD" if name in given), 0)}
+    sizes["output_names"] = len(given["C"]) if "C" in given else len(given["A"])
+    found: dict[str, float] = {}
+    for (field, kind), prefix in zip(_DELAYS_OF.items(), "uy", strict=True):
+        values = np.ravel(_numbers_in(fields[field])) if field in fields else np.zeros(0)
+        if not np.any(values):
+            continue
+        if len(values) not in (1, sizes[kind]):
+            raise SpecError(
+                f"{source}: {field} has {len(values)} numbers, but there are {sizes[kind]} such signals.",
+                path=str(source),
+            )
+        names = labels[kind] or [f"{prefix}{i + 1}" for i in range(sizes[kind])]
+        for name, value in zip(names, np.broadcast_to(values, sizes[kind]), strict=True):
+            found[name] = float(value) * unit
+    return found
 
 
 def _in(variable: str | None) -> str:

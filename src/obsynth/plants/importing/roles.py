@@ -25,10 +25,12 @@ def plant_of(
     labels: Mapping[str, Sequence[str] | None],
     point: Mapping[str, float] | None = None,
     units: Mapping[str, str] | None = None,
+    delays: Mapping[str, float] | None = None,
 ) -> DescriptorSystem:
     """Return the plant of matrices ``E, A, B, C, D`` whose inputs are shared out among known, faults and unknown.
     ``labels``: ``state_names``, ``input_names``, ``output_names``; ``plant``: roles and arguments of the plant, which
-    go before ``dt``, and entry by entry before operating point and units."""
+    go before ``dt``, and entry by entry before operating point, units and delays.  A delayed input that is a fault or
+    unknown has none: its time is counted from when it acts."""
     more = {"dt": dt, **plant}
     for name, stated in (("operating_point", point), ("units", units)):
         if stated is not None:
@@ -76,6 +78,9 @@ def plant_of(
                 *(f"bias of {name}" for name in sensor_faults),
             ],
         }
+    late = {name: delay for name, delay in (delays or {}).items() if name not in (*faults, *disturbances)}
+    if late:
+        more["delays"] = {**late, **(more.get("delays") or {})}
     if unknown:
         _refuse_both(more, "disturbances", ("Bd", "Dd", "disturbance_names"))
         arguments |= {"Bd": b[:, unknown], "Dd": d[:, unknown], "disturbance_names": list(disturbances)}

@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.numerics.sparse_factor import SolutionBounds
-from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.recovery_operator import RecoveryOperator
 from obsynth.plants.uncertainty import matrices_of
@@ -119,6 +117,13 @@ class Transformation:
 
     def then(self, later: Transformation) -> Transformation:
         """Return both steps as one, for a ``later`` that starts from this one's plant."""
+        lost = set(self.plant.delays).intersection(self.plant.input_names) - set(later.plant.delays)
+        if lost and np.any(self.recovery.from_input):
+            raise SpecError(
+                "Delayed inputs act on states that were eliminated: give the transformation itself to discretise or "
+                "absorb_delays.",
+                path="delays",
+            )
         description = "; ".join(text for text in (self.description, later.description) if text)
         return Transformation(
             self.source,
@@ -130,27 +135,6 @@ class Transformation:
             self.bounds or later.bounds,
             self.is_of_lower_index or later.is_of_lower_index,
         )
-
-
-def plant_and_recovery(given: Any, recovery: StateRecovery | None = None) -> tuple[Any, StateRecovery | None]:
-    """Return the plant of a transformation with its way back, or a plant as it is; a stated way back goes first."""
-    if not isinstance(given, Transformation):
-        return given, recovery
-    return given.plant, given.recovery if recovery is None else recovery
-
-
-def linear_plant(given: Any) -> DescriptorSystem:
-    """Return a linear plant, of a transformation the transformed one; raise `SpecError` for anything else."""
-    plant = given.plant if isinstance(given, Transformation) else given
-    if isinstance(plant, DAEModel):
-        raise SpecError(
-            "This is for linear plants; of a plant of equations give the linear one that its spec makes with "
-            "transform: {linearise: {at: equilibrium, faults: [...]}}, or obsynth.linearise.",
-            path="plant",
-        )
-    require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
-    found: DescriptorSystem = plant
-    return found
 
 
 def unchanged_states(

@@ -17,6 +17,7 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
 from obsynth.numerics.sparse import dense
 from obsynth.plants.descriptor import DescriptorSystem, note_source
+from obsynth.plants.transformations.delayed_signals import sampled_with_delays
 from obsynth.plants.transformations.elimination import columns_of, eliminate_algebraic_states
 from obsynth.plants.transformations.exact_elimination import MOST_STATES_EXACTLY, sampled_exact_numbers
 from obsynth.plants.transformations.recovery import Transformation, unchanged_states
@@ -37,9 +38,11 @@ SQUARING_BITS = 640
 def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> Transformation:
     """Sample a continuous plant with a zero-order hold.
 
-    Exact for inputs, faults and disturbances that are constant between samples.  Algebraic states are
-    eliminated first.  A fault that changes within an interval acts there like its mean over it, weighted by how much
-    of the effect of each moment is left at the next sample: for short intervals the plain mean.
+    Exact for inputs, faults and disturbances that are constant between samples, and for delays (``plant.delays``) of
+    any length: samples on their way become states, and a sample is split where a delayed input changes or a delayed
+    output is taken.  Algebraic states are eliminated first.  A fault that changes within an interval acts there like
+    its mean over it, weighted by how much of the effect of each moment is left at the next sample: for short intervals
+    the plain mean.
 
     Parameters
     ----------
@@ -58,7 +61,7 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
     ------
     SpecError
         ``plant.dt > 0``, or ``sample_time`` is not a positive number, or an unstable mode outgrows double precision
-        within it.
+        within it, or a delay is hundreds of samples.
     PreconditionError
         As for `eliminate_algebraic_states`; or continuous white noise reaches an output directly.
 
@@ -75,7 +78,14 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
     ([[0.9048]], [[0.0952]], 0.1)
     """
     if isinstance(plant, Transformation):
+        if plant.plant.delays:
+            return _sampled(plant.plant, sample_time, before=plant)
         return plant.then(discretise(plant.plant, sample_time))
+    return _sampled(plant, sample_time)
+
+
+def _sampled(plant: DescriptorSystem, sample_time: float, *, before: Transformation | None = None) -> Transformation:
+    """Return a plant on samples; ``before``: what was done to it, of which delayed inputs are a part."""
     if plant.dt > 0.0:
         raise SpecError(f"The plant is already sampled (dt = {plant.dt:g} s): give a continuous plant.", path="dt")
     real_number(sample_time, "sample_time", "a positive number of seconds", above=0.0)
@@ -93,9 +103,12 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
             signals=signals,
         )
     _require_bounded_growth(smooth.A, float(sample_time))
+    if smooth.delays:
+        made = sampled_with_delays(smooth, float(sample_time), _held, _noise_factor)
+        note_source(smooth, made.plant, sample_time=float(sample_time))
+        return made.after(first if before is None else before.then(first), _described(sample_time))
     signals_in = np.hstack([smooth.B, smooth.Bf, smooth.Bd])
-    few = sum(signals_in.shape) <= MOST_ROUNDED_ONCE
-    transition, held = zero_order_hold(smooth.A, signals_in, sample_time, exponential=_rounded_once if few else None)
+    transition, held = _held(smooth.A, signals_in, sample_time)
     B, Bf, Bd = columns_of(held, (smooth.nu, smooth.nf, smooth.nd))
     factor = _noise_factor(smooth.A, smooth.Bw, sample_time)
     kept = [smooth.noise_names[i] for i in direct]
@@ -107,10 +120,19 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
     sampled = smooth.replace(**changes, dt=float(sample_time), noise_names=noise_names, exact=exact)
     noise_kept = np.hstack([np.zeros((smooth.nw, factor.shape[1])), np.eye(smooth.nw)[:, direct]])
     recovery = unchanged_states(smooth, sampled, from_state=np.eye(smooth.nx), noise_kept=noise_kept)
-    description = f"sampled every {sample_time:g} s (zero-order hold)"
     note_source(smooth, sampled, sample_time=float(sample_time))
-    step = Transformation(smooth, sampled, description, recovery)
+    step = Transformation(smooth, sampled, _described(sample_time), recovery)
     return first.then(step.with_tolerances(SAMPLED, sample_time))
+
+
+def _described(sample_time: float) -> str:
+    return f"sampled every {sample_time:g} s (zero-order hold)"
+
+
+def _held(A: FloatArray, signals: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
+    """Return ``exp(A h)`` and its integral times ``signals``; of few entries each rounded once."""
+    few = sum(signals.shape) <= MOST_ROUNDED_ONCE
+    return zero_order_hold(A, signals, step, exponential=_rounded_once if few else None)
 
 
 def _rounded_once(block: FloatArray, step: float) -> FloatArray | None:

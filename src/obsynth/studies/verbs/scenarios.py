@@ -11,7 +11,7 @@ from obsynth.files.outputs import write_atomically
 from obsynth.monitoring.thresholds.options import CHANGE, FALSE_ALARMS, PARAMETER_OPTIONS, refuse_idle
 from obsynth.monitoring.verbs.arguments import MONITOR_NAMES, stated_settings
 from obsynth.monitoring.verbs.data_arguments import monitor_settings, stated_delay
-from obsynth.plants.transformations.recovery import linear_plant
+from obsynth.plants.transformations.delays import linear_plant
 from obsynth.report.terminal.arguments import columns_of, flag_of, numbers_of, refuse_given
 from obsynth.report.terminal.output import emit, output_file, progress, stdout_console
 from obsynth.report.terminal.pictures import picture_kind, written_picture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from obsynth.plants.transformations.recovery import linear_plant
+from obsynth.plants.transformations.delays import linear_plant
 from obsynth.report.terminal.arguments import refuse_given
 from obsynth.report.terminal.output import emit, progress, stdout_console
 
