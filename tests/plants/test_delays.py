@@ -373,7 +373,10 @@ def test_on_logs_in_c_and_in_python_the_same(tmp_path):
     # A log that is taken as if nothing were late shows another fault.
     plain = obsynth.design(obsynth.discretise(loaded.transformation.source.replace(delays=None), 0.05), loaded.method)
     wrong = obsynth.run_on_data(plain, table)
-    assert np.abs(wrong.table["fhat[f1]"].to_numpy()[60:100]).max() > 3.0 * np.abs(log.table["fhat[f1]"].to_numpy()[60:100]).max()
+    assert (
+        np.abs(wrong.table["fhat[f1]"].to_numpy()[60:100]).max()
+        > 3.0 * np.abs(log.table["fhat[f1]"].to_numpy()[60:100]).max()
+    )
     obsynth.export(design, tmp_path / "late.c")
     signals = np.column_stack([run.inputs, run.outputs])
     found = through_c(design.observer, tmp_path / "late.c", signals)

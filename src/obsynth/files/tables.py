@@ -19,7 +19,7 @@ _FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")
 _MARK = "'"
 
 #: A number at the begin of a cell of a table, and what follows it, such as a unit.
-_NUMBER_CELL = re.compile(r"(-?(?:\d{1,3}(?:,\d{3})+|\d+))(\.\d+)?(?=$|[ e])(.*)")
+_NUMBER_CELL = re.compile(r"(-?(?:\d{1,3}(?:,\d{3})+|\d+))((?:\.\d+)?(?:e[-+]?\d+)?)(?=$| )(.*)")
 
 
 def standing_page(title: str, body: Iterable[str], *, generator: str = "obsynth") -> str:
@@ -72,11 +72,11 @@ def aligned(cells: Sequence[str]) -> list[str]:
     """Return the cells of a column with decimal points below each other; what is no number stays as it is."""
     parts = [_NUMBER_CELL.fullmatch(cell) for cell in cells]
     before = max((len(part.group(1)) for part in parts if part), default=0)
-    after = max((len(part.group(2) or "") for part in parts if part), default=0)
+    after = max((len(part.group(2)) for part in parts if part), default=0)
     if sum(part is not None for part in parts) < 2:
         return list(cells)
     return [
-        cell if part is None else f"{part.group(1):>{before}}{part.group(2) or '':<{after}}{part.group(3)}"
+        cell if part is None else f"{part.group(1):>{before}}{part.group(2):<{after}}{part.group(3)}"
         for cell, part in zip(cells, parts, strict=True)
     ]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.console import Console
 from rich.text import Text
 
@@ -13,6 +14,9 @@ from obsynth.results.layout import duration, headed_table, number, print_section
 if TYPE_CHECKING:
     from obsynth.simulation.simulate import Simulation
 
+
+#: Errors below this share of the largest value of a signal are rounding, and shown as 0.
+ROUNDING_SHARE = 1e-13
 
 #: Rows of a table; of a large plant the worst estimates are shown.
 SHOWN_ROWS = 12
@@ -44,13 +48,16 @@ def simulation_report(
     ):
         if not summary[kind]:
             continue
-        lasts = _last_column(found, kind)
+        lasts, rounding = _last_column(found, kind), _rounding(found, kind)
         table = headed_table("signal", "RMSE", "largest error", next(lasts), "unit")
         title, rows = worst_rows(
             title, list(zip(summary[kind].items(), lasts, strict=True)), lambda row: row[0][1]["rmse"]
         )
         for (signal, row), last in rows:
-            table.add_row(Text(signal), number(row["rmse"]), number(row["largest"]), last, Text(units.get(signal, "")))
+            rmse, largest = (
+                number(0.0 if row["largest"] <= rounding[signal] else row[key]) for key in ("rmse", "largest")
+            )
+            table.add_row(Text(signal), rmse, largest, last, Text(units.get(signal, "")))
         told = "errors of the whole record"
         if linear and (end := summary[f"{kind[:-1]}_warm_up"]) is None:
             told = "the initial-condition response has not settled: errors of the whole record"
@@ -61,6 +68,17 @@ def simulation_report(
         console.print(Text(note))
     if file is not None:
         console.print(Text(f"Written: {file}"))
+
+
+def _rounding(found: Simulation, kind: str) -> dict[str, float]:
+    """Return by signal the size of errors that are only rounding: a share of its largest value."""
+    shown = found.estimates
+    if kind == "faults":
+        names, truth, values = shown.fault_names, found.faults[:, list(found.fault_columns)], shown.faults
+    else:
+        names, truth, values = shown.state_names, found.states, shown.states
+    sizes = np.nanmax(np.abs(np.vstack([truth, np.nan_to_num(values)])), axis=0, initial=0.0)
+    return dict(zip(names, (ROUNDING_SHARE * sizes).tolist(), strict=True))
 
 
 def _last_column(found: Simulation, kind: str) -> Iterator[str]:

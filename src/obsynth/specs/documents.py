@@ -169,7 +169,7 @@ class DocumentProblems:
         lines = [f"{path}: {text}" if path else text for path, text in self.found]
         if len(lines) > MAXIMUM_PROBLEMS:
             lines = [*lines[:MAXIMUM_PROBLEMS], f"and {len(lines) - MAXIMUM_PROBLEMS} more"]
-        head = f"{self.source} is no valid {self.what}:"
+        head = f"{self.source} is not a valid {self.what}:"
         raise SpecError(head, path=self.found[0][0] or str(self.source), problems=lines)
 
 
