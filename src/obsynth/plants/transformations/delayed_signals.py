@@ -42,12 +42,18 @@ class _Lags:
 
     @classmethod
     def of(cls, plant: DescriptorSystem, step: float) -> _Lags:
-        inputs = tuple(in_samples(plant.delays.get(name, 0.0), step) for name in plant.input_names)
+        moments: list[float] = []
+
+        def moment(time: float) -> float:
+            """Return a time within a sample; those that differ by rounding alone are one."""
+            same = (other for other in moments if abs(other - time) <= WHOLE_SAMPLES * step)
+            moments.append(next(same, time))
+            return moments[-1]
+
+        early = [in_samples(plant.delays.get(name, 0.0), step) for name in plant.input_names]
         late = [in_samples(plant.delays.get(name, 0.0), step) for name in plant.output_names]
-        outputs = [(whole + 1, step - rest) if rest else (whole, 0.0) for whole, rest in late]
-        # An input that changes at the moment at which an output is taken has changed, whatever rounding says.
-        changes = [rest for _, rest in inputs]
-        taken = tuple((wait, _known(after, changes, step)) for wait, after in outputs)
+        inputs = tuple((whole, moment(rest) if rest else 0.0) for whole, rest in early)
+        taken = tuple((whole + 1, moment(step - rest)) if rest else (whole, 0.0) for whole, rest in late)
         return cls(inputs, taken)
 
     @property
@@ -83,11 +89,6 @@ class _Lags:
         """Return which sample of input j acts from the time ``at`` on."""
         whole, rest = self.inputs[j]
         return whole + (at < rest)
-
-
-def _known(moment: float, others: Sequence[float], step: float) -> float:
-    """Return the one of other moments within a sample that this is but for rounding, or the moment itself."""
-    return next((other for other in others if abs(other - moment) <= WHOLE_SAMPLES * step), moment)
 
 
 @dataclass(frozen=True, eq=False)
