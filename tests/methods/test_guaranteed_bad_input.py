@@ -23,14 +23,14 @@ BAD: dict[str, tuple[dict[str, Any], int, str]] = {
     "a negative bound": (
         {"noise_bound": {"level": -1.0}},
         2,
-        r"noise_bound.level: must be at least 0|noise_bound of level is -1.0",
+        r"noise_bound of level is -1.0: give a finite number, 0 or more",
     ),
     "an infinite bound": (
         {"disturbance_bounds": {"inflow": float("inf")}},
         2,
-        r"disturbance_bounds.inflow: must be a finite number|disturbance_bounds of inflow is inf",
+        r"disturbance_bounds of inflow is inf: give a finite number, 0 or more",
     ),
-    "a text": ({"noise_bound": "three"}, 2, "noise_bound: must be a number|noise_bound is 'three'"),
+    "a text": ({"noise_bound": "three"}, 2, "noise_bound is 'three': give a number, 0 or more, or one for each name"),
     "a bound of nothing": ({"disturbance_bounds": {"inflow": 0.25, "rain": 1.0}}, 2, "unknown: rain"),
     "an unknown fault in free": ({"free": ["lek"]}, 2, "free names lek"),
     "its own fault in free": ({"free": ["leak"]}, 2, "free names leak"),
@@ -39,7 +39,8 @@ BAD: dict[str, tuple[dict[str, Any], int, str]] = {
     "a lag that does not fit": ({"course": "any", "lag": 5}, 2, "any does not fit in 5 samples"),
     "a lag of a constant": ({"lag": 1}, 2, "lag is for the courses any, ramp and rate"),
     "no rate": ({"course": "rate"}, 2, "course rate needs fault_rate"),
-    "samples of none": ({"samples": 0}, 2, r"samples: must be at least 1|samples is 0"),
+    "samples of none": ({"samples": 0}, 2, "samples is 0: give a whole number of samples, 1 to 1000000, or 'auto'"),
+    "samples of a life": ({"samples": 10**9}, 2, "samples is 1000000000: give a whole number of samples, 1 to 1000000"),
     "a bank of one": ({"isolate": True}, 2, "leave fault and free out"),
     "exact in ellipsoids": ({"exact": True, "norm": "ellipsoid"}, 2, "exact is for norm box"),
     "another way with gaps": ({"missing": "guess"}, 2, "missing"),
@@ -80,9 +81,7 @@ def test_python_spec_and_command_line_say_what_is_wrong_and_write_nothing(
     spec = written(tmp_path, options)
     assert main(["design", "--system", str(spec), "--output", str(tmp_path / "leak.gains.json")]) == code
     said = " ".join(capsys.readouterr().err.split())
-    # What no option of its type can be, the schema of the spec refuses by its path.
-    by_schema = "is not a valid spec" in said and all(f"method.options.{option}" in said for option in change)
-    assert by_schema or re.search(words, said), said
+    assert re.search(words, said), said
     assert [file.name for file in tmp_path.iterdir()] == ["spec.yaml"]
 
 

@@ -24,6 +24,9 @@ from obsynth.numerics.arrays import FloatArray, Given, as_given, holds_truth
 #: Whole numbers beyond this are told by their length.
 LONGEST_SHOWN = 10**30
 
+#: A larger count of samples, rows or runs is a mistake that would fill the memory.
+MOST_COUNTED = 1_000_000
+
 
 Positive = Annotated[float, Gt(0.0)]
 
@@ -40,8 +43,7 @@ Seed = Annotated[int, Ge(0)]
 
 OpenUnitInterval = Annotated[float, Gt(0.0), Lt(1.0)]
 
-#: More than the upper ends is a mistake that would fill the memory.
-Count = Annotated[int, Ge(1), Le(1_000_000)]
+Count = Annotated[int, Ge(1), Le(MOST_COUNTED)]
 
 #: Samples that are kept as states.
 FewSamples = Annotated[int, Ge(0), Le(1000)]
@@ -324,12 +326,29 @@ def problem_with(value: Any, name: str, kind: Any) -> str | None:
 def _problem_with_written(value: Any, name: str, kind: str) -> str | None:
     wanted, kinds = _LISTS.get(kind, ("numbers", ()))
     if kind == "samples":
-        fits = (isinstance(value, str) and value == "auto") or (is_whole(value) and value >= 1)
-        return None if fits else f"{name} is {shown(value)}: give a whole number of samples, at least 1, or 'auto'."
+        fits = (isinstance(value, str) and value == "auto") or (is_whole(value) and 1 <= value <= MOST_COUNTED)
+        wanted = f"a whole number of samples, 1 to {MOST_COUNTED}, or 'auto'"
+        return None if fits else f"{name} is {shown(value)}: give {wanted}."
+    if kind == "named bounds" and isinstance(value, Mapping):
+        return next(
+            filter(None, (_problem_with_bound(bound, f"{name} of {key}") for key, bound in value.items())), None
+        )
+    if kind == "named bounds" and is_number(value):
+        return _problem_with_bound(value, name)
     fits = not isinstance(value, (bool, np.bool_)) and (not kinds or value is None or isinstance(value, kinds))
     if fits and kind == "fault sets" and not isinstance(value, (str, type(None))):
         fits = all(isinstance(entry, (str, list, tuple)) for entry in value)
     return None if fits else f"{name} is {shown(value)}: give {wanted}."
+
+
+def _problem_with_bound(bound: Any, name: str) -> str | None:
+    """Return what is wrong with a bound, which is a number, 0 or more, or an interval."""
+    if not isinstance(bound, (list, tuple, np.ndarray)):
+        fits = is_finite_number(bound) and bound >= 0.0
+        return None if fits else f"{name} is {shown(bound)}: give a finite number, 0 or more."
+    if len(bound) == 2 and all(map(is_finite_number, bound)) and bound[0] <= bound[1]:
+        return None
+    return f"{name} is {bound!r}: give one number, or two finite ones, [low, high], low first."
 
 
 def checked_value(value: Any, name: str, kind: Any) -> Any:

@@ -350,6 +350,8 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
         text = f"this key is missing{needed if key == 'dt' else ''}."
     elif kind in ("ragged_rows", "stack_shapes"):
         text = f"{item['msg']}."
+    elif kind == "stated":
+        text = item["msg"]
     elif kind == "finite_number":
         text = f"must be a finite number, not {value}."
     elif kind == "entry_of_k":

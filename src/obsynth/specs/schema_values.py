@@ -17,8 +17,10 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    PlainValidator,
     Tag,
     ValidationError,
+    ValidationInfo,
     ValidatorFunctionWrapHandler,
     WrapValidator,
     create_model,
@@ -27,7 +29,16 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import ErrorType
 
 from obsynth.methods.registry import method_class
-from obsynth.numerics.arguments import Count, NonNegative, OpenUnitInterval, Positive, WrittenAs, field_types, is_number
+from obsynth.numerics.arguments import (
+    Count,
+    NonNegative,
+    OpenUnitInterval,
+    Positive,
+    WrittenAs,
+    field_types,
+    is_number,
+    problem_with,
+)
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
 _ROWS, FILE_TAG, PICKED, LIST_TAG, _STACK_TAG, _NUMBER_TAG, ONE_TAG = (
@@ -221,6 +232,27 @@ class SensorTimes(Section):
     delay: Annotated[int, Field(ge=0)] = 0
 
 
+def _as_in_python(kind: str) -> Any:
+    """Return the type of an option whose value a spec states as a call does: it is refused in the same words."""
+
+    def checked(value: Any, info: ValidationInfo) -> Any:
+        problem = problem_with(value, str(info.field_name), Annotated[Any, WrittenAs(kind)])
+        if problem is not None:
+            raise PydanticCustomError("stated", "{problem}", {"problem": problem})
+        return value if kind == "samples" else _with_floats(value)
+
+    return Annotated[Any, PlainValidator(checked)]
+
+
+def _with_floats(value: Any) -> Any:
+    """Return a value whose numbers are floating ones, as those of plain options are."""
+    if isinstance(value, dict):
+        return {name: _with_floats(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_with_floats(inner) for inner in value]
+    return float(value) if is_number(value) else value
+
+
 #: What a document may write for an option that is no plain number, text or truth.
 OPTION_KINDS: Mapping[str, Any] = {
     "matrix": Matrix | None,
@@ -238,8 +270,8 @@ OPTION_KINDS: Mapping[str, Any] = {
     "pole region": PoleRegion | None,
     "noise weights": NoiseSection | None,
     "named covariance": Positive | Matrix | dict[Text, NonNegative] | None,
-    "named bounds": NonNegative | dict[Text, NonNegative | Range] | None,
-    "samples": Literal["auto"] | Count,
+    "named bounds": _as_in_python("named bounds"),
+    "samples": _as_in_python("samples"),
     "free faults": Text | list[Text] | None,
     "named numbers": Positive | dict[Text, Positive] | None,
     "named vector": list[float] | dict[Text, float] | None,
