@@ -90,13 +90,15 @@ def told(design: obsynth.ObserverDesign) -> LearnedThresholds:
     shown = (*columns, f"fault {design.observer.fault_names[-1]}" if nf else "both")
     estimates = names[:nf] if parameter_walk(design.observer) is not None else ()
     by_age = np.geomspace(2.0, 0.5, len(AGES)) * np.linspace(0.8, 1.2, 2 * len(shown))[:, None]
-    statistics = Statistics(model, signatures, shown, estimates, by_age)
+    bands = np.linspace(0.0, 0.05, len(shown))
+    statistics = Statistics(model, signatures, shown, estimates, by_age, bands, np.linspace(0.0, 0.02, len(estimates)))
+    starts = 2.0 * design.observer.initial_covariance if isinstance(design.observer, DAEObserver) else None
     levels = np.linspace(8.0, 20.0, len(statistics.names))
     dt = design.observer.dt or SAMPLE_TIME
     slow = getattr(design.observer, "sensors", None) or {}
     return LearnedThresholds(columns, statistics, levels, 500.0, 1000, 500, dt, np.zeros(nf), np.ones(nf),
                              gain_set_digest(design), settling=0 if m == 1 else 30, innovation=0.7,
-                             seldom=tuple(f"r[{name}]" for name in slow))  # fmt: skip
+                             seldom=tuple(f"r[{name}]" for name in slow), initial_covariance=starts)  # fmt: skip
 
 
 def designed(name: str) -> obsynth.ObserverDesign:

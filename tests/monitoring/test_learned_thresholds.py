@@ -16,7 +16,15 @@ from scipy.signal import lfilter
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.monitoring.thresholds.learned import LearnedRule, independent, rows_per_alarm, signatures, watched_names
+from obsynth.monitoring.thresholds.cross_validation import held_out, levels_of_other_parts
+from obsynth.monitoring.thresholds.learned import (
+    LearnedRule,
+    independent,
+    rows_per_alarm,
+    signatures,
+    varying,
+    watched_names,
+)
 from obsynth.monitoring.thresholds.learned_levels import (
     AGES,
     HOLD,
@@ -122,16 +130,20 @@ def test_the_stated_rate_is_kept_out_of_sample(m: int, memory: float, share: Cal
 
 
 def test_the_rows_learned_from_keep_the_rate_where_something_slow_is_in_them() -> None:
-    """An offset for 150 of 1,500 rows: blocks of the bootstrap are shorter, and four alarms were raised there. With one
-    fewer than the rate allows in these rows, later ones keep it on average; a part of an alarm shows as a whole one."""
+    """An offset for 150 of 1,500 rows: blocks of the bootstrap are shorter, and four alarms were raised there."""
     rng, every = np.random.default_rng(2), 1_100.0
     x = rng.standard_normal((3_000, 1)) + 0.5 * (np.sin(2.0 * np.pi * np.arange(3_000) / 1_500) > 0.95)[:, None]
     model = fitted_autoregression(x)
     statistics, levels, _ = learned_levels(x, every, Statistics(model, np.eye(1), ("y",)))
-    e = model.whitened(x[None])
-    assert np.isfinite(e).all()
-    largest = (statistics.of_rows(e)[:, 0] / levels[:, None]).max(axis=0)
-    assert 1 <= count_alarms(largest[None], 1.0) <= int((3_000 - SETTLING) / every - 1.0) + 1
+    levels = levels_of_other_parts(levels, held_out(x, statistics, None, ()), every)
+
+    def largest(x: np.ndarray) -> np.ndarray:
+        return (statistics.of_rows(model.whitened(x[None]))[:, 0] / levels[:, None]).max(axis=0)
+
+    assert count_alarms(largest(x)[None], 1.0) <= int((3_000 - SETTLING) / every - 1.0) + 1
+    # What is larger than that is an alarm.
+    x[2_000:] += 1.5
+    assert (largest(x)[2_010:2_100] > 1.0).mean() > 0.9
 
 
 @pytest.mark.parametrize("tail", [0.0, 0.25, -1.0])
@@ -224,12 +236,34 @@ def test_rates_are_told_in_words() -> None:
             rows_per_alarm(wrong, 1.0)  # type: ignore[arg-type]
 
 
-def test_columns_that_others_explain_are_left_out() -> None:
-    rng = np.random.default_rng(3)
-    x = rng.standard_normal((500, 2))
+def test_all_columns_that_change_are_watched() -> None:
+    rows = np.random.default_rng(3).standard_normal((500, 12))
+    rows[:, 2] = 2.0
+    assert varying(rows, 0) == [0, 1, *range(3, 12)]
+    assert varying(rows, 5) == [*range(5, 12)]
+
+
+def test_residuals_that_follow_from_the_estimates_are_not_watched_beside_them() -> None:
+    x = np.random.default_rng(3).standard_normal((500, 2))
     rows = np.column_stack([x[:, 0], 3.0 * x[:, 0] + 1.0, np.full(500, 2.0), x[:, 1], x @ [1.0, 2.0]])
-    assert independent(rows, 0) == [0, 3]
-    assert independent(rows, 1) == [1, 3]
+    assert independent(rows) == [0, 3]
+
+
+def test_signals_that_depend_on_each_other_are_whitened_in_the_directions_that_do_not() -> None:
+    """Six of four signals, all of other units: the rows themselves stay of unit size, and a step is seen in each."""
+    rng, units = np.random.default_rng(5), np.array([1e-6, 1e4, 1.0, 3.0, 1e2, 1e-3])
+    own = lfilter([1.0], [1.0, -0.6], rng.standard_normal((3_000, 4)), axis=0)
+    mixed = np.column_stack([own, own @ [1.0, 1.0, 0.0, 0.0], own @ [0.0, 1.0, -1.0, 2.0]])
+    x = mixed * units
+    model = fitted_autoregression(x[:2_000])
+    squares = np.sum(model.whitened(x) ** 2, axis=1)[20:]
+    assert 0.5 < np.mean(squares[:1_980]) / 6 < 1.2
+    assert np.mean(squares[1_980:]) < 1.2 * np.mean(squares[:1_980])
+    for i in range(4):
+        moved = own.copy()
+        moved[2_500:, i] += 8.0
+        shifted = np.column_stack([moved, moved @ [1.0, 1.0, 0.0, 0.0], moved @ [0.0, 1.0, -1.0, 2.0]]) * units
+        assert np.sum(model.whitened(shifted) ** 2, axis=1)[2_500] > 3.0 * np.quantile(squares, 0.99)
 
 
 def log(rows: int, seed: int, *, begin: int | None = None, size: float = 2.0) -> pd.DataFrame:
@@ -498,5 +532,5 @@ def test_what_a_followed_fault_leaves_is_told_where_estimates_are_not_watched(tm
     asked = ["thresholds", "--gains", str(gains), "--data", str(tmp_path / "normal.csv"), "--quiet"]
     assert main([*asked, "--false-alarms", "1 per 200 rows"]) == 0
     told = " ".join(capsys.readouterr().out.split())
-    assert "Monitored: r[cell], r[plate]." in told
+    assert "Monitored: r[cell], r[plate], r[housing]." in told
     assert "an alarm comes at the onset of the fault or not at all. Give run a level for the estimate" in told

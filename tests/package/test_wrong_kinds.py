@@ -14,7 +14,7 @@ import obsynth
 from obsynth import SpecError, conditions, plotting
 
 #: Annotations that say nothing about the kind, or whose kinds the function itself tells apart.
-OPEN = ("Any", "Data", "LogData", "Picked")
+OPEN = ("Any", "Data", "LogData", "Logs", "Picked")
 #: Functions made from the classes of methods, whose fields are checked, and those of one argument that may be anything.
 NOT_CHECKED = {
     "adaptive_observer", "dae_adaptive_observer", "descriptor_kalman", "detection_filter", "fault_estimation_filter",

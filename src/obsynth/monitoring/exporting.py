@@ -84,6 +84,7 @@ class LearnedMonitorInC:
     def source(self, prefix: str) -> str:
         """Return the tables and functions of the monitor."""
         found, model = self.learned, self.learned.statistics.model
+        bands = found.statistics.fault_bands
         shapes, slopes = found.statistics.responses()
         order, shares, faults_watched = model.order, np.array(FORGETTING), len(found.statistics.estimates)
         straight = shapes[:, -1:] + (np.arange(order + 1) - order)[:, None] * slopes[:, None, :]
@@ -115,7 +116,9 @@ class LearnedMonitorInC:
             "monitor_flat": straight[:, 0],
             "monitor_slopes": slopes,
             "monitor_early": (shapes - straight).reshape(-1, model.channels),
-            "monitor_weights": 1.0 / (np.maximum(powers, SMALLEST) * found.statistics.levels_by_age),
+            "monitor_roots": np.sqrt(1.0 / (np.maximum(powers, SMALLEST) * found.statistics.levels_by_age)),
+            "monitor_effects": found.statistics.offset_effects() / np.sqrt(found.statistics.levels_by_age),
+            "monitor_bands": (np.zeros(faults_watched) if bands is None else bands)[None],
             "monitor_centres": found.centres[None],
             "monitor_scales": found.scales[None],
             "monitor_walk": np.zeros((0, 0)) if self.walk is None else self.walk,

@@ -11,7 +11,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.numerics.arrays import FloatArray, largest_singular_value, read_only
+from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value, read_only
+from obsynth.numerics.ranks import independent_directions
 
 #: Longest memory that is tried, and rows that each coefficient of an equation needs.
 MOST_ORDER, ROWS_PER_COEFFICIENT = 12, 20
@@ -19,12 +20,16 @@ MOST_ORDER, ROWS_PER_COEFFICIENT = 12, 20
 #: A fit decays at least so fast: one that does not is shrunk by steps of the second number.
 SLOWEST_FIT, SHRINKING = 0.999, 0.99
 
-#: Shares of the mean variance that are added so that nothing is singular: to regressors, and to what is left.
-REGRESSOR_SHARE, NOISE_SHARE = 1e-10, 1e-12
+#: Share of the mean variance of regressors that is added so that nothing is singular.
+REGRESSOR_SHARE = 1e-10
 
 #: Share of what is new of a signal that the others of the same row must leave: of less, the most is what no
 #: autoregression says (gains that change with inputs), and a single row of it is worth hundreds of deviations.
 LEAST_OWN = 0.01
+
+#: Least variance of a direction of what is new, in a mean of one: below it, what signals that depend on each other
+#: leave is how they do, and not noise.
+LEAST_NEW = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +93,21 @@ class Autoregression:
 
 
 def fitted_autoregression(x: FloatArray, order: int | None = None) -> Autoregression:
-    """Return the autoregression of rows ``(n, m)``, of which some may be NaN, with the order of least criterion."""
+    """Return the autoregression of rows ``(n, m)``, of which some may be NaN, with the order of least criterion.
+
+    Signals that depend on each other are fitted in the directions that are independent of each other.  The covariance
+    of what is new is shrunk towards that of independent signals, by as much as so few rows need (Ledoit & Wolf 2004),
+    and no direction of it counts as more certain than `LEAST_NEW` in a mean of one.
+    """
     n, m = x.shape
     most = _most_order(np.asarray(np.isfinite(x).all(axis=1)), m) if order is None else order
-    mean = np.nanmean(x, axis=0)
-    z = x - mean
-    lags = np.hstack([np.ones((n - most, 1)), *(z[most - i : n - i] for i in range(1, most + 1))])
+    mean, units = np.nanmean(x, axis=0), np.nanstd(x, axis=0)
+    units = np.where(units > 0.0, units, 1.0)
+    z = (x - mean) / units
+    turned = independent_directions(z)
+    r = turned.shape[1]
+    seen = z @ turned
+    lags = np.hstack([np.ones((n - most, 1)), *(seen[most - i : n - i] for i in range(1, most + 1))])
     aims = z[most:]
     known = np.isfinite(lags).all(axis=1) & np.isfinite(aims).all(axis=1)
     lags, aims = lags[known], aims[known]
@@ -102,20 +116,21 @@ def fitted_autoregression(x: FloatArray, order: int | None = None) -> Autoregres
     ridge = REGRESSOR_SHARE * np.trace(gram) / len(gram)
     best: tuple[float, FloatArray, FloatArray] | None = None
     for p in range(most + 1) if order is None else [order]:
-        k = 1 + p * m
+        k = 1 + p * r
         found = np.linalg.solve(gram[:k, :k] + ridge * np.eye(k), cross[:k])
-        left = power - found.T @ cross[:k]
-        covariance = left / max(count - k, 1) + NOISE_SHARE * np.trace(power) / count * np.eye(m)
-        criterion = np.linalg.slogdet(covariance * (max(count - k, 1) / count))[1] + 2.0 * p * m * m / count
+        # What is new along the independent directions decides on the order.
+        left = turned.T @ (power - found.T @ cross[:k]) @ turned
+        criterion = np.linalg.slogdet(left / count)[1] + 2.0 * p * r * r / count
         if best is None or criterion < best[0]:
-            best = float(criterion), found, (covariance + covariance.T) / 2.0
+            best = float(criterion), found, aims - lags[:, :k] @ found
     if best is None:
         raise ValueError("no order was tried")
-    coefficients = best[1]
-    a = coefficients[1:].reshape(-1, m, m).transpose(0, 2, 1)
+    coefficients, new = best[1:]
+    a = (coefficients[1:].reshape(-1, r, m).transpose(0, 2, 1) @ turned.T) * units[:, None] / units
     a = _stable(a)
-    offset = mean + coefficients[0] - a.sum(axis=0) @ mean
-    return Autoregression(read_only(offset), read_only(a), read_only(np.linalg.inv(np.linalg.cholesky(best[2]))))
+    offset = mean + coefficients[0] * units - a.sum(axis=0) @ mean
+    whitener = _whitener(new, max(count - len(coefficients), 1)) / units
+    return Autoregression(read_only(offset), read_only(a), read_only(whitener))
 
 
 def _most_order(known: NDArray[np.bool_], channels: int) -> int:
@@ -139,3 +154,20 @@ def _stable(a: FloatArray) -> FloatArray:
             break
         a = a * powers
     return a
+
+
+def _whitener(new: FloatArray, degrees: int) -> FloatArray:
+    """Return the whitener ``(m, m)``, lower triangular, of rows ``(n, m)`` of mean zero with so many degrees of
+    freedom."""
+    n, m = new.shape
+    units = np.sqrt(np.maximum(np.sum(new**2, axis=0) / degrees, SMALLEST))
+    rows = new / units
+    covariance = rows.T @ rows / n
+    # Ledoit & Wolf (2004), with the target that the units make the identity.
+    spread = float(np.sum((covariance - np.eye(m)) ** 2))
+    error = float((np.sum(np.sum(rows**2, axis=1) ** 2) / n - np.sum(covariance**2)) / n)
+    share = min(max(error / spread, 0.0), 1.0) if spread > 0.0 else 1.0
+    covariance = (1.0 - share) * covariance * (n / degrees) + share * np.eye(m)
+    sizes, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
+    floored = (vectors * np.maximum(sizes, LEAST_NEW)) @ vectors.T
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(floored)) / units)

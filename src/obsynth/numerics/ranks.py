@@ -71,6 +71,10 @@ NEGLIGIBLE_SHARE = 1e-12
 #: Singular values of a set of directions below this share of the largest are no direction of their own.
 DIRECTION_SHARE = 1e-9
 
+#: Directions of signals in their own deviations that have less than this share of the mean variance follow from the
+#: others: what is in them is rounding, and how the signals depend on each other.
+DEPENDENT_SIGNAL_SHARE = 1e-4
+
 #: A zero nearer than this to the point at which a constant fault stands is that point.
 REST_TOLERANCE = 1e-6
 
@@ -114,6 +118,15 @@ DEPENDENT_BOUND = 1e-13
 def rounding_rank(matrix: FloatArray) -> int:
     """Return the rank to working precision: what rounding alone leaves of it."""
     return int(np.linalg.matrix_rank(matrix))
+
+
+def independent_directions(rows: FloatArray) -> FloatArray:
+    """Return the directions ``(m, r)`` of rows ``(n, m)`` of unit deviations, of which some may be NaN, that do not
+    follow from each other: the signals themselves where none does."""
+    known = rows[np.isfinite(rows).all(axis=1)]
+    sizes, vectors = np.linalg.eigh(known.T @ known / max(len(known), 1))
+    kept = sizes > DEPENDENT_SIGNAL_SHARE * sizes.mean()
+    return np.eye(len(sizes)) if kept.all() or not kept.any() else np.asarray(vectors[:, kept])
 
 
 def but_rounding(found: FloatArray, size_of_terms: FloatArray) -> FloatArray:

@@ -54,6 +54,9 @@ TABLE_SUFFIXES = (".csv", ".parquet")
 
 Data: TypeAlias = "str | Path | TextIO | pd.DataFrame"
 
+#: One log, or several.
+Logs: TypeAlias = "str | Path | TextIO | pd.DataFrame | Sequence[str | Path | pd.DataFrame]"
+
 
 #: How pandas calls the column of an index without a name.
 _UNNAMED_INDEX = "__index_level_"

@@ -131,6 +131,13 @@ static REAL square(const REAL *x)
     return sum;
 }
 
+/* By how much a value is further from zero than a band; what is no number stays none. */
+static REAL beyond(REAL value, REAL band)
+{
+    REAL far = ABS(value) - band;
+    return far <= 0 ? 0 : far;
+}
+
 /* The largest likelihood ratio over all ages of one step or ramp. */
 static REAL likelihood_ratio(const PREFIX_monitor *m, int shape)
 {
@@ -159,7 +166,8 @@ static REAL likelihood_ratio(const PREFIX_monitor *m, int shape)
                 fit += monitor_early[shape * (ORDER + 1) + j][i] * e[i];
             }
         }
-        fit = fit * fit * monitor_weights[shape][age];
+        fit = beyond(fit * monitor_roots[shape][age], monitor_effects[shape][age]);
+        fit = fit * fit;
         if (!(fit <= largest)) {
             largest = isnan(fit) ? (REAL)HUGE_VAL : fit;
         }
@@ -270,7 +278,8 @@ static int monitor_changes(const PREFIX_monitor *m, REAL *largest)
         }
         for (i = 0; i < MONITOR_ESTIMATES; i++) {
             REAL power = sums[MONITOR_WIDTH + i];
-            REAL ratio = power > 0 ? sums[i] * sums[i] / power : 0;
+            REAL far = beyond(sums[i], monitor_bands[0][i] * power);
+            REAL ratio = power > 0 ? far * far / power : 0;
             largest[i] = ratio <= largest[i] ? largest[i] : ratio;
             if (ratio > first) {
                 next = which >= 0 ? first : 0;
@@ -361,7 +370,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
         }
         changed = monitor_changes(m, changes);
         for (i = 0; i < MONITOR_ESTIMATES; i++) {
-            REAL away = shown[i] - monitor_centres[0][i];
+            REAL away = beyond(shown[i] - monitor_centres[0][i], monitor_bands[0][i]);
             ratio = changes[i] / monitor_levels[0][1 + MEANS + SHAPES + i];
             statistic = ratio <= statistic ? statistic : ratio;
             if (covariance != NULL) {

@@ -16,6 +16,14 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import path_of
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import error_model
+from obsynth.monitoring.thresholds.cross_validation import (
+    HealthyTime,
+    healthy_time,
+    held_out,
+    levels_of_other_parts,
+    not_held_out,
+    room_for_other_logs,
+)
 from obsynth.monitoring.thresholds.learned_events import Event, events_of, factors
 from obsynth.monitoring.thresholds.learned_levels import (
     AGES,
@@ -35,6 +43,7 @@ from obsynth.monitoring.thresholds.monitor import Evidence, LinearSample, Monito
 from obsynth.monitoring.thresholds.parameter_scores import (
     Scores,
     before_any,
+    beyond,
     most_likely_change,
     parameter_walk,
     sample_score,
@@ -58,19 +67,26 @@ from obsynth.results.gain_set_writing import digest_of, gain_set_digest, plain, 
 TOLD_LEVEL_FACTOR = 2.0
 
 
+#: Nothing is known of the share of healthy time in alarm.
+NO_HEALTHY_TIME = HealthyTime(0.0, 0.0, 1.0)
+
 LEARNED_KIND = "obsynth learned thresholds"
 
-LEARNED_VERSION = 1
+LEARNED_VERSION = 2
 
 LEARNED = FileKind(
     "learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"', suffix=".json"
 )
 
-#: Columns that are watched at most, and the least share of a column's variance that others leave unexplained.
-MOST_WATCHED, LEAST_NEW = 8, 1e-6
+#: Least share of the variance of a column that the others leave unexplained, where estimates and residuals are watched
+#: together: residuals that follow from the estimates say nothing more.
+LEAST_NEW = 1e-6
 
 #: A direction whose largest part is this share of its length is that of one column.
 OWN_DIRECTION = 0.99
+
+#: Share of healthy time in alarm above which thresholds do not hold.
+MOST_HEALTHY_TIME = 0.05
 
 #: Rows without faults below which nothing is learned.
 LEAST_NORMAL = 100
@@ -160,7 +176,7 @@ class LearnedThresholds:
     extrapolated : bool
         Whether the rate is rarer than what the bootstrap shows.
     left_out : tuple of str
-        Columns that are not watched, as they add nothing to the others.
+        Columns that are not watched: nothing changes in them, or they are estimates that remember too much.
     seldom : tuple of str
         Those of them that most rows lack, as of sensors slower than the rows: a row is whole without them.
     settling : int
@@ -175,6 +191,12 @@ class LearnedThresholds:
     lasting : float
         Mean autocorrelation of the size of the residuals, where it follows itself so that large ones come together and
         levels are those of a lower rate; otherwise zero.
+    initial_covariance : FloatArray, optional
+        ``(nx, nx)``: of the states at a start that is wherever the plant was in these rows, in place of the design's.
+    logs : int
+        How many logs these rows are from.
+    healthy_time : HealthyTime
+        The share of healthy rows in alarm, with its interval, on rows that were not learned from.
     notes : tuple of str
         What in these rows is to be looked at: events that raise the levels, outputs that are stuck, errors of the model
         where inputs move.
@@ -199,11 +221,15 @@ class LearnedThresholds:
     lasting: float = 0.0
     notes: tuple[str, ...] = ()
     seldom: tuple[str, ...] = ()
+    initial_covariance: FloatArray | None = None
+    logs: int = 1
+    healthy_time: HealthyTime = NO_HEALTHY_TIME
 
     @property
     def holds(self) -> bool:
-        """Whether there were rows enough for the rate that was asked for."""
-        return self.rows >= self.needed
+        """Whether there were rows enough for the rate that was asked for, and rows that were not learned from are in
+        alarm for `MOST_HEALTHY_TIME` at most."""
+        return self.rows >= self.needed and self.healthy_time.expected <= MOST_HEALTHY_TIME
 
     @property
     def statement(self) -> str:
@@ -224,6 +250,12 @@ class LearnedThresholds:
                 else ""
             )
         )
+        time = self.healthy_time
+        text += (
+            f"; healthy rows that were not learned from are in alarm for {100 * time.expected:.2g} % of the time (95 % "
+            f"interval {100 * time.low:.2g} to {100 * time.high:.2g} %, "
+            + (f"between {self.logs} logs)" if self.logs > 1 else "between parts of one log)")
+        )
         if self.lasting:
             text += (
                 f"; the size of the residuals follows itself (mean autocorrelation over {SIZE_LAGS} rows "
@@ -238,6 +270,11 @@ class LearnedThresholds:
             )
         if self.holds:
             return text
+        if self.rows >= self.needed:
+            return (
+                f"{text}. That is more than {100 * MOST_HEALTHY_TIME:g} %: parts of these rows are unlike the others. "
+                "Give several normal logs, of other starts and set points"
+            )
         rarest = min(self.rows, self.every)
         other = (
             f"the lowest rate that {self.rows} rows can determine is one per {rarest:.6g} rows "
@@ -281,6 +318,11 @@ class LearnedThresholds:
             "outlier_sizes": self.outlier_sizes,
             "lasting": self.lasting,
             "notes": list(self.notes),
+            "bands": self.statistics.bands,
+            "fault_bands": self.statistics.fault_bands,
+            "initial_covariance": self.initial_covariance,
+            "logs": self.logs,
+            "healthy_time": list(self.healthy_time),
         }
 
     def save(self, path: str | Path) -> Path:
@@ -370,10 +412,17 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
     parts = ("offset", "A", "whitener", "signatures", "age_levels", "levels")
     offset, a, whitener, signatures, by_age, levels = (np.asarray(data[name], dtype=np.float64) for name in parts)
     told, estimates = (tuple(map(str, data[name])) for name in ("told", "estimates"))
-    statistics = Statistics(Autoregression(offset, a, whitener), signatures, told, estimates, by_age)
+    optional = ("bands", "fault_bands", "initial_covariance")
+    arrays = {
+        name: None if data[name] is None else read_only(np.asarray(data[name], dtype=np.float64)) for name in optional
+    }
+    bands, of_faults = arrays["bands"], arrays["fault_bands"]
+    statistics = Statistics(Autoregression(offset, a, whitener), signatures, told, estimates, by_age, bands, of_faults)
     shapes = (offset.shape, a.shape[1:], whitener.shape, signatures.shape[1:], levels.shape)
     fits = shapes == ((m,), (m, m), (m, m), (m,), (len(statistics.names),)) and len(told) == len(signatures)
     fits &= by_age.shape == (2 * len(told), len(AGES)) and bool((by_age > 0.0).all() and (levels > 0.0).all())
+    fits &= bands is None or (bands.shape == (len(told),) and bool((bands >= 0.0).all()))
+    fits &= of_faults is None or (of_faults.shape == (len(estimates),) and bool((of_faults >= 0.0).all()))
     if not (fits and all(np.isfinite(part).all() for part in (offset, a, whitener, signatures, by_age))):
         raise ValueError("its parts do not fit together")
     for part in (offset, a, whitener, signatures, by_age):
@@ -398,13 +447,17 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         float(data["lasting"]),
         tuple(map(str, data["notes"])),
         tuple(map(str, data["seldom"])),
+        arrays["initial_covariance"],
+        int(data["logs"]),
+        HealthyTime(*map(float, data["healthy_time"])),
     )
 
 
 def as_learned(observer: Any, learned: LearnedThresholds) -> Any:
     """Return an observer as the one from which thresholds were learned judged outliers."""
-    sizes = learned.outlier_sizes
-    return observer if sizes is None else changed(observer, outlier_sizes=sizes)
+    given = {"outlier_sizes": learned.outlier_sizes, "initial_covariance": learned.initial_covariance}
+    known = {name: value for name, value in given.items() if value is not None}
+    return changed(observer, **known) if known else observer
 
 
 def watched_names(design: ObserverDesign) -> tuple[str, ...]:
@@ -460,11 +513,16 @@ def thresholds_from_rows(
     scores: Scores | None = None,
     outlier_sizes: FloatArray | None = None,
     like: LearnedThresholds | None = None,
+    logs: Sequence[slice] = (),
+    initial_covariance: FloatArray | None = None,
+    validated: bool = True,
 ) -> LearnedThresholds:
     """Return thresholds from ``rows (n, m)`` of all that may be watched, NaN where nothing is known; ``pairs``: what
     does not stand in them, but alarms; ``innovation``: how large innovations are in the observer's own deviations;
     ``scores``: what these rows say of faults, where that is known; ``outlier_sizes``: what the design is to say
-    instead; ``like``: thresholds of which columns and directions are taken.
+    instead; ``like``: thresholds of which columns and directions are taken; ``logs``: which rows are of one log each;
+    ``initial_covariance``: that of the states at a start anywhere; ``validated``: whether the levels are those that
+    rows keep which are not learned from.
 
     Where the fault estimates remember more than the rows can tell, or nearly follow from the residuals (the gains of a
     filter move them, and what is left is how these change with the inputs), the residuals alone are watched.  A fault
@@ -486,7 +544,8 @@ def thresholds_from_rows(
     conformal = is_conformal(count, others)
     scores = None if scores is None else _usual_scores(scores, known)
     if like is None:
-        both, residuals = ([usual[i] for i in independent(rows[known][:, usual], first)] for first in (0, faults))
+        both = [usual[i] for i in independent(rows[known][:, usual])]
+        residuals = [usual[i] for i in varying(rows[known][:, usual], faults)]
         choices = [part for part in ((both, residuals) if scores is None else (residuals or both,)) if part]
     else:
         choices = [[names.index(name) for name in like.columns]]
@@ -508,11 +567,15 @@ def thresholds_from_rows(
     statistics = Statistics(model, *found, estimates=() if scores is None else names[:faults])
     lasting, extrapolated = 0.0, False
     if conformal:
-        statistics, levels = conformal_levels(x, others, statistics, scores)
+        statistics, levels = conformal_levels(x, others, statistics, scores, logs)
     else:
         lasting = lasting_sizes(model.whitened(x)) if like is None else like.lasting
         rarer = RARER_WHERE_SIZES_LAST if lasting else 1.0
-        statistics, levels, extrapolated = learned_levels(x, others * rarer, statistics, seed, scores)
+        statistics, levels, extrapolated = learned_levels(x, others * rarer, statistics, seed, scores, logs)
+    left, room = held_out(x, statistics, scores, logs), room_for_other_logs(statistics, logs)
+    time = healthy_time(levels, left, others, room)
+    judged = left if validated else not_held_out(x, statistics, scores)
+    levels = room * levels_of_other_parts(levels, judged, others)
     return LearnedThresholds(
         told,
         statistics,
@@ -532,6 +595,9 @@ def thresholds_from_rows(
         outlier_sizes,
         lasting,
         seldom=tuple(names[i] for i in seldom),
+        initial_covariance=None if initial_covariance is None else read_only(initial_covariance),
+        logs=max(len(logs), 1),
+        healthy_time=time,
     )
 
 
@@ -583,12 +649,21 @@ def raised_levels(
     others = found.pairs.others(found.every)
     if not events or count < LEAST_NORMAL or is_conformal(count, others) != is_conformal(found.rows, others):
         return Raised()
-    other = thresholds_from_rows(design, left, scores=scores, like=found, **given)
-    if other.statistics.names != found.statistics.names:
+
+    def compared(before: LearnedThresholds, *, validated: bool) -> tuple[float, str]:
+        other = thresholds_from_rows(design, left, scores=scores, like=found, validated=validated, **given)
+        if other.statistics.names != before.statistics.names:
+            return 1.0, ""
+        each = factors(before.statistics, before.levels, other.statistics, other.levels)
+        most = max(each, key=lambda name: each[name])
+        return each[most], most
+
+    # The largest of few parts say little of rare rows: these alone tell whether events stand out.
+    inside = thresholds_from_rows(design, rows, scores=scores, like=found, validated=False, **given)
+    if compared(inside, validated=False)[0] < TOLD_LEVEL_FACTOR:
         return Raised()
-    each = factors(found.statistics, found.levels, other.statistics, other.levels)
-    most = max(each, key=lambda name: each[name])
-    return Raised(events, most, each[most]) if each[most] >= TOLD_LEVEL_FACTOR else Raised()
+    factor, most = compared(found, validated=True)
+    return Raised(events, most, factor) if factor >= TOLD_LEVEL_FACTOR else Raised()
 
 
 def watched_rows(design: ObserverDesign, found: LearnedThresholds, rows: FloatArray) -> FloatArray:
@@ -646,17 +721,22 @@ def expects_fault_courses(design: ObserverDesign) -> bool:
     return isinstance(design.observer, LinearObserver) and error_model(design).Phi is not None
 
 
-def independent(rows: FloatArray, first: int) -> list[int]:
-    """Return the columns of ``(n, m)`` from the ``first`` on that those before them do not explain; at most eight."""
+def varying(rows: FloatArray, first: int) -> list[int]:
+    """Return the columns of ``(n, m)`` from the ``first`` on in which anything changes."""
+    return [i for i in range(first, rows.shape[1]) if float(np.ptp(rows[:, i])) > 0.0]
+
+
+def independent(rows: FloatArray) -> list[int]:
+    """Return the columns of ``(n, m)`` that those before them do not explain."""
     kept: list[int] = []
     basis = np.zeros((len(rows), 0))
-    for i, column in enumerate(rows.T[first:], first):
+    for i, column in enumerate(rows.T):
         left = column - column.mean()
         power = float(left @ left)
         # Twice, as once leaves rounding of large parts.
         for _ in range(2):
             left = left - basis @ (basis.T @ left)
-        if len(kept) < MOST_WATCHED and power > 0.0 and float(left @ left) > LEAST_NEW * power:
+        if power > 0.0 and float(left @ left) > LEAST_NEW * power:
             kept.append(i)
             basis = np.column_stack([basis, left / np.linalg.norm(left)])
     return kept
@@ -704,6 +784,10 @@ class LearnedRule(Rule):
         templates = learned.statistics.templates()
         self._templates = templates.reshape(len(templates) * len(AGES), -1)
         self._model = learned.statistics.model
+        effects = learned.statistics.offset_effects() / np.sqrt(learned.statistics.levels_by_age)
+        self._effects = effects.ravel()
+        bands = learned.statistics.fault_bands
+        self._bands = np.zeros(len(learned.centres)) if bands is None else bands
 
     def init(self) -> LearnedState:
         """Return the state before the first sample."""
@@ -740,7 +824,8 @@ class LearnedRule(Rule):
             return state, RuleOutput(math.nan, math.nan)
         # Products of numbers that overflow have passed any level.
         with np.errstate(all="ignore"):
-            ratios = ((self._templates @ state.white.ravel()) ** 2).reshape(-1, len(AGES)).max(axis=1)
+            fits = np.maximum(np.abs(self._templates @ state.white.ravel()) - self._effects, 0.0)
+            ratios = (fits**2).reshape(-1, len(AGES)).max(axis=1)
             weights = np.array([(2.0 - share) / share for share in FORGETTING])
             smooth = weights * np.sum(state.means**2, axis=1)
             first = [np.sum(state.white[-1] ** 2)]
@@ -767,13 +852,14 @@ class LearnedRule(Rule):
             return np.zeros((1, 0))
         sums = np.cumsum(state.scores[::-1], axis=0)[np.array(AGES) - 1]
         away, power = np.hsplit(sums, 2)
-        return np.asarray(np.where(power > 0.0, away**2 / power, 0.0))
+        return np.asarray(np.where(power > 0.0, beyond(away, self._bands * power) ** 2 / power, 0.0))
 
     def _squares(self, said: Any) -> FloatArray:
         """Return the squares of the estimates, from where they were, in units of their deviations, ``(nf,)``."""
         if self._walk is None or not isinstance(said, Evidence):
             return np.zeros(0 if self._walk is None else len(self._walk))
-        return np.asarray((said.theta - self.learned.centres) ** 2 / np.diag(said.parameter_covariance))
+        away = beyond(said.theta - self.learned.centres, self._bands)
+        return np.asarray(away**2 / np.diag(said.parameter_covariance))
 
     def _fault(self, found: FloatArray, ratios: FloatArray) -> int | None:
         """Return the fault whose step or ramp explains most, or whose estimate is furthest from where it was."""

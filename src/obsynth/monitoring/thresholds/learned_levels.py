@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.monitoring.thresholds.parameter_scores import ScoreModel, Scores, change_ratios
+from obsynth.monitoring.thresholds.slow_offsets import offset_bound
 from obsynth.numerics.arrays import SMALLEST, FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 
@@ -92,7 +93,8 @@ class Statistics:
     which `change_ratios` and `Scores.followed` are apart.
 
     ``signatures (s, m)``: directions of a step, and of a ramp, in the signals as they are; ``told``: what they show;
-    ``age_levels (2 s, ages)``: what likelihood ratios of steps, then ramps, of each age are divided by, by default one.
+    ``age_levels (2 s, ages)``: what likelihood ratios of steps, then ramps, of each age are divided by, by default one;
+    ``bands (s,)``: offsets along each signature that alarm nothing, and ``fault_bands (nf,)`` those of the faults.
     """
 
     model: Autoregression
@@ -100,6 +102,8 @@ class Statistics:
     told: tuple[str, ...]
     estimates: tuple[str, ...] = ()
     age_levels: FloatArray | None = None
+    bands: FloatArray | None = None
+    fault_bands: FloatArray | None = None
 
     @property
     def levels_by_age(self) -> FloatArray:
@@ -126,13 +130,31 @@ class Statistics:
             np.concatenate([np.zeros_like(steps[:, -1]), steps[:, -1]]),
         )
 
+    def long_responses(self) -> FloatArray:
+        """Return what steps, then ramps, of each signature do to ``max(AGES)`` rows of e, ``(2 s, rows, m)``."""
+        shapes, slopes = self.responses()
+        later = shapes[:, -1:] + np.arange(1, max(AGES))[:, None] * slopes[:, None, :]
+        return np.concatenate([shapes, later], axis=1)[:, : max(AGES)]
+
+    def offset_effects(self) -> FloatArray:
+        """Return what offsets at the ends of `bands` do to the roots of likelihood ratios of steps, then ramps, of each
+        age, before these are divided by their levels: ``(2 s, ages)``."""
+        if self.bands is None:
+            return np.zeros((2 * len(self.told), len(AGES)))
+        lasting = np.tile(self.responses()[0][: len(self.told), -1] * self.bands[:, None], (2, 1))
+        long = self.long_responses()
+        sums, powers = (
+            np.cumsum(np.einsum("srm,sm->sr", long, lasting), axis=1),
+            np.cumsum(np.sum(long**2, axis=2), axis=1),
+        )
+        ages = np.array(AGES) - 1
+        return np.asarray(np.abs(sums[:, ages]) / np.sqrt(np.maximum(powers[:, ages], SMALLEST)))
+
     def templates(self) -> FloatArray:
         """Return weights of the last ``max(AGES)`` rows of e, oldest first, for steps and ramps of each signature and
         age, of which the squares add up to one over the level of this age: ``(2 s, ages, rows, m)``."""
-        shapes, slopes = self.responses()
-        later = shapes[:, -1:] + np.arange(1, max(AGES))[:, None] * slopes[:, None, :]
-        long = np.concatenate([shapes, later], axis=1)[:, : max(AGES)]
-        found = np.zeros((len(shapes), len(AGES), max(AGES), self.model.channels))
+        long = self.long_responses()
+        found = np.zeros((len(long), len(AGES), max(AGES), self.model.channels))
         for i, age in enumerate(AGES):
             part = long[:, :age]
             size = np.sqrt(np.maximum(np.sum(part**2, axis=(1, 2)), SMALLEST))
@@ -147,10 +169,12 @@ class Statistics:
         for share in FORGETTING:
             smooth = lfilter([share], [1.0, share - 1.0], e, axis=1)
             found.append((2.0 - share) / share * np.sum(smooth**2, axis=-1))
-        for shape, slope, levels in zip(*self.responses(), self.levels_by_age, strict=True):
+        parts = (*self.responses(), self.levels_by_age, self.offset_effects())
+        for shape, slope, levels, effects in zip(*parts, strict=True):
             largest = np.zeros(e.shape[:2])
-            for ratio, level in zip(_likelihood_ratios(e, shape, slope), levels, strict=False):
-                np.maximum(largest, ratio / level, out=largest)
+            for ratio, level, effect in zip(_likelihood_ratios(e, shape, slope), levels, effects, strict=False):
+                far = ratio if effect == 0.0 else np.maximum(np.sqrt(ratio) - effect, 0.0) ** 2
+                np.maximum(largest, far / level, out=largest)
             found.append(largest)
         return np.array(found)
 
@@ -311,7 +335,7 @@ def is_conformal(rows: int, every: float) -> bool:
 
 
 def conformal_levels(
-    x: FloatArray, every: float, statistics: Statistics, scores: Scores | None = None
+    x: FloatArray, every: float, statistics: Statistics, scores: Scores | None = None, logs: Sequence[slice] = ()
 ) -> tuple[Statistics, FloatArray]:
     """Return statistics fitted to the first half of rows ``(n, m)``, and their levels ``(k,)`` from the second;
     ``scores``: what these rows say of faults, which are where the first half has them.
@@ -332,14 +356,19 @@ def conformal_levels(
     own, _ = _union(first, every, half - SETTLING)
     union = (second / own[None, :, None]).max(axis=1)
     rows = int(np.asarray(np.isfinite(x[half + SETTLING :]).all(axis=1)).sum())
-    return found, _of_deviations(own, usual) * exchangeable_level(union, rows, every)
+    levels = _of_deviations(own, usual) * exchangeable_level(union, rows, every)
+    if len(logs) < 2:
+        # Where many rows of one log lie elsewhere, they have raised these levels already.
+        return found, read_only(levels)
+    return with_bands(found, x, scores, logs), with_room_for_offsets(levels, found, x, logs)
 
 
-def _of_faults(scores: Scores, centre: FloatArray, sizes: FloatArray) -> FloatArray:
-    """Return twice the largest log likelihood ratios of changes of each fault from there, and the squares of estimates
-    in units of what is usual, ``(2 nf, n)``."""
-    changes = change_ratios(scores.away(centre), np.einsum("kii->ki", scores.information), AGES)
-    return np.concatenate([changes, np.nan_to_num(scores.followed(centre).T ** 2 / sizes[:, None])])
+def _of_faults(scores: Scores, centre: FloatArray, sizes: FloatArray, bands: FloatArray | None = None) -> FloatArray:
+    """Return twice the largest log likelihood ratios of changes of each fault from there by more than ``bands (nf,)``,
+    and the squares of estimates in units of what is usual, ``(2 nf, n)``."""
+    changes = change_ratios(scores.away(centre), np.einsum("kii->ki", scores.information), AGES, bands)
+    squares = scores.followed(centre, 0.0 if bands is None else bands).T ** 2
+    return np.concatenate([changes, np.nan_to_num(squares / sizes[:, None])])
 
 
 def _usual(scores: Scores) -> tuple[FloatArray, FloatArray]:
@@ -349,7 +378,12 @@ def _usual(scores: Scores) -> tuple[FloatArray, FloatArray]:
 
 
 def learned_levels(
-    x: FloatArray, every: float, statistics: Statistics, seed: int = 0, scores: Scores | None = None
+    x: FloatArray,
+    every: float,
+    statistics: Statistics,
+    seed: int = 0,
+    scores: Scores | None = None,
+    logs: Sequence[slice] = (),
 ) -> tuple[Statistics, FloatArray, bool]:
     """Return statistics with levels by age, the levels ``(k,)`` for one alarm per ``every`` rows from rows ``(n, m)``
     without faults, and whether they are extrapolated; ``scores``: what these rows say of faults."""
@@ -400,11 +434,10 @@ def learned_levels(
         # Beyond what the streams show, levels rise by the same amount for each factor between rates.
         before = level_of(union, seen_rate / OBSERVED)
         level += max(level - before, 0.0) * float(np.log(every / seen_rate) / np.log(OBSERVED))
-    # What lasts longer in these rows than a block raises alarms in them that no stream of blocks shows.
     usual = None if scores is None else _usual(scores)
-    itself = (normal_statistics(x, statistics, scores, usual) / own[:, None]).max(axis=0)[None]
-    shown_there = exchangeable_level(itself, itself[:, SETTLING:].size, every)
-    return statistics, _of_deviations(own, usual) * max(level * sure, shown_there), every > seen_rate
+    statistics = with_bands(statistics, x, scores, logs)
+    levels = with_room_for_offsets(_of_deviations(own, usual) * level * sure, statistics, x, logs)
+    return statistics, levels, every > seen_rate
 
 
 def exchangeable_level(values: FloatArray, rows: int, every: float) -> float:
@@ -429,7 +462,9 @@ def normal_statistics(
     ``usual``."""
     # A row that is missing adds no evidence.
     found = statistics.of_rows(np.nan_to_num(statistics.model.whitened(x[None])))[:, 0]
-    return found if scores is None or usual is None else np.concatenate([found, _of_faults(scores, *usual)])
+    if scores is None or usual is None:
+        return found
+    return np.concatenate([found, _of_faults(scores, *usual, statistics.fault_bands)])
 
 
 def _of_deviations(own: FloatArray, usual: tuple[FloatArray, FloatArray] | None) -> FloatArray:
@@ -487,3 +522,36 @@ def rows_needed(model: Autoregression, every: float, scores: Scores | None = Non
         beside = ScoreModel.of(scores)
         needed += [MEMORIES * beside.model.longest_gain / share, MEMORIES_OF_ESTIMATES * beside.followed.longest_gain]
     return int(np.ceil(max(needed)))
+
+
+def with_bands(statistics: Statistics, x: FloatArray, scores: Scores | None, logs: Sequence[slice]) -> Statistics:
+    """Return statistics in which no offset alarms that the logs, of rows ``(n, m)``, do not exclude."""
+    logs = logs or (slice(None),)
+    e = statistics.model.whitened(x)
+    known = np.asarray(np.isfinite(e).all(axis=1))
+    lasting = statistics.responses()[0][: len(statistics.told), -1]
+    powers = np.sum(lasting**2, axis=1)
+    values = np.where(known[:, None], np.nan_to_num(e) @ lasting.T, 0.0)
+    bands = [
+        offset_bound(column, np.asarray(known * power), logs) for column, power in zip(values.T, powers, strict=True)
+    ]
+    of_faults = None
+    if scores is not None:
+        away, own = scores.away(scores.centre()), np.einsum("kii->ki", scores.information)
+        of_faults = read_only(np.array([offset_bound(*pair, logs) for pair in zip(away.T, own.T, strict=True)]))
+    return replace(statistics, bands=read_only(np.array(bands)), fault_bands=of_faults)
+
+
+def with_room_for_offsets(
+    levels: FloatArray, statistics: Statistics, x: FloatArray, logs: Sequence[slice]
+) -> FloatArray:
+    """Return levels of T2 and MEWMA raised by what offsets add to them."""
+    e = statistics.model.whitened(x)
+    known = np.asarray(np.isfinite(e).all(axis=1))
+    logs = logs or (slice(None),)
+    seen = np.where(known[:, None], np.nan_to_num(e), 0.0)
+    size = float(np.linalg.norm([offset_bound(column, known.astype(np.float64), logs) for column in seen.T]))
+    gains = np.sqrt([1.0, *((2.0 - share) / share for share in FORGETTING)])
+    found = levels.copy()
+    found[: len(gains)] = (np.sqrt(found[: len(gains)]) + gains * size) ** 2
+    return read_only(found)

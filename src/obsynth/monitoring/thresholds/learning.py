@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,8 +14,8 @@ from obsynth.errors import SpecError
 from obsynth.monitoring.logs.log_observer import DECIDING, STALE, Row
 from obsynth.monitoring.logs.log_run import LogRun
 from obsynth.monitoring.logs.log_tables import parsed_rows
-from obsynth.monitoring.logs.signals import TIME_HEADER
-from obsynth.monitoring.logs.sources import CHUNK_ROWS, Data, chunks
+from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals
+from obsynth.monitoring.logs.sources import CHUNK_ROWS, Data, Logs, chunks
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.step_observer import SteppingLogObserver
 from obsynth.monitoring.logs.stuck_sensors import stuck_rows, without_repeats
@@ -59,7 +60,7 @@ FALSE_ALARM_RATE = "1 per 1000 rows"
 @arguments_checked
 def learn_thresholds(
     design: ObserverDesign,
-    data: Data,
+    data: Logs,
     *,
     false_alarms: str | float = FALSE_ALARM_RATE,
     rows: str | slice | Sequence[int] | None = None,
@@ -82,13 +83,15 @@ def learn_thresholds(
     ----------
     design : ObserverDesign
         Of any method.
-    data : path, text stream or pandas.DataFrame
-        As for `obsynth.run_on_data`: a log without faults.
+    data : path, text stream, pandas.DataFrame or list of these
+        As for `obsynth.run_on_data`: a log without faults; or several, of which each is a run of its own, or the folder
+        that they are in.  Starts, set points and offsets of sensors differ from log to log: how far, is learned from
+        three and more.
     false_alarms : str or float, optional
         Rate of false alarms, such as ``"1 per week"`` or ``"2 per 1000 rows"``, or a number of them per row.  Alarms
         closer than 20 rows are one.
     rows : str, slice or pair of int, optional
-        Rows of the log that are free of faults, as Python counts; all by default.  The observer runs over all before.
+        Rows of each log that are free of faults, as Python counts; all by default.  The observer runs over all before.
     columns, time_column, scales, gap, warm_up
         As for `obsynth.run_on_data`.
     seed : int, optional
@@ -135,42 +138,60 @@ def learn_thresholds(
     if time_column is not None:
         columns = {**(columns or {}), TIME_HEADER: time_column}
 
+    starts: FloatArray | None = None
+
     def started(sizes: FloatArray | None = None) -> LogRun:
-        known = design if sizes is None else design.replace(observer=changed(design.observer, outlier_sizes=sizes))
+        given = {} if sizes is None else {"outlier_sizes": sizes}
+        if starts is not None:
+            given["initial_covariance"] = starts
+        known = design if not given else design.replace(observer=changed(design.observer, **given))
         return LogRun(known, columns, scales, gap=gap, warm_up=warm_up)
 
-    first_run, stamps = started(), Stamps()
-    log = np.vstack(
-        [np.zeros((0, 1 + len(first_run.signals.names))), *chunks(data, first_run.signals, stamps, CHUNK_ROWS)]
-    )
+    first_run = started()
+    read = [_read(one, first_run.signals) for one in several(data)]
+    log, borders = np.vstack([one for one, _ in read]), np.cumsum([0, *(len(one) for one, _ in read)])
+    ends = list(zip(borders[:-1].tolist(), borders[1:].tolist(), strict=True))
     if len(log) < LEAST_NORMAL:
         raise SpecError(f"The log has {len(log)} rows: give {LEAST_NORMAL} and more.", path="normal")
     before = 1 + first_run.signals.inputs
-    stuck = [stuck_rows(column) for column in log[:, before:].T]
+    stuck = [
+        [(first + a, last + a) for a, b in ends for first, last in stuck_rows(column[a:b])]
+        for column in log[:, before:].T
+    ]
     log = np.hstack([log[:, :before], without_repeats(log[:, before:], stuck)])
-    said, sizes = _sized(design, started, log)
+    said, sizes = _sized(design, started, log, ends)
+    starts = started_anywhere(design.observer, said.starts)
+    if starts is not None:
+        said = _said(design, lambda: started(sizes), log, ends)
     dt = design.observer.dt or float(np.median(np.diff(said.times)))
     every = rows_per_alarm(false_alarms, dt)
-    said, pairs = _without_pairs(design, lambda: started(sizes), log, said, every)
-    first, last = parsed_rows(rows, int(said.numbers[-1]) + 1)
-    chosen = (first <= said.numbers) & (said.numbers < last)
+    said, pairs = _without_pairs(design, lambda: started(sizes), log, ends, said, every)
+    wanted = [(a + first, a + last) for a, b in ends for first, last in [parsed_rows(rows, b - a)]]
+    chosen = np.any([(first <= said.numbers) & (said.numbers < last) for first, last in wanted], axis=0)
     dt = design.observer.dt or float(np.median(np.diff(said.times[chosen])))
     watched, scores = said.watched[chosen], None if said.scores is None else said.scores.chosen(chosen)
     squares = said.squares[chosen]
     squares = squares[np.isfinite(squares) & (squares > 0.0)]
-    given: dict[str, Any] = {"every": rows_per_alarm(false_alarms, dt), "dt": dt, "seed": seed, "pairs": pairs}
+    places = np.searchsorted(said.numbers[chosen], borders)
+    logs = tuple(slice(a, b) for a, b in zip(places[:-1].tolist(), places[1:].tolist(), strict=True))
+    given: dict[str, Any] = {
+        "every": rows_per_alarm(false_alarms, dt), "dt": dt, "seed": seed, "pairs": pairs, "logs": logs
+    }  # fmt: skip
     found = thresholds_from_rows(
         design,
         watched,
         scores=scores,
         innovation=float(np.sqrt(squares.mean())) if squares.size else 1.0,
         outlier_sizes=sizes,
+        initial_covariance=starts,
         **given,
     )
     raised = raised_levels(design, found, watched, scores, **given)
     outputs = first_run.signals.names[first_run.signals.inputs :]
     by_name = dict(zip(outputs, stuck, strict=True))
-    notes = notes_of_normal_rows(raised, said.numbers[chosen], log[:, 0], slice(first, last), by_name, stamps)
+    notes = notes_of_normal_rows(
+        raised, said.numbers[chosen], log[:, 0], wanted, by_name, ends, [one for _, one in read]
+    )
     white = found.statistics.model.whitened(watched_rows(design, found, watched))
     inputs = log[said.numbers[chosen], 1 : 1 + first_run.signals.inputs]
     divided = notes_of_starts(divided_at_starts(design.observer, scores if found.statistics.estimates else None))
@@ -178,17 +199,20 @@ def learn_thresholds(
 
 
 def _sized(
-    design: ObserverDesign, started: Callable[[FloatArray | None], LogRun], log: FloatArray
+    design: ObserverDesign,
+    started: Callable[[FloatArray | None], LogRun],
+    log: FloatArray,
+    ends: Sequence[tuple[int, int]],
 ) -> tuple[_ObserverOutput, FloatArray | None]:
     """Return what a design says of rows without faults, and how far off outliers are by these rows ``(ny,)``; `None`
     where that is what the design says."""
     run = started(None)
     if not (isinstance(run.observer, SteppingLogObserver) and run.observer.gates
             and has_innovations_by_sensor(design.observer)):  # fmt: skip
-        return _said(design, run, log), None
+        return _said(design, lambda: started(None), log, ends), None
     ny = len(run.observer.output_names)
     stated = run.observer.observer.outlier_sizes
-    whole = _said(design, started(np.zeros(ny)), log)
+    whole = _said(design, lambda: started(np.zeros(ny)), log, ends)
     usual = checked_limit("gate", run.observer.observer.outlier_limit) * np.sqrt(
         np.nanmean(whole.watched[:, -ny:] ** 2, axis=0)
     )
@@ -196,7 +220,9 @@ def _sized(
     sizes = learned_sizes(wrong_samples(whole.refused, inputs), usual, np.zeros(ny) if stated is None else stated)
     if not sizes.any():
         return (whole, None) if stated is None else (whole, sizes)
-    return _said(design, started(sizes), log), None if stated is not None and np.array_equal(sizes, stated) else sizes
+    return _said(design, lambda: started(sizes), log, ends), None if stated is not None and np.array_equal(
+        sizes, stated
+    ) else sizes
 
 
 def wrong_samples(refused: Sequence[FloatArray], known: NDArray[np.bool_]) -> list[FloatArray]:
@@ -246,50 +272,34 @@ class _ObserverOutput(NamedTuple):
     watched: FloatArray  # ``(n, m)``: NaN where nothing is decided, or rows are missing
     squares: FloatArray  # ``(n,)``: mean squares of innovations in the observer's own deviations, where it has these
     scores: Scores | None  # of the faults, where it is known what samples say of these
+    starts: FloatArray  # ``(nx,)``: how far the estimated states have been from those at the start
     refused: list[FloatArray]  # ``(4, ny)`` each: what a gate remembers after each row; empty without a gate
 
 
-def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _ObserverOutput:
-    """Return what a design says of rows ``(n, 1 + nu + ny)``."""
-    nothing = np.full(len(watched_names(design)), np.nan)
-    residuals = [i for i, name in enumerate(run.observer.columns) if name.startswith("r[")]
-    found, refused = list[tuple[int, float, FloatArray, float, Scores]](), list[FloatArray]()
-    walk, taken = parameter_walk(design.observer), 0
-    faults = len(design.observer.fault_names)
-    before, nothing_of_faults = before_any(faults), np.full(faults, np.nan)
-    silent = Scores(np.zeros(faults), np.zeros((faults, faults)), nothing_of_faults, nothing_of_faults)
-    settling = settling_rows(design)
-    gate = run.observer if isinstance(run.observer, SteppingLogObserver) and run.observer.gates else None
-    for count, last in enumerate(_rows(run, log, CHUNK_ROWS if gate is None else 1)):
-        if gate is not None:
-            refused.append(gate.state.refused)
-        # Rows that are missing are among those that a monitor takes.
-        for row in () if last.status in STALE else (*last.missed, last):
-            said = watched_values(row.values[residuals], row.evidence)
-            taken += 1
-            if row.status not in DECIDING or taken <= settling:
-                said = None
-            square, score = np.nan, silent
-            if walk is not None and isinstance(row.evidence, Evidence):
-                before, score = sample_score(before, row.evidence, walk, row.skipped + 1)
-            if said is not None and isinstance(row.evidence, Evidence) and np.isfinite(said).all():
-                own = row.evidence.whitened
-                square = float(np.mean(own**2)) if own.size else np.nan
-            # Longer gaps than the statistics look back are all the same.
-            missing = min(row.skipped, max(AGES))
-            found += [(count, row.time, nothing, np.nan, silent)] * missing
-            found.append((count, row.time, nothing if said is None else said, square, score))
-        if len(last.missed) > max(AGES):
-            del found[-1 - len(last.missed) : -1 - max(AGES)]
-    numbers, times, rows, squares, scores = zip(*found, strict=True) if found else ((),) * 5
-    both = [np.array([getattr(one, part.name) for one in scores]) for part in fields(Scores)]
+def _said(
+    design: ObserverDesign, started: Callable[[], LogRun], log: FloatArray, ends: Sequence[tuple[int, int]]
+) -> _ObserverOutput:
+    """Return what a design says of rows ``(n, 1 + nu + ny)`` of logs that begin and end where ``ends`` says, one after
+    the other with so many unknown rows between them that no statistic looks from one into another."""
+    parts = []
+    for first, last in ends:
+        part = _said_of(design, started(), log[first:last], first)
+        parts += [part] if last == ends[-1][1] else [part, _unknown_rows(part, last - 1)]
+    if len(parts) == 1:
+        return parts[0]
+    known = [part for part in parts if len(part.numbers)]
+    scores = None
+    if all(part.scores is not None for part in known):
+        columns = [[getattr(part.scores, one.name) for part in known] for one in fields(Scores)]
+        scores = Scores(*(np.concatenate(column) for column in columns))
     return _ObserverOutput(
-        np.array(numbers),
-        np.array(times),
-        np.array(rows),
-        np.array(squares),
-        None if walk is None or not scores else Scores(*both),
-        refused,
+        np.concatenate([part.numbers for part in known]),
+        np.concatenate([part.times for part in known]),
+        np.concatenate([part.watched for part in known]),
+        np.concatenate([part.squares for part in known]),
+        scores,
+        np.max([part.starts for part in parts], axis=0),
+        [row for part in parts for row in part.refused],
     )
 
 
@@ -300,7 +310,12 @@ def _rows(run: LogRun, log: FloatArray, together: int) -> Iterator[Row]:
 
 
 def _without_pairs(
-    design: ObserverDesign, started: Callable[[], LogRun], log: FloatArray, said: _ObserverOutput, every: float
+    design: ObserverDesign,
+    started: Callable[[], LogRun],
+    log: FloatArray,
+    ends: Sequence[tuple[int, int]],
+    said: _ObserverOutput,
+    every: float,
 ) -> tuple[_ObserverOutput, WrongPairs]:
     """Return what a design says of rows without pairs of wrong samples, and what there was of these."""
     from scipy.special import pdtrc
@@ -314,13 +329,14 @@ def _without_pairs(
         return said, NO_PAIRS
 
     def again(chosen: Sequence[Pair]) -> _ObserverOutput:
-        return _said(design, started(), np.hstack([log[:, :before], without(y, chosen)]))
+        return _said(design, started, np.hstack([log[:, :before], without(y, chosen)]), ends)
 
     hidden = again(pairs)
     wrong = taken_back(pairs, hidden.refused, y)
     seen = np.isfinite(y).sum(axis=0)
     # All of a pair are wrong samples: those that were believed too.
-    refused = hidden.refused[-1][1] + 2.0 * np.bincount([output for _, _, output in wrong], minlength=len(seen))
+    last = np.sum([hidden.refused[end - 1][1] for _, end in ends], axis=0)
+    refused = last + 2.0 * np.bincount([output for _, _, output in wrong], minlength=len(seen))
     # A second comes with the same probability as the first, and in half of the cases on the same side.
     chance = float(0.5 * np.sum((refused / np.maximum(seen, 1)) ** 2))
     # So many pairs are what single wrong samples make at this rate, and leave most of the alarms to others.
@@ -328,3 +344,97 @@ def _without_pairs(
     if not wrong or not are_chance:
         return said, NO_PAIRS
     return hidden if len(wrong) == len(pairs) else again(wrong), WrongPairs(len(wrong), chance)
+
+
+def several(data: Logs) -> list[Data]:
+    """Return the logs that are given: one, several, or all files of a folder by their names."""
+    if isinstance(data, Sequence) and not isinstance(data, str):
+        if not data:
+            raise SpecError("There is no log: give one without faults.", path="normal")
+        return list(data)
+    if not (isinstance(data, str | Path) and Path(data).is_dir()):
+        return [data]
+    files = sorted(file for file in Path(data).iterdir() if file.is_file() and not file.name.startswith("."))
+    if not files:
+        raise SpecError(f"There is no log in {data}: give one without faults.", path="normal")
+    return [*files]
+
+
+def _read(data: Data, signals: LogSignals) -> tuple[FloatArray, Stamps]:
+    """Return the rows of a log ``(n, 1 + nu + ny)``, and how to write its times."""
+    stamps = Stamps()
+    return np.vstack([np.zeros((0, 1 + len(signals.names))), *chunks(data, signals, stamps, CHUNK_ROWS)]), stamps
+
+
+def started_anywhere(observer: Any, reached: FloatArray) -> FloatArray | None:
+    """Return the covariance ``(nx, nx)`` of states at a start that may be wherever the plant has been, so far from the
+    observer's own ``(nx,)``; `None` where that is what the observer has."""
+    if not reached.size:
+        return None
+    stated = np.asarray(observer.initial_covariance)
+    missing = np.maximum(reached**2 - np.diag(stated), 0.0)
+    return stated + np.diag(missing) if missing.any() else None
+
+
+def _unknown_rows(like: _ObserverOutput, number: int) -> _ObserverOutput:
+    """Return rows in which nothing is known, after those of a log whose last one has this number."""
+    count = max(AGES)
+    scores = None
+    if like.scores is not None:
+        one = like.scores
+        fills = ((one.score, 0.0), (one.information, 0.0), (one.theta, np.nan), (one.deviations, np.nan))
+        scores = Scores(*(np.full((count, *part.shape[1:]), fill) for part, fill in fills))
+    last = float(like.times[-1]) if len(like.times) else 0.0
+    return _ObserverOutput(
+        np.full(count, number), np.full(count, last), np.full((count, *like.watched.shape[1:]), np.nan),
+        np.full(count, np.nan), scores, like.starts, [],
+    )  # fmt: skip
+
+
+def _said_of(design: ObserverDesign, run: LogRun, log: FloatArray, first: int) -> _ObserverOutput:
+    """Return what a design says of rows ``(n, 1 + nu + ny)`` of one log, of which the first one has this number."""
+    nothing = np.full(len(watched_names(design)), np.nan)
+    residuals = [i for i, name in enumerate(run.observer.columns) if name.startswith("r[")]
+    found, refused = list[tuple[int, float, FloatArray, float, Scores]](), list[FloatArray]()
+    walk, taken = parameter_walk(design.observer), 0
+    faults = len(design.observer.fault_names)
+    before, nothing_of_faults = before_any(faults), np.full(faults, np.nan)
+    silent = Scores(np.zeros(faults), np.zeros((faults, faults)), nothing_of_faults, nothing_of_faults)
+    settling = settling_rows(design)
+    gate = run.observer if isinstance(run.observer, SteppingLogObserver) and run.observer.gates else None
+    initial = np.asarray(getattr(design.observer, "initial_state", ()), dtype=np.float64)
+    starts = np.zeros(len(initial))
+    for count, last in enumerate(_rows(run, log, CHUNK_ROWS if gate is None else 1)):
+        if gate is not None:
+            refused.append(gate.state.refused)
+        # Rows that are missing are among those that a monitor takes.
+        for row in () if last.status in STALE else (*last.missed, last):
+            said = watched_values(row.values[residuals], row.evidence)
+            taken += 1
+            if row.status not in DECIDING or taken <= settling:
+                said = None
+            if row.status in DECIDING and starts.size:
+                starts = np.fmax(starts, np.abs(row.values[: len(starts)] - initial))
+            square, score = np.nan, silent
+            if walk is not None and isinstance(row.evidence, Evidence):
+                before, score = sample_score(before, row.evidence, walk, row.skipped + 1)
+            if said is not None and isinstance(row.evidence, Evidence) and np.isfinite(said).all():
+                own = row.evidence.whitened
+                square = float(np.mean(own**2)) if own.size else np.nan
+            # Longer gaps than the statistics look back are all the same.
+            missing = min(row.skipped, max(AGES))
+            found += [(first + count, row.time, nothing, np.nan, silent)] * missing
+            found.append((first + count, row.time, nothing if said is None else said, square, score))
+        if len(last.missed) > max(AGES):
+            del found[-1 - len(last.missed) : -1 - max(AGES)]
+    numbers, times, rows, squares, scores = zip(*found, strict=True) if found else ((),) * 5
+    both = [np.array([getattr(one, part.name) for one in scores]) for part in fields(Scores)]
+    return _ObserverOutput(
+        np.array(numbers),
+        np.array(times),
+        np.array(rows),
+        np.array(squares),
+        None if walk is None or not scores else Scores(*both),
+        starts,
+        refused,
+    )

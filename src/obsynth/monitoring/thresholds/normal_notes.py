@@ -28,16 +28,20 @@ def notes_of_normal_rows(
     raised: Raised,
     numbers: NDArray[np.int64],
     times: FloatArray,
-    rows: slice,
+    wanted: Sequence[tuple[int, int]],
     stuck: Mapping[str, Sequence[tuple[int, int]]],
-    stamps: Stamps,
+    ends: Sequence[tuple[int, int]],
+    stamps: Sequence[Stamps],
 ) -> tuple[str, ...]:
-    """Return the notes on ``rows`` of a log with ``times (n,)``, from 0: on events that stand in rows of these
-    ``numbers``, and on outputs, by name, that are stuck."""
+    """Return the notes on rows ``wanted`` of logs with ``times (n,)``, one after the other with these ``ends``: on
+    events that stand in rows of these ``numbers``, and on outputs, by name, that are stuck."""
 
     def shown(first: int, last: int) -> str:
-        begin, end = (stamps.shown(float(times[row])) for row in (first, last))
-        return f"row {first} ({begin})" if first == last else f"rows {first} to {last} ({begin} to {end})"
+        place = next(i for i, (_, end) in enumerate(ends) if first < end)
+        begin, end = (stamps[place].shown(float(times[row])) for row in (first, last))
+        a, b = first - ends[place][0], last - ends[place][0]
+        which = f" of log {place + 1}" if len(ends) > 1 else ""
+        return f"row {a}{which} ({begin})" if a == b else f"rows {a} to {b}{which} ({begin} to {end})"
 
     def found() -> Iterator[str]:
         if raised.events:
@@ -51,7 +55,7 @@ def notes_of_normal_rows(
                 "was not, blank its outputs in these rows, or give another log."
             )
         told = {
-            name: [(begin, end) for begin, end in runs if end >= rows.start and begin < rows.stop]
+            name: [(begin, end) for begin, end in runs if any(end >= a and begin < b for a, b in wanted)]
             for name, runs in stuck.items()
         }
         yield from stuck_texts(told, shown, ": what it repeats there counts as not measured")

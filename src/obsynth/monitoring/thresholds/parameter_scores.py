@@ -76,9 +76,9 @@ class Scores:
         """Return those of some rows."""
         return Scores(self.score[rows], self.information[rows], self.theta[rows], self.deviations[rows])
 
-    def followed(self, centre: FloatArray) -> FloatArray:
-        """Return the estimates from there in units of their deviations ``(..., nf)``."""
-        return np.asarray((self.theta - centre) / self.deviations)
+    def followed(self, centre: FloatArray, bands: FloatArray | float = 0.0) -> FloatArray:
+        """Return how far the estimates are further from there than ``bands (nf,)``, in units of their deviations."""
+        return beyond(self.theta - centre, bands) / self.deviations
 
 
 def before_any(faults: int) -> FloatArray:
@@ -121,9 +121,12 @@ def roots(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     return units[:, None] * ((vectors * lengths[:, None, :]) @ turned), (vectors * inverse[:, None, :]) @ turned / units
 
 
-def change_ratios(away: FloatArray, own: FloatArray, ages: tuple[int, ...]) -> FloatArray:
-    """Return twice the largest log likelihood ratio over ages of a change of each parameter alone ``(nf, n)``, from
-    scores ``(n, nf)`` of a change and the information ``own (n, nf)`` on each."""
+def change_ratios(
+    away: FloatArray, own: FloatArray, ages: tuple[int, ...], bands: FloatArray | None = None
+) -> FloatArray:
+    """Return twice the largest log likelihood ratio over ages of a change of each parameter alone ``(nf, n)`` by more
+    than ``bands (nf,)``, from scores ``(n, nf)`` of a change and the information ``own (n, nf)`` on each."""
+    widths = np.zeros((away.shape[1], 1)) if bands is None else bands[:, None]
     n, nf = away.shape
     sums, powers = (np.vstack([np.zeros((1, nf)), np.cumsum(part, axis=0)]) for part in (away, own))
     found = np.zeros((nf, n))
@@ -132,7 +135,8 @@ def change_ratios(away: FloatArray, own: FloatArray, ages: tuple[int, ...]) -> F
             break
         power = (powers[age:] - powers[:-age]).T
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.where(power > 0.0, (sums[age:] - sums[:-age]).T ** 2 / power, 0.0)
+            far = beyond((sums[age:] - sums[:-age]).T, widths * power)
+            ratio = np.where(power > 0.0, far**2 / power, 0.0)
         np.maximum(found[:, age - 1 :], ratio, out=found[:, age - 1 :])
     return found
 
@@ -179,3 +183,8 @@ class ScoreModel:
         units = self.model.simulated(whites[0])
         score = (self.root[places] @ units[..., None])[..., 0]
         return score, self.information[places], self.followed.simulated(whites[1])
+
+
+def beyond(values: FloatArray, bands: FloatArray | float) -> FloatArray:
+    """Return by how much values are further from zero than bands, with their signs."""
+    return np.asarray(np.sign(values) * np.maximum(np.abs(values) - bands, 0.0))

@@ -197,7 +197,13 @@ VERBS = {
         (
             GAINS,
             UNVERIFIED,
-            option("--data", "FILE", _LOG, required=True),
+            option(
+                "--data",
+                "FILE",
+                "one log without faults or several, or the folder that they are in; " + _LOG,
+                required=True,
+                nargs="+",
+            ),
             option("--false-alarms", "RATE", "such as '1 per week' or '2 per 1000 rows' (default: '1 per 1000 rows')"),
             option(
                 "--out",

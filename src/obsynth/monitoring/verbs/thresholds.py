@@ -18,16 +18,21 @@ def run_thresholds(options: argparse.Namespace) -> int:
     from obsynth.monitoring.thresholds.learned import LEARNED, expects_fault_courses
     from obsynth.monitoring.thresholds.learning import FALSE_ALARM_RATE, learn_thresholds
 
-    is_stream = options.data == STREAM
-    require_distinct({"--gains": options.gains, "--out": options.out, "--data": None if is_stream else options.data})
-    protect_inputs(options)
+    logs = options.data
+    is_stream = logs == [STREAM]
+    if STREAM in logs and not is_stream:
+        raise SpecError("One of several logs cannot be a stream: give files.", path="--data")
+    for log in logs:
+        require_distinct({"--gains": options.gains, "--out": options.out, "--data": None if is_stream else log})
+        options.data = log
+        protect_inputs(options)
     target = None if options.out is None else output_file(options.out, LEARNED, options)
     if target is not None and target.suffix.lower() != ".json":
         raise SpecError(f"{target}: thresholds are written as JSON (.json).", path="--out")
     design, _ = gains_to_hand_on(options.gains, unverified=options.unverified)
     found = learn_thresholds(
         with_input_delay(design, options),
-        sys.stdin if is_stream else Path(options.data),
+        sys.stdin if is_stream else Path(logs[0]) if len(logs) == 1 else [Path(log) for log in logs],
         false_alarms=options.false_alarms or FALSE_ALARM_RATE,
         rows=options.rows,
         columns=columns_of(options),
@@ -39,7 +44,10 @@ def run_thresholds(options: argparse.Namespace) -> int:
     levels = dict(zip(found.statistics.names, found.levels.tolist(), strict=True))
     if not found.holds:
         print(
-            f"Warning: the rate needs {found.needed} rows without faults, and {found.rows} are given.", file=sys.stderr
+            f"Warning: the rate needs {found.needed} rows without faults, and {found.rows} are given."
+            if found.rows < found.needed
+            else f"Warning: {100 * found.healthy_time.expected:.2g} % of healthy time is in alarm.",
+            file=sys.stderr,
         )
     lines = [f"{found.statement[0].upper()}{found.statement[1:]}.", f"Monitored: {', '.join(found.columns)}."]
     if found.seldom:
@@ -67,6 +75,8 @@ def run_thresholds(options: argparse.Namespace) -> int:
             "watched": list(found.columns),
             "left_out": list(found.left_out),
             "levels": levels,
+            "logs": found.logs,
+            "healthy_time": found.healthy_time._asdict(),
         },
         "\n".join(lines),
     )
