@@ -105,14 +105,17 @@ def designed(name: str) -> obsynth.ObserverDesign:
     if name in (WALKING, SLOWLY_SEEN):
         model = obsynth.DAEModel(
             {"coil": "3000 * der(coil) = valve * (1 - stuck) * 20 * (60 - coil) - 8 * (coil - air)",
-             "air": "800 * der(air) = 8 * (coil - air) + 10 * (15 - air)"},
-            {"Tair": "air + bias", "Tcoil": "coil"}, states={"coil": 40.0, "air": 25.0}, inputs={"valve": 0.5},
+             "air": "800 * der(air) = 8 * (coil - air) + 10 * (outside - air)"},
+            {"Tair": "air + bias", "Tcoil": "coil"}, states={"coil": 40.0, "air": 25.0},
+            inputs={"valve": 0.5, "outside": 15.0},
             parameters={"stuck": 0.0, "bias": 0.0},
         )  # fmt: skip
         return obsynth.dae_adaptive_observer(
             model, dt=60.0, Q=np.diag([4e-4, 4e-4]), R=np.diag([0.02, 0.01]), form="augmented-kalman", name=name,
             random_walk=np.diag([1e-4, 1e-3]), initial_parameter_covariance=np.diag([1e-3, 1e-2]),
-            sensors={"Tair": {"every": 3}} if name == SLOWLY_SEEN else None,
+            sensors={"Tair": {"every": 3}} if name == SLOWLY_SEEN else None, outliers="gate",
+            # Nearer than what the prediction excludes: only a sensor that waits for the next sample is judged by them.
+            outlier_sizes={"Tair": 0.3, "Tcoil": 0.3},
         )  # fmt: skip
     spec = load_spec(ROOT / "designs" / f"{name}.yaml")
     return obsynth.design(spec.plant, spec.method, name=spec.name, **dict(spec.options))

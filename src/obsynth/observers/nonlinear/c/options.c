@@ -205,7 +205,7 @@ static int robust(const struct observer *state, const double *u, const double *v
     int i;
     copy(received, y, NY);
     for (i = 0; i < NU; i++) {
-        is_back = is_back || state->inputs[3 * NU + i] > 0.0;
+        is_back = is_back || state->inputs[5 * i + 3] > 0.0;
     }
     /* What the inputs may have been meanwhile makes deviations so large that an outlier would pass once they are known
        again: what is as far off as outliers of its sensor are waits until others go on with it. */
