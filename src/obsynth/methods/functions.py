@@ -11,6 +11,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.designing import design
 from obsynth.methods.method import Method
 from obsynth.methods.registry import method_class
+from obsynth.numerics.arguments import argument_kinds, field_types, problem_with
 from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.design import ObserverDesign
 
@@ -37,7 +38,9 @@ def design_function(
                 "(obsynth.uncertain_system), or leave scenario out.",
                 path="scenario",
             )
-        found = design(**Signature(first).bind(plant, *given).arguments, method=method.id, **options)
+        bound = {**Signature(first).bind(plant, *given).arguments, **options}
+        _require_kinds(method, bound)
+        found = design(**bound, method=method.id)
         if isinstance(found, result):
             return found
         return result(**{part.name: getattr(found, part.name) for part in fields(found)})
@@ -54,6 +57,21 @@ def design_function(
     designed.__name__ = designed.__qualname__ = method.id.replace("-", "_")
     designed.__doc__ = getdoc(method)
     return designed
+
+
+def _require_kinds(method: type[Method], given: dict[str, Any]) -> None:
+    """Raise `SpecError` for all arguments of a wrong kind at once, where the plant or the name is one of them."""
+    wrong = {name: text for name, kind in argument_kinds(design).items()
+             if name in given and (text := problem_with(given[name], name, kind))}  # fmt: skip
+    if not wrong:
+        return
+    kinds = field_types(method)
+    wrong |= {
+        name: text for name, kind in kinds.items() if name in given and (text := problem_with(given[name], name, kind))
+    }
+    function = method.id.replace("-", "_")
+    message = next(iter(wrong.values())) if len(wrong) == 1 else f"Arguments of {function}:"
+    raise SpecError(message, path=next(iter(wrong)), problems=tuple(wrong.values()) if len(wrong) > 1 else ())
 
 
 fault_estimation_filter = design_function(method_class("fault-estimation-filter"))

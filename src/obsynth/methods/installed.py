@@ -19,6 +19,7 @@ OWN = {
     "pd-observer": "obsynth.methods.pd_observer.method:PdObserver",
     "ui-pi-observer": "obsynth.methods.ui_pi_observer.method:UiPiObserver",
     "functional-filter": "obsynth.methods.functional_filter.method:FunctionalFilter",
+    "optimal-filter": "obsynth.methods.optimal_filter.method:OptimalFilterMethod",
     "detection-filter": "obsynth.methods.detection_filter.method:DetectionFilterMethod",
     "descriptor-kalman": "obsynth.methods.descriptor_kalman.method:DescriptorKalman",
     "adaptive-observer": "obsynth.methods.adaptive_observer.method:AdaptiveObserver",

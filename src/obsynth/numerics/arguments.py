@@ -335,6 +335,14 @@ def _problem_with_written(value: Any, name: str, kind: str) -> str | None:
         )
     if kind == "named bounds" and is_number(value):
         return _problem_with_bound(value, name)
+    if kind == "delay":
+        fits = (isinstance(value, str) and value == "auto") or (is_whole(value) and 0 <= value <= MOST_COUNTED)
+        return None if fits else f"{name} is {shown(value)}: give a whole number of samples, at least 0, or 'auto'."
+    if kind == "reference model":
+        fits = value is None or isinstance(value, Mapping) or hasattr(value, "dt")
+        fits = fits or (isinstance(value, (list, tuple)) and len(value) == 4)
+        wanted = "{'bandwidth': 10}, matrices {'A': ..., 'B': ..., 'C': ..., 'D': ...} or a system of python-control"
+        return None if fits else f"{name} is {shown(value)}: give {wanted}."
     fits = not isinstance(value, (bool, np.bool_)) and (not kinds or value is None or isinstance(value, kinds))
     if fits and kind == "fault sets" and not isinstance(value, (str, type(None))):
         fits = all(isinstance(entry, (str, list, tuple)) for entry in value)
@@ -375,7 +383,7 @@ def check_fields(made: Any, kind: Any) -> None:
 
 
 @cache
-def _argument_kinds(function: Callable[..., Any]) -> dict[str, Any]:
+def argument_kinds(function: Callable[..., Any]) -> dict[str, Any]:
     """Return name -> kind of the arguments of a function, as its annotations say them."""
     known: dict[str, Any] = {"ArrayLike": _Numbers}
     kinds = {}
@@ -402,7 +410,7 @@ def arguments_worded(**words: str) -> Callable[[Callable[Given, Returned]], Call
 
         @wraps(function)
         def called(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
-            kinds = _argument_kinds(function)
+            kinds = argument_kinds(function)
             given = dict(zip(stated.parameters, args, strict=False)) | kwargs
             wrong = {
                 name: f"{name} is {a_kind(value)}: give {words[name]}." if name in words else text

@@ -17,6 +17,9 @@ from obsynth.numerics.arrays import FloatArray, read_only
 #: Singular values below this fraction of the largest count as zero (data are balanced first).
 RANK_TOLERANCE = 1e-10
 
+#: Singular values of windows of outputs, whose entries are powers of a plant's, below this fraction count as zero.
+WINDOW_RANK_TOLERANCE = 1e-9
+
 #: A gap between kept and dropped singular values smaller than this is reported as unclear.
 CLEAR_GAP = 1e3
 

@@ -272,6 +272,8 @@ OPTION_KINDS: Mapping[str, Any] = {
     "named covariance": Positive | Matrix | dict[Text, NonNegative] | None,
     "named bounds": _as_in_python("named bounds"),
     "samples": _as_in_python("samples"),
+    "delay": _as_in_python("delay"),
+    "reference model": _as_in_python("reference model"),
     "free faults": Text | list[Text] | None,
     "named numbers": Positive | dict[Text, Positive] | None,
     "named vector": list[float] | dict[Text, float] | None,

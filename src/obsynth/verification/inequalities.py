@@ -13,8 +13,9 @@ congruence S (here close to the inverse of Q).  Q is stored: P, rounded, loses d
 from __future__ import annotations
 
 from hashlib import blake2b
-from typing import Any
+from typing import Any, Protocol
 
+import flint
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, remembered
@@ -25,7 +26,15 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
-from obsynth.proofs.extended_balls import Enclosed, block, enclosed_eigenvalues
+from obsynth.proofs.extended_balls import (
+    EIGENVALUE_BITS,
+    MOST_ENCLOSED,
+    Enclosed,
+    ExtendedBall,
+    block,
+    enclosed_eigenvalues,
+    undecided_pivot,
+)
 from obsynth.results.checks import Check, CheckKind
 from obsynth.verification.error_system import contraction_of
 
@@ -150,6 +159,91 @@ def prove_gain(
         return block([[-(moved + moved.T), -entering, shown.T], [-entering.T, level, d.T], [shown, d, identity]])
 
     return prove_positive_definite(formula)
+
+
+class System(Protocol):
+    """How a system ``(a, b, c, d)`` is formed, in an arithmetic of whoever calls it."""
+
+    def __call__(self, kind: type[Enclosed], /) -> tuple[Enclosed, Enclosed, Enclosed, Enclosed]:
+        """Return the matrices with what forming them may have cost."""
+
+
+def prove_norm(system: System, P: FloatArray, gain: float, *, dt: float) -> DefinitenessProof:
+    """Try to prove that a system is stable and of an H-infinity norm below ``gain``, in either time.
+
+    Discrete time: ``P > 0`` and ``[P, 0, a'P, c'; 0, gain^2 I, b'P, d'; P a, P b, P, 0; c, d, 0, I] > 0``; continuous:
+    ``P > 0`` and ``[-(P a + a'P), -P b, c'; -b'P, gain^2 I, d'; c, d, I] > 0``.
+    """
+    positive = prove_symmetric_positive(P)
+    if not positive.proved:
+        return unproved(f"P itself: {positive.reason}")
+
+    def formula(kind: type[Enclosed]) -> Enclosed:
+        a, b, c, d = system(kind)
+        p = kind.exact(P)
+        moved, driven = p @ a, p @ b
+        n, nw, nz = a.shape[0], b.shape[1], c.shape[0]
+        level, one = kind.exact(np.eye(nw)).scaled(gain).scaled(gain), kind.exact(np.eye(nz))
+
+        def zero(rows: int, columns: int) -> Enclosed:
+            return kind.exact(np.zeros((rows, columns)))
+
+        if dt == 0.0:
+            return block([[-(moved + moved.T), -driven, c.T], [-driven.T, level, d.T], [c, d, one]])
+        return block(
+            [
+                [p, zero(n, nw), moved.T, c.T],
+                [zero(nw, n), level, driven.T, d.T],
+                [moved, driven, p, zero(n, nz)],
+                [c, d, zero(nz, n), one],
+            ]
+        )
+
+    return prove_positive_definite(formula)
+
+
+def prove_norm_by_eigenvalues(system: System, order: int, gain: float, *, dt: float) -> DefinitenessProof:
+    """Try to prove that a stable system has an H-infinity norm below ``gain``: no certificate is needed.
+
+    ``g^2 I - D'D > 0``, and no eigenvalue of the Hamiltonian matrix lies on the imaginary axis: all are enclosed.
+    Discrete time is mapped by ``s = (z - 1) / (z + 1)``, which keeps the norm.  Boyd, Balakrishnan, Kabamba 1989.
+    """
+    if not 0 < 2 * order <= MOST_ENCLOSED:
+        return unproved("the system has no states, or too many for all eigenvalues to be enclosed")
+    for bits in EIGENVALUE_BITS:
+        with flint.ctx.workprec(bits):
+            try:
+                distance = _distance_from_axis(system, gain, discrete=dt > 0.0)
+            except (ValueError, ZeroDivisionError):  # not enough digits
+                continue
+        if distance > 0.0:
+            return DefinitenessProof(True, distance, 0.0, "ball arithmetic", f"{bits} bits")
+        if distance < 0.0:
+            return unproved("the level is not above the gain at infinite frequency")
+    return unproved("an eigenvalue of the Hamiltonian matrix is on the axis, or cannot be told from one that is")
+
+
+def _distance_from_axis(system: System, gain: float, *, discrete: bool) -> float:
+    """Return a lower bound on the distance of the Hamiltonian's eigenvalues from the axis; 0 for none proved."""
+    a, b, c, d = (part.content for part in system(ExtendedBall))
+    if discrete:
+        one = flint.arb_mat([[int(i == j) for j in range(a.ncols())] for i in range(a.nrows())])
+        moved = a + one
+        c, b, a = c * moved.inv(), moved.solve(b), moved.solve(a - one)
+        d, b = d - c * (moved * b), b * 2
+    level = flint.arb_mat([[flint.arb(gain) ** 2 * int(i == j) for j in range(d.ncols())] for i in range(d.ncols())])
+    gap = level - d.transpose() * d
+    if undecided_pivot(gap.tolist()) is not None:
+        return -1.0
+    inverse = gap.inv()
+    closed = a + b * inverse * d.transpose() * c
+    entering, shown = b * inverse * b.transpose(), c.transpose() * c
+    shown = shown + c.transpose() * d * inverse * d.transpose() * c
+    order, tables = a.nrows(), (closed.tolist(), entering.tolist(), shown.tolist(), closed.transpose().tolist())
+    rows = [[*tables[0][i], *tables[1][i]] for i in range(order)]
+    rows += [[*(-x for x in tables[2][i]), *(-x for x in tables[3][i])] for i in range(order)]
+    found = flint.acb_mat(flint.arb_mat(rows)).eig(multiple=True)
+    return max(min(float(abs(value.real).abs_lower()) for value in found), 0.0)
 
 
 def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessProof:

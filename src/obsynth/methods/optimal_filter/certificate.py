@@ -1,0 +1,175 @@
+"""Witnesses of an optimal filter's claims: P of its gain, and the points of what no output shows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from obsynth.errors import SolverError
+from obsynth.methods.optimal_filter.error_channel import ErrorChannel
+from obsynth.methods.optimal_filter.fault_maps import Designed
+from obsynth.methods.optimal_filter.realisation import Followed
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.matrix_equations import bounded_real_matrix
+from obsynth.numerics.standard_form import INFINITE_EIGENVALUE
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.inequalities import prove_norm, prove_norm_by_eigenvalues
+from obsynth.verification.invisible_faults import Setting, proved_least, proved_limit
+
+#: What is claimed above the recomputed gain, as a share of it: the first that can be proved.
+CLAIM_ROOMS = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
+#: Levels that are claimed of a gain that is zero but for rounding, in units of what counts as zero.
+ZERO_LEVELS = (1.0, 1e1, 1e2, 1e3, 1e4)
+#: Slacks of the inequality that the certificate solves, of the square of the output matrix.
+SLACKS = (1e-3, 1e-6, 1e-8, 1e-10, 1e-12)
+#: A bound this near the gain, as a share of it, is not improved further.
+CLOSE_ENOUGH = 1e-8
+#: What is claimed of a proved bound: machines differ in the last digits of the combination that they find.
+CLAIMED_SHARE = 1.0 - 1e-10
+#: Decays below this per sample are left to the last samples, which are free.
+FASTEST_DECAY = 1e-2
+#: Slower ones last too long for the sums of their energies.
+SLOWEST_DECAY = 1.0 - 1e-12
+#: Imaginary parts below this share are rounding; angles nearer to those of real points than this are theirs.
+REAL_SHARE, EDGE_ANGLE = 1e-9, 1e-9
+#: How far, as a share, a frequency is moved off the circle, or the axis, so that its signals decay.
+OFF_THE_EDGE = 1e-9
+#: Last samples that are free beyond the delay, and unknowns of all of them that are solved for.
+MORE_SAMPLES, MOST_UNKNOWNS = 3, 150
+
+
+def certified(
+    plant: DescriptorSystem, chosen: Designed, observer: LinearObserver, found: Followed, norm: str
+) -> tuple[dict[str, FloatArray], dict[str, float]]:
+    """Return the claims of a filter and their witnesses; raise `SolverError` where no gain near its own is proved."""
+    fault_map = chosen.fault_map
+    claims = {"order": float(observer.order)}
+    if fault_map.delay is not None:
+        claims["delay"] = float(fault_map.delay)
+    if norm == "h2":
+        return {}, claims | {"deviation": chosen.gain, "least_deviation": chosen.gain}
+    model = ErrorModel(plant, observer, found.T, -found.T0, lag=found.lag, decoupled=True)
+    channel = ErrorChannel(model, None if fault_map.exact else fault_map.reference)
+    factors = [factor * chosen.nothing for factor in ZERO_LEVELS] if chosen.is_nothing else []
+    levels = factors or [chosen.gain * (1.0 + room) for room in CLAIM_ROOMS]
+    matrices: dict[str, FloatArray] = {}
+    for level in levels:
+        P = gain_matrix(channel, level, plant.dt, chosen.problem.alpha)
+        scaled = channel.in_units_of(level)
+        if P is not None:
+            matrices["P"] = P
+        elif not prove_norm_by_eigenvalues(scaled, scaled.order, level / scaled.unit, dt=plant.dt).proved:
+            continue
+        claims["gain"] = level
+        break
+    else:
+        raise SolverError(
+            f"A gain of {chosen.gain:.6g} was found, and no level near it can be proved: the result is inconclusive. "
+            "Scale the plant's signals, or give every sensor noise."
+        )
+    if chosen.is_nothing:
+        return matrices, claims
+    return matrices | _lower_bounds(plant, chosen, claims), claims
+
+
+def gain_matrix(channel: ErrorChannel, level: float, dt: float, alpha: float) -> FloatArray | None:
+    """Return a matrix P that proves the bounded real inequality of an error system at a level; ``None`` for none."""
+    channel = channel.in_units_of(level)
+    (a, b, c, d), own = channel.middle, level / channel.unit
+    if dt == 0.0:
+        inverse, root = np.linalg.inv(alpha * np.eye(len(a)) - a), np.sqrt(2.0 * alpha)
+        a, b, c, d = inverse @ (alpha * np.eye(len(a)) + a), root * inverse @ b, root * c @ inverse, d + c @ inverse @ b
+    size = float(np.linalg.norm(c)) ** 2 + float(np.finfo(float).tiny)
+    for share in SLACKS:
+        P = bounded_real_matrix(a, b, c, d, own, slack=share * size)
+        if P is not None and prove_norm(channel, P, own, dt=dt).proved:
+            return P
+    return None
+
+
+def _lower_bounds(plant: DescriptorSystem, chosen: Designed, claims: dict[str, float]) -> dict[str, FloatArray]:
+    """Claim what is proved of every causal filter, and of every delay; return the witnesses."""
+    fault_map, best, matrices = chosen.fault_map, 0.0, dict[str, FloatArray]()
+    setting = Setting(fault_map.delay or 0, fault_map.reference, fault_map.exact)
+    block = plant.nx + plant.nf + plant.nd + plant.nw
+    samples = min(setting.delay + MORE_SAMPLES, max(setting.delay, 1) + MOST_UNKNOWNS // block)
+    for points in _candidates(plant, chosen):
+        bound = proved_least(plant, points, samples, setting, level=chosen.gain)
+        bound = None if bound is None else bound * CLAIMED_SHARE
+        if bound is not None and best < bound <= claims["gain"]:
+            best = bound
+            matrices["invisible"] = np.array([[p.real, p.imag] for p in points]).reshape(-1, 2)
+            matrices["samples"] = np.array([[float(samples)]])
+        if best >= chosen.gain * (1.0 - CLOSE_ENOUGH):
+            break
+    if best > 0.0:
+        claims["least"] = best
+    if fault_map.delay is not None and fault_map.exact and chosen.limit > chosen.nothing:
+        point = _edge_point(plant, chosen)
+        limit = proved_limit(plant, point, setting)
+        if limit is not None and limit > chosen.nothing:
+            claims["non_causal_limit"] = min(limit * CLAIMED_SHARE, claims.get("least", np.inf))
+            matrices["limit_point"] = np.array([[point.real, point.imag]])
+    return matrices
+
+
+def _edge_point(plant: DescriptorSystem, chosen: Designed) -> complex:
+    """Return the frequency of the limit as a point just outside the circle, or right of the axis."""
+    angle = chosen.limit_angle
+    if plant.is_discrete:
+        turn = (
+            complex(np.cos(angle), np.sin(angle)) if min(angle, np.pi - angle) > EDGE_ANGLE else complex(np.cos(angle))
+        )
+        return complex((1.0 + OFF_THE_EDGE) * turn)
+    alpha = chosen.problem.alpha
+    rate = alpha * np.tan(angle / 2.0) if np.pi - angle > EDGE_ANGLE else alpha / OFF_THE_EDGE
+    return complex(OFF_THE_EDGE * (alpha + rate), rate if angle > EDGE_ANGLE else 0.0)
+
+
+def _candidates(plant: DescriptorSystem, chosen: Designed) -> list[list[complex]]:
+    """Return sets of points to be tried: zeros where only these are invisible, else the worst noise, level by level."""
+    free = plant.nf + plant.nd + plant.nw - plant.ny
+    if free <= 0:
+        return [_zeros_outside(plant), []] if plant.is_discrete else [_zeros_outside(plant)]
+    edge = [_edge_point(plant, chosen)] if chosen.limit > chosen.nothing else []
+    found: list[list[complex]] = []
+    for decays in reversed(chosen.decays):
+        points = [point for value in decays if (point := _point_of(plant, chosen, complex(value))) is not None]
+        found.append(points + edge if not found else points)
+    return [*found, edge] if edge else [*found, []] if plant.is_discrete else found
+
+
+def _point_of(plant: DescriptorSystem, chosen: Designed, decay: complex) -> complex | None:
+    """Return where a decay per sample (of the Cayley transform, in continuous time) is; ``None`` for conjugates."""
+    real = abs(decay.imag) <= REAL_SHARE * abs(decay)
+    if (decay.imag < 0.0 and not real) or abs(decay) >= SLOWEST_DECAY:
+        return None
+    decay = complex(decay.real) if real else decay
+    if plant.is_discrete:
+        return 1.0 / decay if abs(decay) > FASTEST_DECAY else None
+    return complex(chosen.problem.alpha * (1.0 - decay) / (1.0 + decay))
+
+
+def _zeros_outside(plant: DescriptorSystem) -> list[complex]:
+    """Return the finite zeros, from all that is invisible to the outputs, that are not stable; none of wide plants."""
+    inputs, through = np.hstack([plant.Bf, plant.Bd, plant.Bw]), np.hstack([plant.Df, plant.Dd, plant.Dw])
+    if inputs.shape[1] != plant.ny:
+        return []
+    still = np.block([[-plant.A, -inputs], [plant.C, through]])
+    moved = np.zeros_like(still)
+    moved[: plant.nx, : plant.nx] = plant.E
+    alpha, beta = scipy.linalg.eigvals(still, -moved, homogeneous_eigvals=True)
+    found: list[complex] = []
+    for top, bottom in zip(alpha, beta, strict=True):
+        if abs(bottom) * INFINITE_EIGENVALUE <= abs(top):
+            continue
+        value: Any = complex(top / bottom)
+        value = complex(value.real) if abs(value.imag) <= REAL_SHARE * abs(value) else value
+        outside = abs(value) > 1.0 if plant.is_discrete else value.real > 0.0
+        if outside and value.imag >= 0.0:
+            found.append(value)
+    return found

@@ -1,0 +1,297 @@
+"""Checks of an optimal filter, from the plant and the shipped realisation alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from obsynth.errors import PreconditionError
+from obsynth.methods.optimal_filter.error_channel import ErrorChannel
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.decoupling_windows import Model
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.balls import Ball
+from obsynth.results.checks import Check, fitting_check, lower_bound_check, upper_bound_check
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.claims import claimed, listed_gains
+from obsynth.verification.error_system import IDENTITY_SHARE, ErrorModel
+from obsynth.verification.inequalities import proof_row, prove_norm, prove_norm_by_eigenvalues, stability_row
+from obsynth.verification.invisible_faults import (
+    LONGEST_DELAY,
+    Setting,
+    proved_least,
+    proved_limit,
+    seen_plant,
+)
+from obsynth.verification.plant import plant_information
+
+#: Faults pass by the fault map to this share of its largest entry.
+FAULT_MAP_SHARE = 1e-6
+#: What passes directly to the error is rounding below so many bounds on the rounding of its terms.
+ROUNDED_UNITS = 1e4
+#: A recomputed deviation repeats the claimed one to this share.
+DEVIATION_SHARE = 1e-6
+
+
+def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+    """Yield every check of ``design``; see `obsynth.methods.verifying.verify`."""
+    plant, observer = design.linear
+    yield from plant_information(plant)
+    fitting = _fits(design)
+    yield fitting_check("observer, certificate, options and plant have matching signals and shapes", fits=fitting)
+    if not fitting:
+        return
+    matrices, claims, options = design.certificate.matrices, design.certificate.claims, design.options
+    # Disturbances that are not decoupled count as noise.
+    plant = seen_plant(plant, options["decoupled"])
+    lag = matrices["T0"].shape[1] // plant.nx - 1
+    model = ErrorModel(plant, observer, matrices["T"], -matrices["T0"], lag=lag, decoupled=True)
+    yield _decoupling(model, printed_digits)
+    yield listed_gains(design, {name: matrices[name] for name in ("T", "T0")})
+    yield stability_row(observer.Az, matrices["stability"], plant.dt, "Lyapunov")
+    yield upper_bound_check(
+        "order",
+        "the filter has as many states as claimed: difference",
+        abs(observer.order - claimed(claims, "order")),
+        0.0,
+        source="shipped realisation",
+        kind="equality",
+        detail=f"{observer.order} states",
+    )
+    if options["exact"]:
+        yield _fault_map(design, model)
+    channel = ErrorChannel(model, None if options["exact"] else _reference(matrices))
+    if options["norm"] == "h2":
+        yield _deviation(channel, claimed(claims, "deviation"), plant)
+        yield _least_deviation(design, plant)
+        return
+    channel = channel.in_units_of(claimed(claims, "gain"))
+    level = claims["gain"] / channel.unit
+    if "P" in matrices:
+        proof, source = prove_norm(channel, matrices["P"], level, dt=plant.dt), "bounded real lemma"
+    else:
+        proof = prove_norm_by_eigenvalues(channel, channel.order, level, dt=plant.dt)
+        source = "eigenvalues of the Hamiltonian matrix"
+    driven = "noise" if options["exact"] else "faults and noise together"
+    yield proof_row("gain", f"the error is at most {claims['gain']:.9g} times the {driven}", proof, source)
+    if "least" in claims:
+        yield _least(design, plant)
+    if "non_causal_limit" in claims:
+        yield _limit(design, plant)
+
+
+def _decoupling(model: ErrorModel, printed_digits: int | None) -> Check:
+    """Return whether neither the state, nor known inputs, nor decoupled disturbances reach the estimates."""
+    bound = IDENTITY_SHARE if printed_digits is None else 10.0**-printed_digits
+    return upper_bound_check(
+        "decoupling",
+        "neither states, nor known inputs, nor decoupled disturbances reach the estimates",
+        model.missed(),
+        bound,
+        source="Az T E + By C = T A, Bu + By D = T B, Cz T E + Dy C = T0 A, Du + Dy D = T0 B, T0 E = 0, By Dd = T Bd",
+        kind="equality",
+        detail="relative to the size of the terms",
+    )
+
+
+def _fits(design: ObserverDesign) -> bool:
+    (plant, observer), matrices = design.linear, design.certificate.matrices
+    claims, options = design.certificate.claims, design.options
+    if not {"T", "T0", "stability"} <= set(matrices) or not _options_fit(design):
+        return False
+    parts = (observer.Az, observer.Bu, observer.By, observer.Cz, observer.Du, observer.Dy, *matrices.values())
+    states, reference = matrices["T0"].shape[1], _reference(matrices)
+    extra = 0 if reference is None or options["exact"] else len(reference[0])
+    rows = plant.nf if reference is None else len(reference[2])
+    shapes = {
+        "stability": (observer.order,) * 2,
+        "T": (observer.order, states),
+        "T0": (rows, max(states // plant.nx, 1) * plant.nx),
+    }
+    shapes |= {} if "P" not in matrices else {"P": (observer.order + extra,) * 2}
+    if "least" in claims:
+        shapes |= {"invisible": (len(matrices.get("invisible", ())), 2), "samples": (1, 1)}
+    shapes |= {"limit_point": (1, 2)} if "non_causal_limit" in claims else {}
+    needed = {"gain"} if options["norm"] == "hinf" else {"deviation", "least_deviation"}
+    return bool(
+        all(np.all(np.isfinite(part)) for part in parts)
+        and all(name in matrices and matrices[name].shape == shape for name, shape in shapes.items())
+        and needed <= set(claims)
+        and len(observer.Cz) == rows
+        and (observer.input_names, observer.output_names) == (plant.input_names, plant.output_names)
+        and observer.state_names == ()
+        and observer.fault_names == (plant.fault_names if rows == plant.nf else ())
+        and observer.dt == plant.dt
+    )
+
+
+def _options_fit(design: ObserverDesign) -> bool:
+    """Whether the options are those of this method, and the delay and the reference model are those of the claims."""
+    (plant, observer), options = design.linear, design.options
+    claims, matrices = design.certificate.claims, design.certificate.matrices
+    if not {"norm", "exact", "delay", "reference", "decoupled"} <= set(options):
+        return False
+    reference = _reference(matrices)
+    late = observer.fault_delays
+    if reference is None:
+        delay = claims.get("delay")
+        timed = options["delay"] == delay and options["reference"] is None and all(one == delay for one in late)
+        timed = timed and plant.is_discrete and options["exact"] is True
+    else:
+        given = options["reference"]
+        same = isinstance(given, Mapping) and all(
+            np.array_equal(np.reshape(given.get(name, ()), np.shape(part)), part)
+            if np.size(given.get(name, ())) == np.size(part)
+            else False
+            for name, part in zip("ABCD", reference, strict=True)
+        )
+        timed = same and "delay" not in claims and not any(late) and _is_stable(reference, plant)
+    return bool(
+        timed
+        and options["norm"] in ("hinf", "h2")
+        and isinstance(options["exact"], bool)
+        and set(options["decoupled"]) <= set(plant.disturbance_names)
+    )
+
+
+def _is_stable(reference: Model, plant: DescriptorSystem) -> bool:
+    a, b, c, d = reference
+    n = len(a)
+    if a.shape != (n, n) or b.shape != (n, plant.nf) or c.shape != (len(d), n) or d.shape[1] != plant.nf:
+        return False
+    modes = np.linalg.eigvals(a) if n else np.zeros(0)
+    return bool(np.all(np.abs(modes) < 1.0) if plant.is_discrete else np.all(modes.real < 0.0))
+
+
+def _reference(matrices: Mapping[str, FloatArray]) -> Model | None:
+    names = [f"reference_{name}" for name in "ABCD"]
+    if any(name not in matrices for name in names):
+        return None
+    a, b, c, d = (matrices[name] for name in names)
+    return a, b, c, d
+
+
+def _setting(design: ObserverDesign) -> Setting:
+    delay = int(design.certificate.claims.get("delay", 0))
+    return Setting(delay, _reference(design.certificate.matrices), bool(design.options["exact"]))
+
+
+def _fault_map(design: ObserverDesign, model: ErrorModel) -> Check:
+    """Compare the transfer from the faults with the fault map at more points than the difference has states."""
+    plant, observer = design.linear
+    reference, delay = _reference(design.certificate.matrices), int(design.certificate.claims.get("delay", 0))
+    c, df, _, _ = model.output(slice(0, len(observer.Cz)))
+    own = 0 if reference is None else len(reference[0])
+    count = 2 * (observer.order + own + delay) + 3
+    if plant.is_discrete:
+        points = np.exp(1j * (np.arange(count) + 0.5) * np.pi / count)
+    else:
+        size = max(float(np.max(np.abs(np.linalg.eigvals(observer.Az)), initial=0.0)), 1.0) if observer.order else 1.0
+        points = 1j * size * np.tan((np.arange(count) + 0.5) * np.pi / (2 * count))
+    worst, largest = 0.0, 0.0
+    for point in points:
+        found = df - _response((observer.Az, model.fault, c, 0.0 * df), point)
+        wanted = point**-delay * np.eye(plant.nf) if reference is None else _response(reference, point)
+        worst = max(worst, float(np.max(np.abs(found - wanted), initial=0.0)))
+        largest = max(largest, float(np.max(np.abs(wanted), initial=0.0)))
+    late = f"late by {delay} samples" if reference is None else "as by the reference model"
+    return upper_bound_check(
+        "fault map",
+        f"faults pass exactly, {late}, whatever their time course",
+        worst / largest if largest > 0.0 else worst,
+        FAULT_MAP_SHARE,
+        source=f"transfer functions at {count} points, which determine them",
+        kind="equality",
+    )
+
+
+def _response(system: Model, point: complex) -> Any:
+    a, b, c, d = system
+    return c @ np.linalg.solve(point * np.eye(len(a)) - a, b) + d if len(a) else d
+
+
+def _least(design: ObserverDesign, plant: DescriptorSystem) -> Check:
+    """Prove the bound on every causal filter again, from the plant and the points: no filter is in it."""
+    matrices, stated = design.certificate.matrices, claimed(design.certificate.claims, "least")
+    points = [complex(*pair) for pair in matrices["invisible"]]
+    samples = int(matrices["samples"][0, 0])
+    bound = proved_least(plant, points, samples, _setting(design), level=stated)
+    return _bound_row(
+        "least gain",
+        "every causal filter, linear or not, with this fault map has at least this gain",
+        bound,
+        stated,
+        f"{len(points)} points of faults and noise that no output shows",
+    )
+
+
+def _limit(design: ObserverDesign, plant: DescriptorSystem) -> Check:
+    matrices, stated = design.certificate.matrices, claimed(design.certificate.claims, "non_causal_limit")
+    point = complex(*matrices["limit_point"][0])
+    return _bound_row(
+        "gain at any delay",
+        f"no delay of up to {LONGEST_DELAY} samples brings the gain of an exact fault map below this",
+        proved_limit(plant, point, _setting(design)),
+        stated,
+        "faults and noise of one frequency that no output shows",
+    )
+
+
+def _bound_row(name: str, claim: str, bound: float | None, stated: float, detail: str) -> Check:
+    """Return the row of a proved lower bound on what is claimed."""
+    if bound is None:
+        return lower_bound_check(
+            name, claim, np.nan, stated, source="the plant's equations in ball arithmetic", detail="not proved"
+        )
+    return Check(
+        name,
+        claim,
+        bound,
+        stated,
+        bound - stated,
+        bool(bound >= stated > 0.0),
+        "the plant's equations in ball arithmetic",
+        "proved",
+        detail,
+    )
+
+
+def _deviation(channel: ErrorChannel, stated: float, plant: DescriptorSystem) -> Check:
+    (a, b, c, d), direct = channel.middle, channel(Ball)[3]
+    if plant.is_discrete:
+        covariance = scipy.linalg.solve_discrete_lyapunov(a, b @ b.T) if len(a) else np.zeros((0, 0))
+    else:
+        covariance = scipy.linalg.solve_continuous_lyapunov(a, -b @ b.T) if len(a) else np.zeros((0, 0))
+        # White noise that passes, by more than rounding, has no mean square.
+        d = np.where(np.abs(d) > ROUNDED_UNITS * direct.radius, np.inf, 0.0)
+    found = float(np.sqrt(max(np.trace(c @ covariance @ c.T + d @ d.T), 0.0)))
+    return upper_bound_check(
+        "deviation",
+        "root mean square of the error for white noise, recomputed: relative difference",
+        abs(found - stated) / max(stated, float(np.finfo(float).tiny)),
+        DEVIATION_SHARE,
+        source="Lyapunov equation",
+        kind="computed",
+    )
+
+
+def _least_deviation(design: ObserverDesign, plant: DescriptorSystem) -> Check:
+    """Compute the least mean square from the plant again: the filtering Riccati equation is the proof."""
+    from obsynth.methods.optimal_filter.fault_maps import FaultMap, designed
+
+    setting, stated = _setting(design), claimed(design.certificate.claims, "least_deviation")
+    delay = setting.delay if setting.reference is None else None
+    try:
+        found = designed(plant, FaultMap(delay, setting.reference, setting.exact), "h2").gain
+    except PreconditionError:
+        found = np.nan
+    return lower_bound_check(
+        "least deviation",
+        "every causal linear filter with this fault map has at least this root mean square",
+        found * (1.0 + DEVIATION_SHARE),
+        stated,
+        source="filtering Riccati equation of the plant, solved again",
+    )

@@ -1,0 +1,217 @@
+"""The fault maps that the options leave open, and the filter of least gain for each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import scipy.linalg
+
+from obsynth.analysis.existence.condition import Condition
+from obsynth.errors import PreconditionError
+from obsynth.methods.optimal_filter.reference import lag_model, reference_model
+from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
+from obsynth.numerics.decoupling_windows import Channels, EstimationProblem, Model, estimation_problem
+from obsynth.numerics.least_estimation import (
+    LeastEstimation,
+    least_estimation,
+    least_mean_square,
+    realised,
+    require_stable_filter,
+)
+from obsynth.numerics.standard_form import cayley_point, uncayley
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.pencil import regularity_of
+from obsynth.plants.plant_units import PlantUnits
+from obsynth.verification.invisible_faults import seen_plant
+
+#: A gain below this share of what the faults do to the error without a filter is zero but for rounding.
+ZERO_GAIN = 1e-9
+
+_SOURCE = "Varga 2017, section 5.2, and ours"
+
+
+class Options(Protocol):
+    """The options that say which fault maps are open."""
+
+    @property
+    def delay(self) -> Any:
+        """Samples, or ``"auto"``."""
+
+    @property
+    def reference(self) -> Any:
+        """A reference model, or ``None``."""
+
+    @property
+    def exact(self) -> bool:
+        """Whether faults pass exactly by the fault map."""
+
+    def decoupled_names(self, plant: DescriptorSystem) -> tuple[str, ...]:
+        """Return the disturbances that never reach the error."""
+
+
+class FaultMap(NamedTuple):
+    """What the estimate is of the faults: a delay, or a reference model; exact or not."""
+
+    delay: int | None
+    reference: Model | None
+    exact: bool
+
+
+class Units(NamedTuple):
+    """Powers of two in which a plant is near one, and its errors and noise, on which the gain rests, are scaled."""
+
+    equations: FloatArray
+    outputs: FloatArray
+    error: float
+    noise: float
+
+
+class Designed(NamedTuple):
+    """The filter of least gain for a fault map, from y, in the units of the plant; ``nothing``: a gain that is zero."""
+
+    fault_map: FaultMap
+    problem: EstimationProblem
+    filter: Model
+    gain: float
+    limit: float
+    limit_angle: float
+    added_noise: float
+    decays: tuple[ComplexArray, ...]
+    nothing: float
+
+    @property
+    def is_nothing(self) -> bool:
+        """Whether the gain is zero but for rounding."""
+        return self.gain <= self.nothing
+
+
+def conditions(plant: DescriptorSystem, asked: Options) -> tuple[Condition, ...]:
+    """Return whether the pencil is regular, whether there are faults, and whether a stable filter has a fault map."""
+    plant = seen_plant(plant.dense(), asked.decoupled_names(plant))
+    regular, rank = regularity_of(plant)
+    claim = "the equations determine the states: det(z E - A) is not zero everywhere"
+    first = Condition("regularity", claim, regular, rank, plant.nx, _SOURCE)
+    if not regular:
+        return (first,)
+    if not plant.nf:
+        return first, Condition("faults", "the plant has a fault to be estimated", False, 0.0, 1.0, _SOURCE)
+    claim = "a stable causal filter has this fault map, whatever known and decoupled inputs do"
+    try:
+        first_problem(plant, asked)
+    except PreconditionError as error:
+        return first, Condition("fault map", claim, False, 0.0, 1.0, _SOURCE, detail=str(error))
+    return first, Condition("fault map", claim, True, 1.0, 1.0, _SOURCE, detail="decided in floating point")
+
+
+def first_problem(plant: DescriptorSystem, asked: Options) -> tuple[FaultMap, EstimationProblem]:
+    """Return the first fault map that exists, of those that the options leave open, with its problem."""
+    last: PreconditionError | None = None
+    for fault_map in _open_maps(plant, asked):
+        try:
+            problem = problem_of(plant, fault_map)
+            require_stable_filter(problem)
+        except PreconditionError as error:
+            last = error
+            # Neither depends on the delay.
+            if error.condition in ("decoupling", "zeros") and plant.is_discrete:
+                break
+        else:
+            return fault_map, problem
+    assert last is not None
+    raise last
+
+
+def _open_maps(plant: DescriptorSystem, asked: Options) -> Iterator[FaultMap]:
+    if asked.reference is not None:
+        yield FaultMap(None, reference_model(asked.reference, plant), asked.exact)
+    elif asked.delay != "auto":
+        yield FaultMap(int(asked.delay), None, True)
+    elif plant.is_discrete:
+        yield from (FaultMap(delay, None, True) for delay in range(plant.nx + 2))
+    else:
+        width = cayley_point(scipy.linalg.eigvals(plant.A, plant.E))
+        yield from (FaultMap(None, lag_model(width, order, plant.nf, 0.0), True) for order in range(1, plant.nx + 2))
+
+
+@remembered
+def _units_of(plant: DescriptorSystem) -> tuple[PlantUnits, Units]:
+    own = PlantUnits.of(plant).rounded()
+    noise = np.vstack([own.equations[:, None] * plant.Bw, own.outputs[:, None] * plant.Dw])
+    faults = own.faults[own.faults > 0.0]
+    return own, Units(
+        own.equations,
+        own.outputs,
+        _power(float(np.exp(np.mean(np.log(faults)))) if faults.size else 1.0),
+        1.0 / _power(float(np.max(np.abs(noise), initial=0.0)) or 1.0),
+    )
+
+
+def _power(value: float) -> float:
+    return float(2.0 ** np.round(np.log2(value))) if value > 0.0 and np.isfinite(value) else 1.0
+
+
+def problem_of(plant: DescriptorSystem, fault_map: FaultMap) -> EstimationProblem:
+    """Return the problem of estimation of a fault map, in units in which the plant is near one."""
+    own, units = _units_of(plant)
+    left, shown, states = own.equations[:, None], own.outputs[:, None], own.states
+    each = own.faults if fault_map.exact else np.full(plant.nf, units.error)
+    noise = units.noise if fault_map.exact else units.error
+    channels = Channels(
+        left * plant.E * states,
+        left * plant.A * states,
+        shown * plant.C * states,
+        left * plant.B,
+        shown * plant.D,
+        left * plant.Bf * each,
+        shown * plant.Df * each,
+        left * plant.Bd * own.disturbances,
+        shown * plant.Dd * own.disturbances,
+        left * plant.Bw * noise,
+        shown * plant.Dw * noise,
+        plant.dt,
+    )
+    reference = fault_map.reference
+    if reference is None:
+        found = estimation_problem(channels, delay=fault_map.delay, exact=fault_map.exact)
+        weights = (own.faults / units.error)[:, None]
+        return replace(found, L=weights * found.L, D1=weights * found.D1, F=weights * found.F)
+    a, b, c, d = reference
+    scaled = (a, b * each, c / units.error, d * each / units.error)
+    return estimation_problem(channels, reference=scaled, exact=fault_map.exact)
+
+
+def designed(plant: DescriptorSystem, fault_map: FaultMap, norm: str) -> Designed:
+    """Return the filter of least norm; raise `PreconditionError` where there is none."""
+    problem, (own, units) = problem_of(plant, fault_map), _units_of(plant)
+    ratio = units.error / (units.noise if fault_map.exact else units.error)
+    size = float(np.linalg.norm(problem.D1) + np.linalg.norm(problem.L) * np.linalg.norm(problem.B))
+    try:
+        if norm == "h2" and not plant.is_discrete:
+            continuous = least_mean_square(problem)
+            found = None
+            filter_ = continuous.A, continuous.B, continuous.C, continuous.D
+            gain = continuous.deviation
+        else:
+            found = least_estimation(problem, norm=norm)
+            filter_, gain = realised(problem, found.K, found.Z0, plant.ny), found.gain
+            filter_ = filter_ if plant.is_discrete else uncayley(*filter_, problem.alpha)
+    except np.linalg.LinAlgError as error:
+        raise PreconditionError(
+            f"The equations of the least gain have no solution: {error}.", condition="zeros"
+        ) from error
+    a, b, c, d = filter_
+    least = found or LeastEstimation(a, a, gain, 0.0, 0.0, 0.0, ())
+    return Designed(
+        fault_map,
+        problem,
+        (a, b * own.outputs, units.error * c, units.error * d * own.outputs),
+        gain * ratio,
+        least.limit * ratio,
+        least.limit_angle,
+        least.added_noise,
+        least.decays,
+        ZERO_GAIN * (1.0 + size) * ratio,
+    )

@@ -1,0 +1,154 @@
+"""The optimal filter as a method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.numerics.arguments import WrittenAs
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.signal_names import require_known
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_system import ErrorModel
+
+
+@dataclass(frozen=True)
+class OptimalFilterMethod(Method):
+    r"""Design the fault-estimation filter of least gain among all causal filters, linear or not.
+
+    Known inputs never reach the error, nor do disturbances that are decoupled; the others count as noise.  Either the
+    fault map is exact, :math:`\hat f_k = f_{k - L}` (or a reference model of f) but for noise, and the gain is that
+    from noise to the error; or faults and noise together drive the error from a reference model (``exact=False``,
+    model matching).
+
+    Parameters
+    ----------
+    plant : DescriptorSystem or Transformation
+        Either time, a regular pencil of any index; ``Bw, Dw`` (or ``sensor_noise``) and ``Bd, Dd`` are what the gain
+        is from: signals of unit energy, or white of unit intensity for ``norm="h2"``.
+    delay : int or "auto", optional, samples
+        Discrete time: L of the exact fault map.  By default the first delay whose least gain is within 5 % of that of
+        the later ones; ``trade_off`` has what each delay gives.
+    reference : mapping, sequence of matrices or control system, optional
+        What the estimate shall be of the faults: ``{"bandwidth": 10}`` in rad/s (a lag for each fault, of ``"order"``
+        1), or ``A, B, C, D`` of a stable model with nf inputs, as a mapping, in this order, or as a system of
+        python-control.  In continuous time the default is the lag of least order that has an exact fault map, as fast
+        as the plant's own poles.
+    norm : {"hinf", "h2"}, optional
+        Least largest gain (of energies), or least mean square for white noise of unit intensity.
+    exact : bool, optional
+        Whether faults pass exactly by the fault map; otherwise they drive the error beside the noise.
+    decoupled : str or sequence of str, optional
+        Disturbances that never reach the error, whatever their time course; none by default.
+    name : str, optional
+        Name of the design.
+
+    Returns
+    -------
+    OptimalFilter
+        An `ObserverDesign` with ``gain`` (of this filter, proved), ``least`` (no causal filter has less with this
+        fault map, proved), ``non_causal_limit`` (nor at any delay), ``delay`` and ``trade_off``.
+
+    Raises
+    ------
+    SpecError
+        An option is malformed, or the reference model is unstable, improper or of other sizes.
+    PreconditionError
+        No causal filter has this fault map: the delay is too short, the faults have an unstable zero, or disturbances
+        cannot be decoupled.
+    SolverError
+        The Riccati equations have no usable solution, or no level near the gain is proved.
+    VerificationError
+        The shipped realisation fails a check.
+
+    References
+    ----------
+    .. [Hassibi] B. Hassibi, A. Sayed, T. Kailath, Indefinite-Quadratic Estimation and Control, SIAM 1999, chapter 4:
+       the filtering Riccati equation.  Ours: the reduction of exact fault maps to one problem of estimation for any
+       index, and the signals that no output shows, which bound every causal filter.
+    .. [Varga] A. Varga, Solving Fault Diagnosis Problems, 2017, sections 5.2 and 7.4 to 7.9: the null-space method.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.5]], C=[[1], [1]], Bf=[[0]], Df=[[1], [1]], Bw=[[0, 0]], Dw=[[1, 0], [0, 1]], dt=1.0
+    ... )
+    >>> design = obsynth.optimal_filter(plant, delay=0)
+    >>> print(f"{design.least:.6f} <= {design.gain:.6f}")
+    0.707107 <= 0.707107
+    """
+
+    id: ClassVar[str] = "optimal-filter"
+    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant",)
+    time: ClassVar[str] = "both"
+    summary: ClassVar[str] = "the least gain over all causal filters, with a bound that no filter beats"
+    source: ClassVar[str] = "ours, after Hassibi, Sayed, Kailath 1999 and Varga 2017"
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = {
+        "gain": ClaimMeaning("", "largest gain of this filter from the noise to the error", "gain"),
+        "least": ClaimMeaning("", "no causal filter with this fault map has a smaller gain", "least gain"),
+        "non_causal_limit": ClaimMeaning("", "no delay brings the gain below this", "gain at any delay"),
+        "deviation": ClaimMeaning("", "root mean square of the error for white noise of unit intensity", "deviation"),
+        "least_deviation": ClaimMeaning("", "no causal linear filter with this fault map has less", "least deviation"),
+        "delay": ClaimMeaning("samples", "by which the fault map is late", "fault map"),
+        "order": ClaimMeaning("", "states of the filter", "order"),
+    }
+    witnesses: ClassVar[frozenset[str]] = frozenset(
+        {"T", "T0", "stability", "P", "invisible", "samples", "limit_point"} | {f"reference_{name}" for name in "ABCD"}
+    )
+    # Its estimates are of the faults, but which noise counts is the caller's choice: only who names it gets it.
+    purposes: ClassVar[frozenset[Purpose]] = frozenset()
+
+    delay: Annotated[Any, WrittenAs("delay")] = "auto"
+    reference: Annotated[Any, WrittenAs("reference model")] = None
+    norm: Literal["hinf", "h2"] = "hinf"
+    exact: bool = True
+    decoupled: Annotated[Any, WrittenAs("texts")] = None
+
+    def conflicts(self) -> Iterator[str]:
+        """Yield a sentence for each rule across options that is broken."""
+        if self.delay != "auto" and self.reference is not None:
+            yield "delay and reference both say what the estimate shall be of the faults: give one."
+        if not self.exact and self.reference is None:
+            yield "exact is False: model matching needs a reference model."
+
+    def decoupled_names(self, plant: DescriptorSystem) -> tuple[str, ...]:
+        """Return the disturbances that are decoupled; raise `SpecError` for names that the plant does not have."""
+        none: tuple[str, ...] = ()
+        given = none if self.decoupled is None else self.decoupled
+        given = (given,) if isinstance(given, str) else tuple(given)
+        require_known(given, plant.disturbance_names, what=f"{OPTIONS_PATH}.decoupled", kind="disturbance")
+        return tuple(name for name in plant.disturbance_names if name in given)
+
+    def as_plain(self) -> dict[str, Any]:
+        """Return every option by name, as lists, mappings, numbers and texts."""
+        found = super().as_plain()
+        if hasattr(self.reference, "dt"):
+            import control
+
+            system = control.ss(self.reference)
+            found["reference"] = {name: getattr(system, name).tolist() for name in "ABCD"}
+        return found
+
+    def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
+        """Return whether any causal filter has the fault map that is asked for, in floating point."""
+        del exactly
+        from obsynth.methods.optimal_filter.fault_maps import conditions
+
+        return conditions(plant, self)
+
+    @classmethod
+    def error_model(cls, design: ObserverDesign) -> ErrorModel:
+        """Return the plant as it is: without faults and noise every row is zero, as T and T0 prove."""
+        (plant, observer), matrices = design.linear, design.certificate.matrices
+        return ErrorModel(
+            plant,
+            observer,
+            matrices["T"],
+            -matrices["T0"],
+            lag=matrices["T0"].shape[1] // plant.nx - 1,
+            decoupled=set(design.options["decoupled"]) == set(plant.disturbance_names),
+        )

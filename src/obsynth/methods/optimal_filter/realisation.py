@@ -1,0 +1,213 @@
+"""The realisation of an optimal filter from u and y, and the matrices T and T0 that show what it follows.
+
+The filter of least gain reads y alone.  Its state follows ``T E x`` where nothing but u acts, which gives what u adds;
+modes of the plant that die out by themselves and that it reads are followed by a copy that only u drives.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from obsynth.errors import SolverError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.decoupling_windows import Model
+from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.standard_form import INFINITE_EIGENVALUE, reachable_basis
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.verification.error_system import with_past
+
+#: The identities of T and T0 hold to this, of the numbers in them.
+IDENTITY_LEFT = 1e-9
+#: Entries of T and T0 that are smaller, of the largest, are rounding.
+CLEANED_SHARE = 1e-13
+#: Entries of the filter that are smaller, of the largest of their matrix, are rounding.
+ROUNDING_SHARE = 1e-14
+#: Equations are solved so many times, each time for what is left: small rows of a filter keep their digits.
+SOLUTIONS = 3
+
+
+class Followed(NamedTuple):
+    """A filter ``z+ = A z + B y``, rows ``C z + D y``, copies of modes included, with T and T0.
+
+    Where u alone acts on the plant, ``z = T E xa``, xa the state with its last ``lag`` ones, and the rows are zero:
+    ``A T E + B C = T Aa``, ``C T E + D C = T0 Aa``, ``T0 E = 0``; with ``Bd`` in place of u's columns likewise.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    T: FloatArray
+    T0: FloatArray
+    lag: int
+
+
+def minimal(filter_: Model) -> Model:
+    """Return a filter without states that are not reached or not read."""
+    a, b, c, d = filter_
+    basis = reachable_basis(a, b)
+    a, b, c = basis.T @ a @ basis, basis.T @ b, c @ basis
+    basis = reachable_basis(a.T, c.T)
+    a, b, c = basis.T @ a @ basis, basis.T @ b, c @ basis
+    passed = float(np.linalg.norm(d) + np.linalg.norm(c) * np.linalg.norm(b))
+    return _cleaned(a), _cleaned(b), _cleaned(c), _cleaned(d, passed)
+
+
+def _cleaned(matrix: FloatArray, size: float = 0.0) -> FloatArray:
+    """Return a matrix without entries that are rounding, of its largest or of ``size``."""
+    least = ROUNDING_SHARE * max(size, float(np.max(np.abs(matrix), initial=0.0)))
+    return np.where(np.abs(matrix) > least, matrix, 0.0)
+
+
+def followed(plant: DescriptorSystem, filter_: Model, longest: int) -> Followed:
+    """Return a filter that follows the plant; raise `SolverError` where none is found.
+
+    ``plant``: with the disturbances that are decoupled; ``longest``: the most past states that T may be on.
+    """
+    none = np.zeros((0, plant.nx)), np.zeros((0, 0))
+    copies = _dying_modes(plant)
+    for lag, (rows, moved) in ((0, none), (0, copies), *((lag, none) for lag in range(1, longest + 1))):
+        if lag == 0 and rows is copies[0] and not len(rows):
+            continue
+        found = _followed(plant, filter_, rows, moved, lag)
+        if found is not None:
+            return found
+    raise SolverError(
+        "The filter of least gain reads the plant's state by rounding: the result is inconclusive. Measure with noise "
+        "(sensor_noise), or give a longer delay."
+    )
+
+
+def observer_of(plant: DescriptorSystem, found: Followed, names: tuple[str, ...], delay: int) -> LinearObserver:
+    """Return the observer; known inputs enter it as they do the plant."""
+    t, t0 = found.T[:, : plant.nx], found.T0[:, : plant.nx]
+    named = names == plant.fault_names
+    return LinearObserver(
+        Az=found.A,
+        Bu=t @ plant.B - found.B @ plant.D,
+        By=found.B,
+        Cz=found.C,
+        Du=t0 @ plant.B - found.D @ plant.D,
+        Dy=found.D,
+        dt=plant.dt,
+        input_names=plant.input_names,
+        output_names=plant.output_names,
+        state_names=(),
+        fault_names=names if named else (),
+        residual_names=() if named else names,
+        state_delays=(),
+        fault_delays=(delay,) * len(names) if named else (),
+    )
+
+
+def _dying_modes(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
+    """Return ``U (k, nx)`` and ``M (k, k)`` with ``U A = M U E``: all finite modes that decay."""
+
+    def dies(alpha: FloatArray, beta: FloatArray) -> FloatArray:
+        finite = np.abs(beta) * INFINITE_EIGENVALUE > np.abs(alpha)
+        ratio = alpha / np.where(beta == 0.0, 1.0, beta)
+        return np.asarray(finite & ((np.abs(ratio) < 1.0) if plant.is_discrete else (ratio.real < 0.0)))
+
+    a, e, alpha, beta, _, right = scipy.linalg.ordqz(plant.A.T, plant.E.T, sort=dies, output="real")
+    count = int(np.sum(dies(alpha, beta)))
+    moved = np.linalg.solve(e[:count, :count], a[:count, :count]).T if count else np.zeros((0, 0))
+    return right[:, :count].T, moved
+
+
+def _followed(
+    plant: DescriptorSystem, filter_: Model, copied: FloatArray, moved: FloatArray, lag: int
+) -> Followed | None:
+    """Return a filter beside copies ``copied`` of modes, with T and T0; ``None`` where the equations do not hold."""
+    a, b, c, d = filter_
+    e, own, _, seen = with_past(plant, lag)
+    nz, rows, na, count = len(a), len(c), len(e), len(copied)
+    bd = np.vstack([plant.Bd, np.zeros((na - plant.nx, plant.nd))])
+    left = _left_kernel(e)
+    shadow = np.hstack([copied @ plant.E, np.zeros((count, na - plant.nx))])
+    # Unknowns: T, the copies in the state, S with T0 = S left, the copies in the rows.
+    sizes = [nz * na, nz * count, rows * len(left), rows * count]
+
+    def equations(*parts: Any) -> Any:
+        height = next(len(part) for part in parts if part is not None)
+        return np.hstack(
+            [np.zeros((height, size)) if part is None else part for size, part in zip(sizes, parts, strict=True)]
+        )
+
+    states, outputs = np.eye(nz), np.eye(rows)
+    system = np.vstack(
+        [
+            equations(np.kron(a, e.T) - np.kron(states, own.T), np.kron(states, shadow.T), None, None),
+            equations(np.kron(states, bd.T), None, None, None),
+            equations(np.kron(c, e.T), None, -np.kron(outputs, (left @ own).T), np.kron(outputs, shadow.T)),
+            equations(None, None, np.kron(outputs, (left @ bd).T), None),
+        ]
+    )
+    wanted = np.concatenate([part.ravel() for part in (-(b @ seen), b @ plant.Dd, -(d @ seen), d @ plant.Dd)])
+    found = _solved(system, wanted)
+    size = float(np.max(np.abs(found), initial=0.0))
+    found = np.where(np.abs(found) > CLEANED_SHARE * size, found, 0.0)
+    if not _holds(system, found, wanted, (nz * na, nz * plant.nd, rows * na), na):
+        return None
+    t, into, s, shown = (
+        part.reshape(shape)
+        for part, shape in zip(
+            np.split(found, np.cumsum(sizes)[:-1]),
+            ((nz, na), (nz, count), (rows, len(left)), (rows, count)),
+            strict=True,
+        )
+    )
+    # Only the copies that are read.
+    basis = reachable_basis(moved.T, np.vstack([into, shown]).T) if count else np.zeros((0, 0))
+    into, shown, moved = into @ basis, shown @ basis, basis.T @ moved @ basis
+    copies, kept = np.hstack([basis.T @ copied, np.zeros((basis.shape[1], na - plant.nx))]), basis.shape[1]
+    return Followed(
+        np.block([[a, into], [np.zeros((kept, nz)), moved]]),
+        np.vstack([b, np.zeros((kept, plant.ny))]),
+        np.hstack([c, shown]),
+        d,
+        np.vstack([t, copies]),
+        s @ left,
+        lag,
+    )
+
+
+def _solved(system: FloatArray, wanted: FloatArray) -> FloatArray:
+    """Return the least squares solution, each equation in its own unit, refined."""
+    sizes = np.maximum(np.max(np.abs(system), axis=1, initial=0.0), np.abs(wanted))
+    scale = 1.0 / np.where(sizes > 0.0, sizes, 1.0)
+    found = np.zeros(system.shape[1])
+    for _ in range(SOLUTIONS):
+        missed = scale * (wanted - system @ found)
+        found = (
+            found + scipy.linalg.lstsq(scale[:, None] * system, missed, lapack_driver="gelsy", cond=RANK_TOLERANCE)[0]
+        )
+    return found
+
+
+def _holds(system: FloatArray, found: FloatArray, wanted: FloatArray, heights: tuple[int, ...], width: int) -> bool:
+    """Whether equations hold, each to a share of the largest term of its row of the filter."""
+    missed, terms = np.abs(system @ found - wanted), np.abs(system) @ np.abs(found) + np.abs(wanted)
+    ends = np.cumsum(heights)
+    for part, height in ((slice(0, ends[0]), heights[0]), (slice(ends[1], ends[2]), heights[2])):
+        if height:
+            largest = np.max(terms[part].reshape(-1, width), axis=1)
+            if np.any(np.max(missed[part].reshape(-1, width), axis=1) > IDENTITY_LEFT * largest):
+                return False
+    return bool(np.max(missed, initial=0.0) <= IDENTITY_LEFT * (1.0 + np.max(terms, initial=0.0)))
+
+
+def _left_kernel(e: FloatArray) -> FloatArray:
+    """Return rows N with ``N E = 0``: exactly, where equations of E are empty."""
+    empty = ~e.any(axis=1)
+    units = np.eye(len(e))[empty]
+    others = e[~empty]
+    if not len(others):
+        return units
+    kernel = scipy.linalg.null_space(others.T, rcond=RANK_TOLERANCE).T
+    whole = np.zeros((len(kernel), len(e)))
+    whole[:, ~empty] = kernel
+    return np.vstack([units, whole])

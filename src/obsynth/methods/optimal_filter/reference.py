@@ -1,0 +1,96 @@
+"""Reference models: what the estimate shall be of the faults, as matrices."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.existence.condition import OPTIONS_PATH
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_finite_number, is_whole
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.decoupling_windows import Model
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: Where a message points.
+PATH = f"{OPTIONS_PATH}.reference"
+
+
+def reference_model(given: Any, plant: DescriptorSystem) -> Model:
+    """Return ``(A, B, C, D)`` of a reference model with ``nf`` inputs; raise `SpecError` for what is none."""
+    if isinstance(given, Mapping) and "bandwidth" in given:
+        order, width = given.get("order", 1), given["bandwidth"]
+        fits = set(given) <= {"bandwidth", "order"} and is_whole(order) and order >= 1 and is_finite_number(width)
+        if not fits or not width > 0:
+            raise SpecError("A lag is {'bandwidth': rad/s, 'order': 1}, both positive.", path=PATH)
+        return lag_model(float(width), int(order), plant.nf, plant.dt)
+    a, b, c, d = _matrices(given, plant)
+    if d.shape[1] != plant.nf:
+        raise SpecError(f"The reference model has {d.shape[1]} inputs; the plant has {plant.nf} faults.", path=PATH)
+    modes = np.linalg.eigvals(a) if len(a) else np.zeros(0)
+    if np.any(np.abs(modes) >= 1.0) if plant.is_discrete else np.any(modes.real >= 0.0):
+        raise SpecError("The reference model is not stable: no stable filter follows it.", path=PATH)
+    return a, b, c, d
+
+
+def lag_model(bandwidth: float, order: int, faults: int, dt: float) -> Model:
+    """Return a chain of lags of unit gain for each fault: ``(w / (s + w))^order``, sampled where ``dt`` is not zero."""
+    pole, gain = (-bandwidth, bandwidth) if dt == 0.0 else (np.exp(-bandwidth * dt), 1.0 - np.exp(-bandwidth * dt))
+    a = pole * np.eye(order) + gain * np.eye(order, k=-1)
+    b, c = gain * np.eye(order, 1), np.eye(1, order, k=order - 1)
+    repeat = np.eye(faults)
+    a, b, c = (np.asarray(np.kron(repeat, part), dtype=np.float64) for part in (a, b, c))
+    return a, b, c, np.zeros((faults, faults))
+
+
+def plain(model: Model) -> dict[str, Any]:
+    """Return a model as an option: lists by name."""
+    return {name: part.tolist() for name, part in zip("ABCD", model, strict=True)}
+
+
+def _matrices(given: Any, plant: DescriptorSystem) -> Model:
+    if isinstance(given, Mapping):
+        if set(given) - set("ABCD") or "D" not in given:
+            raise SpecError("A reference model is {'bandwidth': 10}, or has matrices A, B, C and D.", path=PATH)
+        parts = [given.get(name, ()) for name in "ABCD"]
+    elif isinstance(given, Sequence) and not isinstance(given, str) and len(given) == 4:
+        parts = [*given]
+    elif hasattr(given, "dt"):
+        return _of_control(given, plant)
+    else:
+        raise SpecError(
+            "A reference model is {'bandwidth': 10}, matrices (A, B, C, D), or a system of python-control.", path=PATH
+        )
+    return _shaped(parts)
+
+
+def _shaped(parts: Sequence[Any]) -> Model:
+    """Return matrices that fit each other."""
+    d = as_matrix(parts[3], "reference.D")
+    rows, inputs = d.shape
+    n = len(np.atleast_2d(parts[0])) if np.size(parts[0]) else 0
+    wanted = ((n, n), (n, inputs), (rows, n))
+    found: list[FloatArray] = []
+    for name, part, shape in zip("ABC", parts, wanted, strict=False):
+        matrix = as_matrix(part, f"reference.{name}") if n else np.zeros(shape)
+        if matrix.shape != shape:
+            raise SpecError(f"{name} of the reference model has shape {matrix.shape}: {shape} fits A and D.", path=PATH)
+        found.append(matrix)
+    return found[0], found[1], found[2], d
+
+
+def _of_control(given: Any, plant: DescriptorSystem) -> Model:
+    """Return the matrices of a system of python-control; raise `SpecError` for an improper or wrongly timed one."""
+    import control
+
+    try:
+        system = control.ss(given)
+    except (ValueError, TypeError, AttributeError, ImportError) as error:
+        raise SpecError(f"The reference model has no proper state space: {error}.", path=PATH) from None
+    if bool(system.dt) != plant.is_discrete or (plant.is_discrete and system.dt not in (True, plant.dt)):
+        raise SpecError(
+            f"The reference model has dt = {system.dt}, the plant {plant.dt:g}: give both the same.", path=PATH
+        )
+    return _shaped([system.A, system.B, system.C, system.D])

@@ -1,0 +1,286 @@
+"""Windows of samples that see no fault and no unknown input: fault estimation as one problem of estimation.
+
+    xi+ = A xi + B w,   r = C xi + D w,   e0 = L xi + D1 w
+
+holds for the errors of every causal linear filter that decouples h = (f, d), or d alone, exactly: each of them is
+``fhat0 - Z r`` with a causal Z, so that no filter is lost.  With ``Y_k = (y_{k-W}, ..., y_k) = O x_{k-W} + T_h H + T_w
+W_k`` and ``G T_h = [Bh 0 .. 0]``, ``Mf T_h = [selects f_{k-L}]``, ``V T_h = 0``, the bank
+
+    chi+ = A chi + G (Y - O chi),   fhat0 = Mf (Y - O chi),   r = V (Y - O chi)
+
+sees no h.  Continuous time needs no window after the Cayley transform.  Source: ours; compare A. Varga, *Solving Fault
+Diagnosis Problems*, 2017, sections 5.2 and 7.4 to 7.9 (null-space method).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from scipy.linalg import block_diag
+
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import WINDOW_RANK_TOLERANCE, decide_rank
+from obsynth.numerics.standard_form import cayley_point, reachable_basis, standard_form
+
+#: Where the normal rank of a transfer matrix is taken, beyond all poles.
+GENERIC_POINT = 1.3717
+#: An identity of the windows holds to this.
+WINDOW_IDENTITY = 1e-7
+#: Modes of a core beyond this modulus count as not asymptotically stable where what nobody sees is taken out.
+EDGE_OF_STABILITY = 0.999
+#: What is seen of such a mode, relative to the outputs.
+SEEN_SHARE = 1e-6
+
+Model = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+class Channels(NamedTuple):
+    """A descriptor plant by its arrays: ``E x+ = A x + B u + Bf f + Bd d + Bw w``, ``y`` likewise, dt."""
+
+    E: FloatArray
+    A: FloatArray
+    C: FloatArray
+    B: FloatArray
+    D: FloatArray
+    Bf: FloatArray
+    Df: FloatArray
+    Bd: FloatArray
+    Dd: FloatArray
+    Bw: FloatArray
+    Dw: FloatArray
+    dt: float
+
+
+@dataclass(frozen=True, eq=False)
+class EstimationProblem:
+    """The problem of estimation, and the bank: ``chi+ = A chi + G Y``, ``r = V Y - C chi``, ``fhat0 = F Y - L chi``."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    L: FloatArray
+    D1: FloatArray
+    G: FloatArray
+    V: FloatArray
+    F: FloatArray
+    window: int
+    alpha: float
+    shift: int
+
+
+class _Window(NamedTuple):
+    observed: FloatArray
+    Th: FloatArray
+    Tw: FloatArray
+    G: FloatArray
+    Mf: FloatArray
+    length: int
+
+
+def estimation_problem(
+    plant: Channels, *, delay: int | None = None, reference: Model | None = None, exact: bool = True
+) -> EstimationProblem:
+    """Return the problem of estimation of a plant.
+
+    Parameters
+    ----------
+    plant : Channels
+        A regular pencil of any index.
+    delay : int, optional
+        Samples L of the exact fault map ``z^-L`` (discrete time).
+    reference : tuple of FloatArray, optional
+        A reference model ``(a, b, c, d)`` of what the estimate shall be of the faults.
+    exact : bool, optional
+        Whether faults pass exactly by the fault map; otherwise they drive the error beside w (model matching).
+
+    Raises
+    ------
+    PreconditionError
+        No causal filter has this fault map, or the unknown inputs cannot be decoupled in this form.
+    """
+    point = None
+    if plant.dt == 0.0 and reference is not None and reference[0].size:
+        point = cayley_point(scipy.linalg.eigvals(plant.A, plant.E), np.linalg.eigvals(reference[0]))
+    inputs, through = np.hstack([plant.Bf, plant.Bd, plant.Bw]), np.hstack([plant.Df, plant.Dd, plant.Dw])
+    form = standard_form(plant.E, plant.A, inputs, plant.C, through, plant.dt, alpha=point)
+    nf, nd = plant.Bf.shape[1], plant.Bd.shape[1]
+    (bf, bd, bw), (df, dd, dw) = (np.split(part, [nf, nf + nd], axis=1) for part in (form.B, form.D))
+    bh, dh = (np.hstack([bf, bd]), np.hstack([df, dd])) if exact else (bd, dd)
+    if not exact:
+        bw, dw = np.hstack([bf, bw]), np.hstack([df, dw])
+    lag = (delay or 0) + form.shift
+    window = _decoupling_window(form.A, form.C, (bh, dh), (bw, dw), nf if exact else 0, lag, plant.dt, nf)
+    core = _core(form.A, (bw, dw), window, len(form.C))
+    if reference is not None:
+        newest = np.hstack([np.zeros((nf, bw.shape[1] * window.length)), np.eye(nf, bw.shape[1])])
+        core = _with_reference(core, reference, form.alpha if plant.dt == 0.0 else None, None if exact else newest)
+    core = _without_unseen(core, modelled=plant.dt == 0.0 or reference is not None)
+    chained = _with_chain(core, bw.shape[1], window.length)
+    return EstimationProblem(*chained, window.length, form.alpha, form.shift)
+
+
+def _stacked(a: FloatArray, c: FloatArray, b: FloatArray, d: FloatArray, length: int) -> FloatArray:
+    """Return the block Toeplitz matrix of a window from inputs to outputs."""
+    rows, width = c.shape[0], b.shape[1]
+    found, moved, blocks = np.zeros((rows * (length + 1), width * (length + 1))), b, [d]
+    for _ in range(length):
+        blocks.append(c @ moved)
+        moved = a @ moved
+    for i in range(length + 1):
+        for j in range(i + 1):
+            found[i * rows : (i + 1) * rows, j * width : (j + 1) * width] = blocks[i - j]
+    return found
+
+
+def _decoupling_window(
+    a: FloatArray,
+    c: FloatArray,
+    hidden: tuple[FloatArray, FloatArray],
+    noise: tuple[FloatArray, FloatArray],
+    estimated: int,
+    lag: int,
+    dt: float,
+    nf: int,
+) -> _Window:
+    """Return the shortest window in which faults and unknown inputs can be told; raise where there is none."""
+    n, (bh, dh) = len(a), hidden
+    nh = bh.shape[1]
+    moved = told = True
+    if nh and _normal_rank(a, bh, c, dh) < nh:
+        raise PreconditionError(
+            "The unknown inputs and faults cannot be reconstructed together from the outputs, with whatever delay: the "
+            "transfer matrix from them to the outputs has a lower rank than there are of them. Let a disturbance count "
+            "as noise (leave it out of decoupled), or measure more.",
+            condition="decoupling",
+        )
+    for length in range(lag if estimated else 0, n + lag + 2):
+        observed = np.vstack([c @ np.linalg.matrix_power(a, j) for j in range(length + 1)])
+        th = _stacked(a, c, bh, dh, length)
+        inverse = np.linalg.pinv(th, rcond=WINDOW_RANK_TOLERANCE) if nh else np.zeros((0, len(th)))
+        first = np.hstack([bh, np.zeros((n, nh * length))])
+        chosen = np.zeros((nf, nh * (length + 1)))
+        if estimated:
+            chosen[:, (length - lag) * nh : (length - lag) * nh + nf] = np.eye(nf)
+        G, Mf = (first @ inverse, chosen @ inverse) if nh else (np.zeros((n, len(th))), np.zeros((nf, len(th))))
+        moved = not nh or bool(np.linalg.norm(G @ th - first) <= WINDOW_IDENTITY * (1.0 + np.linalg.norm(bh)))
+        told = not estimated or bool(np.linalg.norm(Mf @ th - chosen) <= WINDOW_IDENTITY)
+        if (moved and told) or dt == 0.0:
+            break
+    if not moved:
+        raise PreconditionError(
+            "The unknown inputs and faults cannot be reconstructed from the outputs by a window of any length: no "
+            "filter of this form decouples them. Let a disturbance count as noise (leave it out of decoupled).",
+            condition="decoupling",
+        )
+    if not told:
+        raise PreconditionError(
+            f"No causal filter has the exact fault map with a delay of {lag} samples: allow a longer delay.",
+            condition="delay",
+        )
+    return _Window(observed, th, _stacked(a, c, *noise, length), np.asarray(G), np.asarray(Mf), length)
+
+
+def _normal_rank(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> int:
+    """Return the rank of a transfer matrix at a point that is a pole or a zero only by accident."""
+    n = len(a)
+    point = GENERIC_POINT * (1.0 + float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)))
+    return decide_rank(np.block([[point * np.eye(n) - a, -b], [c, d]])).rank - n
+
+
+_Core = tuple[
+    FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray
+]
+
+
+def _core(a: FloatArray, noise: tuple[FloatArray, FloatArray], window: _Window, ny: int) -> _Core:
+    """Return A, B over the whole window, C, D, L, D1 and G, V, F."""
+    nw, length = noise[0].shape[1], window.length
+    hidden = window.Th.shape[1] > 0
+    parity = (
+        scipy.linalg.null_space(window.Th.T, rcond=WINDOW_RANK_TOLERANCE).T if hidden else np.eye(len(window.observed))
+    )
+    # Combinations without the newest sample are repeated by those of the sample before.
+    left, values, _ = np.linalg.svd(parity[:, -ny:], full_matrices=False)
+    parity = left[:, values > WINDOW_RANK_TOLERANCE].T @ parity
+    first = np.hstack([np.eye(nw), np.zeros((nw, nw * length))])
+    return (
+        a - window.G @ window.observed,
+        noise[0] @ first - window.G @ window.Tw,
+        parity @ window.observed,
+        parity @ window.Tw,
+        window.Mf @ window.observed,
+        window.Mf @ window.Tw,
+        window.G,
+        parity,
+        window.Mf,
+    )
+
+
+def _with_reference(core: _Core, reference: Model, alpha: float | None, newest: FloatArray | None) -> _Core:
+    """Put the reference model behind the exact estimates, or beside the plant: ``newest`` picks its faults of w."""
+    a, b, c, d = reference
+    k = len(a)
+    if alpha is not None:
+        inverse, root = np.linalg.inv(alpha * np.eye(k) - a), np.sqrt(2.0 * alpha)
+        a, b, c, d = inverse @ (alpha * np.eye(k) + a), root * inverse @ b, root * c @ inverse, d + c @ inverse @ b
+    A, B, C, D, L, D1, G, V, F = core
+    n = len(A)
+    if newest is None:
+        A = np.block([[A, np.zeros((n, k))], [b @ L, a]])
+        B, L, D1, G, F = np.vstack([B, b @ D1]), np.hstack([d @ L, c]), d @ D1, np.vstack([G, -b @ F]), d @ F
+    else:
+        A, B = block_diag(A, a), np.vstack([B, b @ newest])
+        L, D1 = np.hstack([np.zeros((len(d), n)), -c]), -d @ newest
+        G, F = np.vstack([G, np.zeros((k, G.shape[1]))]), np.zeros((len(d), G.shape[1]))
+    return A, B, np.hstack([C, np.zeros((len(C), k))]), D, L, D1, G, V, F
+
+
+def _without_unseen(core: _Core, *, modelled: bool) -> _Core:
+    """Take out modes that neither r nor e shows: zeros of the faults that the reference cancels, and unreached ones."""
+    A, B, C, D, L, D1, G, V, F = core
+    if modelled and len(A):
+        basis = _seen_basis(A, np.vstack([C, L]))
+        A, B, C, L, G = basis.T @ A @ basis, basis.T @ B, C @ basis, L @ basis, basis.T @ G
+    basis = reachable_basis(A.T, np.hstack([C.T, L.T]))
+    return basis.T @ A @ basis, basis.T @ B, C @ basis, D, L @ basis, D1, basis.T @ G, V, F
+
+
+def _seen_basis(a: FloatArray, outputs: FloatArray) -> FloatArray:
+    """Return a basis of what is left without unstable modes that no output shows."""
+    schur, vectors, count = scipy.linalg.schur(
+        a, output="real", sort=lambda x, y=0.0: np.hypot(x, y) > EDGE_OF_STABILITY
+    )
+    if not count:
+        return np.eye(len(a))
+    own = vectors[:, :count]
+    shown = reachable_basis(
+        schur[:count, :count].T, (outputs @ own).T, share=SEEN_SHARE, scale=float(np.linalg.norm(outputs))
+    )
+    unseen = own @ scipy.linalg.null_space(shown.T) if shown.shape[1] else own
+    return np.asarray(scipy.linalg.null_space(unseen.T)) if unseen.shape[1] else np.eye(len(a))
+
+
+def _with_chain(core: _Core, nw: int, length: int) -> _Core:
+    """Let the noise of a window enter one sample after the other, the oldest first."""
+    A, B, C, D, L, D1, G, V, F = core
+    if not length:
+        return core
+    count = nw * length
+    chain, enter = np.eye(count, k=nw), np.vstack([np.zeros((count - nw, nw)), np.eye(nw)])
+    A = np.block([[A, B[:, :count]], [np.zeros((count, len(A))), chain]])
+    return (
+        A,
+        np.vstack([B[:, count:], enter]),
+        np.hstack([C, D[:, :count]]),
+        D[:, count:],
+        np.hstack([L, D1[:, :count]]),
+        D1[:, count:],
+        np.vstack([G, np.zeros((count, G.shape[1]))]),
+        V,
+        F,
+    )

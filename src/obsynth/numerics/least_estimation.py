@@ -1,0 +1,460 @@
+"""The least gain from w to ``e0 - Z r`` over all causal Z, with a filter that reaches it.
+
+At level g the filtering Riccati equation with ``[C; L]``, ``[D; D1]`` and weight ``diag(0, -g^2)`` has a stabilising
+solution of the right signs exactly when a causal filter of gain below g exists (Hassibi, Sayed, Kailath,
+*Indefinite-Quadratic Estimation and Control*, 1999, chapter 4).  With P and the full gain K of that solution,
+``Phi = (A - K [C; L])'`` is how the worst noise of the past decays backwards: its eigenvalues are what
+`obsynth.verification.invisible_faults` proves a lower bound with, for every causal filter, linear or not.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from obsynth.errors import PreconditionError, SolverError
+from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.decoupling_windows import EstimationProblem, Model
+from obsynth.numerics.norms import hinf_norm
+from obsynth.numerics.ranks import BOUNDARY_RANK_TOLERANCE, WINDOW_RANK_TOLERANCE
+from obsynth.numerics.standard_form import reachable_basis, uncayley
+
+#: The bisection of the level ends at this share.
+LEVEL_SHARE = 1e-8
+MOST_LEVELS = 60
+#: Extra noise, of the size of the matrices, for problems in which some output is measured without noise.
+ADDED_NOISES = (0.0, 1e-6, 1e-5, 1e-4, 1e-3)
+#: A Kalman filter whose errors last longer than this is taken as not stable.
+STABLE_RADIUS = 1.0 - 1e-6
+#: An innovation with eigenvalues further apart is singular.
+SINGULAR_INNOVATION = 1e-11
+#: How much the sizes of what is estimated count beside those of what is measured.
+WANTED_SHARE = 1e-3
+#: How negative a Riccati solution may be, of its size, by rounding.
+NEGATIVE_SHARE = 1e-7
+#: Levels above the least one whose worst noise is returned: nearer ones are closer bounds, until rounding spoils them.
+WORST_LEVELS = (1.0 + 1e-5, 1.0001, 1.001, 1.01)
+#: What a bound is lowered by, of itself, for the rounding of its sums.
+BOUND_ROUNDING = 1e-9
+#: White noise that passes to the error by less than this share is rounding.
+WHITE_SHARE = 1e-9
+#: A gain below this share of the problem's own sizes is zero but for rounding.
+ZERO_SHARE = 1e-9
+#: Samples, and inputs in all, of the finite records that are searched for what r does not show.
+LONGEST_FROM_REST, MOST_INPUTS_FROM_REST = 60, 360
+#: A kernel counts where the other singular values are above this share.
+CLEAR_KERNEL = 1e-5
+#: Squarings of a sum over all samples.
+MOST_DOUBLINGS = 60
+#: A sum over all samples is complete when its last doubling adds no more than this share.
+DOUBLED_SHARE = 1e-17
+#: Outputs that show w by less than this share of the problem's sizes do not show it.
+BLIND_SHARE = 1e-10
+#: Directions that w reaches by less than this share are not reached.
+REACHED_BY_NOISE = 1e-9
+#: A level counts as attained where the norm of its filter is at most this share above it.
+NORM_ABOVE_LEVEL = 1e-6
+#: Least angle of the grid, and angles beside the modes that are looked at.
+LEAST_ANGLE, NEAR_MODES = 1e-6, np.array([0.0, 1e-4, -1e-4, 1e-2, -1e-2])
+#: Angles on the half circle at which a response is looked at first.
+GRID = 1500
+
+
+@dataclass(frozen=True, eq=False)
+class LeastEstimation:
+    """The filter ``i = r - C chi``, ``chi+ = A chi + K i``, ``ehat = L chi + Z0 i``, and its recomputed norm.
+
+    ``limit`` is the least gain with unlimited delay, at the angle ``limit_angle``; ``added_noise`` is above zero where
+    an output is measured without noise; ``decays`` are the eigenvalues of the worst noise, level by level.
+    """
+
+    K: FloatArray
+    Z0: FloatArray
+    gain: float
+    limit: float
+    limit_angle: float
+    added_noise: float
+    decays: tuple[NDArray[np.complex128], ...]
+
+
+class _Whitened(NamedTuple):
+    problem: EstimationProblem
+    plain: EstimationProblem  # without added noise
+    factor: FloatArray | None  # of the innovation
+    K: FloatArray
+    basis: FloatArray
+    noise: float
+
+    def restored(self, given: EstimationProblem, K: FloatArray, Z0: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return gains on the given problem's r of gains on the innovation."""
+        if self.factor is None:
+            return np.zeros((len(given.A), len(given.C))), np.zeros((len(given.L), len(given.C)))
+        return self.K + self.basis @ K @ self.factor, Z0 @ self.factor
+
+
+def least_estimation(problem: EstimationProblem, *, norm: str = "hinf") -> LeastEstimation:
+    """Return the filter of least gain (``"hinf"``) or of least mean square (``"h2"``, the root of the trace).
+
+    Raise `PreconditionError` where no filter is stable.
+    """
+    white = _whitened(problem)
+    core = white.problem
+    P0 = gramian(core.A, core.B @ core.B.T) if len(core.C) else 0.0 * core.A
+    K, Z0 = _central(core, P0)
+    limit, angle = 0.0, 0.0
+    decays: tuple[NDArray[np.complex128], ...] = ()
+    if norm == "hinf":
+        limit, angle = _non_causal_limit(white.plain if white.noise else core)
+        least = _invisible_at(white.plain, angle) if white.noise else limit
+        least = max(least, _invisible_from_rest(white.plain))
+        level = _norm(_closed(core, K, Z0))
+        found = _search(core, (K, Z0), least, level)
+        if found is not None:
+            K, Z0, level = found
+        decays = tuple(_decays(core, share * level) for share in WORST_LEVELS)
+    closed = _closed(white.plain, K, Z0)
+    gain = _norm(closed) if norm == "hinf" else _deviation(closed)
+    return LeastEstimation(*white.restored(problem, K, Z0), gain, limit, angle, white.noise, decays)
+
+
+def require_stable_filter(problem: EstimationProblem) -> None:
+    """Raise `PreconditionError` where no filter is stable: cheaper than the least one."""
+    _whitened(problem)
+
+
+class ContinuousFilter(NamedTuple):
+    """``chi' = A chi + G Y``, ``ehat = C chi + D Y`` in continuous time, and the root mean square of its error."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    deviation: float
+
+
+def least_mean_square(problem: EstimationProblem) -> ContinuousFilter:
+    """Return the continuous-time filter of least mean square: the Cayley transform of the problem keeps no H2 norm.
+
+    Raise `PreconditionError` where white noise passes to the error whatever the filter, or no filter is stable.
+    """
+    rows = len(problem.C)
+    a, b, both, direct = uncayley(
+        problem.A,
+        problem.B,
+        np.vstack([problem.C, problem.L]),
+        np.vstack([problem.D, problem.D1]),
+        problem.alpha,
+    )
+    c, wanted, d, d1 = both[:rows], both[rows:], direct[:rows], direct[rows:]
+    Z0 = d1 @ np.linalg.pinv(d)
+    if np.linalg.norm(d1 - Z0 @ d) > WHITE_SHARE * (1.0 + np.linalg.norm(d1)):
+        raise PreconditionError(
+            "White noise passes to the error whatever the filter: its mean square is infinite. Give a reference model "
+            "of higher order, or norm hinf.",
+            condition="finite mean square",
+        )
+    try:
+        covariance = scipy.linalg.solve_continuous_are(a.T, c.T, b @ b.T, d @ d.T, s=b @ d.T)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise PreconditionError(
+            "Some output is measured without noise, or the faults have a zero that is not strictly stable: the filter "
+            f"of least mean square has no Riccati equation ({error}). State the noise of every sensor (sensor_noise).",
+            condition="zeros",
+        ) from None
+    K = np.asarray(np.linalg.solve(d @ d.T, c @ covariance + d @ b.T).T)
+    closed, entering, shown = a - K @ c, b - K @ d, wanted - Z0 @ c
+    spread = scipy.linalg.solve_continuous_lyapunov(closed, -entering @ entering.T) if len(a) else np.zeros((0, 0))
+    deviation = float(np.sqrt(max(np.trace(shown @ spread @ shown.T), 0.0)))
+    half = np.linalg.solve(np.eye(len(problem.A)) + problem.A, problem.G)
+    moved, through = np.sqrt(2.0 * problem.alpha) * half, np.vstack([problem.C, problem.L]) @ half
+    seen, direct_estimate = problem.V + through[:rows], problem.F + through[rows:]
+    return ContinuousFilter(closed, moved + K @ seen, -shown, direct_estimate - Z0 @ seen, deviation)
+
+
+def _riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> FloatArray:
+    with warnings.catch_warnings(action="ignore"):
+        found = scipy.linalg.solve_discrete_are(a, b, q, r, s=s) if len(a) else np.zeros((0, 0))
+    return np.asarray(0.5 * (found + found.T))
+
+
+def _kalman(problem: EstimationProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return covariance, gain and innovation; raise `LinAlgError` where no filter is stable."""
+    A, B, C, D = problem.A, problem.B, problem.C, problem.D
+    P = _riccati(A.T, C.T, B @ B.T, D @ D.T, B @ D.T)
+    R = C @ P @ C.T + D @ D.T
+    K = np.asarray(np.linalg.solve(R, C @ P @ A.T + D @ B.T).T, dtype=np.float64)
+    if np.max(np.abs(np.linalg.eigvals(A - K @ C)), initial=0.0) >= STABLE_RADIUS:
+        raise np.linalg.LinAlgError("not stabilising")
+    return P, K, R
+
+
+def _size(problem: EstimationProblem) -> float:
+    def size(part: FloatArray) -> float:
+        return float(np.linalg.norm(part))
+
+    shown = size(problem.C) * size(problem.B) + size(problem.D)
+    wanted = size(problem.L) * size(problem.B) + size(problem.D1)
+    return max(shown, WANTED_SHARE * wanted, SMALLEST)
+
+
+def _whitened(problem: EstimationProblem) -> _Whitened:
+    """Return the problem with an innovation for r, without errors that w cannot reach.
+
+    Where an output has no noise, some is added: the filter is then one for the plant as given, and so is its gain.
+    """
+    n, rows, size = len(problem.A), len(problem.C), _size(problem)
+    stable = bool(np.max(np.abs(np.linalg.eigvals(problem.A)), initial=0.0) < 1.0)
+    blind = (
+        not problem.B.shape[1]
+        or np.max(np.abs(_responses(problem, np.array([0.7, 2.1]))[1]), initial=0.0) < BLIND_SHARE * size
+    )
+    if not rows or (blind and stable):
+        if not stable:
+            raise PreconditionError(
+                "The transfer from the faults to the outputs has a zero that is not strictly stable: no stable "
+                "filter has this fault map.",
+                condition="zeros",
+            )
+        bare = replace(problem, C=problem.C[:0], D=problem.D[:0])
+        return _Whitened(bare, bare, None, np.zeros((n, 0)), np.eye(n), 0.0)
+    reason: object = ""
+    for noise in ADDED_NOISES:
+        B, D = problem.B, problem.D
+        if noise:
+            B, D = np.hstack([B, np.zeros((n, rows))]), np.hstack([D, noise * size * np.eye(rows)])
+        try:
+            _, K, R = _kalman(replace(problem, B=B, D=D))
+        except (np.linalg.LinAlgError, ValueError) as error:
+            reason = error
+            continue
+        values, vectors = np.linalg.eigh(R)
+        if values[0] <= SINGULAR_INNOVATION * values[-1]:
+            reason = "the innovation is singular"
+            continue
+        factor = (vectors / np.sqrt(values)).T
+        D1 = np.hstack([problem.D1, np.zeros((len(problem.D1), B.shape[1] - problem.B.shape[1]))])
+        A, B, C = problem.A - K @ problem.C, B - K @ D, factor @ problem.C
+        basis = reachable_basis(A, B, share=REACHED_BY_NOISE)
+        reduced = replace(
+            problem, A=basis.T @ A @ basis, B=basis.T @ B, C=C @ basis, D=factor @ D, L=problem.L @ basis, D1=D1
+        )
+        count = problem.B.shape[1]
+        plain = replace(reduced, B=reduced.B[:, :count], D=reduced.D[:, :count], D1=D1[:, :count])
+        return _Whitened(reduced, plain, factor, K, basis, noise)
+    raise PreconditionError(
+        "The transfer from the faults to the outputs has a zero that is not strictly stable, or none of the "
+        f"outputs shows a mode that lasts: no stable filter has this fault map ({reason}).",
+        condition="zeros",
+    )
+
+
+def _central(problem: EstimationProblem, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return K and Z0 of the filter of a Riccati solution."""
+    A, B, C, D, L, D1 = problem.A, problem.B, problem.C, problem.D, problem.L, problem.D1
+    if not len(C):
+        return np.zeros((len(A), 0)), np.zeros((len(L), 0))
+    R = C @ P @ C.T + D @ D.T
+    wanted = np.hstack([C @ P @ A.T + D @ B.T, C @ P @ L.T + D @ D1.T])
+    both = np.asarray(np.linalg.solve(R, wanted).T, dtype=np.float64)
+    return both[: len(A)], both[len(A) :]
+
+
+def _closed(
+    problem: EstimationProblem, K: FloatArray, Z0: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    return (
+        problem.A - K @ problem.C,
+        problem.B - K @ problem.D,
+        problem.L - Z0 @ problem.C,
+        problem.D1 - Z0 @ problem.D,
+    )
+
+
+def _norm(system: tuple[FloatArray, FloatArray, FloatArray, FloatArray]) -> float:
+    return 0.0 if not system[1].shape[1] or not len(system[2]) else hinf_norm(*system).upper
+
+
+def _deviation(system: tuple[FloatArray, FloatArray, FloatArray, FloatArray]) -> float:
+    a, b, c, d = system
+    covariance = gramian(a, b @ b.T)
+    return float(np.sqrt(max(np.trace(d @ d.T + c @ covariance @ c.T), 0.0)))
+
+
+def _at_level(problem: EstimationProblem, level: float) -> FloatArray | None:
+    """Return the stabilising solution of the filtering equation at a level, or ``None`` where no filter is below it."""
+    rows = len(problem.C)
+    CL, DD = np.vstack([problem.C, problem.L]), np.vstack([problem.D, problem.D1])
+    weight = DD @ DD.T
+    weight[rows:, rows:] -= level**2 * np.eye(len(problem.L))
+    try:
+        P = _riccati(problem.A.T, CL.T, problem.B @ problem.B.T, weight, problem.B @ DD.T)
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    R = CL @ P @ CL.T + weight
+    if len(P) and np.linalg.eigvalsh(P)[0] < -NEGATIVE_SHARE * (np.max(np.abs(P)) + 1.0):
+        return None
+    seen, mixed, error = R[:rows, :rows], R[:rows, rows:], R[rows:, rows:]
+    if rows and np.linalg.eigvalsh(seen)[0] <= 0.0:
+        return None
+    schur = error - (mixed.T @ np.linalg.solve(seen, mixed) if rows else 0.0)
+    if np.linalg.eigvalsh(0.5 * (schur + schur.T))[-1] >= 0.0:
+        return None
+    closed = problem.A - _central(problem, P)[0] @ problem.C
+    return P if np.max(np.abs(np.linalg.eigvals(closed)), initial=0.0) < 1.0 else None
+
+
+def _search(
+    problem: EstimationProblem, first: tuple[FloatArray, FloatArray], least: float, high: float
+) -> tuple[FloatArray, FloatArray, float] | None:
+    """Bisect the level between a lower bound and the norm of the H2 filter; a level counts as the true norm says."""
+    nothing = ZERO_SHARE * max(float(np.linalg.norm(problem.D1)), float(np.linalg.norm(problem.L @ problem.B)), high)
+    if high <= max(least * (1.0 + LEVEL_SHARE), nothing):
+        return None
+    low, found = least * (1.0 - BOUND_ROUNDING), None
+    for tried in range(MOST_LEVELS):
+        level = 0.5 * (low + high) if tried else least * (1.0 + 3.0 * LEVEL_SHARE)
+        level = level if low < level < high else 0.5 * (low + high)
+        P = _at_level(problem, level)
+        if P is None:
+            low = level
+        else:
+            gains = _central(problem, P)
+            if _norm(_closed(problem, *gains)) <= level * (1.0 + NORM_ABOVE_LEVEL):
+                high, found = level, gains
+            else:
+                low = level
+        if high - low <= LEVEL_SHARE * high or high <= nothing:
+            break
+    return None if found is None else (*found, high)
+
+
+def _responses(problem: EstimationProblem, angles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the responses of e0 and of r at angles on the circle."""
+    points = np.exp(1j * np.atleast_1d(angles))[:, None, None]
+    entering = np.broadcast_to(problem.B.astype(complex), (len(points), *problem.B.shape))
+    states = np.linalg.solve(points * np.eye(len(problem.A)) - problem.A, entering)
+    return problem.L @ states + problem.D1, problem.C @ states + problem.D
+
+
+def _hidden_gain(problem: EstimationProblem, angles: FloatArray) -> FloatArray:
+    """Return the gain of what r does not show, at angles: no filter, causal or not, has less."""
+    error, shown = _responses(problem, angles)
+    if len(problem.C):
+        turned = np.conj(np.swapaxes(shown, 1, 2))
+        error = error - error @ turned @ np.linalg.solve(shown @ turned, shown)
+    return np.asarray(np.linalg.norm(error, 2, axis=(1, 2))) if error.size else np.zeros(len(error))
+
+
+def _non_causal_limit(problem: EstimationProblem) -> tuple[float, float]:
+    """Return the least gain with unlimited delay, by a grid that is refined, and its angle."""
+    if not problem.B.shape[1] or not len(problem.L):
+        return 0.0, 0.0
+    near = np.abs(np.angle(np.linalg.eigvals(problem.A)))[:, None] + NEAR_MODES
+    fine = np.geomspace(LEAST_ANGLE, 1.0, GRID // 3)
+    angles = np.unique(
+        np.clip(np.concatenate([np.linspace(0, np.pi, GRID), fine, np.pi - fine, near.ravel()]), 0, np.pi)
+    )
+    with np.errstate(all="ignore"):
+        try:
+            values = _hidden_gain(problem, angles)
+        except np.linalg.LinAlgError:
+            return 0.0, 0.0
+        values = np.where(np.isfinite(values), values, 0.0)
+        best = (float(values.max()), float(angles[values.argmax()]))
+        for i in np.argsort(values)[-5:]:
+            low, high = angles[max(i - 1, 0)], angles[min(i + 1, len(angles) - 1)]
+            for _ in range(8):
+                inner = np.linspace(low, high, 9)
+                found = np.nan_to_num(_hidden_gain(problem, inner))
+                j = int(found.argmax())
+                best = max(best, (float(found[j]), float(inner[j])))
+                low, high = inner[max(j - 1, 0)], inner[min(j + 1, 8)]
+    return best[0] * (1.0 - BOUND_ROUNDING), best[1]
+
+
+def _invisible_at(problem: EstimationProblem, angle: float) -> float:
+    """Return the gain of inputs that r does not show at one angle."""
+    error, shown = (part[0] for part in _responses(problem, np.array([angle])))
+    hidden = scipy.linalg.null_space(shown, rcond=WINDOW_RANK_TOLERANCE) if len(shown) else np.eye(error.shape[1])
+    return float(np.linalg.norm(error @ hidden, 2)) * (1.0 - BOUND_ROUNDING) if hidden.shape[1] else 0.0
+
+
+def _invisible_from_rest(problem: EstimationProblem) -> float:
+    """Return the gain of inputs from rest that r does not show: a bound on every causal filter, linear or not.
+
+    Only kernels with a clear gap count: unstable zeros of r leave singular values like ``|zero|^-N``, which are none.
+    """
+    rows, errors, width = len(problem.C), len(problem.L), problem.B.shape[1]
+    if not width or not errors:
+        return 0.0
+    both, moved = np.vstack([problem.C, problem.L]), problem.B
+    length = max(4, min(LONGEST_FROM_REST, MOST_INPUTS_FROM_REST // width))
+    blocks = [np.vstack([problem.D, problem.D1])]
+    for _ in range(length):
+        blocks.append(both @ moved)
+        moved = problem.A @ moved
+    while length >= 0:
+        whole = np.zeros((length + 1, rows + errors, length + 1, width))
+        for i in range(length + 1):
+            for j in range(i + 1):
+                whole[i, :, j, :] = blocks[i - j]
+        shown, wanted = (whole[:, part].reshape(-1, (length + 1) * width) for part in (slice(rows), slice(rows, None)))
+        _, values, right = np.linalg.svd(shown) if rows else (None, np.zeros(0), np.eye(shown.shape[1]))
+        clear = values > BOUNDARY_RANK_TOLERANCE * max(float(np.max(values, initial=0.0)), SMALLEST)
+        if not clear.any() or values[clear].min() >= CLEAR_KERNEL * values[0]:
+            hidden = right[int(clear.sum()) :].T
+            found = float(np.linalg.norm(wanted @ hidden, 2)) if hidden.shape[1] else 0.0
+            return found * (1.0 - BOUND_ROUNDING)
+        length = length // 2 if length else -1
+    return 0.0
+
+
+def _decays(problem: EstimationProblem, level: float) -> NDArray[np.complex128]:
+    """Return the eigenvalues of Phi of the Riccati solution at a level; none where there is no solution."""
+    rows, P = len(problem.C), _at_level(problem, level)
+    if P is None or not len(P):
+        return np.zeros(0, dtype=complex)
+    CL, DD = np.vstack([problem.C, problem.L]), np.vstack([problem.D, problem.D1])
+    R = CL @ P @ CL.T + DD @ DD.T
+    R[rows:, rows:] -= level**2 * np.eye(len(problem.L))
+    try:
+        K = np.linalg.solve(R, CL @ P @ problem.A.T + DD @ problem.B.T).T
+    except np.linalg.LinAlgError:
+        return np.zeros(0, dtype=complex)
+    return np.asarray(np.linalg.eigvals(problem.A - K @ CL), dtype=complex)
+
+
+def gramian(a: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return ``sum_k a^k weight a'^k`` by doubling: of a stable matrix, near the boundary too."""
+    total, power = np.array(weight), np.array(a)
+    with np.errstate(all="ignore"):
+        for _ in range(MOST_DOUBLINGS):
+            added = power @ total @ power.T
+            total, power = total + added, power @ power
+            size = float(np.linalg.norm(added))
+            if not np.isfinite(size) or size <= DOUBLED_SHARE * float(np.linalg.norm(total)):
+                break
+    return np.asarray(total)
+
+
+def realised(problem: EstimationProblem, K: FloatArray, Z0: FloatArray, ny: int) -> Model:
+    """Return the filter from y to the estimates, ``(A, B, C, D)``: the bank, its corrections, and the window of y."""
+    length, n = problem.window, len(problem.A)
+    Af, By = problem.A - K @ problem.C, problem.G + K @ problem.V
+    Cf, Dy = -(problem.L - Z0 @ problem.C), problem.F - Z0 @ problem.V
+    older = ny * length
+    shift = np.eye(older, k=ny)
+    enter = np.zeros((older, ny))
+    if length:
+        enter[-ny:] = np.eye(ny)
+    A = np.block([[Af, By[:, :older]], [np.zeros((older, n)), shift]])
+    B = np.vstack([By[:, older:], enter])
+    C, D = np.hstack([Cf, Dy[:, :older]]), Dy[:, older:]
+    if not np.all(np.isfinite(A)):
+        raise SolverError("The filter of least gain has no finite realisation: the result is inconclusive.")
+    return A, B, C, D

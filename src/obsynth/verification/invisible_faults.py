@@ -1,0 +1,453 @@
+"""Faults and noise of the whole past that no output shows: a proved lower bound on the gain of every causal filter.
+
+Whatever satisfies the plant's equations with u = 0 and y = 0 up to now is invisible: a causal filter of finite gain,
+linear or not, estimates 0, so that its gain is at least the energy ratio of what it misses to the noise.  Here
+
+.. math::
+    \\begin{bmatrix} s E - A & -B_h & -B_w \\\\ C & D_h & D_w \\end{bmatrix} v = 0, \\qquad (x, h, w)(t) = v\\, s^t
+    \\text{ or } v\\, e^{s t}, \\quad t \\le 0,
+
+for some points s outside the unit circle (right of the axis), h the faults and unknown inputs that the error must not
+show; in discrete time some last samples follow one by one.  The points alone are the witness: each v is enclosed by a
+linear solution in ball arithmetic, where s must be a zero by an interval Newton step (Rump 2010, section 13), and the
+ratio of one combination is rounded down.  Source: ours.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import flint
+import numpy as np
+import scipy.linalg
+
+from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: Digits, in bits, that are tried: close points cancel, and more digits do not.
+PRECISION_BITS = (256, 768)
+#: Steps of inverse iteration towards the worst combination: each gains the digits of the distance of the levels.
+INVERSE_STEPS = 4
+#: Shares by which the level of that iteration lies above the bound that is repeated, and of the noise's energy that is
+#: taken off so that what is invisible without noise leaves no singular matrix.
+LEVEL_ABOVE, REGULAR_SHARE = 1e-9, 1e-40
+#: Newton steps from a zero in double precision to one in all digits, and the half width of the box around it.
+NEWTON_STEPS, BOX_BITS = 8, 0.6
+#: A bound for all delays is lowered by this share: that covers so many samples of delay.
+LIMIT_SHARE, LONGEST_DELAY = 1e-5, 1000
+#: Dependent equations of last samples with more unknowns than this are not solved in rational numbers.
+MOST_UNKNOWNS = 120
+
+
+class Setting(NamedTuple):
+    """What the filter must do: ``delay`` in samples, or a reference model; whether the fault map is exact."""
+
+    delay: int
+    reference: tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None
+    exact: bool
+
+
+def seen_plant(plant: DescriptorSystem, decoupled: Sequence[str]) -> DescriptorSystem:
+    """Return the plant in which disturbances that are not ``decoupled`` count as noise, before the noise."""
+    kept = [plant.disturbance_names.index(name) for name in decoupled]
+    bounded = [i for i in range(plant.nd) if i not in kept]
+    return plant.replace(
+        Bd=plant.Bd[:, kept],
+        Dd=plant.Dd[:, kept],
+        disturbance_names=[plant.disturbance_names[i] for i in kept],
+        Bw=np.hstack([plant.Bd[:, bounded], plant.Bw]),
+        Dw=np.hstack([plant.Dd[:, bounded], plant.Dw]),
+        noise_names=[*(plant.disturbance_names[i] for i in bounded), *plant.noise_names],
+    )
+
+
+def proved_least(
+    plant: DescriptorSystem, points: Sequence[complex], samples: int, setting: Setting, *, level: float
+) -> float | None:
+    """Return a number that the gain of every causal filter reaches, rounded down; ``None`` where nothing is proved.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        As `seen_plant` returns it: its disturbances are those that never reach the error.
+    points : sequence of complex
+        Outside the unit circle, or right of the imaginary axis; conjugates are added.
+    samples : int
+        Last samples, discrete time, that are free: at least the delay.
+    setting : Setting
+        What the filter must do.
+    level : float
+        The gain near which the worst combination is looked for; nothing is concluded from it.
+    """
+    if plant.is_discrete and (samples < max(setting.delay, 1) or not _has_index_one(plant)):
+        return None
+    for bits in PRECISION_BITS:
+        with flint.ctx.workprec(bits):
+            try:
+                found = _Trajectories(plant, points, samples if plant.is_discrete else 0, setting).bound(level)
+            except ZeroDivisionError:  # a matrix is singular to these digits
+                continue
+        if found is not None:
+            return found
+    return None
+
+
+def proved_limit(plant: DescriptorSystem, point: complex, setting: Setting) -> float | None:
+    """Return a number that the gain of every causal filter reaches at any delay up to `LONGEST_DELAY` samples.
+
+    Of the signals ``v s^t`` of one point next to the unit circle: a delay takes ``|s|`` off their ratio per sample.
+    """
+    for bits in PRECISION_BITS:
+        with flint.ctx.workprec(bits):
+            try:
+                trajectories = _Trajectories(plant, [point], 0, setting._replace(delay=0), conjugates=False)
+                found = trajectories.bound(1.0)
+            except ZeroDivisionError:
+                continue
+        if found is not None:
+            left = found * (1.0 - LIMIT_SHARE)
+            return left if LONGEST_DELAY * math.log(abs(point)) <= LIMIT_SHARE / 2.0 else None
+    return None
+
+
+def _has_index_one(plant: DescriptorSystem) -> bool:
+    """Whether every trajectory can be continued after now without inputs: ``rank [E A; 0 E] = n + rank E``."""
+    nothing = np.zeros_like(plant.E)
+    whole = np.block([[plant.E, plant.A], [nothing, plant.E]])
+    return decide_rank(whole).rank == plant.nx + decide_rank(plant.E).rank
+
+
+def _complex(matrix: Any) -> Any:
+    """Return a matrix of floating-point numbers as python-flint's, exactly."""
+    rows, columns = np.shape(matrix)
+    return flint.acb_mat(rows, columns, np.ravel(matrix).tolist())
+
+
+def _zeros(rows: int, columns: int) -> Any:
+    return flint.acb_mat(rows, columns)
+
+
+def _middle(matrix: Any) -> Any:
+    return flint.acb_mat(matrix.nrows(), matrix.ncols(), [entry.mid() for entry in matrix.entries()])
+
+
+def _adjoint(matrix: Any) -> Any:
+    return matrix.conjugate().transpose()
+
+
+def _rows(matrix: Any, rows: Sequence[int]) -> Any:
+    entries, width = matrix.entries(), matrix.ncols()
+    return flint.acb_mat(len(rows), width, [entries[i * width + j] for i in rows for j in range(width)])
+
+
+def _beside(parts: Sequence[Any]) -> Any:
+    rows = parts[0].nrows()
+    tables = [part.tolist() for part in parts]
+    entries = [entry for i in range(rows) for table in tables for entry in table[i]]
+    return flint.acb_mat(rows, sum(part.ncols() for part in parts), entries)
+
+
+class _Member(NamedTuple):
+    point: Any  # a complex ball
+    vector: Any  # (x, h, w), an acb_mat of one column
+
+
+class _Trajectories:
+    """The invisible trajectories of some points, with free last samples, and the energies of their combinations.
+
+    They are complex: real and imaginary part are trajectories, and one of these has no smaller ratio.
+    """
+
+    def __init__(
+        self,
+        plant: DescriptorSystem,
+        points: Sequence[complex],
+        samples: int,
+        setting: Setting,
+        *,
+        conjugates: bool = True,
+    ) -> None:
+        faults, unknown, noise = ((getattr(plant, f"B{name}"), getattr(plant, f"D{name}")) for name in ("f", "d", "w"))
+        hidden, bounded = ((faults, unknown), (noise,)) if setting.exact else ((unknown,), (faults, noise))
+        self.plant, self.setting, self.samples = plant, setting, samples
+        self.Bh, self.Dh = (np.hstack([pair[i] for pair in hidden]) for i in (0, 1))
+        self.Bw, self.Dw = (np.hstack([pair[i] for pair in bounded]) for i in (0, 1))
+        self.members: list[_Member] = []
+        for point in _with_conjugates(points) if conjugates else points:
+            found = self._members(point)
+            # Two starts may lead to one zero.
+            known = any(one.point.overlaps(other.point) for one in found for other in self.members)
+            self.members += [] if known else found
+
+    # The members: kernels of the pencil.
+
+    def _members(self, point: complex) -> list[_Member]:
+        plant, nx = self.plant, self.plant.nx
+        still = np.block([[-plant.A, -self.Bh, -self.Bw], [plant.C, self.Dh, self.Dw]])
+        moved = np.zeros_like(still)
+        moved[:nx, :nx] = plant.E
+        free = still.shape[1] - len(still)
+        if free < 0:
+            return []
+        if not free:
+            found = _zero_near(still, moved, point)
+            if found is None:
+                return []
+            growing = found.point.abs_lower() > 1 if plant.is_discrete else found.point.real > 0
+            return [found] if growing else []
+        pivots, others = _pivots(still + point * moved)
+        exact = _complex(still + 0j) + _complex(moved + 0j) * flint.acb(point)
+        solved = _columns(exact, pivots).solve(-_columns(exact, others))
+        return [_Member(flint.acb(point), _placed(solved, pivots, others, j)) for j in range(free)]
+
+    def _part(self, which: str) -> Any:
+        """Return a part of the members' vectors, one member a column."""
+        nx, nh, nw = self.plant.nx, self.Bh.shape[1], self.Bw.shape[1]
+        nf, start = self.plant.nf, 0 if which == "x" else nx if which == "h" or self.setting.exact else nx + nh
+        count = {"x": nx, "f": nf, "h": nh, "w": nw}[which]
+        start = nx + nh if which == "w" else start
+        columns = [_rows(member.vector, range(start, start + count)) for member in self.members]
+        return _beside(columns) if columns else _zeros(count, 0)
+
+    # Combinations: coefficients of the members, then the last samples.
+
+    def bound(self, level: float) -> float | None:
+        """Return the proved ratio of the worst combination, rounded down."""
+        error, noise = self._energies()
+        count = error.nrows()
+        if not count:
+            return None
+        # Energies of the basis differ by many orders: each member in its own unit.
+        sizes = [(noise[i, i].real + error[i, i].real).mid() for i in range(count)]
+        if not any(size > 0 for size in sizes):
+            return None
+        units = [1 / flint.acb(size).sqrt() if size > 0 else flint.acb(1) for size in sizes]
+        units = [unit.mid() for unit in units]
+        error, noise = (_scaled(_scaled(part, units).transpose(), units).transpose() for part in (error, noise))
+        square = flint.arb(level * (1.0 + LEVEL_ABOVE)) ** 2
+        shifted = _middle(error - noise * square)
+        for i in range(count):
+            shifted[i, i] -= flint.arb(REGULAR_SHARE) * (1 + square)
+        step = _middle(shifted.inv()) * _middle(noise)
+        found = flint.acb_mat(count, 1, [1.0 + 0.37 * (i % 7) for i in range(count)])
+        for _ in range(INVERSE_STEPS):
+            found = _middle(step * found)
+            largest = max(entry.abs_upper() for entry in found.entries())
+            found = _middle(found * (1 / flint.acb(largest)))
+        above, below = ((_adjoint(found) * part * found)[0, 0].real for part in (error, noise))
+        if not (above > 0 and below > 0):
+            return None
+        ratio = (above.lower() / below.upper()).sqrt().lower()
+        value = float(ratio) if ratio.is_finite() else 0.0
+        return math.nextafter(value, 0.0) if value > 0.0 else None
+
+    def _energies(self) -> tuple[Any, Any]:
+        """Return the energies of error and noise as matrices on the members' coefficients and the last samples'."""
+        (reference, delay), points = (self.setting.reference, self.setting.delay), [m.point for m in self.members]
+        faults, noise, states = self._part("f"), self._part("w"), _zeros(0, len(self.members))
+        shown = faults
+        if reference is not None:
+            states, shown = _through(reference, faults, points)
+        weights = _weights(points, discrete=self.plant.is_discrete)
+        energies = [_weighted(part, weights) for part in (shown, noise)]
+        if not self.samples:
+            return energies[0], energies[1]
+        rest = _from_rest(self.plant, (self.Bh, self.Dh), (self.Bw, self.Dw), self.samples)
+        # The members go on, and what starts from rest is added to them.
+        own = 0 if self.setting.exact else self.Bh.shape[1]
+        tails, powers = [], [flint.acb(1) for _ in points]
+        for inputs in rest:
+            added = (
+                _rows(inputs, range(own, own + self.plant.nf)),
+                _rows(inputs, range(self.Bh.shape[1], inputs.nrows())),
+            )
+            tails.append(
+                [_beside([_scaled(part, powers), more]) for part, more in zip((faults, noise), added, strict=True)]
+            )
+            powers = [power * point for power, point in zip(powers, points, strict=True)]
+        count = len(points) + rest[0].ncols()
+        padded = [_padded(part, count) for part in energies]
+        seen = [tail[0] for tail in tails]
+        if reference is None:
+            seen = seen[: self.samples - delay]
+        else:
+            seen = _recursion(reference, _beside([states, _zeros(states.nrows(), rest[0].ncols())]), seen)
+        for which, samples in enumerate((seen, [tail[1] for tail in tails])):
+            for sample in samples:
+                padded[which] = padded[which] + _adjoint(sample) * sample
+        return padded[0], padded[1]
+
+
+def _from_rest(
+    plant: DescriptorSystem, hidden: tuple[FloatArray, FloatArray], noise: tuple[FloatArray, FloatArray], samples: int
+) -> list[Any]:
+    """Return the inputs ``(h, w)`` of each sample, all solutions from rest with y = 0 as columns."""
+    nx, ny = plant.nx, plant.ny
+    (bh, dh), (bw, dw) = hidden, noise
+    inputs, through = np.hstack([bh, bw]), np.hstack([dh, dw])
+    count = inputs.shape[1]
+    # States that no derivative or next sample holds may be anything at the start.
+    loose = [i for i in range(nx) if not plant.E[:, i].any()]
+    block = count + nx
+    system = np.zeros((samples * (nx + ny), len(loose) + samples * block))
+    for j in range(samples):
+        row, own = j * (nx + ny), len(loose) + j * block
+        states, outputs = slice(row, row + nx), slice(row + nx, row + nx + ny)
+        before = slice(own - nx, own) if j else slice(0, len(loose))
+        system[states, before], system[outputs, before] = (
+            (-plant.A, plant.C) if j else (-plant.A[:, loose], plant.C[:, loose])
+        )
+        system[states, own : own + count], system[outputs, own : own + count] = -inputs, through
+        system[states, own + count : own + block] = plant.E
+    system = system[system.any(axis=1)]
+    try:
+        pivots, others = _pivots(system)
+        solved = _columns(_complex(system + 0j), pivots).solve(-_columns(_complex(system + 0j), others))
+        columns = [_placed(solved, pivots, others, j) for j in range(len(others))]
+        kernel = _beside(columns) if columns else _zeros(system.shape[1], 0)
+    except ZeroDivisionError:
+        kernel = _exact_kernel(system)
+    return [_rows(kernel, range(len(loose) + j * block, len(loose) + j * block + count)) for j in range(samples)]
+
+
+def _exact_kernel(system: FloatArray) -> Any:
+    """Return a basis of the kernel of a matrix whose rows are dependent, in rational numbers; none of a large one."""
+    rows, width = system.shape
+    if width > MOST_UNKNOWNS:
+        return _zeros(width, 0)
+    entries = []
+    for row in system:
+        parts = [float(entry).as_integer_ratio() for entry in row]
+        scale = max(bottom for _, bottom in parts)
+        entries += [top * (scale // bottom) for top, bottom in parts]
+    basis, count = flint.fmpz_mat(rows, width, entries).nullspace()
+    table = [[flint.acb(flint.arb(entry)) for entry in row[:count]] for row in basis.tolist()]
+    found = flint.acb_mat(width, count, [entry for row in table for entry in row])
+    sizes = [max(abs(row[j]).abs_upper() for row in table) for j in range(count)]
+    return _scaled(found, [1 / flint.acb(size.mid()) for size in sizes])
+
+
+def _scaled(matrix: Any, factors: Sequence[Any]) -> Any:
+    """Return a matrix whose columns are multiplied."""
+    width = matrix.ncols()
+    return flint.acb_mat(matrix.nrows(), width, [part * factors[i % width] for i, part in enumerate(matrix.entries())])
+
+
+def _with_conjugates(points: Sequence[complex]) -> list[complex]:
+    found = []
+    for point in points:
+        found += [complex(point)] if point.imag == 0.0 else [complex(point), complex(point).conjugate()]
+    return found
+
+
+def _pivots(matrix: Any) -> tuple[list[int], list[int]]:
+    """Return the columns of a well-conditioned square part, and the others; raise for rows that are dependent."""
+    sizes = np.max(np.abs(matrix), axis=1, keepdims=True)
+    scaled = matrix / np.where(sizes > 0.0, sizes, 1.0)
+    _, upper, order = scipy.linalg.qr(scaled, mode="economic", pivoting=True)
+    if len(matrix) > matrix.shape[1]:
+        raise ZeroDivisionError
+    diagonal = np.abs(np.diag(upper))
+    if len(diagonal) and not diagonal[-1] > RANK_TOLERANCE * max(diagonal[0], SMALLEST):
+        raise ZeroDivisionError
+    return [int(i) for i in order[: len(matrix)]], [int(i) for i in order[len(matrix) :]]
+
+
+def _columns(matrix: Any, columns: Sequence[int]) -> Any:
+    table = matrix.tolist()
+    return flint.acb_mat(len(table), len(columns), [row[j] for row in table for j in columns])
+
+
+def _placed(solved: Any, pivots: Sequence[int], others: Sequence[int], which: int) -> Any:
+    """Return the solution in which one free entry is 1 and the other free ones are 0."""
+    found = _zeros(len(pivots) + len(others), 1)
+    found[others[which], 0] = 1
+    for row, place in enumerate(pivots):
+        found[place, 0] = solved[row, which]
+    return found
+
+
+def _zero_near(still: FloatArray, moved: FloatArray, point: complex) -> _Member | None:
+    """Return an enclosed zero of a square pencil ``still + s moved`` with its vector, by an interval Newton step."""
+    size = len(still)
+    normal = np.conj(np.linalg.svd(still + point * moved)[2][-1])
+    fixed, rate = _complex(still + 0j), _complex(moved + 0j)
+    row = _complex(np.conj(normal)[None, :] + 0j)
+    point_, vector = flint.acb(point), _complex(normal[:, None] + 0j)
+
+    def step(s: Any, v: Any, at: tuple[Any, Any]) -> Any:
+        """Return ``J(box)^-1 F(middle)``."""
+        s0, v0 = at
+        slope = _beside([fixed + rate * s, rate * v])
+        entries = [*slope.entries(), *row.entries(), flint.acb(0)]
+        jacobian = flint.acb_mat(size + 1, size + 1, entries)
+        missed = [*((fixed + rate * s0) * v0).entries(), (row * v0)[0, 0] - 1]
+        return jacobian.solve(flint.acb_mat(size + 1, 1, missed))
+
+    for _ in range(NEWTON_STEPS):
+        moved_by = step(point_, vector, (point_, vector))
+        vector = _middle(vector - _rows(moved_by, range(size)))
+        point_ = (point_ - moved_by[size, 0]).mid()
+    radius = flint.arb(0, flint.arb(2) ** -int(BOX_BITS * flint.ctx.prec))
+    around = flint.acb(radius, radius)
+    box = point_ + around, flint.acb_mat(size, 1, [entry + around for entry in vector.entries()])
+    moved_by = step(*box, (point_, vector))
+    inside = [entry - moved_by[i, 0] for i, entry in enumerate(vector.entries())]
+    last = point_ - moved_by[size, 0]
+    wide = [*box[1].entries(), box[0]]
+    if not all(outer.contains(inner) for outer, inner in zip(wide, [*inside, last], strict=True)):
+        return None
+    return _Member(last, flint.acb_mat(size, 1, inside))
+
+
+def _weights(points: Sequence[Any], *, discrete: bool) -> Any:
+    """Return the sums, or integrals, of ``conj(s_i^t) s_j^t`` over the past."""
+    count = len(points)
+    found = _zeros(count, count)
+    for i, left in enumerate(points):
+        for j, right in enumerate(points):
+            rate = left.conjugate() * right - 1 if discrete else left.conjugate() + right
+            found[i, j] = 1 / rate
+    return found
+
+
+def _weighted(part: Any, weights: Any) -> Any:
+    product, count = _adjoint(part) * part, weights.nrows()
+    entries = [a * b for a, b in zip(product.entries(), weights.entries(), strict=True)]
+    return flint.acb_mat(count, count, entries)
+
+
+def _padded(matrix: Any, size: int) -> Any:
+    count, found = matrix.nrows(), _zeros(size, size)
+    for i in range(count):
+        for j in range(count):
+            found[i, j] = matrix[i, j]
+    return found
+
+
+def _through(model: tuple[FloatArray, ...], faults: Any, points: Sequence[Any]) -> tuple[Any, Any]:
+    """Return the states and outputs of a reference model whose inputs are the members' faults."""
+    a, b, c, d = (_complex(part + 0j) for part in model)
+    order, table = a.nrows(), []
+    states = _zeros(order, len(points))
+    if order:
+        for j, point in enumerate(points):
+            resolvent = -a
+            for i in range(order):
+                resolvent[i, i] += point
+            table.append(resolvent.solve(b * _columns(faults, [j])))
+        states = _beside(table) if table else states
+    return states, c * states + d * faults
+
+
+def _recursion(model: tuple[FloatArray, ...], states: Any, faults: Sequence[Any]) -> list[Any]:
+    """Return the outputs of a reference model, as rows on all coefficients, over the last samples."""
+    a, b, c, d = (_complex(part + 0j) for part in model)
+    found = []
+    for sample in faults:
+        found.append(c * states + d * sample)
+        states = a * states + b * sample
+    return found
