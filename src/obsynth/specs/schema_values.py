@@ -239,7 +239,7 @@ def _as_in_python(kind: str) -> Any:
         problem = problem_with(value, str(info.field_name), Annotated[Any, WrittenAs(kind)])
         if problem is not None:
             raise PydanticCustomError("stated", "{problem}", {"problem": problem})
-        return value if kind == "samples" else _with_floats(value)
+        return _with_floats(value) if kind == "named bounds" else value
 
     return Annotated[Any, PlainValidator(checked)]
 
