@@ -21,16 +21,8 @@ from obsynth.observers.progress import RunsProgress, progress_of_runs
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import gain_set_bytes, plain
 from obsynth.results.gain_sets import load, loaded
-from obsynth.studies.work import (
-    WORK_STATUSES,
-    ResultFolder,
-    ResultTable,
-    Work,
-    all_of,
-    carried_out,
-    plant_cases,
-    spec_cases,
-)
+from obsynth.studies.cases import plant_cases, spec_cases
+from obsynth.studies.work import WORK_STATUSES, ResultFolder, ResultTable, Work, all_of, carried_out
 from obsynth.version import __version__
 
 if TYPE_CHECKING:
