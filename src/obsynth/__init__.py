@@ -64,7 +64,7 @@ _PUBLIC_NAMES = {
     "monitoring.thresholds.residual_monitor": "monitor",
     "observers.batches": "run_batch",
     "observers.decisions": "ParameterMonitor decide",
-    "observers.linear.derived": "sample_observer",
+    "observers.linear.sampled": "sample_observer",
     "observers.linear.observer": "LinearObserver",
     "observers.nonlinear.observer": "DAEObserver",
     "observers.recursive.observer": "RecursiveObserver",

@@ -44,8 +44,8 @@ from obsynth.monitoring.thresholds.residual_monitor import monitor as monitor
 from obsynth.observers.batches import run_batch as run_batch
 from obsynth.observers.decisions import ParameterMonitor as ParameterMonitor
 from obsynth.observers.decisions import decide as decide
-from obsynth.observers.linear.derived import sample_observer as sample_observer
 from obsynth.observers.linear.observer import LinearObserver as LinearObserver
+from obsynth.observers.linear.sampled import sample_observer as sample_observer
 from obsynth.observers.nonlinear.observer import DAEObserver as DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver as RecursiveObserver
 from obsynth.observers.recursive.settings import Adaptation as Adaptation

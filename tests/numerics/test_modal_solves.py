@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from obsynth.numerics import modal_response
-from obsynth.numerics.modal_response import ModalSolves, Modes
+from obsynth.numerics import modal_solves
+from obsynth.numerics.modal_response import Modes
+from obsynth.numerics.modal_solves import ModalSolves
 
 POINTS = np.exp(1j * np.geomspace(1e-7, np.pi, 9))
 
@@ -37,8 +38,8 @@ def test_rows_are_those_of_a_factorisation_at_each_point(kind, monkeypatch):
     e = {"nonsingular": np.eye(n) + 0.1 * rng.standard_normal((n, n))}.get(kind)
     e = singular(rng, n) if kind == "singular" else e
     points_factored = []
-    plain = modal_response.resolved
-    monkeypatch.setattr(modal_response, "resolved", lambda *given: points_factored.append(given) or plain(*given))
+    plain = modal_solves.resolved
+    monkeypatch.setattr(modal_solves, "resolved", lambda *given: points_factored.append(given) or plain(*given))
     solves = ModalSolves.of(e, a, at=3.0, modes=Modes.of(a) if kind == "known" else None)
     for rows in (rng.standard_normal((2, n)), rng.standard_normal((len(POINTS), 1, n)) + 1j):
         found, true = solves.rows(POINTS, rows), factored(e, a, rows)

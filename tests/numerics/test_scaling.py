@@ -7,14 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.numerics import scaling
-from obsynth.numerics.scaling import (
-    LogBalance,
-    _whole_parts,
-    balance_system,
-    equilibrate_pencil,
-    power_of_two_below,
-)
+from obsynth.numerics import logarithmic_balance
+from obsynth.numerics.logarithmic_balance import LogBalance, _whole_parts
+from obsynth.numerics.scaling import balance_system, equilibrate_pencil, power_of_two_below
 from obsynth.proofs.exact_arithmetic import nearest_doubles, stored_matrix
 
 PAPER_E = np.diag([1.0, 1.0, 1.0, 0.0])
@@ -40,10 +35,10 @@ def test_power_of_two_below_is_exact_at_the_borders():
 def test_a_large_matrix_that_is_not_definite_is_factored_by_pivots():
     """Cholesky's factorisation takes the place of one half of it: from the other it is there again."""
     rng = np.random.default_rng(3)
-    matrix = rng.normal(size=(scaling.MANY_UNKNOWNS, scaling.MANY_UNKNOWNS))
+    matrix = rng.normal(size=(logarithmic_balance.MANY_UNKNOWNS, logarithmic_balance.MANY_UNKNOWNS))
     matrix, wanted = matrix + matrix.T, rng.normal(size=len(matrix))
     right = matrix @ wanted
-    np.testing.assert_allclose(scaling._factored(matrix)(right), wanted, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(logarithmic_balance._factored(matrix)(right), wanted, rtol=1e-8, atol=1e-8)
 
 
 def test_paper_example_is_left_alone():
@@ -161,10 +156,10 @@ def test_least_squares_are_those_of_the_matrix_of_all_entries() -> None:
             row = np.zeros(9)
             row[0], row[1 + i], row[5 + j] = common, *signs
             rows.append(row), right.append(-np.log2(matrix[i, j])), weights.append(weight)
-    ridge = scaling.RIDGE
+    ridge = logarithmic_balance.RIDGE
     rows += [*np.eye(9), np.eye(9)[3]]
     right += [*np.zeros(9), 2.0]
-    weights += [*np.full(9, ridge), scaling.WISH_WEIGHT * ridge]
+    weights += [*np.full(9, ridge), logarithmic_balance.WISH_WEIGHT * ridge]
     known, wanted, size = map(stored_matrix, (np.array(rows), np.array(right)[:, None], np.diag(weights)))
     turned = known.transpose() * size
     expected = nearest_doubles((turned * known).solve(turned * wanted)).ravel()

@@ -11,7 +11,7 @@ from test_dae_observer import BALANCES, drive, linear_observer, made, observer, 
 
 import obsynth
 from obsynth import DAEModel, DAEObserver, SolverError, SpecError, run_batch, simulate_dae
-from obsynth.numerics.newton import SMALL, solved
+from obsynth.numerics.graph_equations import SMALL, solved
 from obsynth.observers import batches as dae_batch
 from obsynth.observers import progress
 from obsynth.observers.nonlinear import c_code as dae_library

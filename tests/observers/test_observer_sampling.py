@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from obsynth import LinearObserver, SpecError
-from obsynth.observers.linear.derived import sample_observer
+from obsynth.observers.linear.sampled import sample_observer
 
 
 def observer(dt=0.0):

@@ -19,8 +19,8 @@ from obsynth.analysis.existence.filasova import pd_observer_conditions
 from obsynth.analysis.existence.sharepasand import existence_conditions
 from obsynth.methods.designing import check
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
-from obsynth.numerics.sparse import blocks_of, coarse_structure
 from obsynth.numerics.sparse_factor import SparseFactor, scales_by_all_entries
+from obsynth.numerics.sparse_structure import blocks_of, coarse_structure
 from obsynth.plants.faults import exosystem
 from obsynth.plants.transformations.elimination import eliminated_by_sparsity
 from obsynth.plants.transformations.recovery_operator import without_rounding

@@ -14,8 +14,8 @@ import pytest
 
 import obsynth
 from obsynth.methods.ui_pi_observer.assembly import KNOWN_POLES
-from obsynth.numerics import scaling
-from obsynth.numerics.scaling import LogBalance
+from obsynth.numerics import logarithmic_balance
+from obsynth.numerics.logarithmic_balance import LogBalance
 from obsynth.numerics.spectra import rounding_of_eigenvalues
 from obsynth.plants.transformations.elimination import dynamic_coordinates
 from obsynth.proofs import contraction
@@ -196,21 +196,21 @@ def test_an_inequality_is_proved_once_for_the_same_numbers_and_again_for_others(
 
 def test_many_exponents_are_the_same_by_cholesky_and_by_pivots(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(11)
-    n = scaling.MANY_UNKNOWNS // 2 + 10
+    n = logarithmic_balance.MANY_UNKNOWNS // 2 + 10
     a = rng.standard_normal((n, n)) * np.exp2(rng.uniform(-20, 20, n)) * np.exp2(rng.uniform(-20, 20, n))[:, None]
     a[rng.random((n, n)) < 0.9] = 0.0
-    plain, failed = scaling.lapack.dpotrf, []
+    plain, failed = logarithmic_balance.lapack.dpotrf, []
 
     def watched(*given: Any, **named: Any) -> Any:
         found = plain(*given, **named)
         failed.append(found[1])
         return found
 
-    monkeypatch.setattr(scaling.lapack, "dpotrf", watched)
-    found = scaling.balance_by_least_squares(np.eye(n), a)
+    monkeypatch.setattr(logarithmic_balance.lapack, "dpotrf", watched)
+    found = logarithmic_balance.balance_by_least_squares(np.eye(n), a)
     assert failed == [0]
-    monkeypatch.setattr(scaling, "MANY_UNKNOWNS", 10**9)
-    again = scaling.balance_by_least_squares(np.eye(n), a)
+    monkeypatch.setattr(logarithmic_balance, "MANY_UNKNOWNS", 10**9)
+    again = logarithmic_balance.balance_by_least_squares(np.eye(n), a)
     assert failed == [0]
     assert np.array_equal(found.equations, again.equations)
     assert np.array_equal(found.states, again.states)

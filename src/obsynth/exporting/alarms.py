@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from obsynth.errors import SpecError
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arguments import real_number, require_mapping
-from obsynth.observers.linear.derived import checked_warm_up, transient
+from obsynth.observers.linear.modes import checked_warm_up, transient
 
 #: What the statistic of a monitor is called, in units of its level.
 STATISTIC = "statistic"

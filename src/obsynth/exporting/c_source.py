@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.realisation import Realisation, verification_words
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.derived import SETTLING_SLACK
+from obsynth.observers.linear.modes import SETTLING_SLACK
 from obsynth.observers.nonlinear.c_code import in_lines
 
 _KEYWORDS = frozenset(

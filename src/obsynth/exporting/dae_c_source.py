@@ -29,7 +29,7 @@ from obsynth.exporting.c_source import (
 from obsynth.exporting.dae_float import float_error, in_floats, in_precision
 from obsynth.exporting.realisation import verification_words
 from obsynth.files.outputs import write_together
-from obsynth.observers.linear.derived import SETTLING_SLACK, checked_warm_up
+from obsynth.observers.linear.modes import SETTLING_SLACK, checked_warm_up
 from obsynth.observers.nonlinear.c_code import observer_code, observer_struct
 from obsynth.observers.running import as_run, rule_of_outliers
 from obsynth.plants.dae import DAEModel

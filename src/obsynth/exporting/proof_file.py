@@ -23,7 +23,7 @@ from obsynth.files.outputs import write_atomically
 from obsynth.methods.registry import error_model
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balanced_matrix
-from obsynth.observers.linear.derived import poles_of
+from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.witnesses import (

@@ -14,9 +14,9 @@ from obsynth.errors import SpecError
 from obsynth.methods.state_solver import state_solver
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
-from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.missing_samples import GAP_LEFT_SHARE, LEAST_SHOWN, MissingSamples
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.sampled import sample_observer
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.gain_schedule import steady_observer
 from obsynth.observers.recursive.observer import RecursiveObserver

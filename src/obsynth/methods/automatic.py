@@ -16,8 +16,8 @@ from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.method import Method, Purpose
 from obsynth.methods.registry import REGISTRY, kind_of, method_class, methods_for
 from obsynth.numerics.arguments import field_types
-from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.sampled import sample_observer
 from obsynth.observers.recursive.gain_schedule import steady_observer
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign

@@ -1,19 +1,12 @@
-"""Damped Newton iteration on scaled equations; linear equations with pivots inside CasADi graphs.
-
-CasADi's own ``solve`` of scalar expressions takes no pivots, and was measured to be 75 % wrong, silently.  Up to
-`SMALL` unknowns elimination is unrolled into scalar operations, which run fastest; above, a sparse QR is called.
-"""
+"""Damped Newton iteration on scaled equations."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
 import numpy as np
 
-from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import FloatArray
 
 #: Iterations before we give up: a damped iteration that needs more is not converging.
@@ -27,14 +20,6 @@ LARGEST_RESIDUAL = 1e-9
 
 #: A step is halved at most so often; 2^-12 of a Newton step that does not help is no progress.
 MOST_HALVINGS = 12
-
-
-#: Unknowns up to which elimination is unrolled.  Above, the pivots make so many scalar operations that the sparse
-#: factorisation is faster, and C compilers take ten times as long.
-SMALL = 8
-
-#: A pivot below this ends the factorisation, and the function with it; the caller is told and has no result.
-SINGULAR = 1e-16
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,64 +120,3 @@ def _damped(
         if np.isfinite(value).all() and np.abs(rows * value).max() < before:
             return tried, value, jacobian
     return None
-
-
-def equilibrated(matrix: Any, columns: FloatArray) -> tuple[Any, Any]:
-    """Return ``diag(rows) J diag(columns)`` and ``rows``: the scaling of `ScaledMatrix` inside a graph."""
-    scaled = ca.densify(matrix) @ ca.diag(ca.DM(columns))
-    peaks = largest_entries(scaled)
-    rows = 1.0 / ca.if_else(peaks > 0.0, peaks, 1.0)
-    return scaled * ca.repmat(rows, 1, matrix.shape[1]), rows
-
-
-def largest_entries(matrix: Any) -> Any:
-    """Return the largest absolute value of each row ``(rows,)``, which is not NaN where others are not."""
-    sizes = ca.fabs(matrix)
-    found = sizes[:, 0]
-    for j in range(1, matrix.shape[1]):
-        found = ca.fmax(found, sizes[:, j])
-    return found
-
-
-def solved(matrix: Any, right: Any) -> Any:
-    """Return ``A^-1 B`` with row pivots; not finite where A is singular."""
-    return _solution(matrix, right, pivots=True)
-
-
-def definite_solved(matrix: Any, right: Any) -> Any:
-    """Return ``A^-1 B`` for a positive definite A, scaled to a unit diagonal first."""
-    scale = 1.0 / ca.sqrt(ca.diag(matrix))
-    unit = matrix * (scale @ scale.T)
-    return ca.repmat(scale, 1, right.shape[1]) * _solution(unit, ca.repmat(scale, 1, right.shape[1]) * right)
-
-
-def _solution(matrix: Any, right: Any, *, pivots: bool = False) -> Any:
-    n, m = right.shape
-    if not n or not m:
-        return ca.MX(n, m)
-    if n > SMALL:
-        return ca.solve(ca.densify(matrix), ca.densify(right), "qr", {"eps": SINGULAR})
-    A, B = ca.SX.sym("A", n, n), ca.SX.sym("B", n, m)
-    whole = ca.horzcat(A, B)
-    function = ca.Function("solve", [A, B], [_eliminated([whole[i, :] for i in range(n)], pivots=pivots)])
-    return function(matrix, right)
-
-
-def _eliminated(rows: list[Any], *, pivots: bool) -> Any:
-    """Return the solution from rows of ``[A B]``; exchanging neighbours in turn brings the largest pivot up."""
-    n = len(rows)
-    for j in range(n):
-        if pivots:
-            for i in range(j + 1, n):
-                larger = ca.fabs(rows[i][j]) > ca.fabs(rows[j][j])
-                choose = partial(ca.if_else, larger)
-                rows[j], rows[i] = choose(rows[i], rows[j]), choose(rows[j], rows[i])
-        for i in range(j + 1, n):
-            rows[i] = rows[i] - (rows[i][j] / rows[j][j]) * rows[j]
-    found: list[Any] = [None] * n
-    for j in reversed(range(n)):
-        rest = rows[j][n:]
-        for i in range(j + 1, n):
-            rest = rest - rows[j][i] * found[i]
-        found[j] = rest / rows[j][j]
-    return ca.vertcat(*found)

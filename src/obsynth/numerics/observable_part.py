@@ -13,8 +13,8 @@ import numpy as np
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.invariant_zeros import is_outside
+from obsynth.numerics.logarithmic_balance import LogBalance
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE
-from obsynth.numerics.scaling import LogBalance
 from obsynth.numerics.spectra import eigenvalues
 
 #: Fixed modes closer than this, relative to their size, are peeled off together, at their mean: a double one that

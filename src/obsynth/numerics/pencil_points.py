@@ -1,4 +1,4 @@
-"""Whether a tall pencil loses rank at given points, and the staircase (Van Dooren) of its infinite and singular parts.
+"""Whether a tall pencil loses rank at given points.
 
 In the Schur basis of the part on the range of E it is ``[T - z I; W]``, T triangular, few rows W: one Schur form, then
 a cheap QR (``tpqrt``) at each point and inverse iteration, in a tenth of the time of all singular values.
@@ -6,7 +6,6 @@ a cheap QR (``tpqrt``) at each point and inverse iteration, in a tenth of the ti
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -14,9 +13,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
+from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, rank_from
-from obsynth.numerics.scaling import EquilibratedPencil
 from obsynth.numerics.square_root_estimation import TPQRT_BLOCK
 
 #: Matrices with fewer columns are decomposed as a whole.
@@ -25,10 +23,8 @@ FEW_COLUMNS = 80
 #: Steps of inverse iteration: values that decide are smaller than the next by many digits, and each step squares that.
 NULL_DIRECTION_STEPS = 4
 
-
 #: Singular values, smallest first, right singular vectors as columns, and a bound on the largest value.
 Smallest: TypeAlias = tuple[FloatArray, NDArray[Any], float]
-
 
 #: Above this condition of its leading part the Schur basis is not orthonormal enough to judge the pencil in it.
 SAFE_BASIS_CONDITION = 1e5
@@ -44,9 +40,6 @@ ZERO_STEPS = 4
 
 #: A zero that moves further than this, relative to its size or one, is another one.
 ZERO_REACH = 1e-2
-
-
-_Svd: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def smallest_singular(matrix: NDArray[Any], count: int = 1) -> Smallest:
@@ -157,74 +150,3 @@ class PencilPoints:
             return triangle
         found, _, _, _ = ztpqrt(0, min(TPQRT_BLOCK, triangle.shape[0]), triangle, below, overwrite_a=1, overwrite_b=1)
         return np.triu(found)
-
-
-@dataclass(frozen=True, eq=False)
-class Deflation:
-    """A pencil without its infinite and right singular part, and the sizes of the steps taken."""
-
-    E: FloatArray
-    A: FloatArray
-    nullities: tuple[int, ...]
-    ranks: tuple[int, ...]
-    decisions: tuple[RankDecision, ...]
-
-
-def without_infinite_part(pencil: EquilibratedPencil) -> tuple[tuple[float, float], Deflation]:
-    """Deflate the infinite and right singular part; the norms of E and A, which decide its ranks, come first."""
-    first = full_svd(pencil.E)
-    scales = (float(np.max(first[1], initial=0.0)), largest_singular_value(pencil.A))
-    return scales, _deflate(pencil.E, pencil.A, scales, most_nullity=pencil.E.shape[1], first=first)
-
-
-def without_left_singular_part(right: Deflation, scales: tuple[float, float]) -> Deflation:
-    """Deflate what is left of the singular part."""
-    # E now has full column rank, so the ranks of E in the second pass follow from its shape.
-    surplus = right.E.shape[0] - right.E.shape[1]
-    return _deflate(right.E.T, right.A.T, scales, most_nullity=surplus)
-
-
-def _deflate(
-    E: FloatArray, A: FloatArray, scales: tuple[float, float], *, most_nullity: int, first: _Svd | None = None
-) -> Deflation:
-    """Deflate step by step; ``first`` is the singular value decomposition of E, where it is known."""
-    nullities: list[int] = []
-    ranks: list[int] = []
-    decisions: list[RankDecision] = []
-    while most_nullity > 0:
-        rows, columns = E.shape
-        if first is None and (columns > rows or not E.size):
-            first = full_svd(E)
-        # Most often nothing is left to deflate after the first step: bases are then not needed.
-        values = np.asarray(np.linalg.svd(E, compute_uv=False)) if first is None else first[1]
-        decision = rank_from(values, scale=scales[0], expected=columns)
-        # Rows were removed from a matrix of full column rank: this bounds the loss, whatever the tolerance says.
-        rank = max(decision.rank, columns - most_nullity)
-        if max(columns - rows, 0) < most_nullity:
-            decisions.append(decision)
-        if rank == columns:
-            break
-        right = (full_svd(E) if first is None else first)[2]
-        kernel, complement, first = right[rank:].T, right[:rank].T, None
-        left, values, _ = full_svd(A @ kernel)
-        decision = rank_from(values, scale=scales[1], expected=columns - rank)
-        decisions.append(decision)
-        rest = left[:, decision.rank :].T
-        E, A = rest @ E @ complement, rest @ A @ complement
-        nullities.append(columns - rank)
-        ranks.append(decision.rank)
-        most_nullity = decision.rank
-    return Deflation(E, A, tuple(nullities), tuple(ranks), tuple(decisions))
-
-
-def full_svd(matrix: FloatArray) -> _Svd:
-    """Return the full left basis, the singular values and the full right basis."""
-    if matrix.size == 0:
-        return np.eye(matrix.shape[0]), np.zeros(0), np.eye(matrix.shape[1])
-    left, values, right = np.linalg.svd(matrix)
-    return left, values, right
-
-
-def normal_rank_of(right: Deflation, left: Deflation) -> int:
-    """Return the rank of the pencil at almost every point, from both passes."""
-    return sum(right.ranks) + sum(left.ranks) + int(left.E.shape[0])

@@ -14,15 +14,10 @@ from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.lapack import eigenvalues
-from obsynth.numerics.pencil_points import (
-    Deflation,
-    PencilPoints,
-    normal_rank_of,
-    without_infinite_part,
-    without_left_singular_part,
-)
+from obsynth.numerics.pencil_points import PencilPoints
 from obsynth.numerics.ranks import CLUSTER_TOLERANCE, RANK_TOLERANCE, RankDecision
 from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.numerics.staircase import Deflation, normal_rank_of, without_infinite_part, without_left_singular_part
 
 #: From so many states on, a well-conditioned E is inverted: ordinary eigenvalues take a fraction of the time.
 STATES_FOR_INVERTED_E = 100

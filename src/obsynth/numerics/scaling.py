@@ -1,53 +1,17 @@
-"""Balancing by powers of two, exact in floating point; units by least squares on the logarithms of the entries.
-
-The unknowns only shift with the units of the data: up to the rounding of exponents, the result does not depend on them.
-"""
+"""Balancing by powers of two, exact in floating point."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray, read_only
 
 #: Sweeps of the balancing; each one must improve on the last, so few are ever used.
 MOST_SWEEPS = 10
-
-#: Makes the factors unique where one group of signals does not touch another; too small to move them.
-SMALL_RIDGE = 1e-9
-
-
-#: Makes the factors unique where nothing determines them; too small to move them elsewhere.
-RIDGE = 1e-11
-
-#: Rounding of the largest weight may be this share of the ridge: corrections of the solution then gain two digits each.
-ROUNDED_RIDGE = 1.0 / 64.0
-
-#: Weight of a wish in units of the ridge: it decides only what the entries leave open.
-WISH_WEIGHT = 1e3
-
-#: An entry this many bits below one has half a say: what is far below is coupling that hardly counts, or rounding.
-HALF_SAY = 10.0
-
-#: Corrections by exact residuals, each of which takes four or five digits of rounding away.
-RESIDUAL_CORRECTIONS = 3
-
-#: Whole exponents need no further correction once the last is below this share of the distance to where they change.
-SETTLED_SHARE = 1e-2
-
-#: Passes in which small entries lose their say.
-PASSES = 3
-
-#: Bits after the point of what parts of sums are split into: of a million parts below 2^10 the sum of the first has 46
-#: bits, and those of the others have 50.
-PART_BITS = (16, 46, 76)
-
-#: From so many on a positive definite matrix is factored as one, in a third of the time.
-MANY_UNKNOWNS = 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,26 +119,6 @@ def balance_system(
     return best
 
 
-def balance_by_least_squares(
-    E: FloatArray, A: FloatArray, inputs: Sequence[FloatArray] = (), outputs: Sequence[FloatArray] = ()
-) -> Scaling:
-    """Find power-of-two factors that bring all entries of a plant, on the whole, near one.
-
-    The squared logarithms of all nonzero entries are least; input columns are free. The result does not depend on
-    units. Source: R. C. Ward, *Balancing the generalized eigenvalue problem*, SIAM J. Sci. Stat. Comput. 2, 1981.
-    """
-    ne, nx = E.shape
-    b, c = np.hstack([np.zeros((ne, 0)), *inputs]), np.vstack([np.zeros((0, nx)), *outputs])
-    ends = [0, ne, ne + nx, ne + nx + len(c), ne + nx + len(c) + b.shape[1]]
-    equations, states, shown, entering = map(range, ends[:-1], ends[1:])
-    problem = LogBalance(ends[-1])
-    for matrix, rows, columns in ((E, equations, states), (A, equations, states), (c, shown, states)):
-        problem.add(matrix, rows, columns)
-    problem.add(b, equations, entering)
-    exponents = problem.solve(passes=0, ridge=SMALL_RIDGE, whole=True).astype(np.int64)
-    return Scaling(*(read_only(np.ldexp(1.0, exponents[part])) for part in (equations, states, shown)))
-
-
 def _scale_rows(e: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray, states: FloatArray) -> Scaling:
     own = _row_peaks(np.hstack([e, a]) * np.concatenate([states, states]))
     equations = np.where(own > 0.0, own, _row_peaks(b))
@@ -197,176 +141,3 @@ def _imbalance(peaks: FloatArray) -> float:
 
 def _row_peaks(matrix: FloatArray) -> FloatArray:
     return np.asarray(np.max(matrix, axis=1, initial=0.0))
-
-
-@dataclass(eq=False)
-class LogBalance:
-    """Minimise ``log2 abs(M[i, j]) + row[i] + column[j] + common`` over all nonzero entries of matrices."""
-
-    count: int
-    _terms: list[_Entries] = field(default_factory=list)
-    _wishes: list[tuple[int, float]] = field(default_factory=list)
-
-    def add(
-        self,
-        matrix: FloatArray,
-        rows: range,
-        columns: range,
-        *,
-        signs: tuple[int, int] = (1, 1),
-        common: int | None = None,
-        weight: float = 1.0,
-    ) -> None:
-        """Ask for entries of a matrix ``(m, n)`` near one."""
-        row, column = np.nonzero(matrix)
-        count = len(row)
-        self._terms.append(
-            _Entries(
-                self.count,
-                np.log2(np.abs(matrix[row, column])),
-                np.full(count, weight),
-                (rows.start + row, columns.start + column, np.full(count, self.count if common is None else common)),
-                (np.full(count, signs[0]), np.full(count, signs[1]), np.ones(count)),
-            )
-        )
-
-    def wish(self, unknown: int, exponent: float) -> None:
-        """Ask for a value where the entries leave the unknown open."""
-        self._wishes.append((unknown, exponent))
-
-    def solve(self, *, passes: int = PASSES, ridge: float = RIDGE, whole: bool = False) -> FloatArray:
-        """Return the exponents ``(count,)``, rounded to whole numbers where these are wanted."""
-        entries = _Entries.joined(self._terms, self.count)
-        weights = entries.weights
-        # Of hundreds of states with a dense E the weights are so large that their rounding would be the ridge.
-        largest = float(entries.diagonal(weights).max(initial=0.0))
-        ridge = max(ridge, largest * float(np.finfo(np.float64).eps) / ROUNDED_RIDGE)
-        solved, found = self._solved(entries, weights, ridge)
-        for _ in range(passes):
-            weights = entries.weights * entries.say(found)
-            solved, found = self._solved(entries, weights, ridge)
-        # What the entries leave open would be rounding over the ridge: of exact residuals nothing is left of it.
-        for _ in range(RESIDUAL_CORRECTIONS):
-            before, found = found, found + solved(self._missed(entries, weights, found, ridge))
-            if np.array_equal(before, found):
-                break
-            to_a_half = np.abs(np.abs(found - np.round(found)) - 0.5)
-            if whole and np.all(np.abs(found - before) <= SETTLED_SHARE * np.min(to_a_half, initial=1.0)):
-                break
-        return np.asarray(np.round(found) if whole else found, dtype=np.float64)
-
-    def _missed(self, entries: _Entries, weights: FloatArray, found: FloatArray, ridge: float) -> FloatArray:
-        """Return what is left of the normal equations."""
-        parts = _whole_parts(weights * entries.logarithms(found))
-        missed = -ridge * found - sum(map(entries.sums, parts[::-1]))
-        for unknown, exponent in self._wishes:
-            missed[unknown] += WISH_WEIGHT * ridge * (exponent - found[unknown])
-        return missed
-
-    def _solved(
-        self, entries: _Entries, weights: FloatArray, ridge: float
-    ) -> tuple[Callable[[FloatArray], FloatArray], FloatArray]:
-        """Return what solves the normal equations for a right side, and the solution."""
-        normal, right = entries.normal(weights), -entries.sums(weights * entries.sizes)
-        diagonal = np.einsum("ii->i", normal)
-        diagonal += ridge
-        for unknown, exponent in self._wishes:
-            diagonal[unknown] += WISH_WEIGHT * ridge
-            right[unknown] += WISH_WEIGHT * ridge * exponent
-        solved = _factored(normal)
-        return solved, solved(right)
-
-
-def _factored(matrix: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return what solves equations with a matrix ``(n, n)``, definite beyond rounding; what is given is lost."""
-    if not matrix.size:
-        return lambda right: right
-    matrix = np.asarray_chkfinite(matrix)
-    if len(matrix) >= MANY_UNKNOWNS:
-        # In the place of one half, from the other of which all is there again.
-        diagonal = matrix.diagonal().copy()
-        factor, failed = lapack.dpotrf(matrix.T, lower=1, clean=0, overwrite_a=1)
-        if not failed:
-            return lambda right: np.asarray(lapack.dpotrs(factor, right, lower=1)[0], dtype=np.float64)
-        below = np.tril(matrix, -1)
-        matrix = below + below.T
-        np.fill_diagonal(matrix, diagonal)
-    factors, pivots, failed = lapack.dgetrf(matrix)
-    if failed:
-        raise np.linalg.LinAlgError("Singular matrix")
-    return lambda right: np.asarray(lapack.dgetrs(factors, pivots, right)[0], dtype=np.float64)
-
-
-def _whole_parts(parts: FloatArray) -> list[FloatArray]:
-    """Return multiples of smaller and smaller powers of two whose sum is given, but for the last bits of small ones.
-
-    Sums of such multiples are exact: what enters two sums enters both with the same value."""
-    found = []
-    for bits in PART_BITS:
-        found.append(np.ldexp(np.rint(np.ldexp(parts, bits)), -bits))
-        parts = parts - found[-1]
-    return found
-
-
-@dataclass(frozen=True, eq=False)
-class _Entries:
-    """Logarithms and weights ``(k,)`` of entries, and the unknowns that scale them: places and signs, ``(k,)`` each.
-
-    Of row, of column and, where any has one, common; one place more than there are unknowns stands for none.  Sums add
-    up one entry after the other, so that they come out the same on every machine."""
-
-    count: int
-    sizes: FloatArray
-    weights: FloatArray
-    places: Sequence[NDArray[np.int64]]
-    signs: Sequence[FloatArray]
-
-    @classmethod
-    def joined(cls, terms: Sequence[_Entries], count: int) -> _Entries:
-        """Return the entries of all matrices, for so many unknowns."""
-        kinds = range(3 if any((term.places[2] < count).any() for term in terms) else 2)
-        return cls(
-            count,
-            np.concatenate([np.zeros(0), *(term.sizes for term in terms)]),
-            np.concatenate([np.zeros(0), *(term.weights for term in terms)]),
-            [np.concatenate([np.zeros(0, dtype=np.int64), *(term.places[k] for term in terms)]) for k in kinds],
-            [np.concatenate([np.zeros(0), *(term.signs[k] for term in terms)]) for k in kinds],
-        )
-
-    def logarithms(self, exponents: FloatArray) -> FloatArray:
-        """Return the logarithms of the scaled entries."""
-        found, known = self.sizes.copy(), np.append(exponents, 0.0)
-        for place, sign in zip(self.places, self.signs, strict=True):
-            found += sign * known[place]
-        return found
-
-    def say(self, exponents: FloatArray) -> FloatArray:
-        """Return the say of each entry: all of it above one, less the further it is below."""
-        return np.asarray(1.0 / (1.0 + (np.minimum(self.logarithms(exponents), 0.0) / HALF_SAY) ** 2))
-
-    def sums(self, parts: FloatArray) -> FloatArray:
-        """Return for each unknown the sum ``(count,)``, with signs, of what is given for the entries that it scales."""
-        found = np.zeros(self.count + 1)
-        for place, sign in zip(self.places, self.signs, strict=True):
-            found += np.bincount(place, sign * parts, len(found))
-        return found[:-1]
-
-    def diagonal(self, weights: FloatArray) -> FloatArray:
-        """Return for each unknown the weight ``(count,)`` of all entries that it scales."""
-        found = np.zeros(self.count + 1)
-        for place in self.places:
-            found += np.bincount(place, weights, len(found))
-        return found[:-1]
-
-    def normal(self, weights: FloatArray) -> FloatArray:
-        """Return the matrix ``(count, count)`` of the normal equations."""
-        count = self.count + 1
-        found = np.diag(np.append(self.diagonal(weights), 0.0))
-        scaled = list(zip(self.places, self.signs, strict=True))
-        for number, (place, sign) in enumerate(scaled):
-            for other, other_sign in scaled[:number]:
-                both = np.bincount(place * count + other, sign * other_sign * weights, count * count)
-                both = both.reshape(count, count)
-                found += both
-                found += both.T
-        return found[:-1, :-1]

@@ -29,7 +29,8 @@ from obsynth.numerics.expressions import (
     step_function,
 )
 from obsynth.numerics.libraries import imported
-from obsynth.plants.signal_names import Problems, checked_names, checked_units
+from obsynth.plants.checking import Problems, checked_units
+from obsynth.plants.signal_names import checked_names
 
 #: Names that mean something else in the language.
 RESERVED = frozenset({*NAMED_NUMBERS, *FUNCTIONS, *FUNCTIONS_OF_TWO, *DECIDING_WORDS, "der", "where"})

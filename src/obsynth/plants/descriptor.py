@@ -19,22 +19,18 @@ from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.quantities import in_unit
 from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse, same_matrix
-from obsynth.plants.dead_times import checked_delays, delays_in_words
-from obsynth.plants.signal_names import (
+from obsynth.plants.checking import (
     COUNTED_BY,
     Problems,
     any_matrix,
     checked_dt,
     checked_labels,
-    checked_names,
-    is_name_list,
     matrix_or_picks,
     picked_names,
-    plain_names,
-    require_picked,
-    rows_picking,
     signal_counts,
 )
+from obsynth.plants.dead_times import checked_delays, delays_in_words
+from obsynth.plants.signal_names import checked_names, is_name_list, plain_names, require_picked, rows_picking
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertainty_of
 
 #: Matrix, signal of its rows, signal of its columns.

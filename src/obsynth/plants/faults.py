@@ -16,8 +16,8 @@ import scipy
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, largest_singular_value, read_only
+from obsynth.numerics.logarithmic_balance import LogBalance
 from obsynth.numerics.ranks import decide_rank
-from obsynth.numerics.scaling import LogBalance
 from obsynth.plants.signal_names import index_of
 
 #: Distance, relative to the norm of a given matrix, below which computed eigenvalues count as one multiple eigenvalue:

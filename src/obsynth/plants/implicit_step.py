@@ -15,16 +15,8 @@ import numpy as np
 from obsynth.errors import SolverError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.newton import (
-    LARGEST_RESIDUAL,
-    LAST_STEP,
-    MOST_ITERATIONS,
-    SMALL,
-    NewtonResult,
-    equilibrated,
-    newton,
-    solved,
-)
+from obsynth.numerics.graph_equations import SMALL, equilibrated, solved
+from obsynth.numerics.newton import LARGEST_RESIDUAL, LAST_STEP, MOST_ITERATIONS, NewtonResult, newton
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.dae_functions import Compiled, DAEFunctions
 

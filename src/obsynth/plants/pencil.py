@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, read_only, remembered
-from obsynth.numerics.pencil_points import Deflation, normal_rank_of
 from obsynth.numerics.pencils import PencilStructure, is_regular, reduced, structure_of_reduced
+from obsynth.numerics.staircase import Deflation, normal_rank_of
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
 

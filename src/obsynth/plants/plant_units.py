@@ -12,8 +12,8 @@ from itertools import pairwise
 import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only, remembered
+from obsynth.numerics.logarithmic_balance import LogBalance
 from obsynth.numerics.ranks import RANK_TOLERANCE
-from obsynth.numerics.scaling import LogBalance
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem
 

@@ -14,7 +14,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_number, require_mapping, whole_number
 from obsynth.numerics.arrays import MAXIMUM_ENTRIES, FloatArray, as_given, as_matrix, read_only
 from obsynth.numerics.expressions import NAMED_NUMBERS, Expression, parse_expression
-from obsynth.plants.signal_names import Problems, any_matrix, checked_dt
+from obsynth.plants.checking import Problems, any_matrix, checked_dt
 
 #: The name of the time index in expressions.
 INDEX_NAME = "k"

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked
+from obsynth.plants.checking import Problems, checked_labels
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.sequences import (
     LAYOUT,
@@ -22,7 +23,7 @@ from obsynth.plants.sequences import (
     completed,
     positive_dt,
 )
-from obsynth.plants.signal_names import Problems, checked_labels, checked_names
+from obsynth.plants.signal_names import checked_names
 
 #: A matrix, a stack of matrices, a function of k, or rows whose entries may be texts.
 MatrixLike: TypeAlias = ArrayLike | Callable[[int], ArrayLike] | Sequence[Sequence[float | str]] | None

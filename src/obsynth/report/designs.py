@@ -20,8 +20,8 @@ from obsynth.methods.automatic import SETTLING_SAMPLES
 from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, settling_time
 from obsynth.methods.registry import REGISTRY, method_class
-from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.sampled import sample_observer
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.dae import DAEModel

@@ -19,7 +19,7 @@ from obsynth.files.tables import html_table
 from obsynth.methods.fault_figures import FaultFigures
 from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.registry import REGISTRY, method_class
-from obsynth.observers.linear.derived import SETTLED_TO, transient
+from obsynth.observers.linear.modes import SETTLED_TO, transient
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.dae import DAEModel

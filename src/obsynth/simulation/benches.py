@@ -13,8 +13,8 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver, split_rows
+from obsynth.observers.linear.sampled import sample_observer
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.observers.recursive.observer import RecursiveObserver

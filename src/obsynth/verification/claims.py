@@ -14,7 +14,7 @@ import numpy as np
 
 from obsynth.numerics.arguments import is_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.derived import unaveraged
+from obsynth.observers.linear.means import unaveraged
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.recovery import StateRecovery
 from obsynth.proofs.covariances import certain_noise_covariance

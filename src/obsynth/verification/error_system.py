@@ -26,8 +26,9 @@ import flint
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, Made, remembered
-from obsynth.numerics.scaling import Scaling, balance_by_least_squares
-from obsynth.observers.linear.derived import poles_of
+from obsynth.numerics.logarithmic_balance import balance_by_least_squares
+from obsynth.numerics.scaling import Scaling
+from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, rounded_up

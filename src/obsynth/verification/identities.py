@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, remembered
-from obsynth.numerics.scaling import Scaling, balance_by_least_squares
+from obsynth.numerics.logarithmic_balance import balance_by_least_squares
+from obsynth.numerics.scaling import Scaling
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, upper_bound_check
 from obsynth.verification.error_system import ErrorModel, natural_scaling

@@ -20,7 +20,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.spectra import decay_rates, eigenvalues
-from obsynth.observers.linear.derived import poles_of
+from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball

@@ -13,10 +13,11 @@ from functools import cached_property
 import numpy as np
 
 from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, remembered
-from obsynth.numerics.modal_response import MOST_ENTRIES_AT_ONCE, STATES_FOR_MODES, ModalSolves, pencils_at, resolved
+from obsynth.numerics.modal_response import MOST_ENTRIES_AT_ONCE, pencils_at, resolved
+from obsynth.numerics.modal_solves import STATES_FOR_MODES, ModalSolves
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.numerics.spectra import boundary_points
-from obsynth.observers.linear.derived import modes_of, poles_of
+from obsynth.observers.linear.modes import modes_of, poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.pencil import structure_of
 from obsynth.proofs.balls import rounded_up

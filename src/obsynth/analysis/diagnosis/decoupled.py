@@ -12,8 +12,8 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.libraries import on_one_thread_if_small
-from obsynth.numerics.pencil_points import full_svd
 from obsynth.numerics.ranks import RankDecision, product_but_rounding, rank_from
+from obsynth.numerics.staircase import full_svd
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.delays import linear_plant
 from obsynth.plants.transformations.recovery import Transformation

@@ -15,8 +15,8 @@ from flint import fmpq, fmpq_mat
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
-from obsynth.numerics.pencil_points import full_svd
 from obsynth.numerics.ranks import RANK_TOLERANCE, TRACE_TOLERANCE
+from obsynth.numerics.staircase import full_svd
 from obsynth.proofs.exact_arithmetic import blocks, picked_columns, zeros_matrix
 
 

@@ -13,9 +13,10 @@ import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.lapack import LAPACK_BLOCK, pencil_eigenvalues
-from obsynth.numerics.pencil_points import full_svd
+from obsynth.numerics.logarithmic_balance import LogBalance
 from obsynth.numerics.ranks import RankDecision, rank_from
-from obsynth.numerics.scaling import LogBalance, equilibrate_pencil, power_of_two_below
+from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
+from obsynth.numerics.staircase import full_svd
 
 #: Pencils of more columns are of plants of many parts, whose couplings outnumber what each part is made of.
 BY_LEAST_SQUARES = 40

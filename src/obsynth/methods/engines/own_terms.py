@@ -36,7 +36,7 @@ from obsynth.methods.ui_pi_observer.assembly import synthesis_from_gains as ui_p
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane, sector
-from obsynth.observers.linear.derived import averaged
+from obsynth.observers.linear.means import averaged
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import exosystem

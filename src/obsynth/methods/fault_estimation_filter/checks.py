@@ -16,10 +16,11 @@ from obsynth.methods.fault_estimation_filter.checks_over_region import checks_ov
 from obsynth.methods.fault_estimation_filter.printed_gains import gain_rows, gains_fit, printed_allowances
 from obsynth.methods.fault_estimation_filter.whole_transfer import Equations, fault_rows
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.logarithmic_balance import balance_by_least_squares
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import highest_gain_found, hinf_norm
-from obsynth.numerics.scaling import Scaling, balance_by_least_squares
-from obsynth.observers.linear.derived import modes_of
+from obsynth.numerics.scaling import Scaling
+from obsynth.observers.linear.modes import modes_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem

@@ -10,7 +10,8 @@ from obsynth.analysis.existence.over_region import EFFECTIVENESS_SHARES, conditi
 from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.whole_transfer import fault_rows
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.scaling import Scaling, balance_by_least_squares
+from obsynth.numerics.logarithmic_balance import balance_by_least_squares
+from obsynth.numerics.scaling import Scaling
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.descriptor import DescriptorSystem

@@ -27,7 +27,7 @@ from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
 from obsynth.numerics.arguments import is_whole, require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import decide_rank
-from obsynth.observers.linear.derived import poles_of
+from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate

@@ -43,7 +43,7 @@ from obsynth.methods.fault_estimation_filter.search import NOMINAL_GAIN, FoundGa
 from obsynth.methods.fault_estimation_filter.small_gains import PrintedInequality
 from obsynth.methods.method import Synthesis
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.observers.linear.derived import averaged
+from obsynth.observers.linear.means import averaged
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem

@@ -20,7 +20,7 @@ from obsynth.numerics.modal_response import pencils_at
 from obsynth.numerics.ranks import RANK_TOLERANCE, numerical_rank
 from obsynth.numerics.scaling import balancing_factors
 from obsynth.numerics.spectra import boundary_points
-from obsynth.observers.linear.derived import frequency_grid
+from obsynth.observers.linear.modes import frequency_grid
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits

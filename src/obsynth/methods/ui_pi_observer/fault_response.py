@@ -20,7 +20,7 @@ from obsynth.numerics.invariant_zeros import is_outside, system_pencil, system_z
 from obsynth.numerics.norms import balanced_realisation, response
 from obsynth.numerics.ranks import NEGLIGIBLE_INPUT
 from obsynth.numerics.spectra import boundary_points, decay_rates
-from obsynth.observers.linear.derived import frequency_grid, is_stable, poles_of
+from obsynth.observers.linear.modes import frequency_grid, is_stable, poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import balanced_transition

@@ -18,7 +18,7 @@ from obsynth.numerics.spectra import (
     farthest_pole,
     mean_miss,
 )
-from obsynth.observers.linear.derived import poles_of
+from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem

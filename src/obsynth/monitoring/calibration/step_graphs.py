@@ -18,7 +18,7 @@ from obsynth.files.outputs import working_folder
 from obsynth.monitoring.calibration.plants import CalibrationPlant
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import SMALLEST, FloatArray
-from obsynth.numerics.newton import largest_entries
+from obsynth.numerics.graph_equations import largest_entries
 from obsynth.observers.nonlinear.c_code import compiler, shared_library
 
 #: Optimisation costs more than it gains on straight code of thousands of lines.

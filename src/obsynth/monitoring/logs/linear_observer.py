@@ -19,13 +19,13 @@ from obsynth.monitoring.thresholds.monitor import LinearSample
 from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
-from obsynth.observers.linear.derived import transient
 from obsynth.observers.linear.missing_samples import (
     GAP_LEFT_SHARE,
     KEPT_INTERVALS,
     LEAST_SHOWN,
     MissingSamples,
 )
+from obsynth.observers.linear.modes import transient
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.taken_inputs import no_inputs, over_samples, taken_inputs

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.monitor import Evidence, LinearSample
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.derived import SETTLING_SLACK, checked_warm_up
+from obsynth.observers.linear.modes import SETTLING_SLACK, checked_warm_up
 from obsynth.observers.running import state_as_data, state_from_data
 from obsynth.plants.descriptor import DescriptorSystem
 

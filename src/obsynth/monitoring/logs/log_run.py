@@ -26,7 +26,7 @@ from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.monitor import LinearSample, Monitor, Sample
 from obsynth.numerics.arguments import is_finite_number, is_number, real_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.derived import SETTLED_TO, transient
+from obsynth.observers.linear.modes import SETTLED_TO, transient
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.running import BY_COLUMNS
 from obsynth.plants.descriptor import DescriptorSystem

@@ -23,8 +23,8 @@ from obsynth.monitoring.thresholds.rules import NormRule
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
-from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.sampled import sample_observer
 from obsynth.plants.constants import ConstantsBox, shown
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.signal_names import require_known

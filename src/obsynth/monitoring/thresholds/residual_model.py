@@ -19,8 +19,8 @@ from obsynth.monitoring.thresholds.between_samples import IntersampleErrorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.norms import output_covariance
-from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.sampled import sample_observer
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.sampling import discretise
 from obsynth.results.design import ObserverDesign

@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
-from obsynth.observers.linear.derived import noise_variances
+from obsynth.observers.linear.modes import noise_variances
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.numerics import lazy_casadi as ca
-from obsynth.numerics.newton import definite_solved
+from obsynth.numerics.graph_equations import definite_solved
 from obsynth.observers.nonlinear.settings import DAESettings, Layout, memory_layout, row_layout
 from obsynth.plants.dae_functions import DAEFunctions
 from obsynth.plants.implicit_step import StepGraph, input_effect, step_graph

@@ -1,4 +1,4 @@
-"""What a transformation did, and the map back to the states of the plant it started from; faults as states."""
+"""Faults that act on the outputs as algebraic states of the plant."""
 
 from __future__ import annotations
 

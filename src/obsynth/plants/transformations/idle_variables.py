@@ -17,8 +17,9 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencil_points import GENERIC_POINTS
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil
-from obsynth.numerics.sparse import CoarseStructure, Indices, blocks_of, coarse_structure, csr, unmatched_instead
+from obsynth.numerics.sparse import Indices, csr
 from obsynth.numerics.sparse_factor import SparseFactor, scales_by_all_entries, sparse_factor
+from obsynth.numerics.sparse_structure import CoarseStructure, blocks_of, coarse_structure, unmatched_instead
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.signal_names import listed
 from obsynth.plants.transformations.recovery import with_states

@@ -12,8 +12,9 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencil_points import GENERIC_POINTS
 from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, numerical_rank, product_but_rounding
 from obsynth.numerics.scaling import power_of_two_below
-from obsynth.numerics.sparse import coarse_structure, components_of, csr, dense, selection
+from obsynth.numerics.sparse import csr, dense, selection
 from obsynth.numerics.sparse_factor import SolutionBounds, scales_by_all_entries, sparse_factor
+from obsynth.numerics.sparse_structure import coarse_structure, components_of
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.signal_names import listed
 from obsynth.plants.transformations.idle_variables import (

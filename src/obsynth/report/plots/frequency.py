@@ -15,7 +15,7 @@ from obsynth.numerics.modal_response import resolved
 from obsynth.numerics.norms import response
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.spectra import boundary_points
-from obsynth.observers.linear.derived import GRID_REACH, frequency_grid
+from obsynth.observers.linear.modes import GRID_REACH, frequency_grid
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import regularity_of

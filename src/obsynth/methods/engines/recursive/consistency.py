@@ -11,8 +11,8 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.logarithmic_balance import LogBalance
 from obsynth.numerics.ranks import KNOWN_SHARE, ROUNDED_BESIDE
-from obsynth.numerics.scaling import LogBalance
 from obsynth.observers.recursive.gain_schedule import gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.step_model import StepMatrices

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from obsynth.analysis.existence.recursive import SOURCE
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.scaling import balance_by_least_squares
+from obsynth.numerics.logarithmic_balance import balance_by_least_squares
 from obsynth.observers.recursive.gain_schedule import Gains, GainStep, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.step_model import StepMatrices
