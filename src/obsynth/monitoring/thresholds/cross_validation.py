@@ -73,7 +73,7 @@ def held_out(x: FloatArray, statistics: Statistics, scores: Scores | None, logs:
     """Return the statistics of rows ``(n, m)`` with the autoregression and the centres of the other logs, or of the
     other parts of one log; ``scores``: what these rows say of faults."""
     n = len(x)
-    ends = np.linspace(0, n, PARTS_OF_ONE_LOG + 1).astype(int).tolist()
+    ends = np.linspace(0, n, PARTS_OF_ONE_LOG + 1).astype(np.int64).tolist()
     parts = tuple(logs) if len(logs) > 1 else tuple(slice(a, b) for a, b in pairwise(ends))
     found = np.zeros((len(statistics.names), n))
     for part in parts:
