@@ -14,7 +14,7 @@ from scipy.optimize import linprog
 import obsynth
 from obsynth.methods.guaranteed_test import bank, regions
 from obsynth.methods.guaranteed_test.bank import _smallest_groups, blind_to
-from obsynth.methods.guaranteed_test.exact import Programmes, known_rows, lacking
+from obsynth.methods.guaranteed_test.exact import Programmes, known_rows
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
 from obsynth.methods.guaranteed_test.proofs import (
@@ -93,7 +93,7 @@ def test_rows_are_lost_where_a_missing_sample_changes_them(seed: int, singular: 
 def test_no_test_sees_a_lost_row(seed: int) -> None:
     window = window_of(design_of(seed))
     rows = np.array([1, window.outputs_at + 3])
-    less = lacking(window, rows)
+    less = window.without(rows)
     found = Programmes(less, 0)
     programme, _, _ = found._programme(np.zeros((5, 2)), np.zeros((5, 2)))
     assert programme.test is not None

@@ -63,7 +63,7 @@ def structure_of(
     faults: bool = False,
     states: bool = False,
 ) -> ErrorStructure:
-    """Return the error system of a discrete design over its box."""
+    """Return the error system of a discrete design over its box; ``bounds (nd,)`` of the disturbances of the plant."""
     plant, observer = design.linear
     if not plant.is_discrete:
         raise PreconditionError(
@@ -71,7 +71,7 @@ def structure_of(
             "(transform: sample_time, or obsynth.discretise), or give online_monitor the sample time of its data.",
             condition="discrete time",
         )
-    sizes = np.zeros(plant.nd) if bounds is None else bounds
+    sizes = affine.disturbance_bounds(np.zeros(plant.nd) if bounds is None else bounds)
     return error_structure(
         observer,
         affine,

@@ -174,6 +174,10 @@ def _fraction(text: str) -> Fraction:
     return Fraction(int(found.p), int(found.q))
 
 
+#: Larger plants as written are not stored with a design: their elimination is checked where it is done.
+MOST_STORED_STATES = 500
+
+
 def note_source(source: DescriptorSystem, new: DescriptorSystem, *, sample_time: float | None = None) -> None:
     """Note on a plant that elimination or sampling has just made which plant, as written, it comes from."""
     if new is source:

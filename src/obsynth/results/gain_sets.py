@@ -17,7 +17,7 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, json_data, path_of, read_json
 from obsynth.numerics.arguments import arguments_checked, is_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem, note_source
 from obsynth.plants.transformations.recovery import StateRecovery
 from obsynth.plants.transformations.recovery_operator import RecoveryOperator
 from obsynth.results.design import Certificate, ObserverDesign
@@ -208,6 +208,10 @@ def _design_from(data: dict[str, Any]) -> ObserverDesign:
         raise SpecError(f"A design of the kind {data['kind']!r} is unknown to this obsynth.", path="kind")
     kind, observer = types_of(data.get("kind"))
     plant, recovery = _made("plant", kind, **data["plant"]), data["recovery"]
+    source = None if data.get("source") is None else _made("source", PlantSource.from_dict, data["source"])
+    if source is not None and isinstance(plant, DescriptorSystem):
+        # What a disturbance may do between samples follows from the plant as written; `verify` compares both.
+        note_source(source.plant, plant, sample_time=source.sample_time)
     return ObserverDesign(
         name=data["name"],
         method=data["method"],
@@ -220,7 +224,7 @@ def _design_from(data: dict[str, Any]) -> ObserverDesign:
         notes=tuple(data["notes"]),
         recovery=None if recovery is None else _made("recovery", _recovery_from, plant, recovery),
         report=_made("report", VerificationReport.from_dict, data["report"]),
-        source=None if data.get("source") is None else _made("source", PlantSource.from_dict, data["source"]),
+        source=source,
         input_delay=data.get("input_delay", 0),
     )
 

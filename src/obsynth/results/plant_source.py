@@ -10,14 +10,11 @@ from typing import Any
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import MOST_STORED_STATES, DescriptorSystem
 from obsynth.plants.transformations.delays import absorb_delays
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.plants.transformations.recovery import Transformation
 from obsynth.plants.transformations.sampling import discretise
-
-#: Larger plants are not stored: their elimination is checked where it is done.
-MOST_STORED_STATES = 500
 
 
 @dataclass(frozen=True, eq=False)

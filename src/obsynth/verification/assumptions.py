@@ -14,6 +14,8 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import MOST_LISTED, ConstantsBox, deviations_told, shown
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.moving_disturbances import continuous_behind
+from obsynth.plants.uncertainty import SAMPLED
 from obsynth.results.gain_set_writing import digest_of, plain
 
 
@@ -27,6 +29,25 @@ class Assumptions:
     initial_set: Mapping[str, Any] | None = None
     state_bounds: Mapping[str, Any] | None = None
     initial_error: float | None = None
+    #: ``any``: disturbances move within their bounds between samples too; ``held``: they do not.
+    disturbance: str = "any"
+
+    @property
+    def moves(self) -> bool:
+        """Whether disturbances are taken to move between the samples of a plant whose continuous one is known."""
+        uncertain = self.plant.uncertainty
+        sampled = uncertain is not None and any(kind == SAMPLED for kind, _ in uncertain.steps)
+        known = self.plant.dt > 0.0 and self.plant.nd > 0 and (sampled or continuous_behind(self.plant) is not None)
+        return self.disturbance == "any" and known
+
+    @property
+    def movement(self) -> str:
+        """What is assumed of disturbances between samples, to be added to a sentence; empty where there are none."""
+        if not self.plant.dt > 0.0 or not np.any(self.bounds[np.isfinite(self.bounds)]):
+            return ""
+        if self.moves:
+            return ", and any course of disturbances within their bounds, between samples too"
+        return ", and disturbances that are held between samples"
 
     @property
     def box(self) -> ConstantsBox | None:
@@ -37,6 +58,7 @@ class Assumptions:
     def as_dict(self) -> dict[str, Any]:
         """Return everything that is assumed as plain data."""
         return {
+            "disturbances between samples": "any" if self.moves else "held",
             "disturbances": dict(zip(self.plant.disturbance_names, map(float, self.bounds), strict=True)),
             "noise": float(self.noise_bound) if self.plant.nw else None,
             "start": None if self.initial_set is None else _listed(self.initial_set),

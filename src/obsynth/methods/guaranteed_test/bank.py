@@ -96,7 +96,7 @@ def tests_of(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]) -
     for fault, group in enumerate(groups_of(design)):
         own = blind_to(asked, plant, fault, group)
         window = window_as_designed(plant, own)
-        cut = {"witness": len(window.bar), "witness_radius": len(window.bar)}
+        cut = {"witness": len(window.inner.bar), "witness_radius": len(window.inner.bar)}
         matrices = {
             name: certificate.matrices[name][fault][: cut.get(name)] for name in BY_TEST if name in certificate.matrices
         }
@@ -232,9 +232,12 @@ def _pairs(design: ObserverDesign, asked: TestOptions) -> Iterator[Check]:
         else:
             window = window_as_designed(plant, own)
             test = Repaired(shipped[PAIR_MULTIPLIERS][place], shipped[PAIR_RADIUS][place])
-            exact = repaired_multipliers(window, test.values, refine=False, exact_zero=size == 0.0, among=test.radius)
+            zero, promised = size == 0.0, window.outer
+            exact = repaired_multipliers(
+                promised if zero else window, test.values, refine=False, exact_zero=zero, among=test.radius
+            )
             holds = exact is not None and bool(np.all(exact.radius <= test.radius))
-            holds = holds and proved_threshold(window, test, exact_zero=size == 0.0) <= size
+            holds = holds and proved_threshold(promised, test, exact_zero=zero) <= size
         if not holds:
             wrong.append(f"{plant.fault_names[one]} insensitive to {plant.fault_names[other]}")
     yield lower_bound_check(

@@ -29,7 +29,7 @@ from obsynth.methods.guaranteed_test.proofs import (
 )
 from obsynth.methods.guaranteed_test.regions import remainder_check, while_inside
 from obsynth.methods.guaranteed_test.tolerant import MEAN_ROOM, mean_over_record, part_beside
-from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.methods.guaranteed_test.windows import Window, disturbances_in_words
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.window.observer import WindowObserver
@@ -133,7 +133,7 @@ def _what_does_not_fit(
 ) -> list[str]:
     """Return the names of matrices that are missing, or are not of the shape and sign of what they stand for."""
     count, windows, plant = len(programmes.windows), programmes.windows, programmes.windows[0].model.plant
-    rows, columns = max(window.rows for window in windows), sorted(len(window.bar) for window in windows)
+    rows, columns = max(window.rows for window in windows), sorted(len(window.inner.bar) for window in windows)
     least = max((shipped[name].shape[-1] for name in ("witness", "witness_radius") if name in shipped), default=1)
     shapes = {name: (count, rows) for name in ("multipliers", "multiplier_radius")}
     shapes |= {"rounding": (count, plant.nu + plant.ny), "programmes": (len(programmes.of_row), 1)}
@@ -184,8 +184,9 @@ def _judged(
     proved passes its own, the threshold itself, and the rounding error beside the shipped one."""
     claimed = float(shipped["thresholds"][k, 0])
     zero = claimed == 0.0
-    exact = repaired_multipliers(window, test.values, refine=False, exact_zero=zero, among=test.radius)
-    found = proved_threshold(window, test, exact_zero=zero)
+    seen = window.outer if zero else window
+    exact = repaired_multipliers(seen, test.values, refine=False, exact_zero=zero, among=test.radius)
+    found = proved_threshold(window.outer, test, exact_zero=zero)
     over = 0.0 if found <= claimed else found / claimed if claimed > 0.0 else np.inf
     sizes = rounding_of(window, test.values, test.radius)
     share = sizes / np.maximum(shipped["rounding"][k], np.finfo(float).tiny)
@@ -226,7 +227,7 @@ def _of_the_tests(
     threshold = float(claims.get("threshold", np.nan))
     yield upper_bound_check(
         "threshold",
-        f"without the fault the residual never passes this{while_inside(design)}"
+        f"without the fault the residual never passes this{while_inside(design)}{_moving(programmes.windows[0])}"
         if constant
         else "no row has a threshold above this",
         largest,
@@ -251,6 +252,12 @@ def _of_the_tests(
         source=SOURCE,
         kind="computed",
     )
+
+
+def _moving(window: Window) -> str:
+    """Return what the threshold assumes of disturbances beside their bounds, to be added to its row."""
+    words = disturbances_in_words(window)
+    return f", for {words}" if words else ""
 
 
 def _of_what_runs(
@@ -340,6 +347,7 @@ def _proved_witness(
 ) -> tuple[float, float]:
     """Return how far an exact point is away beside what is shipped, and the size that the witness proves; NaN for
     less than what is shipped as the row's own.  Of a test alone the claim itself is below."""
+    window = window.inner
     columns, size = len(window.bar), float(shipped["leasts"][k, 0])
     if "witness" not in shipped or shipped["witness"].shape[1] < columns:
         return np.nan, np.nan

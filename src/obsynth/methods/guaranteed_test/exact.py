@@ -33,21 +33,6 @@ LOOSE = 1e-7
 TIMES_OF_A_RAY = 1e3
 
 
-def lacking(window: Window, rows: np.ndarray) -> Window:
-    """Return a window some rows of which say nothing: each has a free column of its own, which no test may see."""
-    columns = len(window.bar)
-    return replace(
-        window,
-        labels=(*window.labels, *(("missing", None, int(row)) for row in rows)),
-        bar=np.append(window.bar, np.full(len(rows), np.inf)),
-        group=np.append(window.group, np.full(len(rows), -1)),
-        i=np.append(window.i, rows),
-        j=np.append(window.j, columns + np.arange(len(rows))),
-        value=np.append(window.value, np.ones(len(rows))),
-        times=np.append(window.times, np.ones(len(rows), dtype=np.int64)),
-    )
-
-
 def known_rows(window: Window, y: FloatArray, u: FloatArray) -> tuple[FloatArray, np.ndarray]:
     """Return the right sides of a window, zero where a missing sample (NaN) enters, and the numbers of those rows."""
     plant, at = window.plant, window.outputs_at
@@ -89,7 +74,7 @@ class Programmes:
         if key not in self._kept:
             if len(self._kept) == KEPT_PATTERNS:
                 del self._kept[next(iter(self._kept))]
-            self._kept[key] = _Programme(lacking(self.window, lost) if lost.size else self.window)
+            self._kept[key] = _Programme(self.window.without(lost) if lost.size else self.window)
         known = np.nan_to_num(np.abs(np.hstack([u, outputs])))
         return self._kept[key], right, known.max(axis=0, initial=0.0)
 
@@ -128,7 +113,10 @@ class _Programme:
         matrix = window.matrix
         prescribed = np.flatnonzero(window.free | (np.arange(len(window.bar)) == 0))
         rows, _ = window.scales
-        self.prescribed, self.bounded = matrix[:, prescribed].T.tocsr(), matrix[:, window.bounded].T.tocsr()
+        # The programme is about disturbances that rest in pieces of a sample, what is proved about every one.
+        outer = window.outer
+        self.prescribed, self.bounded = matrix[:, prescribed].T.tocsr(), outer.matrix[:, outer.bounded].T.tocsr()
+        self.bars = outer.bar[outer.bounded]
         self.prescribed_sizes, self.bounded_sizes = abs(self.prescribed), abs(self.bounded)
         self.wanted = np.eye(1, len(prescribed)).ravel()
         # Entries that are products with a whole number have been rounded once.
@@ -179,7 +167,7 @@ class _Programme:
         """Return multipliers with the distance to exact ones, and what bounds can do to these."""
         if self.square is None or not self.square.contraction < 1.0:
             found = repaired_multipliers(self.window, multipliers, refine=True)
-            return None if found is None else (found, proved_threshold(self.window, found))
+            return None if found is None else (found, proved_threshold(self.window.outer, found))
         values = np.array(multipliers)
         values[self.square.chosen] += self.square.step(self.wanted - self.prescribed @ values)
         left = np.abs(self.wanted - self.prescribed @ values)
@@ -188,7 +176,7 @@ class _Programme:
         radius[self.square.chosen] = self.square.bounded_step(left)
         sizes = self.bounded_sizes @ rounded_up(self.share * np.abs(values) + radius, 2)
         seen = np.abs(self.bounded @ values) + rounded_up(sizes, self.window.rows)
-        total = float(rounded_up(self.window.bar[self.window.bounded] @ seen, len(seen) + 4))
+        total = float(rounded_up(self.bars @ seen, len(seen) + 4))
         return (Repaired(values, radius), total) if np.isfinite(total) else None
 
     def end(self, right: FloatArray, largest: FloatArray, sign: float) -> float:

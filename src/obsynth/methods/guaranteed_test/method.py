@@ -62,10 +62,13 @@ class GuaranteedTestMethod(TestOptions, Method):
     noise_bound : float or mapping of str to float or [low, high]
         Deviations that no component of the stated noise exceeds; or, by output, the bound or the interval of its noise
         (plants that change with k: always by output).
-    disturbance : {"jump", "held", "rate"}, optional
-        Disturbances change at will from sample to sample, not at all over the window, or by ``disturbance_rate``.
+    disturbance : {"any", "jump", "held", "rate"}, optional
+        How disturbances move within their bounds.  ``any``: as they like, between the samples of a plant that was
+        sampled from a continuous one too; ``jump``: at will from sample to sample, held in between; ``held``: not at
+        all over the window; ``rate``: by ``disturbance_rate``.  Whatever is not ``any`` is an assumption, which every
+        sentence repeats.  Of a plant that is given in discrete time ``any`` is ``jump``.
     disturbance_rate : float or mapping of str to float, optional
-        Largest change of each disturbance from sample to sample.
+        Largest change of each disturbance within the time of a sample.
     fault_rate : float, optional
         Largest change of the fault from sample to sample.
     state_bounds, initial_bounds : mapping of str to float, optional

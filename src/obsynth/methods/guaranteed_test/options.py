@@ -22,7 +22,7 @@ class TestOptions:
     after: Annotated[int, Ge(1), Le(1000)] | None = None
     disturbance_bounds: Annotated[Any, WrittenAs("named bounds")] = None
     noise_bound: Annotated[Any, WrittenAs("named bounds")] = None
-    disturbance: Literal["jump", "held", "rate"] = "jump"
+    disturbance: Literal["any", "jump", "held", "rate"] = "any"
     disturbance_rate: Annotated[Any, WrittenAs("named bounds")] = None
     fault_rate: Positive | None = None
     state_bounds: Annotated[Any, WrittenAs("named bounds")] = None

@@ -28,6 +28,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.moving_disturbances import moving_columns
 from obsynth.proofs.exact_pencils import ExactPencil
 
 #: What each course covers, and what not.
@@ -330,7 +331,21 @@ def bounds_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Test
         noise = by_name(asked.noise_bound, plant.noise_names, "noise_bound", every=False)
     always = by_name(asked.state_bounds, plant.state_names, "state_bounds", every=False, missing=np.inf)
     at_first = by_name(asked.initial_bounds, plant.state_names, "initial_bounds", every=False, missing=np.inf)
-    return Bounds(disturbance, state, output, noise, always, at_first, disturbance_middle, middle)
+    found = Bounds(disturbance, state, output, noise, always, at_first, disturbance_middle, middle)
+    return _between_samples(plant, asked, found) if isinstance(plant, DescriptorSystem) else found
+
+
+def _between_samples(plant: DescriptorSystem, asked: TestOptions, bounds: Bounds) -> Bounds:
+    """Return bounds with what disturbances do between the samples of a plant whose continuous one is known."""
+    moving = moving_columns(plant) if asked.disturbance in ("any", "rate") and bounds.disturbance.any() else None
+    if moving is None:
+        return bounds
+    sizes = bounds.disturbance
+    if asked.disturbance == "rate":
+        # Beside its value at the sample before a disturbance has changed by no more than its rate.
+        rates = by_name(asked.disturbance_rate, plant.disturbance_names, "disturbance_rate", every=True)
+        sizes = np.minimum(rates, 2.0 * sizes)
+    return replace(bounds, moving=moving, moving_bounds=sizes)
 
 
 def between(given: Any, names: tuple[str, ...], option: str, *, every: bool) -> tuple[FloatArray, FloatArray]:

@@ -198,7 +198,8 @@ class GuaranteedTest(ObserverDesign):
         point = self.certificate.matrices.get("witness")
         if point is None:
             return {}
-        return courses_of(window_as_designed(self.linear[0], GuaranteedTestMethod.of(self.options)), point.ravel())
+        window = window_as_designed(self.linear[0], GuaranteedTestMethod.of(self.options))
+        return courses_of(window.inner, point.ravel())
 
     def slack(self, y: FloatArray, u: FloatArray | None = None) -> FloatArray:
         """Return what rounding may add to each row of a run ``(steps,)``, to be added to the threshold.

@@ -38,6 +38,7 @@ from obsynth.methods.guaranteed_test.tolerant import (
     Beside,
     mean_over_record,
     noisy_as_bounded,
+    over_the_box,
     thresholds_over_record,
     with_tolerances,
 )
@@ -47,7 +48,6 @@ from obsynth.methods.tracking import tracking_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.plants.transformations.uncertain_plant import affine_plant
 from obsynth.results.design import Certificate
 from obsynth.simulation.linear import scenario_runs, scenario_stepper
 from obsynth.simulation.scenario import Scenario
@@ -55,6 +55,9 @@ from obsynth.verification.over_tolerances.error_structure import error_structure
 
 #: A threshold below this share of what all bounds could do is tried as an exact zero.
 ZERO_THRESHOLD = 1e-9
+
+#: Another machine's columns of moving disturbances differ by rounding: a factor.
+COLUMN_ROOM = 1.0 + 1e-9
 
 #: The table of samples against threshold in a certificate.
 TRADE_OFF = "trade_off"
@@ -136,7 +139,7 @@ def _observer_beside(
         )
     progress("designing the observer of the state beside the test")
     own = design(plant, BESIDE)
-    affine = affine_plant(plant)
+    affine = over_the_box(plant, asked.disturbance)
     tracking = tracking_of(own, affine)
     observer = own.linear[1]
     quiet = scenario.replace(faults={}, sensors={}, horizon=min(scenario.horizon, MOST_COMPARED_SAMPLES * plant.dt))
@@ -149,7 +152,8 @@ def _observer_beside(
     problem = problem_of(plant, asked)
     noisy = noisy_as_bounded(problem.window(problem.shortest + 1))
     bounded = replace(affine, plant=noisy)
-    structure = error_structure(observer, bounded, tracking, problem.bounds.disturbance, 1.0, states=True)
+    sizes = affine.disturbance_bounds(problem.bounds.disturbance)
+    structure = error_structure(observer, bounded, tracking, sizes, 1.0, states=True)
     found, states = thresholds_over_record(structure, observer, record, varying=affine.box.variation == "varying")
     n = plant.nx
     return Beside(observer, tracking.T, tracking.T0[:n], affine, record, states[:, :n], found.total[0])
@@ -218,11 +222,11 @@ def proved_test(window: Window, found: Optimum) -> Shipped:
     """Return the proved test next to a solution; raise `SolverError` where nothing can be proved."""
     if found.multipliers is None or found.point is None:
         raise SolverError("The linear programme is unbounded on this window: the result is inconclusive.")
-    rows, columns = window.scales
+    rows, _ = window.scales
     # What all bounds together could do to these weights.
     able = float(np.abs(window.matrix[:, window.bounded]).T @ np.abs(found.multipliers) @ window.bar[window.bounded])
     if found.size <= ZERO_THRESHOLD * able and not window.standing:
-        exact = repaired_multipliers(window, found.multipliers, refine=True, exact_zero=True)
+        exact = repaired_multipliers(window.outer, found.multipliers, refine=True, exact_zero=True)
         if exact is not None:
             return Shipped(exact.with_room(rows), 0.0, None, 0.0)
     test = repaired_multipliers(window, found.multipliers, refine=True)
@@ -232,10 +236,14 @@ def proved_test(window: Window, found: Optimum) -> Shipped:
             "are from exact ones: the result is inconclusive. Fewer samples, or signals in units near one, help."
         )
     test = test.with_room(rows)
-    witness = repaired_point(window, found.point, refine=True)
-    witness = None if witness is None else witness.with_room(columns)
-    least = np.nan if witness is None else proved_least(window, witness)
-    return Shipped(test, proved_threshold(window, test), witness, least)
+    inner = window.inner
+    point = found.point if inner is window else largest_hidden_fault(inner).point
+    witness = None if point is None else repaired_point(inner, point, refine=True)
+    witness = None if witness is None else witness.with_room(inner.scales[1])
+    least = np.nan if witness is None else proved_least(inner, witness)
+    threshold = proved_threshold(window.outer_with_room, test)
+    threshold *= 1.0 if window.bounds.moving is None else COLUMN_ROOM
+    return Shipped(test, threshold, witness, least)
 
 
 def _synthesis(

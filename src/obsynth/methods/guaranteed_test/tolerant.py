@@ -16,6 +16,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.moving_disturbances import with_moving_disturbances
 from obsynth.plants.transformations.uncertain_plant import AffinePlant, affine_plant
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.over_tolerances.adaptive_bound import Start, adaptive_bound
@@ -31,6 +32,10 @@ SETTLING_SHARE = 0.2
 #: What other processors may find for a mean threshold, as a share: directions in which constants act are split
 #: otherwise there, and each way is a bound (0.5 % on the drive).
 MEAN_ROOM = 2e-2
+
+
+#: Courses of disturbances that do not change between samples.
+HELD_BETWEEN_SAMPLES = ("jump", "held")
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +118,7 @@ def with_tolerances(window: Window, beside: Beside) -> Window:
     starts = np.unique(np.linspace(*settled(len(beside.record), length), MOST_WINDOWS).astype(np.int64))
     nu = window.plant.nu
     spans = 1.0 + np.abs(affine.offsets)
+    sizes_of_d = affine.disturbance_bounds(window.bounds.disturbance)
 
     def put(matrices: tuple[FloatArray, FloatArray, FloatArray], k: int, columns: list[float]) -> None:
         """Enter what multiplies ``x(k)`` in E, A and C, a column each, with these bounds."""
@@ -142,12 +148,12 @@ def with_tolerances(window: Window, beside: Beside) -> Window:
             matrices = affine.E.parts[j], -affine.A.parts[j], affine.C.parts[j]
             put(matrices, k, (span * errors).tolist())
             put((np.zeros((0, 0)), -affine.Bd.parts[j], affine.Dd.parts[j]), k,
-                (span * window.bounds.disturbance).tolist())  # fmt: skip
+                (span * sizes_of_d).tolist())  # fmt: skip
         sizes = known[starts + k].mean(axis=0)
         inputs = np.abs(beside.record[starts + k, :nu]).mean(axis=0)
-        into = affine.A.radius @ sizes + affine.B.radius @ inputs + affine.Bd.radius @ window.bounds.disturbance
+        into = affine.A.radius @ sizes + affine.B.radius @ inputs + affine.Bd.radius @ sizes_of_d
         later = known[np.minimum(starts + k + 1, len(known) - 1)].mean(axis=0)
-        seen = affine.C.radius @ sizes + affine.D.radius @ inputs + affine.Dd.radius @ window.bounds.disturbance
+        seen = affine.C.radius @ sizes + affine.D.radius @ inputs + affine.Dd.radius @ sizes_of_d
         put((np.zeros((0, 0)), np.eye(window.plant.nx), np.zeros((0, 0))), k, (into + affine.E.radius @ later).tolist())
         put((np.zeros((0, 0)), np.zeros((0, 0)), np.eye(window.plant.ny)), k, seen.tolist())
     return window.with_columns(builder)
@@ -166,12 +172,22 @@ def tracked(window: Window, multipliers: FloatArray, T: FloatArray, T0: FloatArr
     return np.vstack([registers, T]), np.vstack([T0, row])
 
 
+def over_the_box(plant: DescriptorSystem, disturbance: str) -> AffinePlant:
+    """Return a plant over its box, with disturbances that move between samples unless they are held there."""
+    affine = affine_plant(plant)
+    return affine if disturbance in HELD_BETWEEN_SAMPLES else with_moving_disturbances(affine)
+
+
 def mean_over_record(
     window: Window, observer: LinearObserver, multipliers: FloatArray, T: FloatArray, T0: FloatArray, record: FloatArray
 ) -> float:
     """Return the mean threshold over the tolerances on a record ``(steps, nu + ny)``, once the window is full."""
     thresholds = thresholds_over_tolerances(
-        noisy_as_bounded(window), observer, tracked(window, multipliers, T, T0), window.bounds.disturbance, record
+        over_the_box(noisy_as_bounded(window), window.question.disturbance),
+        observer,
+        tracked(window, multipliers, T, T0),
+        window.bounds.disturbance,
+        record,
     )
     begin, end = settled(len(record), observer.order - len(T) + 1)
     return float(thresholds[len(record) - 1 - (end - begin) :, -1].mean())
@@ -191,14 +207,13 @@ def thresholds_over_record(
 
 
 def thresholds_over_tolerances(
-    plant: DescriptorSystem,
+    affine: AffinePlant,
     observer: LinearObserver,
     tracking: tuple[FloatArray, FloatArray],
     bounds: FloatArray,
     record: FloatArray,
 ) -> FloatArray:
     """Return thresholds ``(steps, rows)`` on a record ``(steps, nu + ny)``; noise columns of the plant within one."""
-    affine = affine_plant(plant)
-    structure = error_structure(observer, affine, Tracking(*tracking), bounds, 1.0)
+    structure = error_structure(observer, affine, Tracking(*tracking), affine.disturbance_bounds(bounds), 1.0)
     found, _ = thresholds_over_record(structure, observer, record, varying=affine.box.variation == "varying")
     return np.asarray(found.total[0])

@@ -22,6 +22,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.moving_disturbances import MovingColumns
 from obsynth.proofs.balls import UNIT_ROUNDOFF
 
 if TYPE_CHECKING:
@@ -56,6 +57,13 @@ class Bounds:
     first: FloatArray
     disturbance_middle: FloatArray | None = None
     noise_middle: FloatArray | None = None
+    #: What disturbances put into the states of a sampled plant where they move between samples, and their bounds there
+    #: ``(nd,)``; ``every``: whether every course counts, and not only those that rest in each piece of a sample.
+    moving: MovingColumns | None = None
+    moving_bounds: FloatArray | None = None
+    every: bool = False
+    #: How many times what the columns leave counts.
+    times_rest: float = 1.0
 
     @property
     def middles(self) -> Iterator[tuple[str, int, float]]:
@@ -77,7 +85,7 @@ class TestProblem:
     before: int = 0
     free: tuple[int, ...] = ()
     free_course: str = "any"
-    disturbance: str = "jump"
+    disturbance: str = "any"
     disturbance_rate: FloatArray = field(default_factory=lambda: np.zeros(0))
     fault_rate: float = 0.0
     ellipsoid: bool = False
@@ -133,6 +141,8 @@ def _constant_model(plant: DescriptorSystem, bounds: Bounds, question: TestProbl
     kinds = {
         "f": (plant.Bf, plant.Df),
         "d": (plant.Bd, plant.Dd),
+        # Of a disturbance that moves between samples the value at the samples enters outputs alone.
+        "d at samples": (np.zeros_like(plant.Bd), plant.Dd),
         "w": (bounds.noise_state, bounds.noise_output),
     }
     span = range(max(count, question.samples))
@@ -157,6 +167,24 @@ def _varying_model(plant: TimeVaryingDescriptorSystem, samples: int, start: int)
     equations = tuple((plant.E.at(k + 1), plant.A.at(k), plant.B.at(k)) for k in ks)
     regular = all(has_full_rows(after) for after, _, _ in equations)
     return Model(plant, equations, tuple(plant.C.at(start + k) for k in range(samples)), columns, regular)
+
+
+def disturbances_in_words(window: Window) -> str:
+    """Return what is assumed of disturbances beside their bounds; empty where there are none."""
+    bounds, kind = window.bounds, window.question.disturbance
+    if not bounds.disturbance.any():
+        return ""
+    if bounds.moving is not None:
+        return {
+            "any": "disturbances of any time course, between samples too",
+            "rate": "disturbances that change within a sample's time by their stated rates at most",
+        }[kind]
+    return {
+        "any": "disturbances that may change from sample to sample",
+        "jump": "disturbances that are held between samples",
+        "held": "disturbances that are held over the window",
+        "rate": "disturbances that are held between samples and change by their stated rates at most",
+    }[kind]
 
 
 def has_full_rows(matrix: FloatArray) -> bool:
@@ -229,6 +257,49 @@ class Window:
     def equations(self) -> int:
         """For how many k there are equations."""
         return len(self.model.equations)
+
+    @cached_property
+    def outer(self) -> Window:
+        """The same rows with columns that count every course of disturbances: what a test promises holds for these.
+        The window's own columns are of disturbances that rest in each piece of a sample."""
+        if self.bounds.moving is None or self.bounds.every:
+            return self
+        found = window_of(self.model.plant, replace(self.bounds, every=True), self.question)
+        lost = [label[2] for label in self.labels if label[0] == "missing"]
+        return found.without(np.array(lost, dtype=np.int64)) if lost else found
+
+    @cached_property
+    def outer_with_room(self) -> Window:
+        """The same with twice what the columns leave, so that another machine finds no more."""
+        outer = self.outer
+        return (
+            outer
+            if outer is self
+            else window_of(self.model.plant, replace(outer.bounds, times_rest=2.0), self.question)
+        )
+
+    @cached_property
+    def inner(self) -> Window:
+        """The same rows for courses that disturbances may have for certain: a fault that these hide is hidden.
+
+        Of a rate that is bounded those are of disturbances that are held between samples."""
+        if self.bounds.moving is None or self.question.disturbance == "any":
+            return self
+        return window_of(self.model.plant, replace(self.bounds, moving=None), self.question)
+
+    def without(self, rows: np.ndarray) -> Window:
+        """Return a window some rows of which say nothing: each has a free column of its own, which no test may see."""
+        columns = len(self.bar)
+        return replace(
+            self,
+            labels=(*self.labels, *(("missing", None, int(row)) for row in rows)),
+            bar=np.append(self.bar, np.full(len(rows), np.inf)),
+            group=np.append(self.group, np.full(len(rows), -1)),
+            i=np.append(self.i, rows),
+            j=np.append(self.j, columns + np.arange(len(rows))),
+            value=np.append(self.value, np.ones(len(rows))),
+            times=np.append(self.times, np.ones(len(rows), dtype=np.int64)),
+        )
 
     @property
     def outputs_at(self) -> int:
@@ -385,7 +456,11 @@ def courses_of(window: Window, point: FloatArray) -> dict[str, FloatArray]:
     own[question.before :] = point[0]
     found[names["f"][question.fault]] = own
     for label, value in zip(window.labels, point, strict=True):
-        if label[0] in names:
+        if label[0] == "moving d" and window.bounds.moving is not None:
+            # The mean over the sample.
+            course = found.setdefault(names["d"][label[2]], np.zeros(length))
+            course[label[1]] += value * len(names["d"]) / window.bounds.moving.resting.shape[1]
+        elif label[0] in names:
             course = found.setdefault(names[label[0]][label[2]], np.zeros(length))
             course[slice(None) if label[1] is None else label[1]] = value
         elif label[0] == "slope":
@@ -441,6 +516,7 @@ def window_of(
             column = builder.columns([("w", k, int(i)) for i in moving], bounds.noise[moving], 2 * k)
             acting("w", moving, k, column)
     rows = _disturbances(bounds, question, builder, acting, range(max(equations, samples)), rows)
+    _between_samples(bounds, builder, equations, ne)
     _course(question, builder, acting, span)
     for fault in question.free:
         column = -1
@@ -464,14 +540,16 @@ def window_of(
 def _disturbances(bounds: Bounds, question: TestProblem, builder: Builder, acting: Any, span: range, rows: int) -> int:
     """Enter the disturbances; return the number of rows."""
     one = np.ones((1, 1))
+    kind = "d at samples" if bounds.moving is not None and question.disturbance == "any" else "d"
     for i in np.flatnonzero(bounds.disturbance > 0.0).tolist():
         which, bar = np.array([i]), bounds.disturbance[i]
         column = before = -1
         for k in span:
             if question.disturbance != "held" or column < 0:
                 label = ("d", None if question.disturbance == "held" else k, i)
-                column = builder.columns([label], [bar], 2 * k + 1 if question.disturbance == "jump" else -1)
-            acting("d", which, k, column)
+                free = question.disturbance in ("any", "jump")
+                column = builder.columns([label], [bar], 2 * k + 1 if free else -1)
+            acting(kind, which, k, column)
             if question.disturbance == "rate" and before >= 0:
                 change = builder.columns([("change of d", k, i)], [question.disturbance_rate[i]])
                 for place, times in ((column, 1), (before, -1), (change, -1)):
@@ -479,6 +557,27 @@ def _disturbances(bounds: Bounds, question: TestProblem, builder: Builder, actin
                 rows += 1
             before = column
     return rows
+
+
+def _between_samples(bounds: Bounds, builder: Builder, equations: int, ne: int) -> None:
+    """Enter what disturbances that move between samples put into the equations of each: columns of one time in one
+    ellipsoid, and, where every course counts, one for each direction of what these columns leave."""
+    moving = bounds.moving
+    if moving is None or bounds.moving_bounds is None:
+        return
+    nd, acting = len(bounds.moving_bounds), np.flatnonzero(bounds.moving_bounds > 0.0)
+    columns = moving.columns if bounds.every else moving.resting
+    rest = bounds.times_rest * moving.rest(bounds.moving_bounds) if bounds.every else np.zeros(ne)
+    left, blocks = np.flatnonzero(rest > 0.0), columns.shape[1] // nd
+    for k in range(equations):
+        for block in range(blocks):
+            # Groups 2 k and 2 k + 1 are those of noise and disturbances at the samples.
+            group = 2 * (equations + 2 + k * blocks + block)
+            labels = [("moving d", k, int(i), block) for i in acting]
+            column = builder.columns(labels, bounds.moving_bounds[acting], group)
+            builder.put(k * ne, -columns[:, block * nd + acting], column)
+        column = builder.columns([("left by d", k, int(i)) for i in left], rest[left])
+        builder.put(k * ne, -moving.directions[:, left], column)
 
 
 def _course(question: TestProblem, builder: Builder, acting: Any, span: range) -> None:

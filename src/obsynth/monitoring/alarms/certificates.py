@@ -96,6 +96,7 @@ def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
         data["initial_set"],
         data["state_bounds"],
         data["window"],
+        data["disturbance"],
     )
     programme, origin = programme_of(design, assumed, data["window"], u, y)
     equal, below = np.asarray(data["equal"]), np.asarray(data["below"])

@@ -23,7 +23,7 @@ from obsynth.methods.guaranteed_test.proofs import (
 )
 from obsynth.methods.guaranteed_test.regions import while_inside
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
-from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.methods.guaranteed_test.windows import Window, disturbances_in_words
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import MOST_LISTED, shown
 from obsynth.results.certificate_files import SHOWN_DIGITS
@@ -49,8 +49,8 @@ def refuted(design: ObserverDesign, u: FloatArray, y: FloatArray) -> tuple[int, 
             continue
         programmes = Programmes.of(test)
         for guess in programmes.refuting(y[-rows:], u[-rows:]):
-            values = exact_multipliers(programmes.window, guess)
-            margin = np.nan if values is None else margin_of(programmes.window, values, y[-rows:], u[-rows:])
+            values = exact_multipliers(programmes.window.outer, guess)
+            margin = np.nan if values is None else margin_of(programmes.window.outer, values, y[-rows:], u[-rows:])
             if values is not None and margin > largest:
                 largest, told = margin, [str(value) for value in values]
                 best = place, rows, {"test": test.fault, "multipliers": told, "margin": margin}
@@ -97,7 +97,7 @@ def statement_of(
         "process noise within its bounds" if bounds.noise_state.any() else "",
         _listed(plant.state_names, bounds.state, plant.units, "within", "states"),
         _listed(plant.state_names, bounds.first, plant.units, "at first within", "states"),
-        "" if question.disturbance == "jump" else f"disturbances that are {question.disturbance}",
+        disturbances_in_words(window),
     ]
     assumed = ", ".join(part for part in parts if part) or "any disturbances and noise"
     return (
@@ -142,7 +142,7 @@ def checked(design: ObserverDesign, body: Mapping[str, Any], u: FloatArray, y: F
     whole = GuaranteedTest.of(design)
     place = [test.fault for test in whole.tests].index(body["test"])
     test = whole.tests[place]
-    window = Programmes.of(test).window
+    window = Programmes.of(test).window.outer
     values = [Fraction(text) for text in body["multipliers"]]
     fits = len(values) == window.rows and len(y) == len(u) == rows_of_test(test)
     yield test, whole.groups[place], margin_of(window, values, y, u) if fits else np.nan

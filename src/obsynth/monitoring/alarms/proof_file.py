@@ -17,8 +17,8 @@ from obsynth.methods.verifying import verify
 from obsynth.monitoring.alarms.multipliers import refuted, rows_of_test, statement_of
 from obsynth.monitoring.alarms.proof_window import Programme, window_data, window_programme
 from obsynth.monitoring.thresholds.guaranteed import refuse_bounds
-from obsynth.monitoring.thresholds.options import WINDOW
-from obsynth.numerics.arguments import whole_number
+from obsynth.monitoring.thresholds.options import DISTURBANCES, WINDOW
+from obsynth.numerics.arguments import chosen, whole_number
 from obsynth.numerics.arrays import FloatArray, require_no_overflow
 from obsynth.plants.noise import require_noise
 from obsynth.plants.signal_names import index_of
@@ -104,6 +104,7 @@ def proved_alarm(
     state_bounds: Mapping[str, Any] | None = None,
     log: LogReference | None = None,
     unverified: bool = False,
+    disturbance: str = "any",
 ) -> AlarmProof:
     """Return the proof for the last sample of a record ``u (steps, nu)``, ``y (steps, ny)`` of deviations.
     A design that fails its own verification proves nothing: `VerificationError`, unless ``unverified``, and then no
@@ -111,11 +112,11 @@ def proved_alarm(
     if is_guaranteed(design):
         given = {
             "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound, "initial_set": initial_set,
-            "state_bounds": state_bounds,
+            "state_bounds": state_bounds, "disturbance": None if disturbance == "any" else disturbance,
         }  # fmt: skip
         refuse_bounds(given)
         return _proved_by_test(design, u, y, log, unverified=unverified)
-    assumed = assumptions_of(design, disturbance_bounds, noise_bound, initial_set, state_bounds, window)
+    assumed = assumptions_of(design, disturbance_bounds, noise_bound, initial_set, state_bounds, window, disturbance)
     row, length = len(y), min(window, len(y))
     if (failing := _failing(design, unverified=unverified)) is not None:
         return AlarmProof(False, row, length, 0.0, failing, "", {})
@@ -131,7 +132,7 @@ def proved_alarm(
     margin = float(programme.proved_least(equal, below))
     if not margin > 0.0:
         text = (
-            f"Cannot be proved: with {assumed.phrase()}, some plant may produce the last "
+            f"Cannot be proved: with {assumed.phrase()}{assumed.movement}, some plant may produce the last "
             f"{length} samples without a fault (the relaxed linear programme has a solution)."
         )
         return AlarmProof(False, row, length, margin, text, origin, {})
@@ -141,6 +142,7 @@ def proved_alarm(
     certificate = {
         "bounds": assumed.bounds,
         "noise_bound": assumed.noise_bound,
+        "disturbance": assumed.disturbance,
         "window": window,
         "initial_set": None if initial_set is None else _as_lists(initial_set),
         "state_bounds": None if state_bounds is None else _as_lists(state_bounds),
@@ -204,7 +206,8 @@ def statement(assumed: Assumptions, window: int, row: int, origin: str, log: Log
     source = "a record" if log is None else f"{log.name} (sha256 {log.sha256[:SHOWN_DIGITS]})"
     first = row - min(window, row) + 1
     return (
-        f"Proved: rows {first} to {row} of {source} cannot occur without a fault {since}, with {assumed.phrase()}: "
+        f"Proved: rows {first} to {row} of {source} cannot occur without a fault {since}, with {assumed.phrase()}"
+        f"{assumed.movement}: "
         f"there is a fault, or {outside}{linear}. Bounds of the state: {origin}. Assumptions "
         f"{assumed.digest[:SHOWN_DIGITS]}, gain set {gain_set[:SHOWN_DIGITS]}."
     )
@@ -217,6 +220,7 @@ def assumptions_of(
     initial_set: Mapping[str, Any] | None,
     state_bounds: Mapping[str, Any] | None,
     window: int,
+    disturbance: str = "any",
 ) -> Assumptions:
     """Return what is assumed of all that is unknown to a discrete linear design, checked, as is the window's length."""
     plant, _ = design.linear
@@ -243,7 +247,9 @@ def assumptions_of(
     if initial_set is None and state_bounds is None:
         raise SpecError("Nothing bounds the state: give initial_set (--initial), or state_bounds.", path="initial_set")
     require_no_overflow(noise_bound or 0.0, "noise_bound", "noise_bound")
-    return Assumptions(plant, bounds, float(noise_bound or 0.0) if plant.nw else 0.0, initial_set, state_bounds)
+    chosen(disturbance, "disturbance", DISTURBANCES)
+    noise = float(noise_bound or 0.0) if plant.nw else 0.0
+    return Assumptions(plant, bounds, noise, initial_set, state_bounds, disturbance=disturbance)
 
 
 def programme_of(
@@ -251,7 +257,7 @@ def programme_of(
 ) -> tuple[Programme, str]:
     """Return the programme of the last samples of a record, and where its bounds of the state come from."""
     affine, data, origin = window_data(design, assumed, window, u, y)
-    bounds = np.concatenate([assumed.bounds, np.full(affine.plant.nw, assumed.noise_bound)])
+    bounds = np.concatenate([affine.disturbance_bounds(assumed.bounds), np.full(affine.plant.nw, assumed.noise_bound)])
     return window_programme(affine, bounds, data), origin
 
 

@@ -19,6 +19,7 @@ from obsynth.methods.tracking import structure_of, tracking_of
 from obsynth.monitoring.thresholds.adaptive_monitor import start_of
 from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.transformations.moving_disturbances import with_moving_disturbances
 from obsynth.plants.transformations.uncertain_plant import AffinePlant, affine_plant
 from obsynth.proofs.balls import gamma
 from obsynth.results.design import ObserverDesign
@@ -157,7 +158,7 @@ class _Builder:
         self.algebraic = moving.max(axis=1, initial=0.0) == 0.0
         # A right side is computed: what rounding may have taken from it, relative to its terms, counts as remainder.
         self.rounding = gamma(plant.B.shape[1] + MORE_ROUNDINGS)
-        nd = plant.Bd.shape[1]
+        nd = plant.Bd.center.shape[1]
         self.loose = (plant.Bd.spread + plant.Bd.radius) @ bounds[:nd]
         self.seen = (plant.Dd.spread + plant.Dd.radius) @ bounds[:nd]
 
@@ -247,6 +248,8 @@ def window_data(
     """Return the plant over its box, the last ``length`` samples with bounds of the state, and where these come from.
     Without stated ones they come from the observer run again from the start, and its error."""
     affine = affine_plant(design.linear[0])
+    if assumed.moves:
+        affine = with_moving_disturbances(affine)
     first = max(0, len(y) - length)
     if assumed.initial_set is None:
         low, high = _stated(affine, assumed.state_bounds or {}, len(y) - first)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -38,6 +38,7 @@ def prove_alarm(
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
     unverified: bool = False,
+    disturbance: Literal["any", "held"] = "any",
 ) -> AlarmProof:
     """Return a proof that measured data up to a row are not fault-free, or that there is none.
 
@@ -69,6 +70,10 @@ def prove_alarm(
         As for `run_on_data`.
     unverified : bool, optional
         Whether a design that fails its own verification gives the answer "cannot be proved" instead of an error.
+    disturbance : {"any", "held"}, optional
+        What disturbances do between the samples of a plant that was sampled from a continuous one: anything within
+        their bounds, or nothing, which the statement and the certificate then repeat.  Of a plant in discrete time they
+        are held.  For guaranteed tests an option of their design.
 
     Returns
     -------
@@ -124,6 +129,7 @@ def prove_alarm(
         state_bounds=state_bounds,
         log=log,
         unverified=unverified,
+        disturbance=disturbance,
     )
 
 

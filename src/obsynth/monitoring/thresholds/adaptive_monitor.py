@@ -17,7 +17,7 @@ import numpy as np
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.tracking import structure_of, tracking_of
 from obsynth.monitoring.thresholds.adaptive_rule import AdaptiveRule
-from obsynth.monitoring.thresholds.monitor import Rule
+from obsynth.monitoring.thresholds.monitor import BOUNDS_AND_HELD_INPUTS, HELD, Rule
 from obsynth.monitoring.thresholds.residual_model import noisy_plant, watches_estimates
 from obsynth.monitoring.thresholds.rules import NormRule
 from obsynth.numerics.arguments import is_finite_number, require_mapping
@@ -29,11 +29,12 @@ from obsynth.plants.constants import ConstantsBox, shown
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.signal_names import require_known
 from obsynth.plants.transformations.elimination import algebraic_coordinates, eliminate_algebraic_states
+from obsynth.plants.transformations.moving_disturbances import all_columns, with_moving_disturbances
 from obsynth.plants.transformations.sampling import discretise
 from obsynth.plants.transformations.uncertain_plant import AffinePlant, affine_plant, reduced_family
 from obsynth.plants.uncertainty import ELIMINATED, SAMPLED, Uncertainty
+from obsynth.proofs.absolute_integrals import interval_columns
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_zero_order_hold
-from obsynth.proofs.balls import rounded_up
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.signals import resolve
@@ -45,11 +46,8 @@ from obsynth.verification.over_tolerances.plants_of_the_box import EXACT_MODEL, 
 from obsynth.verification.over_tolerances.responses import loop_radius
 from obsynth.verification.over_tolerances.subdivision import index_one_on_box, values_at
 
-#: Pieces of an interval in which a disturbance has a sign of its own.
-SIGNED_PIECES = 16
-
-#: Covers the rounding of a matrix exponential in double precision, and of a few sums.
-SERIES_SLACK, SUM_SLACK = 1.0 + 1e-9, 1.0 + 1e-12
+#: Covers the rounding of a few sums.
+SUM_SLACK = 1.0 + 1e-12
 
 #: The name under which what the sampled observer misses counts among the constants.
 SAMPLING = "sampling"
@@ -115,11 +113,12 @@ def sampled_problem(design: ObserverDesign, dt: float, bounds: FloatArray, noise
     reading = back @ np.linalg.pinv(into)
     smooth = eliminate_algebraic_states(plant).plant
     moving, held = affine_zero_order_hold(reduced["A"], reduced["B"], dt)
-    pieces = _pieces(reduced["A"], reduced["Bd"], dt)
+    columns = interval_columns(reduced["A"], reduced["Bd"], dt)
+    gathered = all_columns(columns, np.eye(len(basis)))
     nd, nf = plant.nd, plant.nf
     zero = AffineMatrix.exact(np.zeros((len(basis), nd)), moving.count)
-    blind = AffineMatrix.exact(np.zeros((plant.ny, nd * SIGNED_PIECES)), moving.count)
-    bd, dd = affine_block([[*pieces, zero]]), affine_block([[blind, reduced["Dd"]]])
+    blind = AffineMatrix.exact(np.zeros((plant.ny, gathered.shape[1])), moving.count)
+    bd, dd = affine_block([[gathered, zero]]), affine_block([[blind, reduced["Dd"]]])
     bw, dw = _noise(smooth, back, dt)
     matrices = {
         "E": AffineMatrix.exact(np.eye(len(basis)), moving.count),
@@ -145,7 +144,9 @@ def sampled_problem(design: ObserverDesign, dt: float, bounds: FloatArray, noise
         Dw=dw,
         dt=dt,
     )
-    affine = AffinePlant(sampled, uncertain.box, matrices, np.eye(len(basis)))
+    affine = AffinePlant(
+        sampled, uncertain.box, matrices, np.eye(len(basis)), blocks=len(columns.blocks), rest=columns.rest
+    )
     inputs = np.hstack([observer.Bu, observer.By])
     ramp = first_order_hold(observer.Az, inputs, dt)[2]
     through_u, through_y = ramp[:, : plant.nu], ramp[:, plant.nu :]
@@ -158,29 +159,11 @@ def sampled_problem(design: ObserverDesign, dt: float, bounds: FloatArray, noise
         )
     unknown = np.abs(through_y) @ (reduced["Dd"].magnitude @ bounds + np.abs(dw).sum(axis=1) * noise_bound)
     first = -(through_u + through_y @ affine.D.center)
-    sizes = np.concatenate([np.tile(bounds, SIGNED_PIECES), bounds])
+    sizes = affine.disturbance_bounds(bounds)
     empty = np.zeros((len(observer.Cz), len(basis)))
     return SampledProblem(
         affine, sample_observer(observer, dt), Tracking(t, empty), sizes, reading, first, through_y, unknown
     )
-
-
-def _pieces(a: AffineMatrix, bd: AffineMatrix, dt: float) -> list[AffineMatrix]:
-    """Return what a disturbance of one sign does in each piece of an interval, newest first ``(n, nd)``.
-    The remainder holds a change of sign inside a piece: at most a quarter of its length, squared, times the slope."""
-    from scipy.linalg import expm
-
-    width = dt / SIGNED_PIECES
-    step, gathered = affine_zero_order_hold(a, bd, width)
-    size = a.magnitude
-    # ``exp(S)`` bounds ``sum_k S^k / (k + 1)!`` for ``S >= 0``.
-    growth = np.eye(len(size)) + size * width @ (expm(size * width) * SERIES_SLACK)
-    found, piece, value = [], gathered, bd
-    for _ in range(SIGNED_PIECES):
-        slope = size @ (growth @ value.magnitude)
-        found.append(piece.enlarged(rounded_up(0.25 * width**2 * slope, 6)))
-        piece, value = step @ piece, step @ value
-    return found
 
 
 def _noise(smooth: DescriptorSystem, back: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
@@ -210,6 +193,7 @@ def adaptive_plan(
     initial_set: Mapping[str, Any] | None,
     observer_state: FloatArray | None = None,
     sample_time: float | None = None,
+    disturbance: str = "any",
 ) -> tuple[AdaptivePlan, AdaptivePlan]:
     """Return the plans from the first start on and after a later one, over the plant's box, if there is a bound."""
     plant, observer = design.linear
@@ -226,11 +210,13 @@ def adaptive_plan(
         return _sampled_plan(design, bounds, noise_bound, initial_error, initial_set, observer_state, sample_time)
     affine = affine_plant(plant)
     tracking = tracking_of(design, affine)
+    if disturbance == "any":
+        affine = with_moving_disturbances(affine)
     varying = affine.box.variation == "varying"
     noise = noise_bound if plant.nw else 0.0
     sizes = np.where(np.isfinite(bounds), bounds, 0.0)
     structure = structure_of(design, affine, tracking, bounds=sizes, noise_bound=noise)
-    _require_bounds(structure, bounds, plant)
+    _require_bounds(structure, affine, bounds, plant)
     z = np.zeros(observer.order) if observer_state is None else observer_state
     start = start_of(affine, tracking, initial_error, initial_set, z)
     later = Start(observer.order, norm=initial_error, state=z)
@@ -276,7 +262,7 @@ def _sampled_plan(
     structure = error_structure(
         problem.observer, problem.affine, problem.tracking, problem.bounds, noise, reading=problem.reading
     )
-    _require_bounds(structure, np.tile(bounds, SIGNED_PIECES + 1), plant)
+    _require_bounds(structure, problem.affine, bounds, plant)
     z = np.zeros(observer.order) if observer_state is None else observer_state
     box = None if initial_set is None else initial_box(plant, initial_set)
     stated = Start(observer.order, norm=initial_error, state=z)
@@ -300,10 +286,17 @@ def _sampled_plan(
     return plan(problem.start(stated, box)), plan(problem.start(stated, None))
 
 
-def _require_bounds(structure: ErrorStructure, bounds: FloatArray, plant: DescriptorSystem) -> None:
+def _require_bounds(
+    structure: ErrorStructure, affine: AffinePlant, bounds: FloatArray, plant: DescriptorSystem
+) -> None:
     """Raise `SpecError` where a disturbance without a bound reaches the error."""
-    reached = structure.disturbances.magnitude.max(axis=0, initial=0.0)[: len(bounds)] > 0.0
-    lacking = sorted({int(i) % plant.nd for i in np.flatnonzero(reached & ~np.isfinite(bounds))})
+    seen = structure.disturbances.magnitude.max(axis=0, initial=0.0) > 0.0
+    lacking = []
+    for i in np.flatnonzero(~np.isfinite(bounds)).tolist():
+        # The columns that this disturbance alone would move.
+        own = affine.disturbance_bounds(np.eye(1, plant.nd, i).ravel()) > 0.0
+        if (seen[: len(own)] & own).any():
+            lacking.append(i)
     if lacking:
         names = ", ".join(plant.disturbance_names[i] for i in lacking)
         raise SpecError(
@@ -373,7 +366,9 @@ def adaptive_statement(plan: AdaptivePlan, assumed: Assumptions) -> str:
         kept = "; the state does not jump" if sampled else "; the value at k + 1 multiplies x(k+1)"
     radius = loop_radius(plan.bound.responses)
     ever = "" if radius < 1.0 else (f"; it holds at each sample, but may grow (loop radius {radius:.3g})")
-    held = "; inputs and disturbances are held between samples" if sampled else ""
+    held = ""
+    if sampled or assumed.moves:
+        held = BOUNDS_AND_HELD_INPUTS.format(dt=shown(assumed.plant.dt)) if assumed.moves else HELD
     if plan.sample_time is not None:
         apart = shown(plan.sample_time)
         held = f"; known inputs are held between rows, {apart} s apart, disturbances may move in between"
@@ -416,6 +411,7 @@ def over_box(
     *,
     sample_time: float | None = None,
     scenario: Scenario | None = None,
+    disturbance: str = "any",
 ) -> tuple[Rule, str]:
     """Return the pointwise rule over the box of the plant of a design with the noise that is bounded, and what it
     promises: for a record of a scenario, from its start unless one is given, or for data, which may have gaps."""
@@ -440,7 +436,10 @@ def over_box(
         initial_set=initial_set,
         observer_state=state,
         sample_time=sample_time,
+        disturbance=disturbance,
     )
-    assumed = Assumptions(plant, bounds, noise_bound or 0.0, initial_set, initial_error=initial_error)
+    assumed = Assumptions(
+        plant, bounds, noise_bound or 0.0, initial_set, initial_error=initial_error, disturbance=disturbance
+    )
     rule = AdaptiveRule(first, later if scenario is None else first, nominal)
     return rule, adaptive_statement(first, assumed)

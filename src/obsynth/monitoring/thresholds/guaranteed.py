@@ -15,20 +15,22 @@ from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
 from obsynth.methods.guaranteed_test.regions import while_inside
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
-from obsynth.methods.guaranteed_test.tolerant import noisy_as_bounded, rows_before
+from obsynth.methods.guaranteed_test.tolerant import HELD_BETWEEN_SAMPLES, noisy_as_bounded, rows_before
+from obsynth.methods.guaranteed_test.windows import disturbances_in_words
 from obsynth.monitoring.thresholds.adaptive_monitor import over_box
 from obsynth.monitoring.thresholds.monitor import LinearSample, Monitor, Rule, RuleOutput, Sample
 from obsynth.monitoring.thresholds.rules import NormRule
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.window.observer import WindowObserver
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.benches import make_bench
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.over_tolerances.plants_of_the_box import with_tolerances
 
 #: Options that other designs leave to their monitor.
-STATED_BY_DESIGN = ("disturbance_bounds", "noise_bound", "initial_error", "gamma")
+STATED_BY_DESIGN = ("disturbance_bounds", "noise_bound", "initial_error", "gamma", "disturbance")
 
 
 def refuse_bounds(given: Mapping[str, Any]) -> None:
@@ -75,6 +77,11 @@ def _bounded(test: GuaranteedTest, constants: Any) -> tuple[ObserverDesign, Floa
     return with_tolerances(changed, constants)[0], window.bounds.disturbance
 
 
+def _course_of(test: GuaranteedTest) -> str:
+    """Return what disturbances do between samples, as the other monitors have it."""
+    return "held" if test.options["disturbance"] in HELD_BETWEEN_SAMPLES else "any"
+
+
 def _statement(test: GuaranteedTest) -> str:
     course = test.options["course"]
     said = "; ".join(_promise(one, group) for one, group in zip(test.tests, test.groups, strict=True))
@@ -87,8 +94,12 @@ def _promise(test: GuaranteedTest, group: tuple[str, ...]) -> str:
     bounded = any(test.options.get(name) for name in ("state_bounds", "initial_bounds"))
     words = "estimates the fault to within less than" if bounded else "has a threshold below"
     least = "" if np.isnan(test.least) else f", and no function of these samples {words} {test.least:.6g}"
+    words = ""
+    if isinstance(test.plant, DescriptorSystem):
+        words = disturbances_in_words(window_as_designed(test.linear[0], GuaranteedTestMethod.of(test.options)))
     return (
-        f"never passed without {' or '.join(group)} while disturbances and noise keep the bounds of the design{least}; "
+        f"never passed without {' or '.join(group)} while disturbances and noise keep the bounds of the design"
+        f"{f', for {words}' if words else ''}{least}; "
         f"a fault {test.fault} of {test.surely_found:.6g} raises an alarm within {test.delay:g} s"
     )
 
@@ -125,7 +136,9 @@ def record_monitor(design: ObserverDesign, scenario: Scenario, kind: str, given:
     rule: Rule = nominal
     if constants is not None or initial_set is not None:
         changed, bounds = _bounded(test, constants)
-        rule, statement = over_box(changed, nominal, bounds, 1.0, None, initial_set, scenario=scenario)
+        rule, statement = over_box(
+            changed, nominal, bounds, 1.0, None, initial_set, scenario=scenario, disturbance=_course_of(test)
+        )
     return Monitor(
         kind,
         statement,
@@ -326,7 +339,7 @@ def data_monitor(design: ObserverDesign, kind: str, given: Mapping[str, Any]) ->
     statement = _statement(test) + ("" if own is None else "; each row has its own threshold")
     if constants is not None or initial_set is not None:
         changed, bounds = _bounded(test, constants)
-        rule, statement = over_box(changed, None, bounds, 1.0, None, initial_set)
+        rule, statement = over_box(changed, None, bounds, 1.0, None, initial_set, disturbance=_course_of(test))
         if initial_set is None:
             statement += "; it holds once the effect of the initial error, which is not stated, has settled"
     return Monitor(

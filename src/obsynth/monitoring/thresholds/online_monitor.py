@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,13 +16,13 @@ from obsynth.monitoring.thresholds.guaranteed import data_monitor
 from obsynth.monitoring.thresholds.learned import LearnedThresholds, learned_monitor, load_thresholds
 from obsynth.monitoring.thresholds.learning import learn_thresholds
 from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
-from obsynth.monitoring.thresholds.options import LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options
+from obsynth.monitoring.thresholds.options import DISTURBANCES, LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options
 from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.monitoring.thresholds.residual_monitor import RESIDUAL_ROUNDING_SHARE, bounds_of
 from obsynth.monitoring.thresholds.rules import ANY_LENGTH, NormRule, WhitenedRule, parameter_monitor
 from obsynth.monitoring.thresholds.stated_noise import samples_of, scaled_inputs, unlimited_bound, unlimited_paper
 from obsynth.monitoring.thresholds.whitening import steady_mean, whitened
-from obsynth.numerics.arguments import arguments_checked, is_finite_number
+from obsynth.numerics.arguments import arguments_checked, chosen, is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.nonlinear.observer import DAEObserver
@@ -71,6 +71,7 @@ def online_monitor(
     initial_set: Mapping[str, Any] | None = None,
     normal: Any = None,
     unverified: bool = False,
+    disturbance: Literal["any", "held"] = "any",
 ) -> Monitor:
     """Return a monitor for measured data, for `run_on_data`: its threshold holds however long the data are.
 
@@ -118,6 +119,10 @@ def online_monitor(
         faults, whose rate is one false alarm per 1,000 rows.
     unverified : bool, optional
         Whether a design whose report fails is watched all the same; nothing is promised then.
+    disturbance : {"any", "held"}, optional
+        ``pointwise`` and ``window``: what disturbances do between the samples of a plant that was sampled from a
+        continuous one: anything within their bounds, or nothing, which the statement then repeats.  Of a plant in
+        discrete time they are held; for guaranteed tests an option of their design.
 
     Returns
     -------
@@ -152,7 +157,7 @@ def online_monitor(
         "scenario": scenario, "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound,
         "initial_error": initial_error, "gamma": gamma, "window": window, "false_alarms": false_alarms,
         "change": change, "sample_time": sample_time, "constants": constants, "initial_set": initial_set,
-        "normal": normal,
+        "normal": normal, "disturbance": None if chosen(disturbance, "disturbance", DISTURBANCES) == "any" else "held",
     }  # fmt: skip
     window, false_alarms, change = checked_options(PARAMETER_OPTIONS if recursive else LINEAR_OPTIONS, kind, given)
     if kind == "learned":
@@ -165,6 +170,7 @@ def online_monitor(
     design, adaptive = tolerances_of(design, constants, initial_set, initial_error)
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
+    model = model.held() if disturbance == "held" else model
     require_noise(noise_bound, noisy=model.noisy)
     bounds = bounds_of(design, model, disturbance_bounds)
     if scenario is None:
@@ -189,7 +195,9 @@ def online_monitor(
         start = 0.0 if initial_error is None else float(initial_error)
         norm, limit = _norm_rule(design, kind, model, bounds, noise_bound, start, gamma, window, dt, estimates)
         if adaptive:
-            rule, told = over_box(noisy, norm, bounds, noise_bound, initial_error, initial_set, sample_time=dt)
+            rule, told = over_box(
+                noisy, norm, bounds, noise_bound, initial_error, initial_set, sample_time=dt, disturbance=disturbance
+            )
             first = _AFTER_WARM_UP if initial_error is None else _AFTER_A_GAP
             return made(told + (first if initial_set is None else _FROM_THE_FIRST), rule)
         _require_above_rounding(kind, limit, model, bounds)

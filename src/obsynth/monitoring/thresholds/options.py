@@ -9,7 +9,10 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_number, whole_number
 from obsynth.numerics.arrays import require_no_overflow
 
-_BOUNDED = ("disturbance_bounds", "noise_bound", "initial_error", "scenario", "sample_time")
+_BOUNDED = ("disturbance_bounds", "noise_bound", "initial_error", "scenario", "sample_time", "disturbance")
+
+#: What disturbances do between the samples of a plant that was sampled from a continuous one.
+DISTURBANCES = ("any", "held")
 
 _STATISTICAL = ("window", "false_alarms", "scenario", "sample_time")
 

@@ -64,6 +64,11 @@ class ResidualModel:
     continuous: ContinuousDesign | None = None
     sampled: IntersampleErrorSystem | None = None  # of a plant on samples, where the continuous one behind it is known
 
+    def held(self) -> ResidualModel:
+        """Return the model of a sampled plant for disturbances that are held between samples; a continuous design takes
+        signals as they are."""
+        return replace(self, sampled=None)
+
     @property
     def initial_error(self) -> float:
         """Norm of e at the start of the scenario."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.monitoring.thresholds.adaptive_monitor import NO_TOLERANCE, noisy_design, over_box, tolerances_of
 from obsynth.monitoring.thresholds.guaranteed import record_monitor
 from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
-from obsynth.monitoring.thresholds.options import LINEAR_OPTIONS, checked_options
+from obsynth.monitoring.thresholds.options import DISTURBANCES, LINEAR_OPTIONS, checked_options
 from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.monitoring.thresholds.rules import NormRule, WhitenedRule
 from obsynth.monitoring.thresholds.stated_noise import (
@@ -55,6 +55,7 @@ def monitor(
     constants: Any = None,
     initial_set: Mapping[str, Any] | None = None,
     unverified: bool = False,
+    disturbance: Literal["any", "held"] = "any",
 ) -> Monitor:
     """Return a threshold for the residual of a linear design, and the statistic it belongs to.
 
@@ -93,6 +94,10 @@ def monitor(
         default.
     unverified : bool, optional
         Whether a design whose report fails is watched all the same; nothing is promised then.
+    disturbance : {"any", "held"}, optional
+        ``pointwise`` and ``window``: what disturbances do between the samples of a plant that was sampled from a
+        continuous one: anything within their bounds, or nothing, which the statement then repeats.  Of a plant in
+        discrete time they are held; for guaranteed tests an option of their design.
 
     Returns
     -------
@@ -139,6 +144,7 @@ def monitor(
         "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound, "initial_error": initial_error,
         "gamma": gamma, "window": window, "false_alarms": false_alarms, "change": change, "constants": constants,
         "initial_set": initial_set,
+        "disturbance": None if chosen(disturbance, "disturbance", DISTURBANCES) == "any" else "held",
     }  # fmt: skip
     window, false_alarms, change = checked_options(LINEAR_OPTIONS, kind, given, isolation_delay)
     if is_guaranteed(design):
@@ -146,6 +152,7 @@ def monitor(
     design, adaptive = tolerances_of(design, constants, initial_set, initial_error)
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model = residual_model(design, scenario, estimates=estimates)
+    model = model.held() if disturbance == "held" else model
     start = 0.0 if adaptive else model.initial_error
     start = start if initial_error is None else float(initial_error)
     bounds, bench = bounds_of(design, model, disturbance_bounds), make_bench(design, scenario)
@@ -168,7 +175,9 @@ def monitor(
     statement = statement_of(kind, model, bounded, estimates=estimates, **numbers) + NO_TOLERANCE
     if adaptive:
         nominal = cast(NormRule, rule)
-        rule, statement = over_box(noisy, nominal, bounds, noise_bound, initial_error, initial_set, scenario=scenario)
+        rule, statement = over_box(
+            noisy, nominal, bounds, noise_bound, initial_error, initial_set, scenario=scenario, disturbance=disturbance
+        )
     return Monitor(
         kind,
         statement,

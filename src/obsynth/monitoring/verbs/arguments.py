@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from obsynth.monitoring.thresholds.options import FALSE_ALARMS, LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW
+from obsynth.monitoring.thresholds.options import DISTURBANCES, FALSE_ALARMS, LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW
 from obsynth.report.terminal.arguments import OPTION_NAMES, Group, Settings, numbers_of, option, ranges_of
 from obsynth.report.terminal.common_options import _SCALE, INPUT_DELAY, MAP, TIME_COLUMN, count, positive, probability
 
@@ -24,10 +24,19 @@ MONITOR_NAMES = sorted(
 
 MONITOR = Group("monitor", (option("--monitor", "KIND", _WHAT_A_MONITOR_DOES),))
 
+#: What disturbances do between samples.
+DISTURBANCE_COURSE = option(
+    "--disturbance-course",
+    "KIND",
+    "of a sampled plant, between samples: any (default), or held",
+    choices=DISTURBANCES,
+)
+
 #: What its threshold is made of, where the scenario does not say it.
 MONITOR_SETTINGS = Settings(
     (
         option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
+        DISTURBANCE_COURSE,
         option("--noise-bound", "N", "bound on the noise, in standard deviations", type=float),
         option(
             "--initial",
@@ -95,5 +104,6 @@ def stated_settings(options: argparse.Namespace) -> dict[str, Any]:
         "change": options.change,
         "initial_set": ranges_of(options.initial) or None,
         "nominal": numbers_of(getattr(options, "nominal", [])),
+        "disturbance": "held" if options.disturbance_course == "held" else None,
         "normal": getattr(options, "normal", None),
     }

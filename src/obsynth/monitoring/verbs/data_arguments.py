@@ -248,6 +248,7 @@ def proof_of(design: ObserverDesign, options: argparse.Namespace, row: int, **mo
         scales=numbers_of(options.scale),
         disturbance_bounds=numbers_of(options.disturbance),
         noise_bound=options.noise_bound,
+        disturbance=options.disturbance_course or "any",
         initial_set=ranges_of(options.initial) or None,
         unverified=options.unverified,
         **more,

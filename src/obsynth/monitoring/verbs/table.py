@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from obsynth.monitoring.verbs.arguments import DATA_OPTIONS
+from obsynth.monitoring.verbs.arguments import DATA_OPTIONS, DISTURBANCE_COURSE
 from obsynth.report.terminal.arguments import Argument, Group, Settings, flag, option
 from obsynth.report.terminal.common_options import (
     CLUSTER,
@@ -363,6 +363,7 @@ VERBS = {
                     INPUT_DELAY,
                     option("--window", "N", "length of the window in samples (default: 20)", type=int, default=20),
                     option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
+                    DISTURBANCE_COURSE,
                     option(
                         "--initial", "STATE=BOUND", "bound of a state at the first row (or LOW:HIGH); may be repeated"
                     ),

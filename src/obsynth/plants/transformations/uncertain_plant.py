@@ -15,6 +15,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.elimination import algebraic_coordinates
 from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, as_written, matrices_of
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse, affine_zero_order_hold
+from obsynth.proofs.balls import rounded_up
 
 #: Their coordinates are rounded to this many digits: any invertible change of coordinates is exact.
 COORDINATE_DIGITS = 9
@@ -34,6 +35,15 @@ class AffinePlant:
     box: ConstantsBox
     matrices: Mapping[str, AffineMatrix]
     coordinates: FloatArray
+    #: Where disturbances move between samples: Bd and Dd have so many times their columns, then those of
+    #: ``rest (k, nd)``, which says how far each goes per disturbance, and then those of the values at the samples.
+    blocks: int = 0
+    rest: FloatArray | None = None
+
+    def disturbance_bounds(self, bounds: FloatArray) -> FloatArray:
+        """Return the bounds of the columns of Bd and Dd for those of the disturbances ``(nd,)``."""
+        rest = np.zeros(0) if self.rest is None else sums_of_bounds(self.rest, bounds)
+        return np.concatenate([np.tile(bounds, self.blocks), rest, bounds])
 
     def __getattr__(self, name: str) -> AffineMatrix:
         """Return a matrix by its letter."""
@@ -50,6 +60,13 @@ class AffinePlant:
     def offsets(self) -> FloatArray:
         """Where the nominal plant is in the unknowns."""
         return self.box.offsets
+
+
+def sums_of_bounds(sizes: FloatArray, bounds: FloatArray) -> FloatArray:
+    """Return ``sizes @ bounds``, rounded up, where zero times infinity is zero."""
+    with np.errstate(invalid="ignore"):
+        total = np.sum(np.where(sizes > 0.0, sizes * bounds, 0.0), axis=1)
+    return np.asarray(np.where(total > 0.0, rounded_up(total, len(bounds) + 2), 0.0))
 
 
 def affine_plant(plant: DescriptorSystem, box: ConstantsBox | None = None) -> AffinePlant:

@@ -22,7 +22,7 @@ STREAM = "-"
 
 
 #: Arguments of the command line that are not called as the options that they give.
-OPTION_NAMES = {"disturbance_bounds": "disturbance", "initial_set": "initial"}
+OPTION_NAMES = {"disturbance_bounds": "disturbance", "initial_set": "initial", "disturbance": "disturbance_course"}
 
 
 class Argument(NamedTuple):

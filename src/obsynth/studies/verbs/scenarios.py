@@ -30,7 +30,17 @@ def _run_tolerances(options: argparse.Namespace) -> int:
 
     if options.monitor not in (None, "pointwise"):
         raise SpecError("--tolerances compares two pointwise monitors: leave out --monitor.", path="--tolerances")
-    unused = ("plants", "confidence", "jobs", "initial_error", "initial", "false_alarms", "window", "change")
+    unused = (
+        "plants",
+        "confidence",
+        "jobs",
+        "initial_error",
+        "initial",
+        "false_alarms",
+        "window",
+        "change",
+        "disturbance_course",
+    )
     refuse_given(options, unused, "one monitor on many runs, and --tolerances compares two on plants that it draws")
     with progress(quiet=options.quiet) as report_stage:
         kind = None if options.out is None else RESULT_FILE if _is_json(options.out) else picture_kind(options.out)

@@ -1,0 +1,149 @@
+"""Disturbances that move between samples: what any course within their bounds puts into the states of a sampled plant.
+
+.. math::
+    q = \\int_0^h e^{A s} B_d d(h - s)\\, ds, \\qquad |d_i(t)| \\le \\bar d_i
+
+What weights c of the states can make of q is at most the sum of ``\\bar d_i \\int |c e^{A s} B_{d,i}| ds``: the sum of
+absolute values of what c makes of some columns (`obsynth.proofs.absolute_integrals`), a fraction of a per cent larger.
+Every threshold, proof and tolerance of a sampled plant takes these columns from here.  What is at least possible comes
+from fewer columns, of disturbances that rest in each piece of a sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import MOST_STORED_STATES, DescriptorSystem
+from obsynth.plants.transformations.elimination import eliminate_algebraic_states
+from obsynth.plants.transformations.uncertain_plant import AffinePlant, reduced_family, sums_of_bounds
+from obsynth.plants.uncertainty import SAMPLED
+from obsynth.proofs.absolute_integrals import IntervalColumns, interval_columns
+from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse
+from obsynth.proofs.balls import rounded_up
+from obsynth.proofs.products import exponential
+
+#: Pieces of a sample in which a disturbance rests, in the linear programmes of windows; of many disturbances fewer.
+RESTING_PIECES, RESTING_PIECES_OF_MANY, MANY = 8, 4, 6
+
+
+@dataclass(frozen=True, eq=False)
+class MovingColumns:
+    """What moving disturbances put into the states of a plant in a sample, from both sides.
+
+    ``resting (nx, pieces nd)``, the last piece of a sample first: what disturbances that rest in each piece do.
+    ``columns (nx, k nd)``, and ``directions (nx, nx)`` with ``sizes (nx, nd)``: |c q| is at most
+    ``|c columns| bounds + |c directions| sizes bounds`` for every row c.
+    """
+
+    resting: FloatArray
+    columns: FloatArray
+    directions: FloatArray
+    sizes: FloatArray
+
+    def rest(self, bounds: FloatArray) -> FloatArray:
+        """Return how far q goes in each direction beside the columns ``(nx,)``, for bounds ``(nd,)``."""
+        return sums_of_bounds(self.sizes, bounds)
+
+
+def continuous_behind(plant: DescriptorSystem) -> DescriptorSystem | None:
+    """Return the plant in continuous time that a plant was sampled from, without algebraic states.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        Any plant.
+
+    Returns
+    -------
+    DescriptorSystem or None
+        ``None`` where the plant was not sampled from one that is known, or has no disturbance.
+    """
+    written, sample_time = getattr(plant, "_made_from", (None, None))
+    if type(written) is not DescriptorSystem or sample_time is None or not plant.nd or plant.dt != sample_time:
+        return None
+    if written.nx > MOST_STORED_STATES:
+        # A design of it does not hold it: what is claimed has to be proved again from the design.
+        return None
+    smooth = eliminate_algebraic_states(written).plant
+    same = smooth.nx == plant.nx and smooth.nd == plant.nd and np.array_equal(smooth.C, plant.C)
+    return smooth if same else None
+
+
+def moving_columns(plant: DescriptorSystem) -> MovingColumns | None:
+    """Return what disturbances of any time course put into the states in a sample; ``None`` where that is Bd d.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        Sampled by `obsynth.discretise`, or a spec with a sample time; of others nothing is known between samples.
+    """
+    smooth = continuous_behind(plant)
+    if smooth is None or not smooth.Bd.any():
+        return None
+    found = interval_columns(AffineMatrix.exact(smooth.A, 0), AffineMatrix.exact(smooth.Bd, 0), plant.dt)
+    radius = np.sum([block.radius for block in found.blocks], axis=0)
+    inverse = affine_inverse(AffineMatrix.exact(found.directions, 0)).magnitude
+    sizes = np.where(
+        (found.rest > 0.0) | (radius > 0.0),
+        rounded_up(found.rest + inverse @ radius, plant.nx + len(found.blocks)),
+        0.0,
+    )
+    pieces = RESTING_PIECES if plant.nd <= MANY else RESTING_PIECES_OF_MANY
+    columns = np.hstack([block.center for block in found.blocks])
+    return MovingColumns(_resting(smooth, plant.dt, pieces), columns, found.directions, sizes)
+
+
+def _resting(smooth: DescriptorSystem, dt: float, pieces: int) -> FloatArray:
+    """Return what a disturbance of one does that acts in one piece of a sample alone, newest piece first."""
+    n, nd = smooth.nx, smooth.nd
+    whole = np.vstack([np.hstack([smooth.A, smooth.Bd]), np.zeros((nd, n + nd))])
+    moved = exponential(whole, dt / pieces).midpoint
+    found = [moved[:n, n:]]
+    while len(found) < pieces:
+        found.append(moved[:n, :n] @ found[-1])
+    return np.hstack(found)
+
+
+def with_moving_disturbances(affine: AffinePlant) -> AffinePlant:
+    """Return a sampled plant over its box with disturbances that move between samples: the columns that count them,
+    and those of the values at the samples, which enter outputs.  Bounds go with `AffinePlant.disturbance_bounds`.
+
+    Where no continuous plant is known it is returned as it is.
+    """
+    plant = affine.plant
+    uncertain = plant.uncertainty
+    if not plant.nd or plant.dt <= 0.0:
+        return affine
+    if uncertain is not None and any(kind == SAMPLED for kind, _ in uncertain.steps):
+        reduced, basis = reduced_family(plant, uncertain, affine.box)
+        a, bd = reduced["A"], reduced["Bd"]
+    else:
+        smooth = continuous_behind(plant)
+        if smooth is None:
+            return affine
+        if not (affine.Bd.is_certain and affine.E.is_certain):
+            raise PreconditionError(
+                "Constants in E or Bd were given tolerances after the plant was sampled: between samples nothing is "
+                "known of them. Give them in the continuous plant, or state disturbances that are held "
+                "(disturbance: held).",
+                condition="tolerances",
+            )
+        # Constants of the sampled plant act from sample to sample; in between it is the nominal one.
+        basis = np.eye(plant.nx)
+        a, bd = AffineMatrix.exact(smooth.A, affine.count), AffineMatrix.exact(smooth.Bd, affine.count)
+    found = interval_columns(a, bd, plant.dt)
+    zero = AffineMatrix.exact(np.zeros((plant.nx, plant.nd)), affine.count)
+    matrix = all_columns(found, basis)
+    blind = AffineMatrix.exact(np.zeros((plant.ny, matrix.shape[1])), affine.count)
+    moved = {"Bd": affine_block([[matrix, zero]]), "Dd": affine_block([[blind, affine.Dd]])}
+    return replace(affine, matrices={**affine.matrices, **moved}, blocks=len(found.blocks), rest=found.rest)
+
+
+def all_columns(found: IntervalColumns, basis: FloatArray) -> AffineMatrix:
+    """Return the columns ``(nx, k)`` of all blocks, then the directions of the rest, multiplied by a basis."""
+    directions = AffineMatrix.exact(found.directions, found.blocks[0].count)
+    return affine_block([[*(block.after(basis) for block in found.blocks), directions.after(basis)]])
