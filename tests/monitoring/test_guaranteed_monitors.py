@@ -28,9 +28,12 @@ def drive() -> obsynth.ObserverDesign:
 
 def test_the_step_is_found_and_nothing_before_it() -> None:
     watched = obsynth.monitor(drive(), spec().scenario)
-    assert "no function of these samples has a threshold below 0.045456" in watched.statement
+    # Held between samples the load torque allows 0.045456; as it likes, half as much again.
+    least = drive().certificate.claims["least"]
+    assert 1.4 * 0.045456 < least <= drive().certificate.claims["threshold"] < 1.6 * 0.045456
+    assert f"no function of these samples has a threshold below {least:.6g}" in watched.statement
     found = watched.watch(obsynth.simulate(drive(), spec().scenario).estimates)
-    # 0.1 N m are more than twice the threshold: found at the latest 19 samples after the step at 4 s.
+    # Found at the latest 19 samples after the step at 4 s, though 0.1 N m are no more than 1.5 times the threshold.
     assert found.time is not None
     assert 4.0 < found.time <= 4.0 + 0.38 + 1e-9
     assert np.isinf(found.threshold[:29]).all()

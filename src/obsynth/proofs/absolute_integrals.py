@@ -11,17 +11,19 @@ but the last remainder: the bound is as tight for rows to which b is nearly invi
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
+import flint
 import numpy as np
 
-from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.affine import AffineMatrix, affine_exponential, affine_inverse
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction
-from obsynth.proofs.products import exponential
+from obsynth.proofs.extended_balls import arb_matrix
+from obsynth.proofs.products import as_ball, exponential
 
 #: An interval is cut at least into so many pieces, and into no more than so many times these.
 LEAST_PIECES, MOST_TIMES = 16, 8
@@ -46,6 +48,9 @@ MODE_BITS = 10
 
 #: Condition of eigenvectors, in balanced units, up to which they serve as coordinates.
 MOST_DEPENDENT = 1e6
+
+#: Bits in which motions of a plant without tolerances are followed, and the most states for it.
+BITS_OF_MOTIONS, MOST_STATES_IN_BALLS = 256, 40
 
 #: Covers the rounding of the largest eigenvalue of a symmetric matrix of two rows, as a share of its entries.
 GROWTH_ROUNDING = 1e-14
@@ -85,19 +90,17 @@ def interval_columns(
         For several inputs at once, of which the weighted squares stay below one at
         each time, the columns of a block belong together: the same holds with ``|c v_j|`` as a norm.
     """
-    cuts = _cuts(a.center, b.center, length, pieces, shared)
+    cuts = halvings(a.center, b.center, length, pieces=pieces, shared=shared)
     modes = _modes(a, length, apart=len(set(cuts)) > 1)
     widths = [length * 2.0 ** -int(level) for level in cuts]
     reached = _reached(a, b)
-    moves = {width: _transition(a, width) for width in set(widths)}
-    nodes = [b]
-    for width in widths:
-        nodes.append(_within(moves[width] @ nodes[-1], reached))
+    nodes, second, fourth = (
+        [_within(one, reached) for one in ones] for ones in zip(*_motions(a, b, widths), strict=True)
+    )
     blocks = [
         node.scaled(0.5 * (before + after) * ROUNDED)
         for node, before, after in zip(nodes, [0.0, *widths], [*widths, 0.0], strict=True)
     ]
-    second = [_within(a @ (a @ node), reached) for node in nodes]
     weights, rest = np.zeros(len(nodes)), np.zeros(b.shape)
     for first, last in _groups(cuts, shared):
         # In units of the pieces of this group, which all have one length: masses w^3 / 12 at their middles.
@@ -107,7 +110,7 @@ def interval_columns(
         weights[last] += mass * float(middles.sum()) / count
         weights[first] += mass * float((count - middles).sum()) / count
         left = mass * width**2 * float((middles * (count - middles)).sum()) / 2.0
-        largest = modes.largest(_within(a @ (a @ second[first]), reached), width * count)
+        largest = modes.largest(fourth[first], width * count)
         rest += rounded_up(left * largest, 12)
     blocks += [block.scaled(weight * ROUNDED) for block, weight in zip(second, weights, strict=True) if weight]
     rest = rounded_up(rest, len(widths) + 8)
@@ -125,12 +128,15 @@ def _within(matrix: AffineMatrix, reached: np.ndarray) -> AffineMatrix:
     )
 
 
-def _cuts(a: FloatArray, b: FloatArray, length: float, pieces: int, shared: int) -> list[int]:
-    """Return how often the interval is halved for each piece, first piece first."""
+def halvings(
+    a: FloatArray, b: FloatArray, length: float, *, pieces: int, shared: int = 1, times: int = MOST_TIMES
+) -> list[int]:
+    """Return how often an interval is halved for each piece of it, first piece first, so that the modes that ``b``
+    excites are near straight lines in each: ``pieces`` at least, and at most so many ``times`` these."""
     level = max(int(np.ceil(np.log2(pieces))), 0)
     cuts = [(level, k) for k in range(2**level)]
     values = _excited(a, b)
-    while len(cuts) < MOST_TIMES * pieces and values.size:
+    while len(cuts) < times * pieces and values.size:
         levels, places = (np.array(part, dtype=np.float64) for part in zip(*cuts, strict=True))
         widths = length * 2.0**-levels
         with np.errstate(over="ignore", invalid="ignore", under="ignore"):
@@ -187,17 +193,42 @@ def _reached(a: AffineMatrix, b: AffineMatrix) -> np.ndarray:
     return np.asarray(found)
 
 
+def _motions(
+    a: AffineMatrix, b: AffineMatrix, widths: list[float]
+) -> Iterator[tuple[AffineMatrix, AffineMatrix, AffineMatrix]]:
+    """Yield ``e^{A s} b`` at both ends of each piece, with its second and fourth derivatives."""
+    certain = a.is_certain and b.is_certain and len(a.center) <= MOST_STATES_IN_BALLS
+    # Of fast modes that have decayed nothing is left but rounding, which derivatives would magnify: many bits.
+    if not certain:
+        moves = {width: _transition(a, width) for width in set(widths)}
+        node = b
+        for width in [0.0, *widths]:
+            node = moves[width] @ node if width else node
+            second = a @ (a @ node)
+            yield node, second, a @ (a @ second)
+        return
+    with flint.ctx.workprec(BITS_OF_MOTIONS):
+        matrix, vectors = arb_matrix(a.center), arb_matrix(b.center)
+        exact = {width: (matrix * flint.arb(width)).exp() for width in set(widths)}
+        found = []
+        for width in [0.0, *widths]:
+            vectors = exact[width] * vectors if width else vectors
+            twice = matrix * (matrix * vectors)
+            found.append((vectors, twice, matrix * (matrix * twice)))
+        balls = [tuple(_as_affine(as_ball(part), a.count) for part in parts) for parts in found]
+    for node, second, last in balls:
+        yield node, second, last
+
+
+def _as_affine(ball: Ball, count: int) -> AffineMatrix:
+    return AffineMatrix(ball.midpoint, np.zeros((count, *ball.shape)), ball.radius)
+
+
 def _transition(a: AffineMatrix, width: float) -> AffineMatrix:
     """Return ``e^{A w}``."""
-    if not a.is_certain:
-        return affine_exponential(a.scaled(width))
-    ball = exponential(a.center, width)
-    if not ball.is_finite:
-        raise PreconditionError(
-            f"The response of the plant within {width:g} s has no bound in double precision: sample faster.",
-            condition="boundedness",
-        )
-    return AffineMatrix(ball.midpoint, np.zeros((a.count, *a.shape)), ball.radius)
+    return (
+        affine_exponential(a.scaled(width)) if not a.is_certain else _as_affine(exponential(a.center, width), a.count)
+    )
 
 
 class _Modes(NamedTuple):

@@ -145,6 +145,8 @@ class _Programme:
         for tolerance in (TOLERANCE, LOOSE):
             self.highs.setOptionValue("primal_feasibility_tolerance", tolerance)
             if sign in self.bases:
+                # Nothing of the rows before counts, not even in the last digit: a run that goes on is the same run.
+                self.highs.clearSolver()
                 self.highs.setBasis(self.bases[sign])
             self.highs.run()
             status = self.highs.getModelStatus()

@@ -357,8 +357,11 @@ def adaptive_statement(plan: AdaptivePlan, assumed: Assumptions) -> str:
     kept = assumed.bounds_phrase if box is None else assumed.phrase()
     outside = "" if box is None else f": an alarm is a fault, or {box.sentence}"
     text = f"never passed without a fault{f', with {kept}' if kept else ''}{outside}"
+    held = ""
+    if assumed.plant.is_discrete and assumed.plant.nd:
+        held = BOUNDS_AND_HELD_INPUTS.format(dt=shown(assumed.plant.dt)) if assumed.moves else HELD
     if box is None:
-        return text + NO_TOLERANCE
+        return text + held + NO_TOLERANCE
     steps = () if uncertain is None else uncertain.steps
     sampled = any(kind == SAMPLED for kind, _ in steps)
     kept = ""
@@ -366,9 +369,6 @@ def adaptive_statement(plan: AdaptivePlan, assumed: Assumptions) -> str:
         kept = "; the state does not jump" if sampled else "; the value at k + 1 multiplies x(k+1)"
     radius = loop_radius(plan.bound.responses)
     ever = "" if radius < 1.0 else (f"; it holds at each sample, but may grow (loop radius {radius:.3g})")
-    held = ""
-    if sampled or assumed.moves:
-        held = BOUNDS_AND_HELD_INPUTS.format(dt=shown(assumed.plant.dt)) if assumed.moves else HELD
     if plan.sample_time is not None:
         apart = shown(plan.sample_time)
         held = f"; known inputs are held between rows, {apart} s apart, disturbances may move in between"

@@ -21,13 +21,20 @@ from obsynth.plants.descriptor import MOST_STORED_STATES, DescriptorSystem
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.plants.transformations.uncertain_plant import AffinePlant, reduced_family, sums_of_bounds
 from obsynth.plants.uncertainty import SAMPLED
-from obsynth.proofs.absolute_integrals import IntervalColumns, interval_columns
+from obsynth.proofs.absolute_integrals import IntervalColumns, halvings, interval_columns
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse
 from obsynth.proofs.balls import rounded_up
 from obsynth.proofs.products import exponential
 
-#: Pieces of a sample in which a disturbance rests, in the linear programmes of windows; of many disturbances fewer.
-RESTING_PIECES, RESTING_PIECES_OF_MANY, MANY = 8, 4, 6
+#: Pieces of a sample in which a disturbance rests, in the linear programmes of windows, which have a column for each of
+#: each sample: of up to so many disturbances, and of more.
+RESTING_PIECES, FEWEST_PIECES = ((2, 16), (6, 8)), 4
+
+#: The shorter pieces that fast modes need are no more than as many again.
+MOST_RESTING_TIMES = 2
+
+#: Pieces of a sample where given weights are judged, which takes no programme: of up to so many entries, and of more.
+JUDGED_PIECES, MOST_ENTRIES, JUDGED_PIECES_OF_MANY = 32, 60, 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +91,9 @@ def moving_columns(plant: DescriptorSystem) -> MovingColumns | None:
     smooth = continuous_behind(plant)
     if smooth is None or not smooth.Bd.any():
         return None
-    found = interval_columns(AffineMatrix.exact(smooth.A, 0), AffineMatrix.exact(smooth.Bd, 0), plant.dt)
+    judged = JUDGED_PIECES if plant.nx * plant.nd <= MOST_ENTRIES else JUDGED_PIECES_OF_MANY
+    a, bd = AffineMatrix.exact(smooth.A, 0), AffineMatrix.exact(smooth.Bd, 0)
+    found = interval_columns(a, bd, plant.dt, pieces=judged)
     radius = np.sum([block.radius for block in found.blocks], axis=0)
     inverse = affine_inverse(AffineMatrix.exact(found.directions, 0)).magnitude
     sizes = np.where(
@@ -92,7 +101,7 @@ def moving_columns(plant: DescriptorSystem) -> MovingColumns | None:
         rounded_up(found.rest + inverse @ radius, plant.nx + len(found.blocks)),
         0.0,
     )
-    pieces = RESTING_PIECES if plant.nd <= MANY else RESTING_PIECES_OF_MANY
+    pieces = next((pieces for most, pieces in RESTING_PIECES if plant.nd <= most), FEWEST_PIECES)
     columns = np.hstack([block.center for block in found.blocks])
     return MovingColumns(_resting(smooth, plant.dt, pieces), columns, found.directions, sizes)
 
@@ -101,10 +110,12 @@ def _resting(smooth: DescriptorSystem, dt: float, pieces: int) -> FloatArray:
     """Return what a disturbance of one does that acts in one piece of a sample alone, newest piece first."""
     n, nd = smooth.nx, smooth.nd
     whole = np.vstack([np.hstack([smooth.A, smooth.Bd]), np.zeros((nd, n + nd))])
-    moved = exponential(whole, dt / pieces).midpoint
-    found = [moved[:n, n:]]
-    while len(found) < pieces:
-        found.append(moved[:n, :n] @ found[-1])
+    widths = [dt * 2.0**-level for level in halvings(smooth.A, smooth.Bd, dt, pieces=pieces, times=MOST_RESTING_TIMES)]
+    moves = {width: exponential(whole, width).midpoint for width in set(widths)}
+    found, later = [], np.eye(n)
+    for width in widths:
+        found.append(later @ moves[width][:n, n:])
+        later = later @ moves[width][:n, :n]
     return np.hstack(found)
 
 
