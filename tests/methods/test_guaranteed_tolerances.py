@@ -20,8 +20,8 @@ from obsynth.verification.over_tolerances.plants_of_the_box import plant_at
 ROOT = Path(__file__).parents[2]
 #: What the drive's example assumes: |load torque| <= 0.2 N m, |noise| <= 0.002 rad/s.
 BOUNDS = {"disturbance_bounds": 0.2, "noise_bound": {"motor speed": 0.002, "load speed": 0.002}}
-#: By course: options, and the mean threshold with the constants 5 % off (landed filter: 0.540), for disturbances that are
-#: held between samples.
+#: By course: options, and the mean threshold with the constants 5 % off (landed filter: 0.540), for disturbances
+#: that are held between samples.
 MEASURED: dict[str, tuple[dict[str, Any], float]] = {
     "constant, 10": ({"course": "constant", "samples": 10}, 0.336),
     "constant, 20": ({"course": "constant", "samples": 20}, 0.317),
