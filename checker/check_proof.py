@@ -645,7 +645,8 @@ class Window:
     Rows are ``E x(k+1) - A x(k) - Bf f(k) - Bd d(k) - G w(k) = B u(k)`` for the equations from ``-prior`` on, and
     ``C x(k) + Df f(k) + Dd d(k) + H w(k) = y(k) - D u(k)`` for the samples 0 to ``samples - 1``.  Entries of z are the
     size theta of the fault that is looked for, states, noise w, disturbances d, and what else the faults do.  Bounds of
-    disturbances and noise are about ``middles``, which are moved to the right.
+    disturbances and noise are about ``middles``, which are moved to the right.  Disturbances that move between samples
+    enter each equation by the columns of ``between_samples`` with bounds of their own, in place of Bd or beside it.
     """
 
     def __init__(self, system, question):
@@ -681,9 +682,9 @@ class Window:
         first = self.equations * self.system.E.rows
         return first + k * self.system.C.rows + i if 0 <= k < self.samples else None
 
-    def acts(self, k, state, output, i, column, times=1):
+    def acts(self, k, state, output, i, column, times=1, in_states=True):
         """Let a column of z act at k as signal i does, by these matrices of states and outputs."""
-        for r in range(state.rows):
+        for r in range(state.rows) if in_states else ():
             row = self.equation(k, r)
             if row is not None:
                 self.put(row, column, -times * state.fraction(r, i))
@@ -737,23 +738,49 @@ class Window:
         self.move_middles(bounds, span)
 
     def disturb(self, bounds, span):
-        """Disturbances: new at each sample (jump), the same at all (held), or with bounded changes (rate)."""
-        system, kind = self.system, self.question["disturbance"]
-        require(kind in ("jump", "held", "rate"), "the course of disturbances is unknown")
+        """Disturbances: new at each sample (any, jump), the same at all (held), or with bounded changes (rate)."""
+        system, kind, between = self.system, self.question["disturbance"], self.question.get("between_samples")
+        require(kind in ("any", "jump", "held", "rate"), "the course of disturbances is unknown")
+        require(between is None or kind in ("any", "rate"), "disturbances that are held do not move between samples")
+        replaced = between["replaced"] if between else []
         require(len(bounds["disturbances"]) == system.Bd.columns, "each disturbance needs a bound")
         for i, bound in enumerate(bounds["disturbances"]):
             before = column = None
             require(bound is not None, "each disturbance needs a bound")
             for k in span if bound else ():
                 if column is None or kind != "held":
-                    column = self.column(bound, ("d", k) if kind == "jump" else None)
-                self.acts(k, system.Bd, system.Dd, i, column)
+                    column = self.column(bound, ("d", k) if kind in ("any", "jump") else None)
+                self.acts(k, system.Bd, system.Dd, i, column, in_states=i not in replaced)
                 if kind == "rate" and before is not None:
                     change = self.column(bounds["rates"][i])
                     for place, value in ((column, 1), (before, -1), (change, -1)):
                         self.put(self.row_count, place, value)
                     self.row_count += 1
                 before = column
+        if between:
+            self.move(between)
+
+    def move(self, between):
+        """What disturbances that move between samples put into the equations of each."""
+        columns = read_matrix(between["columns"])
+        bounds = [read_matrix(bound).number() for bound in between["bounds"]]
+        require(columns.rows == self.system.E.rows, "the columns of moving disturbances do not fit")
+        require(len(bounds) == len(between["groups"]) == columns.columns, "each column needs a bound and a group")
+        for k in range(-self.prior, self.equations - self.prior):
+            for j, (bound, group) in enumerate(zip(bounds, between["groups"], strict=True)):
+                column = self.column(bound, None if group is None else ("moving", k, int(group)))
+                for r in range(columns.rows):
+                    self.put(self.equation(k, r), column, -columns.fraction(r, j))
+
+    @property
+    def assumed(self):
+        """What is assumed of disturbances between samples, and not proved here."""
+        if any(
+            bound is not None and read_matrix(bound).entries[0] for bound in self.question["bounds"]["disturbances"]
+        ):
+            moving = self.question.get("between_samples")
+            return ", for disturbances that " + ("act as its columns say" if moving else "are held between samples")
+        return ""
 
     def look_for(self, bounds, span):
         """The fault that is looked for: what theta does, and what else this fault may do."""
@@ -881,7 +908,7 @@ def threshold_holds(system, claim):
     require_weights_run(system, claim, window, multipliers)
     return (
         f"without {system.names['faults'][int(claim['window']['fault'])]}, its test never passes {shown(threshold)} "
-        f"(and the rounding of its weights); a fault of twice that passes it"
+        f"(and the rounding of its weights){window.assumed}; a fault of twice that passes it"
     )
 
 
@@ -929,10 +956,11 @@ def least_is_hidden(system, claim):
             if claim["window"]["norm"] == "ellipsoid" and window.groups[j] is not None and bound:
                 groups[window.groups[j]] = groups.get(window.groups[j], 0) + (value / bound) ** 2
     require(all(value <= 1 for value in groups.values()), "the point violates a bound")
+    fault = system.names["faults"][int(claim["window"]["fault"])]
     begun = f"begins {window.prior} samples before the window" if window.prior else "begins with the window"
     return (
-        f"for a plant that {begun}, no function of {window.samples} samples estimates "
-        f"{system.names['faults'][int(claim['window']['fault'])]} to within less than {shown(least, down=True)}"
+        f"for a plant that {begun}, no function of {window.samples} samples estimates {fault} to within "
+        f"less than {shown(least, down=True)}{window.assumed}"
     )
 
 
@@ -966,7 +994,7 @@ def alarm_is_right(system, claim):
     return (
         f"the {window.samples} samples of the alarm cannot occur without "
         f"{system.names['faults'][int(claim['window']['fault'])]}: all bounds would have to be exceeded by "
-        f"{shown(margin * 100, down=True)} %"
+        f"{shown(margin * 100, down=True)} %{window.assumed}"
     )
 
 

@@ -127,7 +127,7 @@ def alarm_proof_of(certificate: Mapping[str, Any]) -> dict[str, Any]:
     place = [test.linear[0].fault_names[window_of_test(test).question.fault] for test in tests].index(
         certificate["test"]
     )
-    window = window_of_test(tests[place])
+    window = window_of_test(tests[place]).outer
     y, u = (np.asarray(restored(certificate[name]), dtype=np.float64) for name in ("y", "u"))
     claim = {
         "claim": "alarm",

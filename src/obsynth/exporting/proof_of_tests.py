@@ -49,6 +49,7 @@ def test_claims(design: ObserverDesign) -> Iterator[tuple[str, dict[str, Any] | 
 
 def _threshold(whole: ObserverDesign, test: ObserverDesign, window: Window, row: int) -> dict[str, Any] | None:
     threshold = float(test.certificate.claims["threshold"])
+    window = window.outer
     exact = exact_test(window, test.certificate.matrices["multipliers"].ravel(), all_columns=threshold == 0.0)
     if exact is None:
         return None
@@ -70,7 +71,7 @@ def _threshold(whole: ObserverDesign, test: ObserverDesign, window: Window, row:
 
 
 def _least(test: ObserverDesign, window: Window) -> dict[str, Any] | None:
-    shipped = test.certificate.matrices.get("witness")
+    shipped, window = test.certificate.matrices.get("witness"), window.inner
     point = None if shipped is None else exact_point(window, shipped.ravel()[: len(window.bar)])
     if point is None:
         return None
@@ -112,6 +113,7 @@ def question_of_window(window: Window) -> dict[str, Any]:
         "free": list(question.free),
         "free_course": question.free_course,
         "disturbance": question.disturbance,
+        "between_samples": _between_samples(window),
         "norm": "ellipsoid" if question.ellipsoid else "box",
         "noise_state": Dyadic.of(bounds.noise_state).data(),
         "noise_output": Dyadic.of(bounds.noise_output).data(),
@@ -127,6 +129,18 @@ def question_of_window(window: Window) -> dict[str, Any]:
             kind: [number_data(float(value)) for value in (np.zeros(counts[kind]) if given is None else given)]
             for kind, given in middles.items()
         },
+    }
+
+
+def _between_samples(window: Window) -> dict[str, Any] | None:
+    """Return the columns by which disturbances that move between samples enter each equation, with their bounds."""
+    if not (columns := window.moving_columns):
+        return None
+    return {
+        "columns": Dyadic.of(np.column_stack([column for _, column, _, _ in columns])).data(),
+        "bounds": [number_data(bound) for _, _, bound, _ in columns],
+        "groups": [block for _, _, _, block in columns],
+        "replaced": window.replaced,
     }
 
 

@@ -91,7 +91,7 @@ def _linear(model: DAEModel, asked: Any) -> tuple[DescriptorSystem, Any]:
         disturbance_bounds={**given, **room},
         region=None,
         sample_time=None,
-        given=None,
+        model=model.as_dict(),
     )
     return linear, own
 
@@ -139,8 +139,9 @@ def synthesise_nonlinear(model: DAEModel, asked: Any, *, progress: Callable[[str
     notes.insert(
         0,
         f"The plant is nonlinear: the remainder of its linear model is at most {share.max():.3g} in a state or an "
-        "output, while all signals stay in the region, between samples too; known inputs, faults and unknown inputs "
-        "are held there. That there is no smaller threshold is not claimed, as the remainder is bounded and not known.",
+        "output, while all signals stay in the region, between samples too; known inputs and faults are held there"
+        + (". " if own.disturbance in ("any", "rate") else ", and unknown inputs. ")
+        + "That there is no smaller threshold is not claimed, as the remainder is bounded and not known.",
     )
     return replace(
         found,

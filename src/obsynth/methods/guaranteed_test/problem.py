@@ -29,6 +29,7 @@ from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.moving_disturbances import moving_columns
+from obsynth.plants.transformations.remainders import continuous_model
 from obsynth.proofs.exact_pencils import ExactPencil
 
 #: What each course covers, and what not.
@@ -337,7 +338,9 @@ def bounds_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Test
 
 def _between_samples(plant: DescriptorSystem, asked: TestOptions, bounds: Bounds) -> Bounds:
     """Return bounds with what disturbances do between the samples of a plant whose continuous one is known."""
-    moving = moving_columns(plant) if asked.disturbance in ("any", "rate") and bounds.disturbance.any() else None
+    if asked.disturbance not in ("any", "rate") or not bounds.disturbance.any():
+        return bounds
+    moving = moving_columns(plant, None if asked.model is None else continuous_model(plant, asked.model, asked.given))
     if moving is None:
         return bounds
     sizes = bounds.disturbance

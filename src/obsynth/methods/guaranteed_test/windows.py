@@ -141,8 +141,8 @@ def _constant_model(plant: DescriptorSystem, bounds: Bounds, question: TestProbl
     kinds = {
         "f": (plant.Bf, plant.Df),
         "d": (plant.Bd, plant.Dd),
-        # Of a disturbance that moves between samples the value at the samples enters outputs alone.
-        "d at samples": (np.zeros_like(plant.Bd), plant.Dd),
+        # Of disturbances that move between samples the values at the samples enter outputs alone.
+        "d at samples": (plant.Bd * (1.0 if bounds.moving is None else ~bounds.moving.moved), plant.Dd),
         "w": (bounds.noise_state, bounds.noise_output),
     }
     span = range(max(count, question.samples))
@@ -286,6 +286,19 @@ class Window:
         if self.bounds.moving is None or self.question.disturbance == "any":
             return self
         return window_of(self.model.plant, replace(self.bounds, moving=None), self.question)
+
+    @property
+    def moving_columns(self) -> list[tuple[tuple[str, int], FloatArray, float, int | None]]:
+        """What disturbances that move between samples put into the states of each (`columns_between_samples`)."""
+        return columns_between_samples(self.bounds)
+
+    @property
+    def replaced(self) -> list[int]:
+        """Numbers of the disturbances whose values at the samples enter outputs alone."""
+        moving = self.bounds.moving
+        if moving is None or self.question.disturbance != "any":
+            return []
+        return [int(i) for i in np.flatnonzero(moving.moved)]
 
     def without(self, rows: np.ndarray) -> Window:
         """Return a window some rows of which say nothing: each has a free column of its own, which no test may see."""
@@ -459,7 +472,7 @@ def courses_of(window: Window, point: FloatArray) -> dict[str, FloatArray]:
         if label[0] == "moving d" and window.bounds.moving is not None:
             # The mean over the sample.
             course = found.setdefault(names["d"][label[2]], np.zeros(length))
-            course[label[1]] += value * len(names["d"]) / window.bounds.moving.resting.shape[1]
+            course[label[1]] += value * window.bounds.moving.shares[label[3]]
         elif label[0] in names:
             course = found.setdefault(names[label[0]][label[2]], np.zeros(length))
             course[slice(None) if label[1] is None else label[1]] = value
@@ -562,22 +575,34 @@ def _disturbances(bounds: Bounds, question: TestProblem, builder: Builder, actin
 def _between_samples(bounds: Bounds, builder: Builder, equations: int, ne: int) -> None:
     """Enter what disturbances that move between samples put into the equations of each: columns of one time in one
     ellipsoid, and, where every course counts, one for each direction of what these columns leave."""
+    columns = columns_between_samples(bounds)
+    blocks = 1 + max((block for *_, block in columns if block is not None), default=0)
+    for k in range(equations):
+        for (kind, place), entries, bar, block in columns:
+            # Groups 2 k and 2 k + 1 are those of noise and disturbances at the samples.
+            group = -1 if block is None else 2 * (equations + 2 + k * blocks + block)
+            column = builder.columns([(kind, k, place, block)], [bar], group)
+            builder.put(k * ne, -entries[:, None], column)
+
+
+def columns_between_samples(bounds: Bounds) -> list[tuple[tuple[str, int], FloatArray, float, int | None]]:
+    """Return what disturbances that move between samples put into the states of each: kind and number of the signal,
+    the column ``(nx,)``, its bound, and the number of its block, or none for what the blocks leave."""
     moving = bounds.moving
     if moving is None or bounds.moving_bounds is None:
-        return
-    nd, acting = len(bounds.moving_bounds), np.flatnonzero(bounds.moving_bounds > 0.0)
+        return []
+    nd, sizes = len(bounds.moving_bounds), bounds.moving_bounds.tolist()
     columns = moving.columns if bounds.every else moving.resting
-    rest = bounds.times_rest * moving.rest(bounds.moving_bounds) if bounds.every else np.zeros(ne)
-    left, blocks = np.flatnonzero(rest > 0.0), columns.shape[1] // nd
-    for k in range(equations):
-        for block in range(blocks):
-            # Groups 2 k and 2 k + 1 are those of noise and disturbances at the samples.
-            group = 2 * (equations + 2 + k * blocks + block)
-            labels = [("moving d", k, int(i), block) for i in acting]
-            column = builder.columns(labels, bounds.moving_bounds[acting], group)
-            builder.put(k * ne, -columns[:, block * nd + acting], column)
-        column = builder.columns([("left by d", k, int(i)) for i in left], rest[left])
-        builder.put(k * ne, -moving.directions[:, left], column)
+    found: list[tuple[tuple[str, int], FloatArray, float, int | None]] = [
+        (("moving d", i), columns[:, block * nd + i], sizes[i], block)
+        for block in range(columns.shape[1] // nd)
+        for i in range(nd)
+        if sizes[i] > 0.0 and moving.moved[i]
+    ]
+    rest = bounds.times_rest * moving.rest(bounds.moving_bounds) if bounds.every else np.zeros(0)
+    for i in np.flatnonzero(rest > 0.0).tolist():
+        found.append((("left by d", i), moving.directions[:, i], float(rest[i]), None))
+    return found
 
 
 def _course(question: TestProblem, builder: Builder, acting: Any, span: range) -> None:

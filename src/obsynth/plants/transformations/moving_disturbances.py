@@ -41,15 +41,19 @@ JUDGED_PIECES, MOST_ENTRIES, JUDGED_PIECES_OF_MANY = 32, 60, 16
 class MovingColumns:
     """What moving disturbances put into the states of a plant in a sample, from both sides.
 
-    ``resting (nx, pieces nd)``, the last piece of a sample first: what disturbances that rest in each piece do.
+    ``resting (nx, pieces nd)``, the last piece of a sample first: what disturbances that rest in each piece do, which
+    has these ``shares (pieces,)`` of the sample.
     ``columns (nx, k nd)``, and ``directions (nx, nx)`` with ``sizes (nx, nd)``: |c q| is at most
-    ``|c columns| bounds + |c directions| sizes bounds`` for every row c.
+    ``|c columns| bounds + |c directions| sizes bounds`` for every row c.  ``moved (nd,)``: which disturbances these
+    are; the others act from sample to sample.
     """
 
     resting: FloatArray
+    shares: FloatArray
     columns: FloatArray
     directions: FloatArray
     sizes: FloatArray
+    moved: np.ndarray
 
     def rest(self, bounds: FloatArray) -> FloatArray:
         """Return how far q goes in each direction beside the columns ``(nx,)``, for bounds ``(nd,)``."""
@@ -80,43 +84,53 @@ def continuous_behind(plant: DescriptorSystem) -> DescriptorSystem | None:
     return smooth if same else None
 
 
-def moving_columns(plant: DescriptorSystem) -> MovingColumns | None:
+def moving_columns(plant: DescriptorSystem, behind: DescriptorSystem | None = None) -> MovingColumns | None:
     """Return what disturbances of any time course put into the states in a sample; ``None`` where that is Bd d.
 
     Parameters
     ----------
     plant : DescriptorSystem
         Sampled by `obsynth.discretise`, or a spec with a sample time; of others nothing is known between samples.
+    behind : DescriptorSystem, optional
+        The plant in continuous time with the same states, where it is known otherwise; its disturbances are the first
+        ones of ``plant``, whose others act from sample to sample.
     """
-    smooth = continuous_behind(plant)
+    smooth = continuous_behind(plant) if behind is None else behind
     if smooth is None or not smooth.Bd.any():
         return None
-    judged = JUDGED_PIECES if plant.nx * plant.nd <= MOST_ENTRIES else JUDGED_PIECES_OF_MANY
+    judged = JUDGED_PIECES if plant.nx * smooth.nd <= MOST_ENTRIES else JUDGED_PIECES_OF_MANY
     a, bd = AffineMatrix.exact(smooth.A, 0), AffineMatrix.exact(smooth.Bd, 0)
     found = interval_columns(a, bd, plant.dt, pieces=judged)
     radius = np.sum([block.radius for block in found.blocks], axis=0)
     inverse = affine_inverse(AffineMatrix.exact(found.directions, 0)).magnitude
-    sizes = np.where(
-        (found.rest > 0.0) | (radius > 0.0),
-        rounded_up(found.rest + inverse @ radius, plant.nx + len(found.blocks)),
-        0.0,
-    )
-    pieces = next((pieces for most, pieces in RESTING_PIECES if plant.nd <= most), FEWEST_PIECES)
+    sizes = rounded_up(found.rest + inverse @ radius, plant.nx + len(found.blocks))
+    sizes = np.where((found.rest > 0.0) | (radius > 0.0), sizes, 0.0)
+    pieces = next((pieces for most, pieces in RESTING_PIECES if smooth.nd <= most), FEWEST_PIECES)
+    resting, shares = _resting(smooth, plant.dt, pieces)
+
+    def of_all(columns: FloatArray) -> FloatArray:
+        """Return columns with zeros for the disturbances that act from sample to sample."""
+        blocks = columns.reshape(plant.nx, -1, smooth.nd)
+        return np.pad(blocks, ((0, 0), (0, 0), (0, plant.nd - smooth.nd))).reshape(plant.nx, -1)
+
     columns = np.hstack([block.center for block in found.blocks])
-    return MovingColumns(_resting(smooth, plant.dt, pieces), columns, found.directions, sizes)
+    moved = np.arange(plant.nd) < smooth.nd
+    return MovingColumns(of_all(resting), shares, of_all(columns), found.directions, of_all(sizes), moved)
 
 
-def _resting(smooth: DescriptorSystem, dt: float, pieces: int) -> FloatArray:
-    """Return what a disturbance of one does that acts in one piece of a sample alone, newest piece first."""
+def _resting(smooth: DescriptorSystem, dt: float, pieces: int) -> tuple[FloatArray, FloatArray]:
+    """Return what a disturbance of one does that acts in one piece of a sample alone, newest piece first, and the
+    shares of the pieces."""
     n, nd = smooth.nx, smooth.nd
     whole = np.vstack([np.hstack([smooth.A, smooth.Bd]), np.zeros((nd, n + nd))])
-    widths = [dt * 2.0**-level for level in halvings(smooth.A, smooth.Bd, dt, pieces=pieces, times=MOST_RESTING_TIMES)]
-    moves = {width: exponential(whole, width).midpoint for width in set(widths)}
+    levels = halvings(smooth.A, smooth.Bd, dt, pieces=pieces, times=MOST_RESTING_TIMES)
+    shares = 2.0 ** -np.array(levels, dtype=np.float64)
+    moves = {share: exponential(whole, dt * share).midpoint for share in set(shares.tolist())}
     found, later = [], np.eye(n)
-    for width in widths:
-        found.append(later @ moves[width][:n, n:])
-        later = later @ moves[width][:n, :n]
-    return np.hstack(found)
+    for share in shares.tolist():
+        found.append(later @ moves[share][:n, n:])
+        later = later @ moves[share][:n, :n]
+    return np.hstack(found), shares
 
 
 def with_moving_disturbances(affine: AffinePlant) -> AffinePlant:

@@ -21,6 +21,7 @@ from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae import DAEModel, equation_of, symbols_of
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.plants.transformations.linearisation import linearise
 from obsynth.plants.transformations.sampling import discretise
 from obsynth.plants.transformations.uncertain_plant import reduced_matrices
@@ -84,6 +85,19 @@ def bounded_model(
         disturbance_names=[*found.disturbance_names, *remainder_names(found)],
     )
     return with_remainders, bounds
+
+
+def continuous_model(
+    plant: DescriptorSystem, model: Mapping[str, Any], given: Mapping[str, float] | None
+) -> DescriptorSystem | None:
+    """Return the linear model in continuous time, without algebraic states, that `bounded_model` sampled, for the
+    ``model`` as plain data; ``None`` where it has no unknown inputs."""
+    unknown = [name for name in plant.disturbance_names if name in model["inputs"]]
+    if not unknown:
+        return None
+    linear = linearise(DAEModel(**model), given=given, faults=list(plant.fault_names), disturbances=unknown)
+    smooth = eliminate_algebraic_states(linear).plant
+    return smooth if smooth.nx == plant.nx else None
 
 
 def remainder_names(plant: DescriptorSystem) -> list[str]:
