@@ -76,6 +76,9 @@ def verify_alarm(path: str | Path, *, data: str | Path | None = None) -> Verific
 
 
 def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
+    if not body.get("proved", True):
+        yield _row("proof", f"there is a proof ({body['statement']})", 0.0, 1.0, False)
+        return
     data = restored({name: value for name, value in body.items() if name != "gain_set"})
     design = loaded(json.dumps(body["gain_set"]).encode(), "the certificate's gain set")
     plant, _ = design.linear
@@ -87,6 +90,11 @@ def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
     yield _log_row(log, log_file, design, u, y, last=data["row"] if by_test else len(y))
     if by_test:
         yield from _checked_by_test(design, body, data, u, y, log)
+        return
+    if "disturbance" not in data:
+        # Proofs were once about disturbances that are held, without a word about it.
+        words = "the certificate says what disturbances do between samples (disturbance: any or held)"
+        yield _row("assumptions", words, 0.0, 1.0, False, detail="it does not: prove the alarm again")
         return
     bounds = np.asarray(data["bounds"], dtype=np.float64)
     assumed = assumptions_of(

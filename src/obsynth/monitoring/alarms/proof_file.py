@@ -72,7 +72,8 @@ class AlarmProof:
     certificate: Mapping[str, Any]
 
     def save(self, path: str | Path) -> Path:
-        """Write the certificate as one JSON document, atomically.
+        """Write the certificate as one JSON document, atomically; without a proof the file says that there is none, and
+        `obsynth verify` refuses it.
 
         Parameters
         ----------
@@ -82,11 +83,10 @@ class AlarmProof:
         Raises
         ------
         SpecError
-            There is no proof to write, or the file cannot be written.
+            The file cannot be written.
         """
-        if not self.proved:
-            raise SpecError("There is no proof to write: the alarm cannot be proved.", path="certificate")
-        return write_atomically(path, sealed(ALARM_KIND, ALARM_VERSION, self.certificate))
+        body = self.certificate if self.proved else {"proved": False, "row": self.row, "statement": self.statement}
+        return write_atomically(path, sealed(ALARM_KIND, ALARM_VERSION, body))
 
     def __repr__(self) -> str:
         return self.statement
