@@ -101,7 +101,8 @@ def case(seed: int) -> Outcome:
     look = (_of_a_test, _of_a_filter, _over_tolerances)[(seed // len(KINDS)) % 3]
     try:
         return look(plant, rng)
-    except (ob.PreconditionError, ob.InfeasibleError, ob.SolverError):
+    except (ob.PreconditionError, ob.InfeasibleError, ob.SolverError, ob.VerificationError):
+        # Nothing is shipped, and nothing claimed: modes that decay by 1e-10 in a sample leave rounding of the equations.
         return Outcome(plant.kind, "no design")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from scipy.linalg import expm
 
 import obsynth
+from obsynth.cli.main import main
 from obsynth.proofs.absolute_integrals import interval_columns
 from obsynth.proofs.affine import AffineMatrix
 
@@ -156,3 +159,137 @@ def test_sums_of_columns_bound_integrals_and_are_near_them(stiffness: float) -> 
             bound = bound + np.abs(row @ found.directions) @ found.rest
             assert integral <= bound[0] * (1.0 + 1e-5)
             assert bound[0] <= 1.02 * integral
+
+
+def worst_record(test: obsynth.GuaranteedTest, plant: obsynth.DescriptorSystem, dt: float) -> np.ndarray:
+    """Outputs ``(SAMPLES, ny)`` without a fault, from rest, whose last residual is the largest there is."""
+    y = np.eye(SAMPLES * plant.ny).reshape(-1, SAMPLES, plant.ny)
+    weights = np.array([residual(test, one) for one in y]).reshape(SAMPLES, -1)
+    effects = responses(plant, dt, SAMPLES)
+    course = np.sign(effects.reshape(len(effects), -1) @ weights.ravel())
+    return np.tensordot(course, effects, 1) + 3.0 * float(plant.Dw[0, 0]) * np.sign(weights)
+
+
+@pytest.mark.parametrize("seed", [1, 5, 6])
+def test_the_worst_record_is_no_alarm_no_proof_and_no_interval_without_zero(seed: int) -> None:
+    plant, dt = plant_of(seed)
+    options = {name: value for name, value in ASKED.items() if name != "before"} | {"course": "constant"}
+    sampled = obsynth.discretise(plant, dt)
+    for more in ({}, {"exact": True}):
+        test = obsynth.guaranteed_test(sampled, **options, **more)
+        y = worst_record(test, plant, dt)
+        data = pd.DataFrame(y, columns=list(plant.output_names))
+        data.insert(0, "time", np.arange(SAMPLES) * dt)
+        run = obsynth.run_on_data(test, data, monitor=obsynth.online_monitor(test))
+        last = run.table.iloc[-1]
+        assert last["statistic"] <= last["threshold"]
+        assert last["statistic"] >= 0.98 * last["threshold"]
+        assert not obsynth.prove_alarm(test, data, SAMPLES).proved
+        if more:
+            assert last["lowest f1"] <= 0.0 <= last["highest f1"]
+    held = obsynth.guaranteed_test(sampled, disturbance="jump", **options)
+    proof = obsynth.prove_alarm(held, data, SAMPLES)
+    assert "held between samples" in proof.statement or not proof.proved
+
+
+@pytest.mark.parametrize("seed", [4, 6])
+def test_disturbances_of_a_bounded_rate_move_within_a_sample_too(seed: int) -> None:
+    plant, dt = plant_of(seed)
+    rate = 0.2
+    test = obsynth.guaranteed_test(obsynth.discretise(plant, dt), disturbance="rate", disturbance_rate=rate, **ASKED)
+    y = np.eye(SAMPLES * plant.ny).reshape(-1, SAMPLES, plant.ny)
+    weights = np.array([residual(test, one) for one in y])
+    noise = 3.0 * float(plant.Dw[0, 0]) * np.abs(weights).sum()
+    # About any level, half of the rate to either side, as fast as it likes: no two values differ by more.
+    moved = 0.5 * rate * np.abs(responses(plant, dt, SAMPLES).reshape(SAMPLES * PARTS, -1) @ weights).sum()
+    assert moved + noise <= test.threshold * (1.0 + 1e-9)
+    free = obsynth.guaranteed_test(obsynth.discretise(plant, dt), **ASKED)
+    assert test.least <= test.threshold <= free.threshold * 1.1
+    assert "by their stated rates" in test.report["threshold"].claim
+
+
+@pytest.mark.parametrize("seed", [2, 5])
+def test_thresholds_of_a_known_start_count_courses_between_samples(seed: int) -> None:
+    plant, dt = plant_of(seed)
+    quiet = plant.replace(Bw=np.zeros((plant.nx, 0)), Dw=np.zeros((plant.ny, 0)), noise_names=None)
+    design = obsynth.fault_estimation_filter(obsynth.discretise(quiet, dt))
+    samples, observer = 10, design.linear[1]
+    effects = responses(quiet, dt, samples, 24)
+    ones = np.array([observer.run(y, np.zeros((samples, 0))).residuals[-1, 0] for y in effects])
+    y = np.tensordot(np.sign(ones), effects, 1)
+    data = pd.DataFrame(y, columns=list(plant.output_names))
+    data.insert(0, "time", np.arange(samples) * dt)
+    given = {"disturbance_bounds": {"d1": 1.0}, "initial_set": dict.fromkeys(plant.state_names, 0.0)}
+    last = f"threshold r[{observer.residual_names[0]}]"
+    found = [
+        obsynth.run_on_data(design, data, monitor=obsynth.online_monitor(design, disturbance=course, **given)).table
+        for course in ("any", "held")
+    ]
+    moving, held = (float(table[last].iloc[-1]) for table in found)
+    worst = float(np.abs(ones).sum())
+    assert held < worst <= moving * (1.0 + 1e-9)
+    assert moving <= TIGHT * worst
+
+
+def test_a_certificate_without_a_word_about_disturbances_is_refused_by_name(tmp_path: Path) -> None:
+    plant, dt = plant_of(1)
+    design = obsynth.fault_estimation_filter(obsynth.discretise(plant, dt))
+    y = np.zeros((8, plant.ny))
+    y[-1, 0] = 1e3
+    data = pd.DataFrame(y, columns=list(plant.output_names))
+    data.insert(0, "time", np.arange(8) * dt)
+    given = {"disturbance_bounds": {"d1": 1.0}, "noise_bound": 3.0}
+    proof = obsynth.prove_alarm(design, data, 8, initial_set=dict.fromkeys(plant.state_names, 0.0), **given)
+    assert proof.proved
+    assert obsynth.verify_certificate(proof.save(tmp_path / "alarm.json")).passed
+    old = {name: value for name, value in proof.certificate.items() if name != "disturbance"}
+    report = obsynth.verify_certificate(replace(proof, certificate=old).save(tmp_path / "old.json"))
+    assert [check.name for check in report.failures] == ["assumptions"]
+    assert "disturbances do between samples" in report["assumptions"].claim
+    none = replace(proof, proved=False, certificate={}, statement="Cannot be proved.")
+    report = obsynth.verify_certificate(none.save(tmp_path / "none.json"))
+    assert [check.name for check in report.failures] == ["proof"]
+
+
+def test_unknown_inputs_of_a_nonlinear_plant_move_between_samples() -> None:
+    equations = {"place": "der(place) = speed - lost", "force": "der(speed) = push + wind - 9*place - 0.05*place**3"}
+    model = obsynth.DAEModel(
+        equations, {"gauge": "place", "meter": "speed"}, states={"place": 0.0, "speed": 0.0},
+        inputs={"push": 0.0, "wind": 0.0}, parameters={"lost": 0.0},
+    )  # fmt: skip
+    dt, samples, v = 0.7, 6, 1e-4
+    region = {"place": [-0.05, 0.05], "speed": [-0.15, 0.15], "push": [0.0, 0.0], "wind": [-0.01, 0.01],
+              "lost": [0.0, 0.01]}  # fmt: skip
+    asked = {
+        "course": "constant", "samples": samples, "sample_time": dt, "region": region,
+        "disturbance_bounds": {"wind": 0.01}, "noise_bound": {"gauge": v, "meter": v},
+    }  # fmt: skip
+    test = obsynth.guaranteed_test(model, "lost", **asked)
+    held = obsynth.guaranteed_test(model, "lost", disturbance="jump", **asked)
+    linear = obsynth.DescriptorSystem(
+        A=[[0.0, 1.0], [-9.0, 0.0]], C=np.eye(2), Bf=[[0.0], [1.0]], Bd=[[0.0], [1.0]]
+    )  # fmt: skip
+    y = np.eye(samples * 2).reshape(-1, samples, 2)
+    inputs = np.zeros((samples, 1))
+    run = [test.observer.run(one, inputs) for one in y]
+    weights = np.array([float(np.hstack([one.faults, one.residuals])[-1, 0]) for one in run])
+    worst = 0.01 * np.abs(responses(linear, dt, samples).reshape(samples * PARTS, -1) @ weights).sum()
+    worst += v * np.abs(weights).sum()
+    assert held.threshold < worst <= test.threshold * (1.0 + 1e-9)
+    assert test.report.passed
+
+
+def test_the_independent_program_forms_the_same_columns(tmp_path: Path) -> None:
+    plant, dt = plant_of(1)
+    test = obsynth.guaranteed_test(obsynth.discretise(plant, dt), **ASKED)
+    path = test.save(tmp_path / "test.json")
+    assert main(["export", "--gains", str(path), "--to", str(tmp_path / "proof.json")]) == 0
+    document = json.loads((tmp_path / "proof.json").read_text("utf-8"))
+    claims = {claim["claim"]: claim for claim in document["claims"]}
+    assert {"threshold", "least"} <= set(claims)
+    assert main(["verify", "--independent", str(tmp_path / "proof.json")]) == 0
+    # Without the columns nothing but the values at the samples would act.
+    for bound in claims["threshold"]["window"]["between_samples"]["bounds"]:
+        bound["entries"][0] = 2 * int(bound["entries"][0])
+    (tmp_path / "changed.json").write_text(json.dumps(document), "utf-8")
+    assert main(["verify", "--independent", str(tmp_path / "changed.json")]) == 6

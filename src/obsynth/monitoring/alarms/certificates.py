@@ -82,8 +82,8 @@ def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
     data = restored({name: value for name, value in body.items() if name != "gain_set"})
     design = loaded(json.dumps(body["gain_set"]).encode(), "the certificate's gain set")
     plant, _ = design.linear
-    u = np.asarray(data["u"], dtype=np.float64).reshape(-1, plant.nu)
-    y = np.asarray(data["y"], dtype=np.float64).reshape(-1, plant.ny)
+    u = np.asarray(data["u"], dtype=np.float64).reshape(len(data["u"]), plant.nu)
+    y = np.asarray(data["y"], dtype=np.float64).reshape(len(data["y"]), plant.ny)
     by_test = "multipliers" in data
     log = None if data["log"] is None else LogReference.from_dict(data["log"])
     yield gain_set_row(design, body["gain_set"]["sha256"])
