@@ -102,7 +102,7 @@ def case(seed: int) -> Outcome:
     try:
         return look(plant, rng)
     except (ob.PreconditionError, ob.InfeasibleError, ob.SolverError, ob.VerificationError):
-        # Nothing is shipped, and nothing claimed: modes that decay by 1e-10 in a sample leave rounding of the equations.
+        # Nothing is shipped, and nothing claimed: modes that decay by 1e-10 in a sample leave rounding alone.
         return Outcome(plant.kind, "no design")
 
 
