@@ -177,7 +177,8 @@ def refuse_given(options: argparse.Namespace, names: Iterable[str], meant: str) 
     """Refuse arguments that would do nothing; ``meant`` says what they are for."""
     for name in names:
         if name not in ("verb", "settings", "command") and getattr(options, name, None) not in (None, False, []):
-            raise SpecError(f"{flag_of(name)} is for {meant}. Otherwise leave it out.", path=flag_of(name))
+            flag = f"--{name.replace('_', '-')}"
+            raise SpecError(f"{flag} is for {meant}. Otherwise leave it out.", path=flag)
 
 
 def columns_of(options: argparse.Namespace) -> dict[str, str]:
@@ -209,5 +210,5 @@ def ranges_of(pairs: list[tuple[str, str]]) -> dict[str, float | tuple[float, fl
 
 
 def flag_of(name: str) -> str:
-    """Return what an option is called on the command line."""
+    """Return what an option of a function is called on the command line."""
     return f"--{OPTION_NAMES.get(name, name).replace('_', '-')}"
