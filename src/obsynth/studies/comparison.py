@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 #: Samples of the window on which the least threshold is looked for, at most.
 LONGEST_WINDOW = 32
 
-#: A picture of estimates reaches as far as this share of their samples.
+#: How far a signal reaches is told by this share of its samples.
 SHOWN_SAMPLES = 0.98
 
 #: Room below and above a fault in its panel, as a share of its range.
@@ -393,7 +393,7 @@ class Comparison:
         return figure
 
     def _range(self, shown: Sequence[ComparedMethod], row: int) -> tuple[float, float]:
-        """Return the ends of the panel of a fault: all of the truth, and nearly all samples of every estimate."""
+        """Return the ends of the panel of a fault: all of the truth, and of every estimate."""
         known = self.truth[np.isfinite(self.truth[:, row]), row]
         low, high = float(np.min(known, initial=0.0)), float(np.max(known, initial=0.0))
         for entry in shown:
@@ -401,8 +401,7 @@ class Comparison:
             if self.fault_names[row] in names:
                 estimate = entry.estimates[:, names.index(self.fault_names[row])]
                 if np.isfinite(estimate).any():
-                    ends = np.nanquantile(estimate, (1.0 - SHOWN_SAMPLES, SHOWN_SAMPLES))
-                    low, high = min(low, float(ends[0])), max(high, float(ends[1]))
+                    low, high = min(low, float(np.nanmin(estimate))), max(high, float(np.nanmax(estimate)))
         room = ROOM_AROUND_FAULT * (high - low or 1.0)
         return low - room, high + room
 

@@ -51,6 +51,9 @@ MOST_STALE = 10
 #: One that differs by this share of dt is one of dt for certain.
 SURE_SHARE = 0.009
 
+#: Of uneven stamps one that differs by more than this is another interval.
+SAME_INTERVAL = 1e-9
+
 #: Without another word, an interval is a gap when it is longer than this many times the longest one before.
 GAP_FACTOR = 10.0
 
@@ -85,8 +88,11 @@ class Row(NamedTuple):
 class Clock:
     """Checks one time stamp after the other; ``dt`` is 0 in continuous time, with gaps longer than ``gap`` seconds."""
 
-    def __init__(self, dt: float, gap: float | None) -> None:
-        self.dt, self.gap = dt, gap
+    def __init__(self, dt: float, gap: float | None, *, irregular: bool = False) -> None:
+        self.dt, self.gap, self.irregular = dt, gap, irregular
+        # Sampled designs that take any interval: whether the last one was taken as it is, and by how many seconds
+        # such intervals have been longer than dt.
+        self.is_own, self.longer, self.is_uneven = False, 0.0, False
         # Sampled designs: the time of the last sample, near which its stamp lies.
         self.last: float | None = None
         self.longest = 0.0
@@ -97,7 +103,8 @@ class Clock:
 
     def as_dict(self) -> dict[str, Any]:
         """Return what goes from row to row, as data."""
-        return {name: getattr(self, name) for name in ("last", "longest", "stamp", "away", "left_out", "count")}
+        found = {name: getattr(self, name) for name in ("last", "longest", "stamp", "away", "left_out", "count")}
+        return found | ({"longer": self.longer, "is_uneven": self.is_uneven} if self.irregular else {})
 
     def resume(self, data: Mapping[str, Any]) -> None:
         """Go on from what `as_dict` returned."""
@@ -107,7 +114,7 @@ class Clock:
     def at(self, time: float, before: int = 0) -> float:
         """Return the time of the last sample, with this stamp, or of one so many before it: sampled designs count
         samples, whatever their stamps are off by."""
-        return (self.count - before) * self.dt if self.dt > 0.0 else time
+        return (self.count - before) * self.dt + self.longer if self.dt > 0.0 else time
 
     def advance(self, time: float, row: int) -> tuple[float, int]:
         """Take the stamp of the next row."""
@@ -122,10 +129,14 @@ class Clock:
         if time < last:
             raise SpecError(f"Row {row}: the time falls from {last:.17g} to {time:.17g} s.", path=f"row {row}")
         step = interval(last, time)
-        missing = self._sampled(step, row) if self.dt > 0.0 else self._continuous(step, row)
+        self.is_own = self.irregular and self._is_irregular(step)
+        if self.is_own:
+            missing, self.longer = 0, self.longer + step - self.dt
+        else:
+            missing = self._sampled(step, row) if self.dt > 0.0 else self._continuous(step, row)
         self.last = time
         self.count += missing + 1
-        if self.dt > 0.0:
+        if self.dt > 0.0 and not self.is_own:
             away = step - (missing + 1) * self.dt
             # Regular stamps are taken as they are, and not as they are summed up.
             self.last = time if abs(away) <= SURE_SHARE * self.dt else time - FOLLOWING_SHARE * away
@@ -172,6 +183,22 @@ class Clock:
         self.stamp, self.left_out, self.away = times[-1], 0, 0.0
         self.count += len(times)
 
+    def _is_irregular(self, step: float) -> bool:
+        """Whether an interval is taken as it is: it is near dt, but not dt; or the stamps are uneven: this one, or one
+        before, is no number of samples with rows missing between them. A gap is none of these."""
+        samples = step / self.dt
+        if samples > LONGEST_BRIDGE:
+            return False
+        count = max(round(samples), 1)
+        away = abs(samples - count)
+        if count == 1:
+            self.is_uneven = self.is_uneven or away > STAMP_SHARE
+            return away > (SAME_INTERVAL if self.is_uneven else SURE_SHARE)
+        # Rows are missing only where some have come one after the other.
+        fits = away <= (OTHER_SHARE if self.longest else SURE_SHARE) and (self.longest > 0.0 or not self.count)
+        self.is_uneven = self.is_uneven or not fits
+        return self.is_uneven
+
     def _sampled(self, step: float, row: int) -> int:
         count = _counted(step / self.dt, step, row)
         away = abs(step - count * self.dt) / self.dt
@@ -180,7 +207,7 @@ class Clock:
             raise SpecError(
                 f"Row {row} comes {step:.10g} s after the row before, but the design has dt = {self.dt:.10g} s: "
                 "a time stamp may be off by 45 % of dt, and all of them by 25 % on average; irregular time stamps "
-                "need a continuous-time design.",
+                "need a continuous-time design, or a recursive one of a continuous plant that was sampled.",
                 path=f"row {row}",
             )
         # One gap may be the first interval of a log.
@@ -231,6 +258,7 @@ class LogObserver(ABC):
     scales: Mapping[str, float] = MappingProxyType({})  # factor of inputs and outputs by name
     notes: tuple[str, ...] = ()  # what a user should know before anything is run
     plant: DescriptorSystem | None = None  # of a linear design
+    takes_any_interval: bool = False  # of a sampled design: each step from the continuous plant, over its own interval
     input_delay: int = 0  # rows of a log by which inputs act later than the design takes them
     saved: ClassVar[Mapping[str, str]] = {}  # attributes that go from row to row, by their names in a saved state
 

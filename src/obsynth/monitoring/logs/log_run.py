@@ -157,7 +157,8 @@ class LogRun:
         if monitor is not None and isinstance(monitor.rule, LearnedRule):
             design = design.replace(observer=as_learned(design.observer, monitor.rule.learned))
         self.observer = observer = log_observer(design, gap=gap, warm_up=warm_up, outliers=outliers)
-        self.clock, self.signals = Clock(observer.dt, gap), LogSignals.of(observer, columns, scales)
+        self.clock = Clock(observer.dt, gap, irregular=observer.takes_any_interval)
+        self.signals = LogSignals.of(observer, columns, scales)
         self.stamps, self.monitor = stamps, monitor
         #: What rows wait in for those after them, if they do.
         self.later: Any = None
@@ -268,7 +269,7 @@ class LogRun:
         try:
             seconds, missing = self.clock.advance(time, number)
             missed = tuple(self._missed(time, missing)) if missing and self.observer.follows(missing) else ()
-            if self.clock.dt > 0.0:
+            if self.clock.dt > 0.0 and not self.clock.is_own:
                 missing -= len(missed)
                 seconds = (missing + 1) * self.clock.dt
             own, longest = self.clock.at(time), self.clock.longest

@@ -6,12 +6,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from obsynth.errors import ObsynthError, SolverError, SpecError
+from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError
 from obsynth.monitoring.logs.log_observer import GAP, OK, PARTIAL, RECOVERING, WARM_UP, LogObserver, Row
 from obsynth.monitoring.thresholds.learned import innovation_names
 from obsynth.monitoring.thresholds.monitor import Evidence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.recursive.irregular_steps import IrregularSteps
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import as_run, rule_of_outliers
 from obsynth.observers.smoothing_chain import SmootherHistory
@@ -33,12 +34,15 @@ class SteppingLogObserver(LogObserver):
         self.input_names, self.output_names = plant.input_names, plant.output_names
         self.input_delay = design.input_delay
         self.is_recursive, self.may_restart = isinstance(self.observer, RecursiveObserver), True
+        self.intervals: IrregularSteps | None = None
         residuals = innovation_names(self.observer)
         if isinstance(self.observer, RecursiveObserver):
             model, Q, R = self.observer.plant, self.observer.Q, self.observer.R
             self.point, self.scales = model.operating_point, model.scales
             constant = model.is_time_invariant and Q.is_constant and R.is_constant
             self.may_restart = constant and model.horizon is None
+            self.intervals = _irregular_steps(self.observer, design)
+            self.takes_any_interval = self.intervals is not None
         self.columns = (
             *self.estimated,
             *(f"sd {name}" for name in self.estimated),
@@ -54,6 +58,8 @@ class SteppingLogObserver(LogObserver):
         #: Of a smoother: the samples since the observer last started.
         self.chain: SmootherHistory | None = None
         self.state: Any = self.observer.init()
+        #: Seconds of the next step.
+        self.seconds = self.dt
         self.u: FloatArray | None = None
         # Deviations of the faults at the last row, and before samples were missing: zero where nothing is left of that.
         self.spread = self.usual = np.zeros(len(self.fault_names))
@@ -92,13 +98,25 @@ class SteppingLogObserver(LogObserver):
         try:
             with np.errstate(all="ignore"):
                 kept = None if self.chain is None else self.chain.add
-                self.state, found = self.observer.accept(self.state, y, u, kept)
+                self.state, found = self._stepping().accept(self.state, y, u, kept)
         except (np.linalg.LinAlgError, ValueError):
             return None
         if found.is_finite:
             return found
         self.state = before
         return None
+
+    def _stepping(self) -> RecursiveObserver | DAEObserver:
+        """Return the observer of the next step: where its interval is not dt, one from the continuous plant."""
+        if self.intervals is None or self.seconds == self.dt:
+            return self.observer
+        if self.chain is not None:
+            raise SpecError(
+                f"a row comes {self.seconds:.6g} s after the one before, and the design has dt = {self.dt:.6g} s: "
+                "estimates are not smoothed over irregular time stamps; run without smooth and lag.",
+                path="smooth",
+            )
+        return self.intervals.over(self.seconds)
 
     def _values(self, found: Evidence) -> FloatArray:
         """Return a row: estimates, standard deviations, innovation at the parameters of one sample before."""
@@ -111,6 +129,8 @@ class SteppingLogObserver(LogObserver):
     def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
         """Take one row."""
         nu, fresh = len(self.input_names), self.u is None
+        # After rows that nothing stands for the observer starts again: no step has that length.
+        self.seconds = self.dt if missing else seconds
         known = np.isfinite(values)
         if self.u is None and not self.is_recursive and not known[:nu].all():
             # A nonlinear model has no zero to begin with: it begins when all inputs are known.
@@ -192,3 +212,14 @@ class SteppingLogObserver(LogObserver):
                 path="inputs",
             )
         return found
+
+
+def _irregular_steps(observer: RecursiveObserver, design: ObserverDesign) -> IrregularSteps | None:
+    """Return the steps over any interval of an observer whose plant was sampled; `None` where there are none."""
+    source = design.source
+    if source is None or source.sample_time is None:
+        return None
+    try:
+        return IrregularSteps(observer, source.plant)
+    except (SpecError, PreconditionError):
+        return None

@@ -183,8 +183,8 @@ def linear_plant(given: Any) -> DescriptorSystem:
 
 def _approximated(plant: DescriptorSystem, order: int) -> Transformation:
     """Return a continuous plant with Pade approximations of its delays, each with ``order`` states."""
-    parts = [_pade(plant.delays[name], order) if name in plant.delays else None
-             for name in (*plant.input_names, *plant.output_names)]  # fmt: skip
+    names = (*plant.input_names, *plant.output_names)
+    parts = [_pade(plant.delays[name], order) if name in plant.delays else None for name in names]
     for_inputs, for_outputs = _stacked(parts[: plant.nu]), _stacked(parts[plant.nu :])
     a_u, b_u, c_u, d_u = for_inputs
     a_y, b_y, c_y, d_y = for_outputs

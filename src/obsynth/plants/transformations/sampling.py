@@ -104,13 +104,13 @@ def _sampled(plant: DescriptorSystem, sample_time: float, *, before: Transformat
         )
     _require_bounded_growth(smooth.A, float(sample_time))
     if smooth.delays:
-        made = sampled_with_delays(smooth, float(sample_time), _held, _noise_factor)
+        made = sampled_with_delays(smooth, float(sample_time), _held, gathered_noise)
         note_source(smooth, made.plant, sample_time=float(sample_time))
         return made.after(first if before is None else before.then(first), _described(sample_time))
     signals_in = np.hstack([smooth.B, smooth.Bf, smooth.Bd])
     transition, held = _held(smooth.A, signals_in, sample_time)
     B, Bf, Bd = columns_of(held, (smooth.nu, smooth.nf, smooth.nd))
-    factor = _noise_factor(smooth.A, smooth.Bw, sample_time)
+    factor = gathered_noise(smooth.A, smooth.Bw, sample_time)
     kept = [smooth.noise_names[i] for i in direct]
     noise_names = [*(f"process noise {i + 1}" for i in range(factor.shape[1])), *kept]
     Bw = np.hstack([factor, np.zeros((smooth.nx, len(kept)))])
@@ -158,7 +158,7 @@ def _require_bounded_growth(A: FloatArray, sample_time: float) -> None:
     require_no_overflow(float(np.abs(A).max(initial=0.0)) * sample_time, "A times sample_time", "sample_time")
 
 
-def _noise_factor(A: FloatArray, noise: FloatArray, step: float) -> FloatArray:
+def gathered_noise(A: FloatArray, noise: FloatArray, step: float) -> FloatArray:
     """Return a factor of the covariance that unit white noise through ``noise`` gathers in ``step``."""
     nx = A.shape[0]
     if not noise.any():

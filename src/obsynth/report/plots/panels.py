@@ -28,8 +28,8 @@ PANEL_HEIGHT = 2.2
 RESOLUTION = 160
 
 #: Okabe and Ito's colours, which most eyes that see no red distinguish, with the two brightest made darker: each has a
-#: contrast of 3 to 1 with white.
-LINE_COLOURS = ("black", "#0072B2", "#D55E00", "#008F66", "#A3478A", "#8A6200")
+#: contrast of 3 to 1 with white. Black is left for the truth.
+LINE_COLOURS = ("#0072B2", "#D55E00", "#008F66", "#A3478A", "#8A6200", "#5B6770")
 
 #: In every picture the truth is black and solid, an estimate coloured, an interval shaded, a threshold dashed.  The
 #: estimate is thinner, and lighter in print, so that it is seen on the truth.
