@@ -26,6 +26,7 @@ from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.noise import noise_words
 from obsynth.proofs.witnesses import (
     Dyadic,
     above,
@@ -276,7 +277,7 @@ class _Proof:
     def _add_deviation(self, system: _Exact) -> None:
         rows = ["fault"] if self.observer.fault_names else ["residual"]
         if self.plant.nw and self.observer.order and (self.plant.Bw.any() or self.plant.Dw.any()):
-            self._add("standard deviations under the stated noise", system.deviation_claim(rows))
+            self._add(f"standard deviations under {noise_words(self.plant.noise_names)}", system.deviation_claim(rows))
 
 
 def rows_of(observer: LinearObserver) -> list[tuple[str, str, int]]:

@@ -70,6 +70,12 @@ def reduced(E: FloatArray, A: FloatArray) -> tuple[Deflation, Deflation]:
     return right, without_left_singular_part(right, scales)
 
 
+def with_nonsingular_e(E: FloatArray, A: FloatArray) -> tuple[Deflation, Deflation]:
+    """Return the two passes over a square pencil whose E is known to be nonsingular: nothing is taken away."""
+    identity, whole = np.eye(len(E)), np.asarray(np.linalg.solve(E, A), dtype=np.float64)
+    return Deflation(identity, whole, (), (), ()), Deflation(identity, whole.T, (), (), ())
+
+
 def structure_of_reduced(shape: tuple[int, ...], passes: tuple[Deflation, Deflation]) -> PencilStructure:
     """Return the structure of a pencil ``(m, n)`` from its two passes."""
     right, left = passes
@@ -215,6 +221,8 @@ def _eigenvalues(E: FloatArray, A: FloatArray) -> ComplexArray:
     """Return the eigenvalues of a square pencil with nonsingular ``E``, in exact conjugate pairs."""
     if not E.size:
         return _in_pairs(np.zeros(0, dtype=np.complex128))
+    if np.array_equal(E, np.eye(len(E))):
+        return _in_pairs(np.asarray(np.linalg.eigvals(A), dtype=np.complex128))
     if len(E) >= STATES_FOR_INVERTED_E and (inverse := _safe_inverse(E)) is not None:
         return _in_pairs(np.asarray(np.linalg.eigvals(inverse @ A), dtype=np.complex128))
     try:

@@ -25,8 +25,26 @@ DEFAULT_WHITE_SHARE = 0.01
 #: second: so that filters with a steady state follow it within a thousand samples.
 OFFSET_SIZE, OFFSET_WALK = 10.0, 1e-3
 
+#: How noise is called that a method assumes on each output where none is stated.
+ASSUMED = "assumed noise"
+
 #: Units of time in s.
 SECONDS_OF_UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+
+
+def assumed_noise_names(outputs: Sequence[str]) -> list[str]:
+    """Return the names of noise that a method assumes on each output, as nobody stated any."""
+    return [f"{ASSUMED} {name}" for name in outputs]
+
+
+def is_noise_assumed(noise_names: Sequence[str]) -> bool:
+    """Whether the noise of a plant is what a method assumes, and not what somebody stated."""
+    return bool(noise_names) and all(name.startswith(f"{ASSUMED} ") for name in noise_names)
+
+
+def noise_words(noise_names: Sequence[str]) -> str:
+    """Return what to call the noise of a plant: stated, or assumed."""
+    return f"the {ASSUMED} (none is stated)" if is_noise_assumed(noise_names) else "the stated noise"
 
 
 def require_noise(noise_bound: float | None, *, noisy: bool) -> None:

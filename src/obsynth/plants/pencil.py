@@ -1,4 +1,4 @@
-"""What a design promises for every plant in the box of its constants."""
+"""The pencil ``A - z E`` of a plant: regularity, index and finite eigenvalues, in units of the plant's own."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, read_only, remembered
-from obsynth.numerics.pencils import PencilStructure, is_regular, reduced, structure_of_reduced
+from obsynth.numerics.pencils import PencilStructure, is_regular, reduced, structure_of_reduced, with_nonsingular_e
 from obsynth.numerics.staircase import Deflation, normal_rank_of
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
+from obsynth.proofs.nonsingular import is_proved_nonsingular
 
 
 @remembered
 def _reduced(plant: DescriptorSystem) -> tuple[Deflation, Deflation]:
-    return reduced(*in_own_units(plant))
+    # With a nonsingular E every pencil is regular and of index 0: no rank beside fast rates of A may say otherwise.
+    return (with_nonsingular_e if is_proved_nonsingular(plant.E) else reduced)(*in_own_units(plant))
 
 
 def in_own_units(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:

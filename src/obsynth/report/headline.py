@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.noise import is_noise_assumed, noise_words
 from obsynth.report.designs import estimate_figures, followed_steps, gains_if_linear
 from obsynth.results.layout import duration, number
 
@@ -95,6 +97,8 @@ def _of_test(test: GuaranteedTest) -> Iterator[str]:
 def _of_estimates(design: ObserverDesign) -> Iterator[str]:
     """Yield for each fault how small a step exceeds the noise of its estimate, how soon, and what looks like it."""
     observer = design.observer
+    names = design.plant.noise_names if isinstance(design.plant, DescriptorSystem) else ()
+    noise = noise_words(names) if is_noise_assumed(names) else "the noise"
     steps = followed_steps(design) if isinstance(observer, LinearObserver) else {}
     for figures in estimate_figures(design, gains_if_linear(design)):
         name, unit = figures["name"], figures["unit"] or ""
@@ -102,7 +106,7 @@ def _of_estimates(design: ObserverDesign) -> Iterator[str]:
         deviation = figures["deviation"]
         if deviation is not None and math.isfinite(deviation) and deviation > 0.0:
             told += (
-                f"{_size(DEVIATIONS * deviation, unit)} exceeds {DEVIATIONS} standard deviations of the noise (false "
+                f"{_size(DEVIATIONS * deviation, unit)} exceeds {DEVIATIONS} standard deviations of {noise} (false "
                 f"alarms: about 1 in {number(1.0 / BEYOND, digits=2)} samples, if the model is exact)"
             )
         else:

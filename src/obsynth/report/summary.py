@@ -24,6 +24,7 @@ from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.noise import is_noise_assumed
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.signal_names import listed
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -278,6 +279,9 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
         yield "noise within its stated bounds"
     elif isinstance(design.plant, DescriptorSystem):
         noisy = sum(bool(row.any()) for row in design.plant.Dw)
+        if is_noise_assumed(design.plant.noise_names):
+            yield "white noise of deviation 1 on every sensor, as none is stated"
+            return
         yield f"white noise on {noisy} of {design.plant.ny} sensors" if noisy else "no sensor noise given"
 
 

@@ -16,6 +16,7 @@ from obsynth.numerics.arguments import is_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.means import unaveraged
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.noise import noise_words
 from obsynth.plants.transformations.recovery import StateRecovery
 from obsynth.proofs.covariances import certain_noise_covariance
 from obsynth.results.checks import Check, information, nothing_wrong, upper_bound_check
@@ -229,7 +230,7 @@ def fault_noise_rows(errors: ErrorModel) -> Iterator[Check]:
     for name, variance in zip(plant.fault_names, np.diag(covariance), strict=True):
         yield information(
             f"noise in fhat[{name}]",
-            "standard deviation of the fault estimate under the stated noise"
+            f"standard deviation of the fault estimate under {noise_words(plant.noise_names)}"
             + ("" if plant.dt else ", for a sample time of 1 s (times its root for others)"),
             float(np.sqrt(variance)),
             source="recomputed, Lyapunov equation",
@@ -249,7 +250,7 @@ def mean_noise_rows(design: ObserverDesign) -> Iterator[Check]:
     for name, variance in zip(observer.fault_names, np.diag(found), strict=True):
         yield information(
             f"noise in the mean of fhat[{name}]",
-            f"standard deviation under the stated noise of what is shipped, a mean of {mean}",
+            f"standard deviation under {noise_words(plant.noise_names)} of what is shipped, a mean of {mean}",
             float(np.sqrt(max(float(variance), 0.0))),
             source="recomputed, Lyapunov equation",
         )

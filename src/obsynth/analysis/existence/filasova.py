@@ -73,7 +73,7 @@ def _form_conditions(judge: Evaluator) -> Iterator[Condition]:
         _SOURCE,
         "none. Name the fault to estimate in Bf or Df.",
     )
-    normal_rank, index, dynamic = _form(judge)
+    (normal_rank, index, dynamic), floating = _form(judge)
     yield _condition(
         "regularity",
         "a regular pencil (det(A - sE) not identically zero)",
@@ -82,6 +82,7 @@ def _form_conditions(judge: Evaluator) -> Iterator[Condition]:
         float(plant.nx),
         "definition of a descriptor plant",
         f"normal rank {normal_rank} of {plant.nx}: the equations do not determine the states. Add what is missing.",
+        unclear=floating,
     )
     yield _condition(
         "index",
@@ -92,6 +93,7 @@ def _form_conditions(judge: Evaluator) -> Iterator[Condition]:
         "ours: elimination of algebraic states",
         f"index {index}: the algebraic equations cannot be solved for the algebraic states without differentiating. "
         "Differentiate the constraints first.",
+        unclear=floating,
     )
     yield _condition(
         "dynamic states",
@@ -101,18 +103,20 @@ def _form_conditions(judge: Evaluator) -> Iterator[Condition]:
         1.0,
         "ours: elimination of algebraic states",
         "none: every state is algebraic. Solve the equations directly.",
+        unclear=floating,
     )
 
 
-def _form(judge: Evaluator) -> tuple[int, int, int]:
-    """Return normal rank, index (0 for a plant that is not regular) and the number of dynamic states."""
+def _form(judge: Evaluator) -> tuple[tuple[int, int, int], bool]:
+    """Return normal rank, index (0 for a plant that is not regular) and the number of dynamic states, and whether
+    floating-point ranks tell so: such a no is none."""
     plant, numbers = judge.plant, judge.numbers
     if numbers is None or not numbers.exact or holds_computed(plant.E):
         pencil = structure_of(plant)
-        return pencil.normal_rank, pencil.index or 0, len(pencil.finite_eigenvalues)
+        return (pencil.normal_rank, pencil.index or 0, len(pencil.finite_eigenvalues)), True
     index = ExactPencil(numbers.matrices["E"], numbers.matrices["A"]).index
     dynamic = numbers.rank(numbers.matrices["E"])
-    return plant.nx if index is not None else numbers.regular_rank, index or 0, dynamic
+    return (plant.nx if index is not None else numbers.regular_rank, index or 0, dynamic), False
 
 
 def _explicit_conditions(judge: Evaluator) -> Iterator[Condition]:
@@ -161,10 +165,12 @@ def _condition(
     failure: str,
     *,
     signals: tuple[str, ...] = (),
+    unclear: bool = False,
 ) -> Condition:
-    return Condition(
+    found = Condition(
         name, claim, holds, value, bound, source, "" if holds else failure, signals=() if holds else signals
     )
+    return replace(found, unclear=True) if unclear and not holds else found
 
 
 def _detectable(facts: SystemFacts) -> Condition:

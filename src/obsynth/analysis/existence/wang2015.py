@@ -230,6 +230,8 @@ def _form_conditions(judge: Evaluator) -> list[Condition]:
             "definition of a descriptor plant",
             f"normal rank {normal_rank} of {plant.nx}"
             + ("" if regular else ": the equations do not determine the states. Add what is missing."),
+            # A rank in floating point is no proof that there is nothing.
+            unclear=True if numbers is None and not regular else None,
         ),
     ]
 

@@ -13,6 +13,7 @@ from obsynth.methods.ui_pi_observer.decoupling import decoupling_norms
 from obsynth.numerics.arrays import FloatArray, reachable
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.noise import noise_words
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
@@ -88,6 +89,7 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
     if not plant.nw or not observer.fault_names:
         return
     found = estimate_deviations(plant, observer, matrices)
+    noise = noise_words(plant.noise_names)
     unit = "" if plant.dt > 0.0 else " (for a sample time of 1 s, times its root for others)"
     for name, (alone, total), (claimed, claimed_total) in zip(
         observer.fault_names, found, matrices["deviations"], strict=True
@@ -95,7 +97,7 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
         if np.isnan(alone) or np.isnan(claimed):
             yield information(
                 f"noise in fhat[{name}]",
-                "standard deviation under the stated noise",
+                f"standard deviation under {noise}",
                 alone,
                 source="recomputed, Lyapunov equation",
                 detail="all digits are rounding errors" + (": no deviation is claimed" if np.isnan(claimed) else ""),
@@ -103,7 +105,7 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
             continue
         yield upper_bound_check(
             f"noise in fhat[{name}]",
-            f"standard deviation under the stated noise is at most the claimed one{unit}",
+            f"standard deviation under {noise} is at most the claimed one{unit}",
             float(alone),
             float(claimed) * (1.0 + DEVIATION_TOLERANCE),
             source="recomputed, Lyapunov equation",

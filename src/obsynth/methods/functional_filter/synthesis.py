@@ -35,6 +35,7 @@ from obsynth.numerics.ranks import rounding_rank
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
+from obsynth.plants.noise import assumed_noise_names
 from obsynth.results.design import Certificate
 from obsynth.verification.inequalities import slowest_decay, stability_factor
 
@@ -121,10 +122,12 @@ def _with_noise(plant: DescriptorSystem, asked: FunctionalFilter) -> tuple[Descr
         return plant, ()
     deviations = np.ones(plant.ny) if given is None else given
     process = np.flatnonzero(plant.Bw.any(axis=0))
+    named = [f"noise {name}" for name in plant.output_names]
+    names = assumed_noise_names(plant.output_names) if given is None else named
     noisy = plant.replace(
         Bw=np.hstack([plant.Bw[:, process], np.zeros((plant.nx, plant.ny))]),
         Dw=np.hstack([plant.Dw[:, process] * 0.0, np.diag(deviations)]),
-        noise_names=[*(plant.noise_names[i] for i in process), *(f"noise {name}" for name in plant.output_names)],
+        noise_names=[*(plant.noise_names[i] for i in process), *names],
     )
     note = "No noise is stated: every sensor is assumed to have the standard deviation 1 in its own unit."
     return noisy, () if given is not None else (note,)

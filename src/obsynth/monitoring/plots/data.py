@@ -15,6 +15,7 @@ from obsynth.monitoring.logs.log_observer import DECIDING
 from obsynth.monitoring.logs.run import DataRun
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.observers.estimates import BAND_WIDTH
+from obsynth.plants.noise import noise_words
 from obsynth.report.plots.estimates import MODEL_BAND
 from obsynth.report.plots.panels import (
     BAND_STYLE,
@@ -217,7 +218,8 @@ class _Drawing:
             panel.fill_between(times, low, high, label="guaranteed interval", **BAND_STYLE)
         elif deviation is not None and not adaptive:
             low, high = values - BAND_WIDTH * deviation, values + BAND_WIDTH * deviation
-            band = MODEL_BAND if f"sd {column}" in table else "95 % interval of the stated noise"
+            noise = noise_words(getattr(getattr(self.design, "plant", None), "noise_names", ()))
+            band = MODEL_BAND if f"sd {column}" in table else f"95 % interval of {noise}"
             contradicted = self._contradicted()
             where = ~contradicted & np.isfinite(low)
             if where.any():

@@ -28,7 +28,7 @@ from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.constants import shown
-from obsynth.plants.noise import require_noise
+from obsynth.plants.noise import is_noise_assumed, require_noise
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.assumptions import Assumptions
@@ -38,6 +38,9 @@ _AFTER_WARM_UP = "; it holds once the initial-condition response has settled (th
 _AFTER_A_GAP = " (after a gap likewise)"
 
 _FROM_THE_FIRST = "; from the first row on; after a gap, once settled"
+
+#: A note of every monitor whose noise is none that somebody stated.
+NOISE_ASSUMED = "; noise of deviation 1 is assumed on every sensor, as none is stated"
 
 _GROWS = "; after missing outputs it is larger by the possible error of the plant's model"
 
@@ -183,7 +186,7 @@ def online_monitor(
     def made(statement: str, rule: Rule) -> Monitor:
         return Monitor(
             kind,
-            statement,
+            statement + (NOISE_ASSUMED if is_noise_assumed(noisy.linear[0].noise_names) else ""),
             rule,
             residuals=len(design.linear[1].residual_names),
             fault_names=design.linear[1].fault_names,

@@ -15,6 +15,7 @@ from obsynth.observers.recursive.estimates import excitation_levels
 from obsynth.observers.recursive.gain_schedule import Gains, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.sample import deviations_in
+from obsynth.observers.recursive.steady_filter import settled_contraction
 
 #: Errors that shrank below this are gone; the product starts anew from there, so that it does not underflow.
 GONE = 1e-200
@@ -40,8 +41,9 @@ class GainScheduleSummary:
 
     steps: int  # how many steps were looked at
     # ``norm(product of L_k A_k)^(1 / steps)``: the mean factor by which an error shrinks in a step; where that is not
-    # below one, over the second half of the horizon
+    # below one, over the second half of the horizon; else, of gains that tend to a steady state, the radius there
     contraction: float
+    settles: bool  # whether the contraction is that of the steady state: errors have not shrunk along these steps
     growth: float  # the largest norm of the product on the way: how much an error may grow before it decays
     span: str  # what the contraction was taken over
     # ``(nx,)``: size of the product in each state after the last step, relative to its largest: where errors last
@@ -83,6 +85,10 @@ def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_st
     if last is None:
         raise SpecError("The plant has no steps.", path="horizon")
     (contraction, span), ne = kept if kept is not None else product.contraction(), len(last.step.A)
+    settled = settled_contraction(plain) if contraction >= 1.0 else None
+    settles = settled is not None and settled < 1.0 - BOUNDARY_TOLERANCE
+    if settled is not None and settles:
+        contraction, span = settled, "of the steady state, which the gains tend to: errors have not shrunk yet"
     window = observer.adaptation.window if observer.adaptation is not None else 1
     levels = excitation_levels(regressors, window)[window - 1 :]
     deviations, state_deviations = deviations_in(last.spread), deviations_in(last.factor)
@@ -93,6 +99,7 @@ def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_st
     return GainScheduleSummary(
         steps=len(regressors),
         contraction=contraction,
+        settles=settles,
         growth=product.growth,
         span=span,
         survivors=product.survivors,

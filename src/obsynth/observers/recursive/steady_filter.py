@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.analysis.existence.condition import Condition, require_all
 from obsynth.analysis.existence.recursive import described_mode, recursive_conditions
 from obsynth.analysis.time_varying import as_time_varying
-from obsynth.errors import SolverError, SpecError
+from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.numerics.arguments import arguments_checked, require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only, require_no_overflow
 from obsynth.numerics.invariant_zeros import are_outside
@@ -20,6 +21,7 @@ from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE, CANCELLATION_TOLERANCE, covariance_factor, decide_rank
 from obsynth.numerics.square_root_estimation import least_squares_step, rank_revealing_step
 from obsynth.observers.recursive.gain_schedule import MOST_SETTLING_STEPS
+from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.step_model import stacked_noise
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -134,17 +136,44 @@ def steady_state_filter(
     )
 
 
-def reached_condition(plant: TimeVaryingDescriptorSystem, Q_root: FloatArray, R_root: FloatArray) -> Condition:
-    """Return the condition that noise reaches every mode on the unit circle, so that the gains never fall asleep."""
+def settled_contraction(observer: RecursiveObserver) -> float | None:
+    """Return the spectral radius of L A in the steady state that the gains of a filter tend to.
+
+    They tend to it from every start that is uncertain in all states, and from any other where noise reaches every mode
+    that does not decay.  ``None`` where plant or noise change with k, where there is a horizon, or no such state.
+    """
+    plant = observer.plant
+    alike = plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant
+    if not alike or plant.horizon or observer.early_constraints:
+        return None
+    q, r, start = observer.Q.at(0), observer.R.at(0), np.asarray(observer.initial_covariance)
+    deviations = np.sqrt(np.maximum(np.diag(start), np.finfo(np.float64).tiny))
+    known_exactly = not decide_rank(start / np.outer(deviations, deviations)).full
+    if known_exactly and _unreached(plant, covariance_factor(q, "Q"), covariance_factor(r, "R")):
+        return None
+    try:
+        # The solution is judged by its own residual, whatever LAPACK thinks of the digits on the way.
+        with warnings.catch_warnings(action="ignore"):
+            steady = steady_state_filter(plant, Q=q, R=r)
+    except (PreconditionError, SolverError, SpecError):
+        return None
+    return float(np.sqrt(steady.rate))
+
+
+def _unreached(plant: TimeVaryingDescriptorSystem, Q_root: FloatArray, R_root: FloatArray) -> list[complex]:
+    """Return the modes that do not decay and that no noise reaches."""
     E, A, C = plant.E.at(1), plant.A.at(0), plant.C.at(1)
     noise = stacked_noise(Q_root, R_root)
     wide_e = np.hstack([np.vstack([E, C]), np.zeros_like(noise)])
     wide_a = np.hstack([np.vstack([A, np.zeros_like(C)]), noise])
     zeros = finite_zeros(wide_e, wide_a, to_the_end=False)
     outside = are_outside(wide_e, wide_a, zeros, plant.dt)
-    on_circle = [
-        complex(z) for z, out in zip(zeros.values, outside, strict=True) if out and abs(z) <= 1.0 + BOUNDARY_TOLERANCE
-    ]
+    return [complex(z) for z, out in zip(zeros.values, outside, strict=True) if out]
+
+
+def reached_condition(plant: TimeVaryingDescriptorSystem, Q_root: FloatArray, R_root: FloatArray) -> Condition:
+    """Return the condition that noise reaches every mode on the unit circle, so that the gains never fall asleep."""
+    on_circle = [z for z in _unreached(plant, Q_root, R_root) if abs(z) <= 1.0 + BOUNDARY_TOLERANCE]
     listed = ", ".join(described_mode(z) for z in on_circle if z.imag >= 0.0)
     detail = (
         "no mode lies on the unit circle unreached"

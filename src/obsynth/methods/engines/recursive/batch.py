@@ -39,7 +39,7 @@ def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> di
         before = reference.x, reference.factor, reference.Upsilon
         running, _ = shipped.advance(running, y[k], u[k])
         reference, _ = stated.advance(reference, y[k], u[k])
-    exact = _solved(stated, y, u)
+    exact, largest = _solved(stated, y, u)
     made_of = _terms(stated.recursion.model.at(steps - 1), before, (y[-1], u[-2], u[-1]))
     covariance = exact.factor @ exact.factor.T
     size = made_of[:, 0] + np.abs(exact.estimate[:, 0]) + np.finfo(np.float64).tiny
@@ -50,7 +50,8 @@ def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> di
     }
     if running.Upsilon.shape[1]:
         regressor = exact.estimate[:, 1:]
-        sizes = np.linalg.norm(regressor, axis=0) + np.linalg.norm(made_of[:, 1:], axis=0) + np.finfo(np.float64).tiny
+        # Without dynamics the last regressor is exactly zero, and what is found is the rounding of the others.
+        sizes = largest[1:] + np.linalg.norm(made_of[:, 1:], axis=0) + np.finfo(np.float64).tiny
         gaps["regressor"] = np.abs(running.Upsilon - regressor) / sizes
     return {name: float(np.max(gap)) for name, gap in gaps.items()}
 
@@ -102,15 +103,18 @@ def _split(flat: FloatArray, y: FloatArray, u: FloatArray) -> tuple[FloatArray, 
     return flat[: y.size].reshape(y.shape), flat[y.size :].reshape(u.shape)
 
 
-def _solved(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> LeastSquaresStep:
-    """Return the last state of the solution over all states at once; further columns belong to the parameters."""
+def _solved(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> tuple[LeastSquaresStep, FloatArray]:
+    """Return the last state of the solution over all states at once, and the largest norm of any state ``(1 + nq,)``;
+    columns after the first belong to the parameters."""
     H, S, data = _problem(observer, y, u)
     n = H.shape[1] // len(y)
     # A factorisation adds rows: in units in which they are alike, which are powers of two, none loses its digits.
     rows = _row_sizes(observer, H, S)
     H, S, data = (part / rows[:, None] for part in (H, S, data))
     found = least_squares_step(H, S, data) or rank_revealing_step(H, S, data, np.zeros((len(H), 0)))
-    return LeastSquaresStep(found.estimate[-n:], found.factor[-n:], found.innovation, found.diffuse[-n:])
+    largest = np.linalg.norm(found.estimate.reshape(len(y), n, -1), axis=1).max(axis=0)
+    last = LeastSquaresStep(found.estimate[-n:], found.factor[-n:], found.innovation, found.diffuse[-n:])
+    return last, np.asarray(largest)
 
 
 def _data(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> FloatArray:

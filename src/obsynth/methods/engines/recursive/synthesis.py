@@ -68,7 +68,8 @@ def _of_varying(
     observer = observer_from_options(plant, options)
     ranks = horizon_ranks(plant, early=observer.early_constraints)
     facts = gain_schedule_summary(observer)
-    if missing and not own_units and not _contracts(facts) and plant.ne == plant.nx and _has_steady_state(observer):
+    contracts = _contracts(facts) and not facts.settles
+    if missing and not own_units and not contracts and plant.ne == plant.nx and _has_steady_state(observer):
         still = DescriptorSystem(
             plant.E.at(1), plant.A.at(0), C=plant.C.at(1), Bf=plant.Phi.at(0), Df=plant.Psi.at(0), dt=plant.dt or 1.0
         )
@@ -135,11 +136,15 @@ def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary
     )
     if _has_steady_state(observer):
         given = f" {' and '.join(identity)} taken as the identity weigh this plant in its units." if identity else ""
+        short = (
+            "the horizon is too short to decide whether errors decay fast enough"
+            if observer.plant.horizon
+            else "errors decay too slowly for double precision to tell how fast"
+        )
         raise PreconditionError(
-            "Unclear: the horizon is too short to decide whether errors decay fast enough. The outputs observe every "
-            f"state, and with these Q and R the errors decay in the end; but over {facts.steps} steps the product of "
-            f"L_k A_k {kept}, in {', '.join(map(repr, names))}.{given} State Q and R in the units of equations and "
-            "outputs, or take units in which entries are near one.",
+            f"Unclear: {short}. The outputs observe every state, and with these Q and R the errors decay in the end; "
+            f"but over {facts.steps} steps the product of L_k A_k {kept}, in {', '.join(map(repr, names))}.{given} "
+            "State Q and R in the units of equations and outputs, or take units in which entries are near one.",
             condition="contraction",
             signals=names,
             unclear=True,

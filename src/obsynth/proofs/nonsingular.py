@@ -1,0 +1,36 @@
+"""Matrices that are nonsingular for certain: an approximate inverse with a residual below one, outward rounded.
+
+With ``|I - B M| < 1`` in any norm of matrices ``B M`` is nonsingular, and so is M (S. M. Rump, Acta Numerica 2010,
+section 10).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import equilibrate
+from obsynth.proofs.balls import Ball, rounded_up
+
+#: An inverse with entries above this, of a matrix with entries near one, leaves the verdict to whoever asks: what was
+#: computed may have such an entry by its own rounding alone.
+LARGEST_INVERSE = 1e6
+
+
+def is_proved_nonsingular(matrix: FloatArray) -> bool:
+    """Return whether a square matrix is proved nonsingular, and no rounding of dense data makes it so; False says
+    nothing."""
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+        return False
+    if np.count_nonzero(matrix) == np.count_nonzero(np.diagonal(matrix)):
+        return bool(np.all(np.diagonal(matrix)))
+    # Powers of two change no verdict.
+    scaled = equilibrate(matrix)
+    try:
+        inverse = np.asarray(np.linalg.inv(scaled), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return False
+    if not np.max(np.abs(inverse)) <= LARGEST_INVERSE:
+        return False
+    missing = Ball.exact(np.eye(len(matrix))) - Ball.exact(inverse) @ Ball.exact(scaled)
+    return bool(np.max(rounded_up(missing.magnitude.sum(axis=1), len(matrix) + 2)) < 1.0)
