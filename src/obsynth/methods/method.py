@@ -98,6 +98,8 @@ class Method(ABC):
     averaged: ClassVar[bool] = False
     #: Whether `synthesise` takes a ``scenario`` where constants of the plant have tolerances.
     over_scenario: ClassVar[bool] = False
+    #: Whether its designs are models without feedback: nothing is claimed of their stability, as the verdict says.
+    open_loop: ClassVar[bool] = False
     #: Values of required options, for questions that do not depend on them.
     placeholders: ClassVar[Mapping[str, Any]] = {}
 

@@ -9,7 +9,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.methods.method import Method
 from obsynth.methods.registry import REGISTRY, method_class
-from obsynth.numerics.arguments import arguments_checked, is_whole, shown
+from obsynth.numerics.arguments import arguments_checked, field_types, is_whole, shown
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.checks import Check, upper_bound_check
@@ -18,8 +18,12 @@ from obsynth.results.verification_report import VerificationReport
 from obsynth.verification.claims import before_the_mean, closed_claims, mean_noise_rows
 from obsynth.verification.error_system import error_model_row
 from obsynth.verification.over_tolerances.rows import tolerance_rows
-from obsynth.verification.plant import derivation_rows, stored_twice_rows
+from obsynth.verification.plant import condition_rows, derivation_rows, stored_twice_rows
+from obsynth.verification.platform import platform_rows
 from obsynth.verification.stored_numbers import stored_number_rows
+
+#: The package whose methods prove decay by rows of their own, which its tests break one by one.
+PLATFORM = "obsynth"
 
 
 @arguments_checked
@@ -66,7 +70,13 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
     with np.errstate(all="ignore"), failed_computations(), one_thread_if_small(design.plant.nx):
         shipped, (design, mean_rows) = design, before_the_mean(design) if method.averaged else (design, ())
         rows = (*mean_rows, *_own_rows(method, design, printed_digits))
-        tracked = isinstance(design.observer, LinearObserver) and method.has_error_model(design)
+        own = method.__module__.partition(".")[0] == PLATFORM
+        linear = isinstance(design.observer, LinearObserver)
+        if linear and not own:
+            rows = (*rows, *_conditions_again(method, design, rows))
+            rows = (*rows, *platform_rows(*design.linear, open_loop=method.open_loop))
+        # A method of ours may rely on bounds of states instead; another has to say what its observer follows.
+        tracked = linear and (not own or method.has_error_model(design))
         if tracked and all(row.passed for row in rows):
             model = method.error_model(design)
             rows = (*rows, error_model_row(model, printed_digits))
@@ -79,6 +89,20 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
         meanings = {name: meaning.meaning for name, meaning in method.claims.items()}
         rows = rows if shipped is design else (*rows, *mean_noise_rows(shipped))
         return VerificationReport.of((*rows, *closed_claims(design, rows, covered, meanings, method.witnesses)))
+
+
+def _conditions_again(method: type[Method], design: ObserverDesign, known: tuple[Check, ...]) -> Iterator[Check]:
+    """Yield the method's conditions of existence, asked of the plant again, but for those that it has rows of."""
+    try:
+        options = {name: design.options[name] for name in field_types(method) if name in design.options}
+        conditions = method.of(options).existence(design.plant)
+    except (SpecError, TypeError) as error:
+        yield upper_bound_check(
+            "options", "the options are those of the method", 1.0, 0.0, source="options", detail=str(error)
+        )
+        return
+    names = {row.name for row in known}
+    yield from (row for row in condition_rows(conditions) if row.name not in names)
 
 
 def _own_rows(method: type[Method], design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:

@@ -14,6 +14,9 @@ Status = Literal["proved", "recomputed", "estimated", "assumed"]
 #: The check without which observer and plant say nothing of one another.
 FITS = "fits the plant"
 
+#: The row of a design that is a model without feedback; the verdict begins with it.
+OPEN_LOOP = "open-loop model"
+
 
 @dataclass(frozen=True)
 class Check:

@@ -18,7 +18,7 @@ from rich.text import Text
 
 from obsynth.files.tables import aligned
 from obsynth.numerics.arguments import is_number
-from obsynth.results.checks import Check, all_hold
+from obsynth.results.checks import OPEN_LOOP, Check, all_hold
 
 #: Two values this near to each other, relative to their size or one, are shown as conjugates.
 SAME_NUMBER = 1e-9
@@ -218,10 +218,12 @@ def verdict(check: Check) -> Text:
 
 
 def verdict_line(checks: Sequence[Check]) -> Text:
-    """Return one line that says whether a whole report holds, and what fails."""
+    """Return one line that says whether a whole report holds, and what fails; first, what it is not about."""
     real = [check for check in checks if check.kind != "information"]
     if all_hold(checks):
-        return Text(f"Verified: all {len(real)} checks hold.", style="green")
+        opens = any(check.name == OPEN_LOOP for check in checks)
+        about = "An open-loop model, of whose stability nothing is claimed. " if opens else ""
+        return Text(f"{about}Verified: all {len(real)} checks hold.", style="green")
     if not real:
         return Text("FAILS: the report is empty, so nothing is verified.", style="bold red")
     failed = [check.name for check in checks if not check.passed]

@@ -1,0 +1,65 @@
+"""What is checked of every linear observer, whichever method made it: its signals fit the plant, and its state decays.
+
+A method's own rows may be anything; these follow from the plant and the stored numbers alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from obsynth.observers.linear.derived import poles_of
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import OPEN_LOOP, Check, information, nothing_wrong, upper_bound_check
+from obsynth.verification.error_system import contraction_of
+
+SOURCE = "ours, for every linear observer"
+
+
+def platform_rows(plant: DescriptorSystem, observer: LinearObserver, *, open_loop: bool) -> Iterator[Check]:
+    """Yield the rows that no method can leave out; of an ``open_loop`` model decay is no claim."""
+    wrong = _unfitting(plant, observer)
+    yield nothing_wrong("signals", "signals and sample time fit the plant", wrong, source=SOURCE)
+    if wrong:
+        return
+    decays = not observer.order or contraction_of(observer) is not None
+    if open_loop:
+        yield information(
+            OPEN_LOOP,
+            "by its method this is a model without feedback: nothing is claimed of its stability",
+            float(decays),
+            source=SOURCE,
+            status="assumed",
+            detail="" if decays else f"no decay is proved: {_outermost(observer)}",
+        )
+        return
+    yield upper_bound_check(
+        "decay of the state",
+        "the observer's state decays from every start: a contraction is proved",
+        float(not decays),
+        0.0,
+        source=SOURCE,
+        kind="proved",
+        detail="" if decays else _outermost(observer),
+    )
+
+
+def _unfitting(plant: DescriptorSystem, observer: LinearObserver) -> list[str]:
+    """Return what does not belong to the plant."""
+    pairs = (
+        ("names of inputs", observer.input_names == plant.input_names),
+        ("names of outputs", observer.output_names == plant.output_names),
+        ("sample time", observer.dt == plant.dt),
+    )
+    wrong = [name for name, fits in pairs if not fits]
+    wrong += [f"fault {name}" for name in observer.fault_names if name not in plant.fault_names]
+    return wrong + [f"state {name}" for name in observer.state_names if name not in plant.state_names]
+
+
+def _outermost(observer: LinearObserver) -> str:
+    """Return the pole that decays least, in words."""
+    poles = poles_of(observer)
+    pole = complex(poles[int(np.argmax(np.abs(poles) if observer.dt > 0.0 else poles.real))])
+    return f"an eigenvalue of {pole.real:.6g}" + (f"{pole.imag:+.6g}j" if pole.imag else "")
