@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from obsynth.observers.linear.derived import poles_of
+from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import OPEN_LOOP, Check, information, nothing_wrong, upper_bound_check
