@@ -11,7 +11,7 @@ import pytest
 
 import obsynth
 from obsynth.analysis.existence.condition import Condition
-from obsynth.errors import PreconditionError, VerificationError
+from obsynth.errors import VerificationError
 from obsynth.methods.method import Method, PlantKind, Synthesis
 from obsynth.methods.registry import REGISTRY
 from obsynth.observers.linear.observer import LinearObserver
@@ -123,7 +123,7 @@ def test_signals_of_another_plant_and_other_numbers_fail() -> None:
     other = design.replace(plant=DISCRETE.replace(B=np.eye(2), D=np.zeros((1, 2)), input_names=("u1", "u2")))
     assert not obsynth.verify(other)["exists: inputs"].passed
     assert not obsynth.verify(design.replace(options={"gain": "large"})).passed
-    with pytest.raises(PreconditionError, match="inputs"):
+    with pytest.raises(VerificationError, match="exists: inputs"):
         obsynth.design(other.plant, "own")
 
 
