@@ -102,11 +102,11 @@ def scheduled_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple
 
 def _source(design: ObserverDesign, prefix: str, header: str, digest: str) -> str:
     _, observer = design.scheduled
-    held, nu, ny = observer.scheduling, observer.inputs, len(observer.output_names)
+    held, nu = observer.scheduling, observer.inputs
     nx, nf, nr = len(observer.state_names), len(observer.fault_names), len(observer.residual_names)
     sizes = {
         "Z_COUNT": observer.order,
-        "Y_COUNT": ny,
+        "Y_COUNT": len(observer.output_names),
         "VERTICES": observer.count,
         "PARAMETERS": len(held.names),
         "FUNCTIONS": max(len(held.functions), 1),
@@ -121,24 +121,6 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str) -> st
         "DIVIDES": int(not observer.effectiveness_is_one),
         "GIVES_WEIGHTS": int(held.gives_weights),
     }
-    first = observer.init()
-    tables: dict[str, FloatArray] = {
-        "first_weights": first.weights[None],
-        "lowest": held.low[None],
-        "highest": held.high[None],
-        "middle": observer.middle[None],
-        "steps": np.minimum(observer.steps, np.finfo(np.float64).max)[None],
-        "Cz": observer.Cz,
-        "Dy": observer.Dy,
-        "Az": np.vstack(list(observer.Az)),
-        "By": np.vstack(list(observer.By)),
-    }
-    if nu:
-        tables |= {"Du": observer.Du, "Bu": np.vstack(list(observer.Bu))}
-    if defined["DIVIDES"]:
-        tables["effectiveness"] = np.vstack(list(observer.effectiveness))
-    if not held.gives_weights:
-        tables["bounds"] = held.bounds
     shown = [("states", nx, 0), ("faults", nf, nx), ("residuals", nr, nx + nf)]
     copied = " ".join(f"for (i = 0; i < {n}; i++) {{ {to}[i] = rows[{at} + i]; }}" for to, n, at in shown if n)
     taken = "for (i = 0; i < U_COUNT; i++) {\n        TAKE_ONE\n    }".replace("TAKE_ONE", _TAKEN) if nu else ""
@@ -164,11 +146,34 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str) -> st
         f"#define WEIGHT_TOLERANCE {WEIGHT_TOLERANCE!r}",
         "#define LENGTH(n) ((n) > 0 ? (n) : 1)",
         "",
-        *(line for name, table in tables.items() for line in table_lines(name, table)),
+        *(line for name, table in _tables(observer).items() for line in table_lines(name, table)),
         "",
         body,
     ]
     return "\n".join(lines)
+
+
+def _tables(observer: ScheduledObserver) -> dict[str, FloatArray]:
+    """Return the numbers of the observer and of its region, by their names in C."""
+    held = observer.scheduling
+    tables: dict[str, FloatArray] = {
+        "first_weights": observer.init().weights[None],
+        "lowest": held.low[None],
+        "highest": held.high[None],
+        "middle": observer.middle[None],
+        "steps": np.minimum(observer.steps, np.finfo(np.float64).max)[None],
+        "Cz": observer.Cz,
+        "Dy": observer.Dy,
+        "Az": np.vstack(list(observer.Az)),
+        "By": np.vstack(list(observer.By)),
+    }
+    if observer.inputs:
+        tables |= {"Du": observer.Du, "Bu": np.vstack(list(observer.Bu))}
+    if not observer.effectiveness_is_one:
+        tables["effectiveness"] = np.vstack(list(observer.effectiveness))
+    if not held.gives_weights:
+        tables["bounds"] = held.bounds
+    return tables
 
 
 def _arguments(observer: ScheduledObserver, prefix: str) -> list[str]:

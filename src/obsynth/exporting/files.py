@@ -152,16 +152,8 @@ def export(
     ...     print([path.name for path in obsynth.export(design, f"{folder}/filter.c")])
     ['filter.c', 'filter.h']
     """
-    target = Path(path)
+    target = _checked_target(path)
     suffix = target.suffix.lower()
-    if suffix not in EXPORT_SUFFIXES:
-        raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(EXPORT_SUFFIXES)}.", path=str(target))
-    if suffix == ".c" and _C_HEADERS.fullmatch(target.stem):
-        raise SpecError(
-            f"{target} comes with a header {target.stem}.h, which a compiler may read in place of C's own: name it "
-            "otherwise, such as observer.c.",
-            path=str(target),
-        )
     require_verified(design, unverified=unverified)
     if checker and suffix != ".json":
         raise SpecError("checker is for proof files (.json): others need none.", path="checker")
@@ -169,14 +161,8 @@ def export(
         _require_fitting_options(
             suffix, fmi=fmi, thresholds=thresholds, warm_up=warm_up, monitor=monitor, precision=precision
         )
-        if sample_time is not None or outliers is not None or unverified:
-            raise SpecError(
-                "A proof is of the design as it is, and of one that holds: leave sample_time, outliers and unverified "
-                "out.",
-                path="sample_time",
-            )
-        proof = write_proof(design, target)
-        return (proof, copy_checker(proof.parent)) if checker else (proof,)
+        as_designed = sample_time is None and outliers is None and not unverified
+        return _write_proof(design, target, checker=checker, as_designed=as_designed)
     require_fixed(design, suffix)
     if isinstance(design.observer, RecursiveObserver):
         require_plain(design.observer, "An export")
@@ -230,6 +216,32 @@ def export(
         )
     bound = None if monitor is None or written is not None else registered("bound_of_monitor")(monitor, found.observer)
     return _write_c(found, target, linear_alarms(found, thresholds, warm_up, written), bound)
+
+
+def _checked_target(path: str | Path) -> Path:
+    """Return the file to write, whose suffix is known and whose header hides none of C's own."""
+    target = Path(path)
+    suffix = target.suffix.lower()
+    if suffix not in EXPORT_SUFFIXES:
+        raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(EXPORT_SUFFIXES)}.", path=str(target))
+    if suffix == ".c" and _C_HEADERS.fullmatch(target.stem):
+        raise SpecError(
+            f"{target} comes with a header {target.stem}.h, which a compiler may read in place of C's own: name it "
+            "otherwise, such as observer.c.",
+            path=str(target),
+        )
+    return target
+
+
+def _write_proof(design: ObserverDesign, target: Path, *, checker: bool, as_designed: bool) -> tuple[Path, ...]:
+    """Write the proof file of a design, and the program that checks it where it is asked for."""
+    if not as_designed:
+        raise SpecError(
+            "A proof is of the design as it is, and of one that holds: leave sample_time, outliers and unverified out.",
+            path="sample_time",
+        )
+    proof = write_proof(design, target)
+    return (proof, copy_checker(proof.parent)) if checker else (proof,)
 
 
 def _write_scheduled(

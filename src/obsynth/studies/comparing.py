@@ -364,13 +364,11 @@ def side_by_side(
         [_compared(entry, sampled, faulty, healthy, log, kept, limit, false_alarms, bounds) for entry in found]
     )
     compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.relative_error))
-    setting = (
-        f"{runs} runs of {duration(happening.horizon)}, sampled every {dt:g} s, disturbances and noise drawn"
-        + (", constants within their tolerances" if plant.uncertainty is not None else "")
-        + (f", parameters off by up to {tolerance:.0%}" if tolerance else "")
-        + (", a state feedback stabilises the plant" if feedback.any() else "")
-        + f"; 90 % of a step to be reached within {duration(limit)}"
-    )
+    parts = [f"{runs} runs of {duration(happening.horizon)}, sampled every {dt:g} s, disturbances and noise drawn"]
+    parts += ["constants within their tolerances"] if plant.uncertainty is not None else []
+    parts += [f"parameters off by up to {tolerance:.0%}"] if tolerance else []
+    parts += ["a state feedback stabilises the plant"] if feedback.any() else []
+    setting = f"{', '.join(parts)}; 90 % of a step to be reached within {duration(limit)}"
     shown, truth = (faulty, faulty.truth) if log is None else (log, np.array(log.truth))
     if log is not None:
         # Nobody says what these faults were in the log: zero would be drawn as the truth.
