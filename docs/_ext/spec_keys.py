@@ -16,7 +16,11 @@ _SIGNALS = {
         "{heater: 60, cell: 80}",
     ),
     "scales": ("unit / unit", "Factor from the unit of a log to the unit of the signal.", "{speed: 0.1047}"),
-    "units": ("", "Unit of each signal, as text: it is printed, and nothing is converted.", "{cell: degC, heater: W}"),
+    "units": (
+        "",
+        "Unit of each signal, as text: it is printed, and columns of a log that state another one are converted to it.",
+        "{cell: degC, heater: W}",
+    ),
 }
 _DELAYS = (
     "s",

@@ -158,7 +158,7 @@ class LogRun:
             design = design.replace(observer=as_learned(design.observer, monitor.rule.learned))
         self.observer = observer = log_observer(design, gap=gap, warm_up=warm_up, outliers=outliers)
         self.clock = Clock(observer.dt, gap, irregular=observer.takes_any_interval)
-        self.signals = LogSignals.of(observer, columns, scales)
+        self.signals = LogSignals.of(observer, columns, scales, getattr(design.plant, "units", {}))
         self.stamps, self.monitor = stamps, monitor
         #: What rows wait in for those after them, if they do.
         self.later: Any = None

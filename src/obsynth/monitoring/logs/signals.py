@@ -5,15 +5,17 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.monitoring.logs.log_observer import LogObserver
-from obsynth.monitoring.logs.stamps import WITH_UNIT
+from obsynth.monitoring.logs.stamps import WITH_UNIT, Stamps
 from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.measurement_units import conversion
 
 #: A time of day without its date, as it stands beside one; hours, minutes and seconds since a log began.
 _TIME_OF_DAY = re.compile(
@@ -49,10 +51,15 @@ class LogSignals:
     one: int | None = None  # number of the signal that is one in every row and has no column, if there is such a one
     inputs: int = 0  # columns of known inputs
     delay: int = 0  # rows by which these act later than the design takes them; negative: earlier
+    units: Mapping[str, str] = field(default_factory=dict)  # of signals whose factor nobody states
 
     @classmethod
     def of(
-        cls, observer: LogObserver, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None
+        cls,
+        observer: LogObserver,
+        columns: Mapping[str, str] | None,
+        scales: Mapping[str, float] | None,
+        units: Mapping[str, str] = MappingProxyType({}),
     ) -> LogSignals:
         """Return the signals that a running design reads."""
         names = observer.input_names + observer.output_names
@@ -79,7 +86,39 @@ class LogSignals:
             names.index(shift) if shift and shift in names else None,
             len(observer.input_names) - int(bool(shift) and shift in observer.input_names),
             observer.input_delay,
+            {name: unit for name, unit in units.items() if name not in factors and name not in observer.scales},
         )
+
+    def conversions(
+        self, header: Sequence[str], places: Sequence[int], stamps: Stamps, below: Sequence[str] = ()
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return factors and shifts ``(columns,)`` from the units in a header, or in the line ``below`` it, to those of
+        the plant; notes of the stamps say what is converted.
+
+        Raises
+        ------
+        SpecError
+            A unit cannot be converted.
+        """
+        names = [name for i, name in enumerate(self.names) if i != self.one]
+        factors, shifts = np.ones(len(names)), np.zeros(len(names))
+        for i, (name, place) in enumerate(zip(names, places[1:], strict=True)):
+            behind = WITH_UNIT.fullmatch(header[place])
+            found = below[i + 1].strip("[]() ") if i + 1 < len(below) else "" if behind is None else behind[2]
+            if not found or name not in self.units:
+                continue
+            try:
+                way = conversion(found, self.units[name])
+            except SpecError as error:
+                raise SpecError(
+                    f"{name} is in {found} in the data, and in {self.units[name]} in the plant: {error}; or state the "
+                    f"factor (--scale {shlex.quote(name)}=FACTOR).",
+                    path=f"columns.{name}",
+                ) from error
+            if way is not None and way != (1.0, 0.0):
+                factors[i], shifts[i] = way
+                stamps.notes.append(f"{name} is converted from {found} to {self.units[name]}.")
+        return factors, shifts
 
     def measured(self, rows: FloatArray) -> FloatArray:
         """Return signals in their units ``(rows, nu + ny)`` from rows of time and columns."""

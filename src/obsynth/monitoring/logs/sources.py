@@ -503,6 +503,7 @@ def _converted(frames: Iterator[pd.DataFrame], signals: LogSignals, stamps: Stam
         places = signals.positions(header)
         if not done:
             stamps.take_header(header, signals.columns, places)
+            factors, shifts = signals.conversions(header, places, stamps)
         date = date_place(header, places)
         times = _times(frame.iloc[:, places[0]], done, stamps, None if date is None else frame.iloc[:, date])
         values = []
@@ -510,7 +511,9 @@ def _converted(frames: Iterator[pd.DataFrame], signals: LogSignals, stamps: Stam
             column = _numbers(frame.iloc[:, place], done, stamps)
             states = None if state is None else frame.iloc[:, state]
             values.append(column if states is None else _without_bad(column, header[place], states, done, stamps))
-        yield np.column_stack([times, *values])
+        yield np.column_stack(
+            [times, *(factor * value + shift for factor, value, shift in zip(factors, values, shifts, strict=True))]
+        )
         done += len(frame)
     if done == 0:
         raise SpecError("The data have no rows.", path="data")

@@ -141,11 +141,13 @@ def stream_rows(stream: TextIO, signals: LogSignals, stamps: Stamps) -> Iterator
     places = signals.positions(header)
     stamps.take_header(header, signals.columns, places)
     date, states = date_place(header, places), status_places(header, places)
+    factors, shifts = signals.conversions(header, places, stamps)
     row = 0
     for cells in table:
         if not any(cell.strip() for cell in cells):
             continue
-        if row == 0 and stamps.take_units([cells[place].strip() for place in places if place < len(cells)]):
+        if row == 0 and stamps.take_units(below := [cells[place].strip() for place in places if place < len(cells)]):
+            factors, shifts = signals.conversions(header, places, stamps, below)
             continue
         row += 1
         if any(cell.strip() for cell in cells[len(header) :]):
@@ -160,7 +162,7 @@ def stream_rows(stream: TextIO, signals: LogSignals, stamps: Stamps) -> Iterator
             if place is not None and is_bad(cells[place]):
                 stamps.take_bad(header[places[i]], row, cells[place].strip(), header[place])
                 values[i - 1] = float("nan")
-        yield np.array([[time, *values]])
+        yield np.array([[time, *(factors * values + shifts)]])
     if row == 0:
         raise SpecError("The data have no rows.", path="data")
 

@@ -1,0 +1,91 @@
+"""Columns of a log in other units than those of the plant are converted, or refused: kelvin beside degC."""
+
+import importlib.util
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import obsynth
+from obsynth.numerics import measurement_units
+from obsynth.numerics.measurement_units import conversion
+
+with_pint = pytest.mark.skipif(importlib.util.find_spec("pint") is None, reason="pint is not installed")
+
+
+@pytest.fixture(scope="module")
+def design():
+    plant = obsynth.DescriptorSystem(
+        A=[[0.9, 0.1], [0.0, 0.8]],
+        B=[[0.0], [0.1]],
+        C=[[1, 0], [0, 1]],
+        Bf=[[1], [0]],
+        dt=1.0,
+        input_names=["power"],
+        output_names=["wall", "air"],
+        units={"power": "W", "wall": "degC", "air": "degC"},
+        operating_point={"wall": 20.0, "air": 20.0},
+        sensor_noise={"wall": 0.1, "air": 0.1},
+    )
+    return obsynth.ui_pi_observer(plant)
+
+
+def log(design, tmp_path, header, *, units="", factor=(1.0, 1.0, 1.0), shift=(0.0, 0.0, 0.0)):
+    """A log in other units, and its estimates in those of the plant."""
+    rng = np.random.default_rng(1)
+    own = np.column_stack([rng.uniform(50, 60, 30), 20.0 + rng.normal(size=(30, 2))])
+    shown = own * factor + shift
+    path = tmp_path / "log.csv"
+    rows = [
+        header,
+        *([units] if units else []),
+        *(f"{k},{a!r},{b!r},{c!r}" for k, (a, b, c) in enumerate(shown.tolist())),
+    ]
+    path.write_text("\n".join(rows) + "\n")
+    table = pd.DataFrame({"time": np.arange(30.0), "power": own[:, 0], "wall": own[:, 1], "air": own[:, 2]})
+    return path, obsynth.run_on_data(design, table).table
+
+
+@with_pint
+@pytest.mark.parametrize(
+    ("header", "units"),
+    [("time,power (kW),wall [K],air (degF)", ""), ("time,power,wall,air", "s,kW,K,degF")],
+)
+def test_values_are_converted_to_the_unit_of_the_plant(design, tmp_path, header, units):
+    path, expected = log(design, tmp_path, header, units=units, factor=(1e-3, 1.0, 1.8), shift=(0.0, 273.15, 32.0))
+    for data in [path] + ([] if units else [pd.read_csv(path)]):
+        found = obsynth.run_on_data(design, data)
+        np.testing.assert_allclose(found.table["fhat[f1]"], expected["fhat[f1]"], atol=1e-9)
+        assert any("wall is converted from K" in text for text in found.warnings)
+
+
+@with_pint
+def test_a_stated_scale_goes_before_and_another_quantity_is_refused(design, tmp_path):
+    path, expected = log(design, tmp_path, "time,power (kW),wall,air", factor=(1e-3, 1.0, 1.0))
+    found = obsynth.run_on_data(design, path, scales={"power": 1000.0})
+    np.testing.assert_allclose(found.table["fhat[f1]"], expected["fhat[f1]"], atol=1e-9)
+    path, _ = log(design, tmp_path, "time,power,wall (bar),air")
+    with pytest.raises(obsynth.SpecError, match=r"wall is in bar in the data, and in degC in the plant.*--scale wall="):
+        obsynth.run_on_data(design, path)
+    # What is no unit is a remark, as before.
+    path, expected = log(design, tmp_path, "time,power,wall (north side),air")
+    np.testing.assert_array_equal(obsynth.run_on_data(design, path).table["fhat[f1]"], expected["fhat[f1]"])
+
+
+def test_without_pint_kelvin_beside_degrees_is_refused(design, tmp_path, monkeypatch):
+    monkeypatch.setattr(measurement_units, "find_spec", lambda name: None)
+    path, _ = log(design, tmp_path, "time,power,wall (K),air", shift=(0.0, 273.15, 0.0))
+    with pytest.raises(obsynth.SpecError, match=r"obsynth\[units\]"):
+        obsynth.run_on_data(design, path)
+    path, expected = log(design, tmp_path, "time,power,wall (°C),air")
+    np.testing.assert_array_equal(obsynth.run_on_data(design, path).table["fhat[f1]"], expected["fhat[f1]"])
+
+
+@with_pint
+def test_conversions_are_exact_where_they_are_factors():
+    assert conversion("mV", "V") == pytest.approx((1e-3, 0.0))
+    assert conversion("K", "degC") == (1.0, -273.15)
+    assert conversion("C", "K")[1] == 273.15
+    assert conversion("degC", "°C") == (1.0, 0.0)
+    assert conversion("north side", "degC") is None
+    assert conversion("1 +", "V") is None
