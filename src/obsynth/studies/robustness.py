@@ -98,17 +98,17 @@ def robustness(
     'proved'
     """
     design, plant = with_tolerances(design, constants)
-    told = progress or (lambda text: None)
+    report_stage = progress or (lambda text: None)
     uncertain = plant.uncertainty
     if uncertain is None or not uncertain.box.names:
         empty = ConstantsBox({}) if uncertain is None else uncertain.box
         return Robustness(empty, True, "open", {}, None, None, {}, {}, {}, {}, "open", 0, EXACT_MODEL)
-    told("regularity over the box")
+    report_stage("regularity over the box")
     regular = index_one_on_box(plant)
     reason = ""
     try:
         affine = affine_plant(plant)
-        told("stability over the box")
+        report_stage("stability over the box")
         stable, untouched = _stability(plant, affine)
     except PreconditionError as error:
         affine, stable, untouched, reason = None, BoxVerdict("open", 0), (), str(error)
@@ -118,16 +118,16 @@ def robustness(
     shares, rows, gains, errors = dict[str, float](), dict[str, float](), dict[str, float](), dict[str, Any]()
     if affine is not None:
         try:
-            told("loop over the box")
+            report_stage("loop over the box")
             tracking = tracking_of(design, affine)
             responses = responses_of(structure_of(design, affine, tracking))
             radius = loop_radius(responses)
             try:
                 same_sample_inverse(responses)
             except PreconditionError as error:
-                # No bound holds at a sample, and all else is told.
+                # No bound holds at a sample; all else is reported.
                 reason = str(error)
-            told("largest tolerances")
+            report_stage("largest tolerances")
             factor = largest_factor(
                 lambda t: structure_of(design, affine_plant(plant, uncertain.box.scaled(t)), tracking), radius
             )
@@ -135,7 +135,7 @@ def robustness(
             parts = (affine.E.parts, affine.A.parts)
             rows = _named(plant.state_names, blamed_rows(responses, tracking.T, parts))
             errors = _error_per_unit(design, responses, affine)
-            told("gains at the vertices")
+            report_stage("gains at the vertices")
             gains = vertex_gains(design, plant, affine, tracking)
         except PreconditionError as error:
             reason = str(error)
