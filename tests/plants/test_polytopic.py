@@ -101,3 +101,17 @@ def test_vertices_must_have_one_e() -> None:
         PolytopicSystem([one, one.replace(E=[[2.0]])])
     with pytest.raises(SpecError, match="another dt"):
         PolytopicSystem([one, one.replace(dt=2.0)])
+
+
+@pytest.mark.parametrize(
+    "text", ["x * (a + sin(b))", "1 / (a * sin(b))", "(a + b) ** 2 * exp(x)", "x - (a - sqrt(b)) ** 3", "2 ** (a * cos(b))"]
+)
+def test_an_entry_is_what_its_text_says_at_every_point(text: str) -> None:
+    ranges = {"x": [1.0, 2.0], "a": [1.0, 2.0], "b": [0.1, 0.5]}
+    used = {name: ends for name, ends in ranges.items() if name in text}
+    plant = PolytopicSystem(plant={"A": [[text]], "C": [[1]]}, scheduling=used)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        point = {name: float(rng.uniform(*ends)) for name, ends in used.items()}
+        value = eval(text, {"sin": np.sin, "cos": np.cos, "exp": np.exp, "sqrt": np.sqrt}, point)
+        assert plant.at(point).A[0, 0] == pytest.approx(value, rel=1e-12)

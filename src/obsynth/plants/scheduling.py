@@ -9,6 +9,7 @@ point is a mean of the :math:`2^q` corners of the box of the :math:`a_k`, with w
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -337,7 +338,7 @@ def _linear_operation(operation: Callable[..., Any]) -> Callable[..., Any]:
             return forms[0].times(1 / forms[1].constant)
         if operation is np.power and not forms[1].parts and forms[1].constant in (0, 1):
             return forms[0] if forms[1].constant else LinearForm(Fraction(1))
-        text = _TEXTS[operation](*(form.text for form in forms)) if operation in _TEXTS else None
+        text = TEXTS_OF_OPERATIONS[operation](*(form.text for form in forms)) if operation in TEXTS_OF_OPERATIONS else None
         if text is None:
             raise SpecError(
                 "An entry of a matrix chooses between formulas (a comparison or where), which may jump: that is no "
@@ -354,13 +355,16 @@ def _number(value: Fraction) -> str:
     return str(int(number)) if number.is_integer() and abs(number) < LARGEST_WHOLE else repr(number)
 
 
+#: A name, a number, or one call whose argument has no brackets of its own.
+_FACTOR = re.compile(r"[A-Za-z_]\w*(\([^()]*\))?|\d+(\.\d+)?")
+
+
 def _bracketed(text: str) -> str:
     """Return a text as a factor."""
-    is_call = text.isidentifier() or (text[:1].isalpha() and text.endswith(")") and text.count("(") == 1)
-    return text if is_call or text.replace(".", "").isdigit() else f"({text})"
+    return text if _FACTOR.fullmatch(text) else f"({text})"
 
 
-_TEXTS: dict[Callable[..., Any], Callable[..., str]] = {
+TEXTS_OF_OPERATIONS: dict[Callable[..., Any], Callable[..., str]] = {
     **{getattr(np, name): partial("{}({})".format, name) for name in _NAMES},
     np.arcsin: lambda x: f"asin({x})",
     np.arccos: lambda x: f"acos({x})",
