@@ -22,6 +22,7 @@ from obsynth.methods.functions import descriptor_kalman as descriptor_kalman
 from obsynth.methods.functions import fault_estimation_filter as fault_estimation_filter
 from obsynth.methods.functions import functional_filter as functional_filter
 from obsynth.methods.functions import pd_observer as pd_observer
+from obsynth.methods.functions import region_observer as region_observer
 from obsynth.methods.functions import ui_pi_observer as ui_pi_observer
 from obsynth.methods.guaranteed_test.result import GuaranteedTest as GuaranteedTest
 from obsynth.methods.guaranteed_test.result import guaranteed_test as guaranteed_test

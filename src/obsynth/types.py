@@ -22,6 +22,7 @@ _TYPE_NAMES = {
     "observers.detection": "Detection",
     "observers.estimates": "Estimates",
     "observers.parameter_alarms": "Alarm Decision",
+    "observers.nonlinear.region_observer": "RegionObserver",
     "observers.running": "RunningObserver",
     "observers.scheduled.observer": "ScheduledObserver",
     "observers.window.observer": "WindowObserver",

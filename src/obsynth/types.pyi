@@ -15,6 +15,7 @@ from obsynth.monitoring.thresholds.learned import LearnedThresholds as LearnedTh
 from obsynth.monitoring.thresholds.monitor import Monitor as Monitor
 from obsynth.observers.detection import Detection as Detection
 from obsynth.observers.estimates import Estimates as Estimates
+from obsynth.observers.nonlinear.region_observer import RegionObserver as RegionObserver
 from obsynth.observers.parameter_alarms import Alarm as Alarm
 from obsynth.observers.parameter_alarms import Decision as Decision
 from obsynth.observers.recursive.steady_filter import SteadyState as SteadyState

@@ -35,7 +35,7 @@ def numpy_scalars(value: Any, place: str, seen: dict[int, Any]) -> Iterator[str]
 
 
 #: Properties that only some designs have, or that warn that they have another name now.
-NOT_ASKED = {"linear", "recursive", "nonlinear", "scheduled", "leak"}
+NOT_ASKED = {"linear", "recursive", "nonlinear", "over_region", "scheduled", "leak"}
 
 
 def _public_names(value: Any) -> Iterator[str]:

@@ -18,7 +18,7 @@ OPEN = ("Any", "Data", "LogData", "Logs", "Picked")
 #: Functions made from the classes of methods, whose fields are checked, and those of one argument that may be anything.
 NOT_CHECKED = {
     "adaptive_observer", "dae_adaptive_observer", "descriptor_kalman", "detection_filter", "fault_estimation_filter",
-    "fault_model", "functional_filter", "guaranteed_test", "pd_observer", "ui_pi_observer",
+    "fault_model", "functional_filter", "guaranteed_test", "pd_observer", "region_observer", "ui_pi_observer",
 }  # fmt: skip
 
 

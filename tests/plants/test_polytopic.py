@@ -104,7 +104,8 @@ def test_vertices_must_have_one_e() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["x * (a + sin(b))", "1 / (a * sin(b))", "(a + b) ** 2 * exp(x)", "x - (a - sqrt(b)) ** 3", "2 ** (a * cos(b))"]
+    "text",
+    ["x * (a + sin(b))", "1 / (a * sin(b))", "(a + b) ** 2 * exp(x)", "x - (a - sqrt(b)) ** 3", "2 ** (a * cos(b))"],
 )
 def test_an_entry_is_what_its_text_says_at_every_point(text: str) -> None:
     ranges = {"x": [1.0, 2.0], "a": [1.0, 2.0], "b": [0.1, 0.5]}

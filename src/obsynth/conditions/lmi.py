@@ -48,7 +48,7 @@ def semidefinite_solvers() -> tuple[str, ...]:
 
 def chosen_solver(name: str, options: Mapping[str, Any] | None) -> ChosenSolver:
     """Return a solver with its settings; raise `SpecError` with the list of those installed for another name."""
-    if name not in SOLVER_SETTINGS and name not in semidefinite_solvers():
+    if not isinstance(name, str) or (name not in SOLVER_SETTINGS and name not in semidefinite_solvers()):
         listed = ", ".join(semidefinite_solvers())
         raise SpecError(
             f"method.options.solver: there is no solver {name!r} that does semidefinite programmes; "

@@ -24,6 +24,7 @@ from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.outliers import Outliers
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
@@ -172,6 +173,12 @@ def export(
     numbers = precision or "double"
     if outliers is not None and not isinstance(design.observer, DAEObserver):
         raise SpecError("outliers is for nonlinear designs: exports of others use every sample.", path="outliers")
+    if isinstance(design.observer, RegionObserver):
+        raise SpecError(
+            f"Design {design.name!r} is for a region of a nonlinear plant, whose steps are not written as files yet: "
+            "it runs in Python (design.observer) and on logs (obsynth.run_on_data).",
+            path="path",
+        )
     if isinstance(design.observer, ScheduledObserver):
         return _write_scheduled(design, target, suffix, monitor, thresholds, warm_up, sample_time, numbers)
     written: ExportedMonitor | None = None if monitor is None else registered("monitor_in_c")(monitor, design)

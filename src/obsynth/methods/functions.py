@@ -87,3 +87,5 @@ descriptor_kalman = design_function(method_class("descriptor-kalman"))
 adaptive_observer = design_function(method_class("adaptive-observer"))
 
 dae_adaptive_observer = design_function(method_class("dae-adaptive-observer"))
+
+region_observer = design_function(method_class("region-observer"))

@@ -152,3 +152,19 @@ def dae_adaptive_observer(
     reset: float = ...,
     name: str = ...,
 ) -> ObserverDesign: ...
+def region_observer(
+    plant: Plant | Transformation,
+    *,
+    region: Any = ...,
+    sample_time: float | None = ...,
+    noise: Any = ...,
+    faults: Any = ...,
+    wanted: Any = ...,
+    goal: Literal["power", "gain", "decay"] = ...,
+    decay: float | None = ...,
+    gains: Any = ...,
+    initial_state: Any = ...,
+    solver: Any = ...,
+    solver_options: Any = ...,
+    name: str = ...,
+) -> ObserverDesign: ...

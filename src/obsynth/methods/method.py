@@ -26,6 +26,7 @@ from obsynth.verification.error_system import ErrorModel
 
 if TYPE_CHECKING:
     from obsynth.observers.nonlinear.observer import DAEObserver
+    from obsynth.observers.nonlinear.region_observer import RegionObserver
     from obsynth.observers.recursive.observer import RecursiveObserver
     from obsynth.observers.scheduled.observer import ScheduledObserver
     from obsynth.observers.window.observer import WindowObserver
@@ -57,7 +58,7 @@ class Synthesis:
 
     options: Mapping[str, Any]
     gains: Mapping[str, FloatArray]
-    observer: LinearObserver | RecursiveObserver | DAEObserver | WindowObserver | ScheduledObserver
+    observer: LinearObserver | RecursiveObserver | DAEObserver | WindowObserver | ScheduledObserver | RegionObserver
     certificate: Certificate
     solver: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()

@@ -338,7 +338,9 @@ def _linear_operation(operation: Callable[..., Any]) -> Callable[..., Any]:
             return forms[0].times(1 / forms[1].constant)
         if operation is np.power and not forms[1].parts and forms[1].constant in (0, 1):
             return forms[0] if forms[1].constant else LinearForm(Fraction(1))
-        text = TEXTS_OF_OPERATIONS[operation](*(form.text for form in forms)) if operation in TEXTS_OF_OPERATIONS else None
+        text = (
+            TEXTS_OF_OPERATIONS[operation](*(form.text for form in forms)) if operation in TEXTS_OF_OPERATIONS else None
+        )
         if text is None:
             raise SpecError(
                 "An entry of a matrix chooses between formulas (a comparison or where), which may jump: that is no "

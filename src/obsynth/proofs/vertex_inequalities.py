@@ -235,7 +235,8 @@ def _flow_problem(vertices: Sequence[Vertex], witness: Witness, ball: float, pow
     G = P if witness.G is None else witness.G[0]
     if not 0 < k <= len(P) or P[k:].any() or (G[:k] != P[:k]).any():
         return "G is not [[P1, 0], [P2, P3]] with P = diag(P1, 0)"
-    if power is not None and any(vertex(Ball)[1].magnitude[k:].any() for vertex in vertices):
+    driven = [vertex(Ball)[1] for vertex in vertices] if power is not None and k < len(P) else []
+    if any(part.midpoint[k:].any() or part.radius[k:].any() for part in driven):
         return "white noise enters the algebraic equations: its mean square is not bounded this way"
     return ""
 

@@ -8,6 +8,7 @@ from obsynth.methods.fault_figures import HELD_GROWTH
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
@@ -39,7 +40,9 @@ def demonstration_scenario(design: ObserverDesign) -> Scenario | None:
     observer = design.observer
     if isinstance(observer, LinearObserver):
         return _of_linear(design.linear[0], observer) if observer.fault_names else None
-    return None if isinstance(observer, (WindowObserver, ScheduledObserver)) else _of_recursive(observer)
+    return (
+        None if isinstance(observer, (RegionObserver, ScheduledObserver, WindowObserver)) else _of_recursive(observer)
+    )
 
 
 def _of_linear(plant: DescriptorSystem, observer: LinearObserver) -> Scenario:

@@ -22,6 +22,7 @@ from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, set
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampled import sample_observer
+from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.dae import DAEModel
@@ -209,7 +210,7 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
         unit = units.get(name, "")
         return missing if value is None else f"{number(value)} {'' if unit == '1' else unit}".strip()
 
-    if isinstance(observer, (WindowObserver, ScheduledObserver)):
+    if isinstance(observer, (RegionObserver, ScheduledObserver, WindowObserver)):
         delayed = zip(observer.fault_names, observer.fault_delays, strict=True)
         return ("fault", "delay", "delay in s"), [(name, str(k), number(k * observer.dt)) for name, k in delayed]
     if gains is None or not isinstance(plant, DescriptorSystem):

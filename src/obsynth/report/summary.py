@@ -20,6 +20,7 @@ from obsynth.methods.fault_figures import FaultFigures
 from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.modes import SETTLED_TO, transient
+from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.dae import DAEModel
@@ -235,6 +236,9 @@ def _dynamics(design: ObserverDesign) -> str:
         return (
             f"errors shrink to {number(100.0 * decay)} % a sample at least; observer of order {design.observer.order}"
         )
+    if isinstance(design.observer, RegionObserver):
+        decay = design.certificate.claims.get("region_decay", math.nan)
+        return f"errors decay by {number(decay)} 1/s at least; observer of order {design.observer.order}"
     factor = design.certificate.claims.get("contraction", math.nan)
     order = f"observer of order {design.observer.order}"
     if not math.isfinite(factor):
@@ -266,6 +270,8 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
         yield "the model is exact; only --monitor pointwise accounts for tolerances" if some else "the model is exact"
     elif isinstance(design.observer, WindowObserver):
         yield "a model with the stated bounds"
+    elif isinstance(design.observer, RegionObserver):
+        yield f"the model is exact, with {design.observer.operating_region.sentence()}"
     elif isinstance(design.plant, PolytopicSystem):
         yield "the model is exact, with the scheduling parameters measured and in their region"
     else:

@@ -13,6 +13,7 @@ from obsynth.errors import SpecError, VerificationError
 from obsynth.numerics.arrays import FloatArray, freeze, read_only
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.sensor_timing import LONGEST_DELAY
@@ -78,7 +79,7 @@ class ObserverDesign:
         Options as resolved, plain data.
     gains : mapping of str to FloatArray
         Gains with the paper's letters, for readers; what is shipped is `observer`.
-    observer : LinearObserver, RecursiveObserver, ScheduledObserver or DAEObserver
+    observer : LinearObserver, RecursiveObserver, ScheduledObserver, RegionObserver or DAEObserver
         What is shipped.
     certificate : Certificate
         Enough to recheck every claim without a solver.
@@ -103,7 +104,7 @@ class ObserverDesign:
     plant: DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem | DAEModel
     options: Mapping[str, Any]
     gains: Mapping[str, FloatArray]
-    observer: LinearObserver | RecursiveObserver | DAEObserver | WindowObserver | ScheduledObserver
+    observer: LinearObserver | RecursiveObserver | DAEObserver | WindowObserver | ScheduledObserver | RegionObserver
     certificate: Certificate
     solver: Mapping[str, Any]
     notes: tuple[str, ...] = ()
@@ -152,6 +153,17 @@ class ObserverDesign:
             The design is for one point.
         """
         return self._parts(PolytopicSystem, ScheduledObserver, "scheduled observer")
+
+    @property
+    def over_region(self) -> tuple[DAEModel, RegionObserver]:
+        """Plant and observer of a design over a region of a nonlinear plant.
+
+        Raises
+        ------
+        SpecError
+            The design is of another kind.
+        """
+        return self._parts(DAEModel, RegionObserver, "observer of a nonlinear plant over a region")
 
     @property
     def nonlinear(self) -> tuple[DAEModel, DAEObserver]:

@@ -24,6 +24,7 @@ from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
@@ -47,7 +48,7 @@ GAIN_SET = FileKind(
 )
 
 #: Tags of kinds of designs; linear time-invariant ones have none.
-DESIGN_KINDS = (None, "recursive", "dae", "window", "scheduled")
+DESIGN_KINDS = (None, "recursive", "dae", "window", "scheduled", "region")
 
 #: From so many numbers on, which are more than a megabyte as text, the arrays of a gain set are a binary member.
 MANY_NUMBERS = 50_000
@@ -136,6 +137,7 @@ def types_of(kind: str | None) -> tuple[Any, Any]:
         "window": (TimeVaryingDescriptorSystem, WindowObserver),
         "dae": (DAEModel, DAEObserver),
         "scheduled": (PolytopicSystem, ScheduledObserver),
+        "region": (DAEModel, RegionObserver),
     }
     return others.get(kind, (DescriptorSystem, LinearObserver))
 

@@ -16,6 +16,7 @@ from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver, split_rows
 from obsynth.observers.linear.sampled import sample_observer
 from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
@@ -167,6 +168,12 @@ def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
         raise SpecError(
             f"Design {design.name!r} is for a region: scenarios have no courses of scheduling parameters yet. Run the "
             "observer on outputs, inputs and parameters (design.observer.run), or on a log (obsynth.run_on_data).",
+            path="observer",
+        )
+    if isinstance(design.observer, RegionObserver):
+        raise SpecError(
+            f"Design {design.name!r} is for a region of a nonlinear plant: scenarios do not run it yet. Simulate the "
+            "plant (obsynth.simulate_dae) and run the observer on the outputs (design.observer.run).",
             path="observer",
         )
     observer: RecursiveObserver | DAEObserver

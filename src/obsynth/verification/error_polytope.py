@@ -19,7 +19,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.proofs.extended_balls import Enclosed
+from obsynth.proofs.extended_balls import Enclosed, block
 from obsynth.proofs.vertex_inequalities import Vertex
 
 
@@ -151,7 +151,7 @@ class ErrorPolytope:
             shipped = exact(gain)
             return (
                 exact(self.A[i]) - shipped @ exact(self.C[i]),
-                exact(self.B[i]) - shipped @ exact(self.D[i]),
+                driven_by(kind, self.B[i], gain, self.D[i]),
                 exact(self.Cz[i]),
                 exact(self.Dz[i]),
             )
@@ -167,6 +167,16 @@ class ErrorPolytope:
         A = mean([a - g @ c for a, g, c in zip(self.A, each, self.C, strict=True)])
         B = mean([b - g @ d for b, g, d in zip(self.B, each, self.D, strict=True)])
         return A, B, mean(self.Cz), mean(self.Dz)
+
+
+def driven_by(kind: type[Enclosed], B: FloatArray, gain: FloatArray, D: FloatArray) -> Enclosed:
+    """Return ``B - L D``, where the last rows of L are zero without any rounding there: nothing enters these equations
+    but what B has."""
+    k = int(np.max(np.flatnonzero(gain.any(axis=1)), initial=-1)) + 1
+    if k == 0:
+        return kind.exact(B)
+    above = kind.exact(B[:k]) - kind.exact(gain[:k]) @ kind.exact(D)
+    return above if k == len(B) else block([[above], [kind.exact(B[k:])]])
 
 
 def _each(given: Any, name: str, count: int) -> tuple[FloatArray, ...]:

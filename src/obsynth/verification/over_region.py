@@ -20,14 +20,22 @@ from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.scheduling import Scheduling
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.extended_balls import Enclosed
-from obsynth.proofs.vertex_inequalities import Pair, Vertex, VertexProof, Witness, prove_decay, prove_gain
+from obsynth.proofs.vertex_inequalities import (
+    Pair,
+    Vertex,
+    VertexProof,
+    Witness,
+    prove_decay,
+    prove_gain,
+    prove_mean_square,
+)
 from obsynth.results.checks import Check, information, nothing_wrong, upper_bound_check
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.identities import equality, tracking_identities, worst
 
 #: Names of the rows.
 GAIN_ROW, DECAY_ROW, DECOUPLING_ROW = "LMI", "decay over the region", "fault decoupled for every scheduling"
-REGION_GAIN_ROW = "gain over the region"
+REGION_GAIN_ROW, DEVIATION_ROW = "gain over the region", "mean square over the region"
 #: Lyapunov matrices and slacks of a certificate over a region, each ``(1 or N, n, n)``.
 WITNESSES = ("P_region", "G_region")
 #: The same of a gain, where it has its own.
@@ -132,6 +140,13 @@ def region_gain_row(
     sound = witness is not None and np.isfinite(level) and level > 0.0
     proof = prove_gain(vertices, witness, level, discrete=discrete) if sound and witness else _no_certificate()
     return _proof_row(name, claim, level, proof)
+
+
+def deviation_row(claim: str, vertices: Sequence[Vertex], witness: Witness | None, level: float) -> Check:
+    """Return the row that the root mean square of errors is below ``level`` in continuous time."""
+    sound = witness is not None and np.isfinite(level) and level > 0.0
+    proof = prove_mean_square(vertices, witness, level, discrete=False) if sound and witness else _no_certificate()
+    return _proof_row(DEVIATION_ROW, claim, level, proof)
 
 
 def gain_row(
@@ -262,3 +277,8 @@ def forgetting_row(decay: float, forgetting: float, *, discrete: bool) -> Check:
         float(forgetting),
         source="decay over the region",
     )
+
+
+def rows_of_euler(rate: float, step: float) -> int:
+    """Return after how many steps of implicit Euler a hundredth of an error is left, for a decay ``rate`` in 1/s."""
+    return rows_to_forget(float(1.0 / np.sqrt(1.0 + 2.0 * rate * step)) if rate > 0.0 else 1.0)

@@ -12,6 +12,7 @@ import numpy as np
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.methods.state_solver import state_solver
 from obsynth.monitoring.logs.log_observer import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, LogObserver, Row
+from obsynth.monitoring.logs.region_observer import RegionLogObserver
 from obsynth.monitoring.logs.scheduled_observer import ScheduledLogObserver
 from obsynth.monitoring.logs.step_observer import SteppingLogObserver
 from obsynth.monitoring.logs.window_observer import WindowLogObserver
@@ -27,6 +28,7 @@ from obsynth.observers.linear.missing_samples import (
 )
 from obsynth.observers.linear.modes import transient
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.taken_inputs import no_inputs, over_samples, taken_inputs
 from obsynth.observers.window.observer import WindowObserver
@@ -435,4 +437,8 @@ def log_observer(
         if outliers not in (None, "none"):
             raise SpecError("outliers is for recursive and nonlinear designs: leave it out.", path="outliers")
         return ScheduledLogObserver(design, warm_up=warm_up)
+    if isinstance(design.observer, RegionObserver):
+        if outliers not in (None, "none"):
+            raise SpecError("outliers is for designs that state deviations: leave it out.", path="outliers")
+        return RegionLogObserver(design, warm_up=warm_up)
     return SteppingLogObserver(design, warm_up=warm_up, outliers=outliers)

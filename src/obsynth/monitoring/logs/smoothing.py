@@ -19,8 +19,10 @@ from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.recursive.sample import deviations_in
 from obsynth.observers.running import changed
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.smoothing import (
     checked_lag,
     linearisation_of,
@@ -183,7 +185,7 @@ def smooth(
     True
     """
     waited = checked_lag(lag)
-    if isinstance(design.observer, LinearObserver):
+    if isinstance(design.observer, (LinearObserver, RegionObserver, ScheduledObserver)):
         # The same refusal as on logs.
         LaterRows(LogRun(design).observer, waited)
     if isinstance(data, str) or any(hasattr(data, name) for name in ("__fspath__", "readline", "columns")):

@@ -53,6 +53,7 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import changed
 from obsynth.observers.scheduled.observer import ScheduledObserver
@@ -469,7 +470,7 @@ def watched_names(design: ObserverDesign) -> tuple[str, ...]:
             "none is learned (use the monitor pointwise).",
             path="design",
         )
-    if isinstance(observer, (LinearObserver, ScheduledObserver)):
+    if isinstance(observer, (LinearObserver, RegionObserver, ScheduledObserver)):
         names = observer.row_names
         return (*names[observer.fault_rows], *names[observer.residual_rows])
     return (*(f"fhat[{name}]" for name in observer.fault_names), *(f"r[{name}]" for name in innovation_names(observer)))
@@ -477,12 +478,14 @@ def watched_names(design: ObserverDesign) -> tuple[str, ...]:
 
 def settling_rows(design: ObserverDesign) -> int:
     """Return how many rows at a start are not like those that follow: linear designs have a warm-up for these."""
-    return 0 if isinstance(design.observer, (LinearObserver, ScheduledObserver)) else SETTLING
+    return 0 if isinstance(design.observer, (LinearObserver, RegionObserver, ScheduledObserver)) else SETTLING
 
 
 def has_innovations_by_sensor(observer: Any) -> bool:
     """Whether each residual is the innovation of one sensor, which says the same where another one is missing."""
-    return not isinstance(observer, (LinearObserver, RecursiveObserver, ScheduledObserver, WindowObserver))
+    return not isinstance(
+        observer, (LinearObserver, RecursiveObserver, RegionObserver, ScheduledObserver, WindowObserver)
+    )
 
 
 def innovation_names(observer: Any) -> tuple[str, ...]:

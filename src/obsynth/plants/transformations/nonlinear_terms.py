@@ -5,8 +5,8 @@ r"""A nonlinear plant as constant matrices beside scalar nonlinearities of linea
     y = C z + c_y + \sum_k w_{y,k} f_k(V_k z + U_k u)
 
 with z the differential states and the faults (parameters that are estimated, :math:`\theta' = 0`), then the algebraic
-states.  Arguments of the nonlinearities are the largest linear sub-expressions of the texts, each once, however often it
-occurs.  Coefficients are exact rationals until the end, where each entry is rounded to double precision once.
+states.  Arguments of the nonlinearities are the largest linear sub-expressions of the texts, each once, however often
+it occurs.  Coefficients are exact rationals until the end, where each entry is rounded to double precision once.
 """
 
 from __future__ import annotations
@@ -40,7 +40,12 @@ class LinearCombination:
     @property
     def text(self) -> str:
         """The combination as an expression."""
-        return " + ".join(f"{exact_number(factor)} * {name}" if factor != 1 else name for name, factor in self.parts)
+        words = []
+        for place, (name, factor) in enumerate(self.parts):
+            size = name if abs(factor) == 1 else f"{exact_number(abs(factor))} * {name}"
+            sign = "-" if factor < 0 else "+" if place else ""
+            words += [sign, size] if place else [f"{sign}{size}"]
+        return " ".join(words)
 
     def over(self, names: Sequence[str]) -> FloatArray:
         """Return the coefficients of names in order ``(n,)``."""
@@ -129,6 +134,30 @@ def nonlinear_terms(model: DAEModel, *, faults: Sequence[str] | None = None) -> 
         rows.append(registry.form(expression, {**known, **rates}, f"equations.{name}"))
     seen = [registry.form(parse_expression(text), known, f"outputs.{name}") for name, text in model.outputs.items()]
     return _assembled(model, chosen, registry, rows, seen)
+
+
+def linear_combination(text: str, known: Sequence[str], path: str) -> tuple[LinearCombination, Fraction, Fraction]:
+    """Return an expression as ``unit * combination + constant``, with a combination that begins with one whole signal.
+
+    Raises
+    ------
+    SpecError
+        A name is unknown, or the expression is not linear.
+    """
+    registry, names = _Registry(), {name: _Form.variable(name) for name in known}
+    numbers = {name: _Form.number(value) for name, value in NAMED_NUMBERS.items()}
+    form = registry.form(parse_expression(text), {**numbers, **names}, path)
+    if form.terms or not form.linear:
+        raise SpecError(f"{text!r} is no linear combination of {', '.join(known)}: give one.", path=path)
+    key, unit = _normalised(form.linear)
+    return LinearCombination(key), unit, form.constant
+
+
+def _normalised(linear: Mapping[str, Fraction]) -> tuple[tuple[tuple[str, Fraction], ...], Fraction]:
+    """Return a combination in units of its first coefficient, and that."""
+    ordered = sorted(linear.items())
+    unit = ordered[0][1]
+    return tuple((name, factor / unit) for name, factor in ordered), unit
 
 
 @dataclass
@@ -232,10 +261,7 @@ class _Registry:
                     "at the vertices says nothing of what is between them. Solve the equation for the derivative.",
                     condition="constant E",
                 )
-            ordered = sorted(form.linear.items())
-            unit = abs(ordered[0][1])
-            unit = unit if ordered[0][1] > 0 else -unit
-            key = tuple((name, factor / unit) for name, factor in ordered)
+            key, unit = _normalised(form.linear)
             number = self.arguments.setdefault(key, len(self.arguments))
             name = f"{ARGUMENT}{number}"
             parts.append(name if unit == 1 else f"{exact_number(unit)} * {name}")
@@ -323,8 +349,8 @@ def _assembled(
         arguments=arguments,
         nonlinearities=tuple(nonlinearities),
         equations=(*origins[: len(moving)], *(f"der({name}) = 0" for name in faults), *origins[len(moving) :]),
-        input_parts=np.array([each.over(model.input_names) for each in arguments]).reshape(-1, model.nu),
-        state_parts=np.array([each.over(names) for each in arguments]).reshape(-1, len(names)),
+        input_parts=np.array([each.over(model.input_names) for each in arguments]).reshape(len(arguments), model.nu),
+        state_parts=np.array([each.over(names) for each in arguments]).reshape(len(arguments), len(names)),
     )
 
 

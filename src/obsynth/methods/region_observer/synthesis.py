@@ -1,0 +1,334 @@
+"""The gain of an observer over a region and its certificate: inequalities at the corners of slopes, then the proof."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.existence.condition import require_all
+from obsynth.conditions.lmi import chosen_solver
+from obsynth.errors import SolverError, SpecError
+from obsynth.methods.engines.vertex_certificates import best_decay, certified
+from obsynth.methods.method import Synthesis
+from obsynth.methods.region_observer.drive import drive_of, wanted_of
+from obsynth.methods.region_observer.method import RegionObserverMethod
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.doubling import is_positive
+from obsynth.numerics.matrix_equations import continuous_solution
+from obsynth.observers.nonlinear.region_observer import RegionObserver
+from obsynth.observers.records import named_vector
+from obsynth.plants.dae import DAEModel
+from obsynth.plants.operating_region import OperatingRegion, Slope
+from obsynth.plants.transformations.nonlinear_terms import NonlinearTerms, nonlinear_terms
+from obsynth.proofs.vertex_inequalities import Witness, prove_decay, prove_gain, prove_mean_square
+from obsynth.results.design import Certificate
+from obsynth.verification.error_polytope import ErrorPolytope
+from obsynth.verification.nonlinear_region import corner_errors, corners_of, directions, fastest_decay, whole_gain
+from obsynth.verification.over_region import GAIN_WITNESSES, WITNESSES, rows_of_euler
+
+#: Bounds of slopes are stored a little wider: on another processor elementary functions may differ in the last digit.
+SLOPE_ROOM = 1e-9
+#: How far above the least level a gain is sought: gains near the least one are large.
+DESIGN_MARGIN = 2e-2
+#: The largest gain that rates alone may ask for, in units of the plant's own, and the fastest rate.
+DECAY_LIMIT = 1e2
+#: Noise on states that nothing drives, as a share of that on the others, where sizes of errors are estimated.
+LEAST_DRIVE = 1e-3
+#: How far a level may be raised where that of the scaled problem just misses the proof of the shipped numbers.
+PROOF_ROOMS = (0.0, 1e-6, 1e-4, 1e-3, 1e-2)
+
+
+def synthesise(plant: DAEModel, asked: RegionObserverMethod, *, progress: Callable[[str], None]) -> Synthesis:
+    """Return an observer over a region with its certificate; see `obsynth.region_observer`."""
+    asked.require_stated(plant)
+    solver = chosen_solver(asked.solver, asked.solver_options)
+    faults = asked.fault_names(plant)
+    step = asked.sample_time or 0.0
+    progress("enclosing the slopes of the nonlinearities over the region")
+    require_all(asked.existence(plant))
+    terms = nonlinear_terms(plant, faults=faults)
+    region = OperatingRegion.of(terms, asked.region)
+    slopes = region.slopes()
+    bounds = _stored_bounds(slopes)
+    drive = _drive(terms, region, asked, step)
+    given = _given_gain(terms, asked.gains)
+    progress("solving the inequalities at the corners of the slopes")
+    problem = _Scaled.of(terms, region, slopes, bounds, drive, asked.goal)
+    found = problem.solved(asked, given, solver)
+    progress("proving the shipped numbers")
+    claims, matrices = _proved(terms, slopes, bounds, drive, found, asked, problem)
+    gain = found.gain
+    start = named_vector(asked.initial_state, (*plant.state_names, *faults), _nominal(plant, faults), "initial_state")
+    places = [(*plant.state_names, *faults).index(name) for name in terms.names]
+    observer = RegionObserver(
+        plant,
+        faults,
+        dict(asked.region),
+        bounds,
+        gain,
+        start[places],
+        rows_of_euler(claims["region_decay"], step),
+        step,
+    )
+    return Synthesis(
+        asked.as_plain(),
+        {"L": gain},
+        observer,
+        Certificate(matrices, claims),
+        {"engine": "lmi", "runs": found.runs},
+        tuple(_notes(region, observer, asked)),
+    )
+
+
+def _stored_bounds(slopes: tuple[Slope, ...]) -> FloatArray:
+    found = np.array([[each.low, each.high] for each in slopes]).reshape(len(slopes), 2)
+    room = SLOPE_ROOM * np.abs(found).max(axis=1, initial=0.0, keepdims=True)
+    return np.asarray(found + room * np.array([[-1.0, 1.0]]))
+
+
+def _drive(
+    terms: NonlinearTerms, region: OperatingRegion, asked: RegionObserverMethod, step: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    wanted = wanted_of(terms, region, asked.wanted)
+    if asked.goal == "decay" and asked.noise is None:
+        return np.zeros((len(terms.names), 0)), np.zeros((len(terms.output_names), 0)), wanted
+    return (*drive_of(terms, asked.noise, step), wanted)
+
+
+def _given_gain(terms: NonlinearTerms, gains: Any) -> FloatArray | None:
+    if gains is None:
+        return None
+    found, shape = as_matrix(gains, "gains"), (terms.differential, len(terms.output_names))
+    if found.shape != shape:
+        moving = ", ".join(terms.names[: terms.differential])
+        raise SpecError(f"gains are {found.shape}: give {shape}, the rows those of {moving}.", path="gains")
+    return found
+
+
+def _nominal(plant: DAEModel, faults: tuple[str, ...]) -> FloatArray:
+    return np.array([*plant.states.values(), *(plant.parameters[name] for name in faults)])
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A gain with its Lyapunov matrices in the plant's units."""
+
+    gain: FloatArray
+    witness: Witness
+    level: float | None
+    runs: tuple[Mapping[str, Any], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Scaled:
+    """The error system at the corners in units in which it is near one: states, equations, outputs and time."""
+
+    errors: ErrorPolytope
+    states: FloatArray
+    rows: FloatArray  # of algebraic equations
+    outputs: FloatArray
+    time: float
+    differential: int
+
+    @classmethod
+    def of(
+        cls,
+        terms: NonlinearTerms,
+        region: OperatingRegion,
+        slopes: tuple[Slope, ...],
+        bounds: FloatArray,
+        drive: tuple[FloatArray, FloatArray, FloatArray],
+        goal: str,
+    ) -> _Scaled:
+        """Return the error system at every corner."""
+        W, Wy, V = directions(terms, slopes)
+        nd = terms.differential
+        corners = corners_of(bounds)
+        A = [terms.A + W @ np.diag(corner) @ V for corner in corners]
+        C = [terms.C + Wy @ np.diag(corner) @ V for corner in corners]
+        B, D, Cz = drive
+        states = _powers(_errors_of_kalman(np.mean(A, axis=0), np.mean(C, axis=0), B, D, nd, _sizes(terms, region)))
+        largest = np.max(np.abs(A), axis=0) * states
+        time = 1.0 / _power(float(np.max(largest[:nd] / states[:nd, None], initial=0.0)) or 1.0)
+        noisy = np.sqrt(time) if goal == "power" else 1.0
+        rows = 1.0 / _powers(np.max(np.max(np.abs(A), axis=0)[nd:] * states, axis=1, initial=0.0))
+        sizes = np.max(np.max(np.abs(C), axis=0) * states, axis=1, initial=0.0)
+        outputs = 1.0 / _powers(sizes)
+        left = np.concatenate([time / states[:nd], rows])[:, None]
+        errors = ErrorPolytope(
+            [left * a * states for a in A],
+            [outputs[:, None] * c * states for c in C],
+            B=left * B / noisy,
+            D=outputs[:, None] * D / noisy,
+            Cz=Cz * states,
+            dt=0.0,
+            differential=nd if nd < len(states) else None,
+        )
+        return cls(errors, states, rows, outputs, time, nd)
+
+    def solved(self, asked: RegionObserverMethod, given: FloatArray | None, solver: str) -> _Found:
+        """Return a gain with its certificate."""
+        gains = None if given is None else [self._gain_in(given)]
+        decay = None if not asked.decay else asked.decay * self.time
+        if asked.goal == "decay":
+            if decay is not None:
+                raise SpecError("goal: decay finds the fastest decay: leave decay out.", path="decay")
+            _, witness, own = best_decay(self.errors, gains=gains, gain="constant", limit=DECAY_LIMIT)
+            return _Found(self._gain_out(own[0], given), self._witness_out(witness), None, ())
+        made = certified(
+            self.errors,
+            goal=asked.goal,
+            margin=DESIGN_MARGIN if given is None else 0.0,
+            decay=decay,
+            gain="constant",
+            gains=gains,
+            solver=solver,
+            settings=asked.solver_options,
+        )
+        return _Found(self._gain_out(made.gains[0], given), self._witness_out(made.witness), made.level, made.runs)
+
+    def decay_of(self, gain: FloatArray) -> Witness | None:
+        """Return Lyapunov matrices of the fastest decay of a gain; ``None`` where none were found."""
+        try:
+            _, witness, _ = best_decay(self.errors, gains=[self._gain_in(gain)], gain="constant", limit=DECAY_LIMIT)
+        except SolverError:
+            return None
+        return self._witness_out(witness)
+
+    def _gain_in(self, gain: FloatArray) -> FloatArray:
+        scaled = gain * self.time / self.states[: self.differential, None] / self.outputs
+        return np.vstack([scaled, np.zeros((len(self.states) - self.differential, scaled.shape[1]))])
+
+    def _gain_out(self, gain: FloatArray, given: FloatArray | None) -> FloatArray:
+        if given is not None:
+            return given
+        nd = self.differential
+        return np.asarray(gain[:nd] * self.states[:nd, None] * self.outputs / self.time)
+
+    def _witness_out(self, witness: Witness) -> Witness:
+        nd, s = self.differential, self.states
+        columns = np.concatenate([self.time / s[:nd], self.rows])
+        P = witness.P[0] / s[:, None] * columns
+        P = 0.5 * (P + P.T)
+        P[nd:], P[:, nd:] = 0.0, 0.0
+        G = witness.P[0] if witness.G is None else witness.G[0]
+        # G' multiplies the equations: its columns are theirs, its rows the states'.
+        G = (G.T / s[:, None] * columns).T
+        G[:nd, :nd] = P[:nd, :nd]
+        G[:nd, nd:] = 0.0
+        return Witness([P], [G], differential=nd)
+
+
+def _errors_of_kalman(
+    A: FloatArray, C: FloatArray, B: FloatArray, D: FloatArray, differential: int, sizes: FloatArray
+) -> FloatArray:
+    """Return what the errors of a Kalman filter of the mean corner are about: P is near a multiple of one in these."""
+    k = differential
+    if not D.any() or not B.any():
+        return sizes
+    with suppress(np.linalg.LinAlgError):
+        below = np.linalg.solve(A[k:, k:], A[k:, :k]) if k < len(A) else np.zeros((0, k))
+        a, c = A[:k, :k] - A[:k, k:] @ below, C[:, :k] - C[:, k:] @ below
+        s = sizes[:k]
+        # A little of everything drives states that nothing else does.
+        drive = B[:k] / s[:, None]
+        least = LEAST_DRIVE * np.linalg.norm(drive) * np.eye(k)
+        scaled = a * s / s[:, None]
+        covariance = continuous_solution(scaled, c * s, drive @ drive.T + least @ least, D @ D.T)
+        if covariance is not None and is_positive(covariance):
+            found = s * np.sqrt(np.diag(covariance))
+            return np.concatenate([found, np.maximum(np.abs(below) @ found, LEAST_DRIVE * sizes[k:])])
+    return sizes
+
+
+def _sizes(terms: NonlinearTerms, region: OperatingRegion) -> FloatArray:
+    """Return what each state and fault is about: the width of its range, or of those that it has a part in."""
+    found = np.zeros(len(terms.names))
+    for each in region.ranges:
+        for name, factor in each.combination.parts:
+            if name in terms.names:
+                place = terms.names.index(name)
+                found[place] = max(found[place], (each.high - each.low) / abs(float(factor)))
+    return np.where(found > 0.0, found, 1.0)
+
+
+def _powers(values: FloatArray) -> FloatArray:
+    positive = np.where(values > 0.0, values, 1.0)
+    return np.asarray(np.exp2(np.round(np.log2(positive))))
+
+
+def _power(value: float) -> float:
+    return float(_powers(np.array([value]))[0])
+
+
+def _proved(
+    terms: NonlinearTerms,
+    slopes: tuple[Slope, ...],
+    bounds: FloatArray,
+    drive: tuple[FloatArray, FloatArray, FloatArray],
+    found: _Found,
+    asked: RegionObserverMethod,
+    problem: _Scaled,
+) -> tuple[dict[str, float], dict[str, FloatArray]]:
+    """Return what the shipped numbers prove: the decay and the level, each with Lyapunov matrices of its own."""
+    vertices = corner_errors(terms, slopes, bounds, found.gain, drive)
+    wanted = asked.decay or 0.0
+    witness = problem.decay_of(found.gain) or found.witness
+    rate = fastest_decay(vertices, witness, _fastest(terms, found.gain))
+    if rate < wanted and prove_decay(vertices, found.witness, wanted, discrete=False).proved:
+        rate, witness = wanted, found.witness
+    matrices = _stored(witness, WITNESSES)
+    if rate <= 0.0 or rate < wanted:
+        raise SolverError(
+            "A gain was found, but no decay of the errors could be proved for it over the region. That is no proof "
+            "that there is none: give a smaller region, or a smaller decay."
+        )
+    claims = {"region_decay": rate}
+    if found.level is None:
+        return claims, matrices
+    matrices |= _stored(found.witness, GAIN_WITNESSES)
+    prover, name = (prove_mean_square, "region_deviation") if asked.goal == "power" else (prove_gain, "region_gain")
+    for room in PROOF_ROOMS:
+        level = found.level * (1.0 + room)
+        if prover(vertices, found.witness, level, discrete=False).proved:
+            return {**claims, name: level}, matrices
+    raise SolverError(
+        "A gain was found, but its certificate could not be proved for the shipped numbers. That is no proof that "
+        "there is none: give a smaller region."
+    )
+
+
+def _stored(witness: Witness, names: tuple[str, str]) -> dict[str, FloatArray]:
+    return {names[0]: np.array(witness.P), names[1]: np.array(witness.G)}
+
+
+def _fastest(terms: NonlinearTerms, gain: FloatArray) -> float:
+    """Return a rate above any that could be proved: the size of the closed system."""
+    closed = terms.A - whole_gain(terms, gain) @ terms.C
+    return float(np.linalg.norm(closed[: terms.differential])) + 1.0
+
+
+def _notes(region: OperatingRegion, observer: RegionObserver, asked: RegionObserverMethod) -> list[str]:
+    seen = {place for place, _, _ in region.measured()}
+    states, _, _ = region.matrices()
+    assumed = [each.text for place, each in enumerate(region.ranges) if place not in seen and bool(states[place].any())]
+    found = [
+        f"One certificate at {2 ** len(observer.slopes)} corners of {len(observer.slopes)} slopes, for the region "
+        f"{region.sentence()}. A row in which an input, a measurement or an estimate leaves it is out: nothing is "
+        f"claimed for {observer.forgetting} rows from the last such row on."
+    ]
+    if assumed:
+        found.append(
+            f"That {', '.join(assumed)} of the plant stay in their ranges is seen by the estimates alone: until these "
+            "have settled it is an assumption."
+        )
+    found.append(
+        "The observer takes steps of implicit Euler, for which the same certificate is proved; what such a step misses "
+        "of the plant's own motion acts as a disturbance. Samples that are close beside the plant's time constants "
+        "keep it small."
+    )
+    return found

@@ -1,0 +1,93 @@
+r"""The error system of an observer of a nonlinear plant over a region: the corners of its slopes.
+
+By the mean value theorem the error obeys :math:`E e' = (A + \sum_i d_i w_i v_i - L (C + \sum_i d_i w_{y,i} v_i)) e
++ B w` with every slope :math:`d_i` between its bounds, where the observer continues each nonlinearity beyond its box
+with a slope between the same bounds.  What is affine in the slopes is proved at their corners.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.operating_region import Slope
+from obsynth.plants.transformations.nonlinear_terms import NonlinearTerms
+from obsynth.proofs.extended_balls import Enclosed
+from obsynth.proofs.vertex_inequalities import Vertex, Witness, prove_decay
+from obsynth.verification.error_polytope import driven_by
+
+#: Corners that are proved one by one: 2 ** 12.
+MOST_CORNERS = 4096
+#: Halvings towards the fastest decay that a certificate proves.
+_HALVINGS = 24
+
+
+def directions(terms: NonlinearTerms, slopes: Sequence[Slope]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return w ``(n, q)``, w_y ``(ny, q)`` and v ``(q, n)`` of every slope."""
+    W = np.column_stack([terms.W[:, each.nonlinearity] for each in slopes] or [np.zeros((len(terms.A), 0))])
+    Wy = np.column_stack([terms.Wy[:, each.nonlinearity] for each in slopes] or [np.zeros((len(terms.C), 0))])
+    V = np.array([terms.state_parts[each.argument] for each in slopes]).reshape(len(slopes), len(terms.A))
+    return W, Wy, V
+
+
+def corners_of(bounds: FloatArray) -> list[FloatArray]:
+    """Return the corners ``(q,)`` of bounds ``(q, 2)``; the last slope changes first."""
+    return [np.array(corner) for corner in itertools.product(*bounds)]
+
+
+def whole_gain(terms: NonlinearTerms, gain: FloatArray) -> FloatArray:
+    """Return the gain ``(n, ny)`` of all equations: none in the algebraic ones."""
+    return np.vstack([gain, np.zeros((len(terms.A) - len(gain), gain.shape[1]))])
+
+
+def corner_errors(
+    terms: NonlinearTerms,
+    slopes: Sequence[Slope],
+    bounds: FloatArray,
+    gain: FloatArray,
+    drive: tuple[FloatArray, FloatArray, FloatArray],
+) -> list[Vertex]:
+    """Return how the error system is formed at each corner of the slopes.
+
+    ``drive``: B ``(n, p)`` and D ``(ny, p)`` of the noise, and the errors that count, Cz ``(q, n)``.
+    """
+    W, Wy, V = directions(terms, slopes)
+    B, D, Cz = drive
+    L = whole_gain(terms, gain)
+
+    def vertex_at(corner: FloatArray) -> Vertex:
+        def vertex(kind: type[Enclosed]) -> tuple[Enclosed, Enclosed, Enclosed, Enclosed]:
+            exact = kind.exact
+            shipped, slope = exact(L), exact(np.diag(corner))
+            into = exact(W) - shipped @ exact(Wy)
+            M = exact(terms.A) - shipped @ exact(terms.C)
+            if len(corner):
+                M = M + into @ (slope @ exact(V))
+            return M, driven_by(kind, B, L, D), exact(Cz), exact(np.zeros((len(Cz), B.shape[1])))
+
+        return vertex
+
+    return [vertex_at(corner) for corner in corners_of(bounds)]
+
+
+def fastest_decay(vertices: Sequence[Vertex], witness: Witness, limit: float) -> float:
+    """Return a rate near the fastest that a certificate proves, from a floating-point guess; 0 without any."""
+    low, high = 0.0, limit
+    if not prove_decay(vertices, witness, 0.0, discrete=False).proved:
+        return 0.0
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        if prove_decay(vertices, witness, middle, discrete=False).proved:
+            low = middle
+        else:
+            high = middle
+        if high - low <= _NEAR * high:
+            break
+    return low
+
+
+#: Where the search for a rate ends, as a share of it.
+_NEAR = 1e-3
