@@ -298,7 +298,7 @@ class TestManyStates:
     def test_as_the_recursion_has_it(self, design, monkeypatch):
         few = gain_schedule_summary(design.observer)
         monkeypatch.setattr("obsynth.observers.recursive.gain_schedule_summary.MANY_STATES", 200)
-        monkeypatch.setattr("obsynth.observers.recursive.gain_schedule.STEPS_WITHOUT_HORIZON", few.steps)
+        monkeypatch.setattr("obsynth.observers.recursive.gain_schedule_summary.STEPS_WITHOUT_HORIZON", few.steps)
         whole = gain_schedule_summary(design.observer)
         assert whole.steps == few.steps
         np.testing.assert_allclose(whole.L, few.L, rtol=0.0, atol=1e-12)
