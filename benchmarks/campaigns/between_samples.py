@@ -21,7 +21,7 @@ from scipy.linalg import expm
 
 import obsynth as ob
 
-CASES = 500
+CASES = 300
 LIMIT = 240.0  # s
 #: Parts of a sample in which a course has one sign; samples of a record.
 PARTS, RECORD = 64, 24
@@ -155,9 +155,8 @@ def _of_a_filter(plant: Plant, rng: np.random.Generator) -> Outcome:
         watched = ob.online_monitor(design, disturbance_bounds=bounds, noise_bound=3.0, **given)
         if "move within their bounds between samples" not in watched.statement:
             return Outcome(plant.kind, "filter", f"says nothing of moving disturbances: {watched.statement}")
-        table = ob.run_on_data(design, data, monitor=watched).table
-        share = float((table["statistic"] / table["threshold"]).max())
-        if share > 1.0 + ROUNDING:
+        share = _share(design, data, watched)
+        if not share <= 1.0 + ROUNDING:
             return Outcome(plant.kind, "filter", f"{share:.9g} of the threshold, {given}")
         shares.append(share)
     proof = ob.prove_alarm(
@@ -191,9 +190,8 @@ def _over_tolerances(plant: Plant, rng: np.random.Generator) -> Outcome:
     watched = ob.online_monitor(
         design, disturbance_bounds=bounds, noise_bound=3.0, initial_set=start, constants=design.linear[0].uncertainty
     )
-    table = ob.run_on_data(design, data, monitor=watched).table
-    share = float((table["statistic"] / table["threshold"]).max())
-    if share > 1.0 + ROUNDING:
+    share = _share(design, data, watched)
+    if not share <= 1.0 + ROUNDING:
         return Outcome(plant.kind, "tolerances", f"{share:.9g} of the threshold")
     proof = ob.prove_alarm(
         design, data, RECORD, window=5, disturbance_bounds=bounds, noise_bound=3.0, initial_set=start
@@ -201,6 +199,12 @@ def _over_tolerances(plant: Plant, rng: np.random.Generator) -> Outcome:
     if proof.proved:
         return Outcome(plant.kind, "tolerances", "a fault-free record is proved faulty")
     return Outcome(plant.kind, "tolerances")
+
+
+def _share(design: ob.ObserverDesign, data: pd.DataFrame, watched: Any) -> float:
+    """Return the largest share of the threshold that a run reaches at any row; NaN where one has none."""
+    table = ob.run_on_data(design, data, monitor=watched, warm_up=0.0).table
+    return float(np.max((table["statistic"] / table["threshold"]).to_numpy(dtype=float)))
 
 
 def _worst_record(

@@ -281,7 +281,7 @@ def _existence(held: Sequence[Condition], convex: GainProblem, gamma: float | No
         else proved_lower_bound(convex, solver="CLARABEL", best=best.injection, enough=gamma)
     )
     holds = bool(best.gain <= gamma or bound <= gamma)
-    detail = f"the best filter found has {best.gain:.9g}, and no filter is below {bound:.9g}"
+    detail = f"the best filter found has {best.gain:.9g}, and none with this T, N and W is below {bound:.9g}"
     source = "dual of (45), checked without the solver"
     claim = "gamma is not below the least gain for this T, N and W"
     return [*found, Condition("gamma", claim, holds, gamma, bound, source, detail)]

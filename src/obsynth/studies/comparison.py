@@ -83,7 +83,7 @@ _FIGURE_MEANINGS = {
     "bias": "largest mean of the estimate without a fault",
     "s to alarm": "median detection delay",
     "smallest": "step that half of the runs detect",
-    "bound": "largest estimate without a fault, for the exact model (tolerances not counted)",
+    "bound": "largest estimate without a fault, for the exact model (tolerances not counted) and held disturbances",
     "bound / optimum": (
         f"1 = as sensitive as the best {LONGEST_WINDOW}-sample test with the same delay; below 1 = better, because the "
         "observer uses older samples"
@@ -114,8 +114,8 @@ class FaultComparison:
     smallest_found : float
         Size of a step that half of the runs find.
     bound : float
-        What the estimate never passes without a fault, with disturbances as large as in the scenario and three
-        deviations of noise: sums of absolute values.
+        What the estimate of the exact model never passes without a fault, with disturbances as large as in the scenario
+        that are held between samples, and three deviations of noise: sums of absolute values.
     least : float
         The least such bound that any test with the same delay on at most `LONGEST_WINDOW` samples can have, linear or
         not: of a fault of any time course where the estimate is one sample of it, else of a constant one.  An observer

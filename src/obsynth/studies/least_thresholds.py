@@ -36,8 +36,9 @@ def thresholds_beside_least(
 ) -> list[tuple[float, float]]:
     """Return for each estimate what it never passes without a fault, and the least that any test with its delay has.
 
-    ``plant`` sampled; ``impulses (steps, estimates, nf + nd + nw)`` as of `step_responses`; ``bounds (nd,)`` of the
-    disturbances, noise within `DEVIATIONS`.  The first is a sum of absolute values; NaN where none is known.
+    ``plant`` sampled, disturbances held between its samples; ``impulses (steps, estimates, nf + nd + nw)`` as of
+    `step_responses`; ``bounds (nd,)`` of the disturbances, noise within `DEVIATIONS`.  The first is a sum of absolute
+    values; NaN where none is known.
     """
     noisy = bool(plant.Dw.any() or plant.Bw.any())
     noise = np.full(impulses.shape[2] - plant.nf - plant.nd, DEVIATIONS if noisy else 0.0)
@@ -62,7 +63,8 @@ def _least(
     try:
         asked = GuaranteedTestMethod.of({
             "fault": fault, "samples": samples, "free": blind, "noise_bound": DEVIATIONS if noisy else None,
-            "disturbance_bounds": dict(zip(plant.disturbance_names, bounds.tolist(), strict=True)), **course,
+            "disturbance_bounds": dict(zip(plant.disturbance_names, bounds.tolist(), strict=True)),
+            "disturbance": "jump", **course,
         })  # fmt: skip
         size = largest_hidden_fault(problem_of(plant, asked).window(samples)).size
     except ObsynthError:
@@ -72,7 +74,10 @@ def _least(
 
 def in_words(fault: str, bound: float, least: float, unit: str = "") -> str:
     """Return a sentence on one fault."""
-    own = f"Fault-free, if the model is exact, |estimate of {fault}| <= {bound:.3g}{f' {unit}' if unit else ''}"
+    size = f"{bound:.3g}{f' {unit}' if unit else ''}"
+    own = (
+        f"Fault-free, if the model is exact and disturbances are held between samples, |estimate of {fault}| <= {size}"
+    )
     if not np.isfinite(least):
         return f"{own}. The smallest possible threshold is not known."
     if least <= SAME_RESPONSE * bound:

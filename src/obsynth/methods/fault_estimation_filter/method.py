@@ -150,7 +150,9 @@ class FaultEstimationFilter(Method):
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "gamma": ClaimMeaning("", "proved bound on the L2 gain from disturbances to the fault-estimate error", "LMI"),
         "gamma_min": ClaimMeaning(
-            "", "smallest achievable gamma; proved where the row 'least gain' says so", "least gain"
+            "",
+            "smallest gamma for this T, N and W (free weight: T and N); proved where 'least gain' says so",
+            "least gain",
         ),
         "gamma_bracket_low": ClaimMeaning("", "lower end of the bisection's bracket", "claimed gains"),
         "gamma_bracket_high": ClaimMeaning("", "upper end of the bisection's bracket", "claimed gains"),
