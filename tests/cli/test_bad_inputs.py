@@ -253,7 +253,7 @@ SCHEMA = [
         "method.options.gamma_search: must be one of",
     ),
     Case("tolerance of one", put("method", "options", "tolerance", 1), "method.options.tolerance: must be less than 1"),
-    Case("switch as number", put("method", "options", "free_residual_weight", 1), "must be true or false"),
+    Case("switch as number", put("method", "options", "prove_least", 1), "must be true or false"),
     Case("S ragged", put("method", "options", "S", [[1, 0], [1]]), "method.options.S: row 2 has 1 entries"),
     Case("options as list", put("method", "options", [1]), "method.options: must be a mapping"),
 ]

@@ -56,7 +56,7 @@ MADE = {
     "filter, h2": lambda: a_filter(objective="h2"),
     "filter, h2 in a region": lambda: a_filter(objective="h2", region=DISK),
     "filter, h2 and gamma": lambda: a_filter(objective="h2", gamma=1.6),
-    "filter, decay": lambda: a_filter(decay=1.0, free_residual_weight=True, mean=3),
+    "filter, decay": lambda: a_filter(decay=1.0, weight="free", mean=3),
     "filter, another solver": lambda: a_filter(engine="lmi", solver="CLARABEL", solver_options={"max_iter": 150}),
     "pd, constraint": lambda: a_pd(delta=0.3, constraints=lambda v: [v["Z"] == 0]),
     "pd, sector": lambda: a_pd(region=conditions.sector(0.9)),
@@ -180,6 +180,7 @@ def test_what_cannot_be_is_told():
 
 def test_a_document_may_write_regions_and_objectives(tmp_path):
     text = (DESIGNS / "wang2015/spec.yaml").read_text().replace("plant.yaml", str(DESIGNS / "wang2015/plant.yaml"))
+    text = text[: text.index("  options:")]
     more = "  options: {objective: h2, region: {disk: [0, 0.3]}, solver: CLARABEL, solver_options: {max_iter: 150}}\n"
     (tmp_path / "spec.yaml").write_text(text + more)
     spec = obsynth.load_spec(tmp_path / "spec.yaml")

@@ -49,7 +49,7 @@ MADE = {
     "wang, riccati": lambda: obsynth.fault_estimation_filter(plant_of("wang2015/spec.yaml")),
     "wang, inequality": lambda: obsynth.fault_estimation_filter(plant_of("wang2015/spec.yaml"), engine="lmi"),
     "wang, free weight": lambda: obsynth.fault_estimation_filter(
-        plant_of("wang2015/spec.yaml"), free_residual_weight=True
+        plant_of("wang2015/spec.yaml"), weight="free"
     ),
     "wang, mean": lambda: obsynth.fault_estimation_filter(plant_of("wang2015/spec.yaml"), mean=3),
     "wang, noise": lambda: obsynth.fault_estimation_filter(plant_of("drive/spec.yaml")),

@@ -52,7 +52,7 @@ def test_a_limit_below_what_the_equations_find_is_kept_all_the_same() -> None:
         None, [[0.5, 0.2, 0.0], [0.0, 0.6, 0.3], [0.1, 0.0, 0.4]], C=np.eye(3), Bf=[[1], [0.5], [0]],
         Bd=[[0.3], [1], [0.2]], dt=1.0,
     )  # fmt: skip
-    free = obsynth.fault_estimation_filter(plant, free_residual_weight=True)
+    free = obsynth.fault_estimation_filter(plant, weight="free")
     upsilon, found = free.gains["Upsilon"], float(np.linalg.norm(free.gains["W"], 2))
     least = 1.0 / float(np.linalg.svd(upsilon, compute_uv=False)[-1])
     limit = 0.5 * (least + found)

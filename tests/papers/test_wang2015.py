@@ -168,7 +168,9 @@ def test_the_evidence_for_the_transposed_digits() -> None:
 
 
 @BOTH
-@pytest.mark.parametrize("options", [{}, {"S": S}, {"gamma_search": "bisection"}], ids=["default", "S", "bisection"])
+@pytest.mark.parametrize(
+    "options", [{"weight": "paper"}, {"S": S}, {"gamma_search": "bisection"}], ids=["paper", "S", "bisection"]
+)
 def test_the_least_gamma(plant, expected, options) -> None:
     design = obsynth.fault_estimation_filter(plant, **options)
     claims, truth = design.certificate.claims, expected["truth"]["gamma_min"]["value"]
@@ -227,7 +229,7 @@ def test_the_second_stage_at_five_percent(plant, expected) -> None:
 @pytest.mark.parametrize(("engine", "key"), [("auto", "shipped"), ("lmi", "shipped_by_the_inequality")])
 def test_what_is_shipped(engine: str, key: str) -> None:
     """A little below the full 5 %, so that the claim has a well-conditioned proof."""
-    design, shipped = obsynth.fault_estimation_filter(PLANT, engine=engine), EXPECTED[key]
+    design, shipped = obsynth.fault_estimation_filter(PLANT, weight="paper", engine=engine), EXPECTED[key]
     assert design.certificate.claims["gamma"] == pytest.approx(shipped["gamma"], abs=5.1e-6)
     assert design.report["H-infinity norm"].value == pytest.approx(shipped["hinf"], abs=5.1e-4)
     assert np.linalg.norm(design.gains["R"]) == pytest.approx(shipped["norm_R"], abs=5.1e-3)
@@ -235,20 +237,20 @@ def test_what_is_shipped(engine: str, key: str) -> None:
 
 
 def test_nothing_is_shipped_where_no_gain_is_needed() -> None:
-    other = obsynth.fault_estimation_filter(PLANT_PSI)
+    other = obsynth.fault_estimation_filter(PLANT_PSI, weight="paper")
     assert np.linalg.norm(other.gains["R"]) == 0.0
     stage = EXPECTED_PSI["truth"]["second_stage"]
     assert spectral_radius(other.observer.Az) == pytest.approx(stage["spectral_radius"], abs=5.1e-4)
 
 
 def test_a_free_residual_weight_lowers_gamma_to_one() -> None:
-    free = obsynth.fault_estimation_filter(PLANT, free_residual_weight=True)
+    free = obsynth.fault_estimation_filter(PLANT)
     truth = EXPECTED["truth"]["gamma_min_free_weight"]
     assert truth <= free.certificate.claims["gamma_min"] < truth + 1e-6
     assert free.report.passed
     np.testing.assert_allclose(free.gains["W"] @ free.gains["Upsilon"], np.eye(2), atol=1e-12)
     # The other reading gains nothing: every admissible filter has the same response.
-    other = obsynth.fault_estimation_filter(PLANT_PSI, free_residual_weight=True)
+    other = obsynth.fault_estimation_filter(PLANT_PSI, weight="free")
     assert other.certificate.claims["gamma_min"] == pytest.approx(np.sqrt(2.0), abs=1e-8)
 
 
@@ -272,7 +274,9 @@ def test_what_is_shipped_has_the_sign_of_60() -> None:
 
 
 @BOTH
-@pytest.mark.parametrize("options", [{}, {"S": S}, {"gamma": 1.5}], ids=["default", "S", "gamma 1.5"])
+@pytest.mark.parametrize(
+    "options", [{"weight": "paper"}, {"S": S}, {"weight": "paper", "gamma": 1.5}], ids=["paper", "S", "gamma 1.5"]
+)
 def test_equal_gains_where_they_are_unique(plant, expected, options) -> None:
     """T, N, Psi and Upsilon by construction, W by (47), and of L what (32) fixes: L Upsilon = T A Psi."""
     ours, fixed = obsynth.fault_estimation_filter(plant, **options).gains, intermediate(plant)
@@ -324,7 +328,11 @@ def errors_of(design: obsynth.ObserverDesign, disturbance: np.ndarray | None) ->
     ids=["printed L", "mended L", "ours, F = [a1, b2]"],
 )
 def test_root_mean_square_errors_of_the_audit(plant, choose, rmse) -> None:
-    design = obsynth.fault_estimation_filter(plant) if choose is None else filter_from(plant, choose("L", EXPECTED))
+    design = (
+        obsynth.fault_estimation_filter(plant, weight="paper")
+        if choose is None
+        else filter_from(plant, choose("L", EXPECTED))
+    )
     errors = errors_of(design, NOISE)
     for window, values in rmse.items():
         first, last = map(int, window.split(".."))
@@ -334,7 +342,7 @@ def test_root_mean_square_errors_of_the_audit(plant, choose, rmse) -> None:
 
 @BOTH
 def test_without_disturbance_the_faults_are_found_exactly(plant, expected) -> None:
-    design = obsynth.fault_estimation_filter(plant)
+    design = obsynth.fault_estimation_filter(plant, weight="paper")
     assert np.max(np.abs(errors_of(design, None)[20:])) < 1e-8
 
 
@@ -346,7 +354,7 @@ def test_without_disturbance_the_printed_L_confuses_the_faults() -> None:
 
 
 def test_the_other_reading_adds_two_noise_samples_whatever_L_is() -> None:
-    errors = errors_of(obsynth.fault_estimation_filter(PLANT_PSI), NOISE)
+    errors = errors_of(obsynth.fault_estimation_filter(PLANT_PSI, weight="paper"), NOISE)
     # The initial error has decayed at 30.
     np.testing.assert_allclose(errors[30:, 0], NOISE[28:-2], atol=1e-9)
     np.testing.assert_allclose(errors[30:, 1], NOISE[29:-1], atol=1e-9)
@@ -377,9 +385,9 @@ def test_detection_one_sample_after_the_fault(which: str) -> None:
     makers = {
         "printed L": lambda: filter_from(PLANT, printed("L", EXPECTED)),
         "mended L": lambda: filter_from(PLANT, corrected("L", EXPECTED)),
-        "ours": lambda: obsynth.fault_estimation_filter(PLANT),
-        "ours, free W": lambda: obsynth.fault_estimation_filter(PLANT, free_residual_weight=True),
-        "F = [a1, b2]": lambda: obsynth.fault_estimation_filter(PLANT_PSI),
+        "ours": lambda: obsynth.fault_estimation_filter(PLANT, weight="paper"),
+        "ours, free W": lambda: obsynth.fault_estimation_filter(PLANT, weight="free"),
+        "F = [a1, b2]": lambda: obsynth.fault_estimation_filter(PLANT_PSI, weight="paper"),
     }
     design = makers[which]()
     size = np.linalg.norm(residuals_of(design, NOISE), axis=1)

@@ -85,7 +85,7 @@ def test_every_plant_is_solved(family, share):
 @pytest.mark.parametrize(
     "options",
     [
-        {"free_residual_weight": True},
+        {"weight": "free"},
         {"gamma_margin": 0.5},
         {"gamma_margin": 1e-2},
         {"gamma": 1e6},

@@ -468,7 +468,7 @@ class TestReport:
     "options",
     [
         {"gamma": "a"}, {"gamma": [1.0]}, {"gamma": True}, {"tolerance": "x"}, {"gamma_margin": None},
-        {"residual_weight_limit": "2"}, {"free_residual_weight": "no"}, {"engine": "fast"},
+        {"residual_weight_limit": "2"}, {"weight": "no"}, {"engine": "fast"},
         {"residual_weight_limit": 2.0, "engine": "riccati"},
     ],
     ids=str,

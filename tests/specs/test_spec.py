@@ -80,19 +80,19 @@ class TestDocument:
     def test_options_are_passed_on_as_given(self, spec_with: Any) -> None:
         method = (
             "method:\n  id: fault-estimation-filter\n  options:\n    gamma: 2\n    solver: SCS\n"
-            "    free_residual_weight: false\n    S: [[1, 0, 0, 0], [0, 1, 0, 0]]\n    gamma_search: bisection\n"
+            "    weight: paper\n    S: [[1, 0, 0, 0], [0, 1, 0, 0]]\n    gamma_search: bisection\n"
         )
         options = spec_with(PLANT + "  Bf: [[1], [0]]\n", method).options
         assert options["S"].tolist() == [[1, 0, 0, 0], [0, 1, 0, 0]]
         assert {name: value for name, value in options.items() if name != "S"} == {
-            "gamma": 2.0, "solver": "SCS", "free_residual_weight": False, "gamma_search": "bisection",
+            "gamma": 2.0, "solver": "SCS", "weight": "paper", "gamma_search": "bisection",
         }  # fmt: skip
 
     def test_null_means_the_default(self, spec_with: Any) -> None:
-        method = "method:\n  id: fault-estimation-filter\n  options: {gamma: null, free_residual_weight: null}\n"
+        method = "method:\n  id: fault-estimation-filter\n  options: {gamma: null, weight: null}\n"
         spec = spec_with(PLANT + "  B: null\n", method)
         assert spec.plant.nu == 0
-        assert dict(spec.options) == {"gamma": None, "free_residual_weight": None}
+        assert dict(spec.options) == {"gamma": None, "weight": None}
 
     def test_a_utf8_byte_order_mark_is_no_problem(self, tmp_path: Path) -> None:
         path = tmp_path / "spec.yaml"

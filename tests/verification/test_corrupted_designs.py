@@ -47,7 +47,7 @@ FAULT, RESIDUAL, FEEDTHROUGH = "unbiased: fault", "unbiased: residual", "unbiase
 DECOUPLED, ESTIMATE = "fault decoupled after its delay", "fault estimate"
 IN_RESIDUAL, IN_STATE = "fault in the residual", "no fault in the state estimate"
 RADIUS, LMI, NORM, FITS = "spectral radius", "LMI", "H-infinity norm", "fits the plant"
-GAINS, RESTRICTED, WEIGHT = "gains fit", "gains: T and N", "gains: W"
+GAINS, RESTRICTED, WEIGHT, PAPERS = "gains fit", "gains: T and N", "gains: W", "gains: paper's W"
 MATRIX, FREE, REALISED = "gains: Psi and Upsilon", "gains: R", "gains: realisation"
 CLAIMS, ORDER = "claims", "claimed gains"
 RECOVERY, KEPT = "recovery fits", "recovery of kept states"
@@ -126,8 +126,8 @@ PLANTS = {"paper": paper, "chain": chain, "direct": direct, "quiet": quiet, "dri
 @cache
 def good(name: str) -> ObserverDesign:
     if name == "metered":
-        return fault_estimation_filter(metered(), free_residual_weight=True, name=name)
-    return fault_estimation_filter(PLANTS[name](), name=name)
+        return fault_estimation_filter(metered(), weight="free", name=name)
+    return fault_estimation_filter(PLANTS[name](), weight="paper", name=name)
 
 
 # Ways to corrupt a design.
@@ -472,7 +472,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
         (LEAST,)),
     "a proof of the least gain, cut": ("paper", certificate_cut("least_gain_pairs", slice(1, None)), (LEAST,)),
     "gamma_min negative": ("chain", claim("gamma_min", -0.1), (ORDER, LEAST)),
-    "gamma_min NaN": ("direct", claim("gamma_min", np.nan), (CLAIMS, ORDER)),
+    "gamma_min NaN": ("direct", claim("gamma_min", np.nan), (CLAIMS, ORDER, LEAST)),
     "gamma_min without gamma": ("quiet", claim("gamma_min", 0.1), (ORDER,)),
     "bracket above gamma_min": ("paper", claimed_bracket(1.001, 1.002), (ORDER,)),
     "bracket below gamma_min": ("paper", claimed_bracket(0.998, 0.999), (ORDER,)),
@@ -484,13 +484,13 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "T": ("paper", gain_entry("T", 0, 0), (RESTRICTED, MATRIX, FREE, REALISED)),
     "N": ("paper", gain_entry("N", 1, 0), (RESTRICTED, REALISED)),
     "L": ("paper", gain_entry("L", 3, 2), (FREE, REALISED)),
-    "W": ("chain", gain_entry("W", 1, 1), (WEIGHT, FREE, REALISED)),
+    "W": ("chain", gain_entry("W", 1, 1), (WEIGHT, PAPERS, REALISED)),
     "Psi": ("paper", gain_entry("Psi", 2, 0), (MATRIX, FREE)),
-    "Upsilon": ("direct", gain_entry("Upsilon", 3, 1), (MATRIX, FREE)),
+    "Upsilon": ("direct", gain_entry("Upsilon", 3, 1), (MATRIX, FREE, PAPERS)),
     "R": ("paper", gain_entry("R", 0, 0), (FREE,)),
     "gains rounded": (
         "paper", gain_set(lambda gains: {key: np.round(gain, 5) for key, gain in gains.items()}),
-        (WEIGHT, FREE, REALISED)),
+        (WEIGHT, FREE, PAPERS, REALISED)),
     "no W": ("quiet", gain_set(lambda gains: {key: gains[key] for key in gains if key != "W"}), (GAINS,)),
     "a letter that nobody knows": ("paper", gain_set(lambda gains: {**gains, "K": gains["L"]}), (GAINS,)),
     "L without a row": ("chain", gain_set(lambda gains: {**gains, "L": gains["L"][1:]}), (GAINS,)),
@@ -526,7 +526,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "direction of a sensor fault": (
         "direct", plant_entry("Df", 1, 0, 1e-6), (*WRONG_FAULT, RESTRICTED, *OTHER_GAINS)),
     "disturbance twice as large": ("paper", lambda d: with_plant(d, Bd=2.0 * d.plant.Bd), (LMI, NORM, LEAST)),
-    "disturbance in the outputs": ("direct", plant_entry("Dd", 1, 0, 5.0), (LMI, NORM)),
+    "disturbance in the outputs": ("direct", plant_entry("Dd", 1, 0, 5.0), (LMI, NORM, LEAST)),
     "sampling time of the plant": ("paper", plant_field(dt=0.5), (FITS,)),
     "continuous plant": ("paper", plant_field(dt=0.0), ("exists: discrete time", FITS)),
     "names of the plant": ("paper", plant_field(state_names=["a", "b", "c", "d"]), (FITS,)),

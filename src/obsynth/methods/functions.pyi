@@ -18,7 +18,6 @@ def fault_estimation_filter(
     gamma: float | None = ...,
     gamma_search: Literal["direct", "bisection"] = ...,
     gamma_margin: float = ...,
-    free_residual_weight: bool | None = ...,
     weight: Literal["paper", "free"] | None = ...,
     residual_weight_limit: float | None = ...,
     S: Any = ...,

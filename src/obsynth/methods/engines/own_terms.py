@@ -115,7 +115,7 @@ def filter_by_inequality(
         matrices, claims = dict(made.certificate.matrices), made.certificate.claims
         matrices["tracking"] = np.vstack([matrices["tracking"], zeros])
         made = replace(made, observer=averaged(made.observer, asked.mean), certificate=Certificate(matrices, claims))
-    return _recorded(made, asked, found, runs, where, free_residual_weight=free)
+    return _recorded(made, asked, found, runs, where, weight="free" if free else "paper")
 
 
 def pd_by_inequality(plant: DescriptorSystem, asked: PdObserver, *, progress: Callable[[str], None]) -> Synthesis:

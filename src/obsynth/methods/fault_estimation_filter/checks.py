@@ -13,12 +13,18 @@ from obsynth.analysis.existence.restricted_equivalent import with_sensor_faults_
 from obsynth.analysis.existence.wang2015 import fault_filter_conditions
 from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.checks_over_region import checks_over_region
-from obsynth.methods.fault_estimation_filter.printed_gains import gain_rows, gains_fit, printed_allowances
+from obsynth.methods.fault_estimation_filter.printed_gains import (
+    gain_rows,
+    gains_fit,
+    paper_weight_row,
+    printed_allowances,
+)
 from obsynth.methods.fault_estimation_filter.whole_transfer import Equations, fault_rows
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.logarithmic_balance import balance_by_least_squares
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import highest_gain_found, hinf_norm
+from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.scaling import Scaling
 from obsynth.observers.linear.modes import modes_of
 from obsynth.observers.linear.observer import LinearObserver
@@ -113,9 +119,9 @@ def _gain_set_rows(
         allowances = printed_allowances(plant, work, observer, gains, scaling, printed_digits)
     equations = Equations.of(plant, work, observer.fault_delays)
     options = design.options
-    # The W of this identity is that of balanced units, without S and without the paper's weight.
-    fixed = options.get("free_residual_weight") is False and not (options.get("S") or options.get("weight"))
-    yield from gain_rows(work, gains, observer, tracking, equations, scaling, allowances, fixed_weight=fixed)
+    yield from gain_rows(work, gains, observer, tracking, equations, scaling, allowances)
+    if options.get("weight") == "paper" and decide_rank(work.C).rank == work.ny:
+        yield paper_weight_row(gains)
     yield from _least_gain(design, work)
     return allowances
 
@@ -125,7 +131,7 @@ def _least_gain(design: ObserverDesign, work: DescriptorSystem | None) -> Iterat
     claims, matrices = design.certificate.claims, design.certificate.matrices
     if "gamma_min" not in claims and not LEAST_GAIN_WITNESSES & matrices.keys():
         return
-    free = bool(design.options.get("free_residual_weight"))
+    free = design.options.get("weight") == "free"
     kept = matrices if work is not None else {}
     sought = bool(design.options.get("prove_least"))
     least = claimed(claims, "gamma_min")

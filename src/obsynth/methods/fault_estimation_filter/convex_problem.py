@@ -93,6 +93,11 @@ def centred(problem: GainProblem, prepared: PreparedPlant, parts: GainParts) -> 
     return moved, replace(parts, W0=w0)
 
 
+def with_output_noise(problem: GainProblem, parts: GainParts) -> GainProblem:
+    """Return the problem whose second stage weighs unit noise on every output, in balanced units."""
+    return replace(problem, Bn=-parts.L0, Dn=parts.V.T, Zn=parts.W0)
+
+
 def with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: GainParts, bound: float) -> GainProblem:
     """Return the problem with the norm of W bounded, in the user's output units."""
     outputs = prepared.scaling.outputs

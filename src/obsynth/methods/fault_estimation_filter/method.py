@@ -54,11 +54,10 @@ class FaultEstimationFilter(Method):
     gamma_margin : float, optional
         Relative distance to the least gain that buys small gains, or little noise where the plant states noise; the
         bare optimum is badly conditioned.
-    free_residual_weight : bool, optional
-        Whether W is free within ``W Upsilon = I``.  By default yes when the plant states noise, else no.
     weight : {"paper", "free"}, optional
         Residual weight W: ``"paper"`` is W = Upsilon^+ of Theorem 2 in the outputs as given; ``"free"`` any W with ``W
-        Upsilon = I``.  By default as ``free_residual_weight`` says, whose fixed W is Upsilon^+ in balanced units.
+        Upsilon = I``, of little noise for the gamma that is shipped.  By default the free one, unless no noise is
+        stated and it lowers the least gamma by less than 5 %; a note gives both.  With S or bisection the paper's.
     residual_weight_limit : float, optional
         Bound on the spectral norm of W (implies a free W; not with engine "riccati").
     S : array_like, optional
@@ -166,7 +165,6 @@ class FaultEstimationFilter(Method):
     gamma: Positive | None = None
     gamma_search: Literal["direct", "bisection"] = "direct"
     gamma_margin: Annotated[float, Ge(LEAST_MARGIN)] = 0.05
-    free_residual_weight: bool | None = None
     weight: Literal["paper", "free"] | None = None
     residual_weight_limit: Positive | None = None
     S: Annotated[Any, WrittenAs("matrix")] = None
@@ -187,10 +185,6 @@ class FaultEstimationFilter(Method):
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""
-        if self.residual_weight_limit is not None and self.free_residual_weight is False:
-            yield "residual_weight_limit needs free_residual_weight: the weight is fixed otherwise."
-        if self.weight is not None and self.free_residual_weight is not None:
-            yield "weight and free_residual_weight both say what W is: leave free_residual_weight out."
         if self.weight == "paper" and self.residual_weight_limit is not None:
             yield "residual_weight_limit needs a free weight: leave weight: paper out."
         if self.residual_weight_limit is not None and self.engine == "riccati":
@@ -206,7 +200,9 @@ class FaultEstimationFilter(Method):
     @property
     def asks_for_free_weight(self) -> bool | None:
         """Whether W is asked to be free; ``None``: nothing is said of it."""
-        return self.free_residual_weight if self.weight is None else self.weight == "free"
+        if self.weight is not None or self.residual_weight_limit is not None:
+            return self.weight != "paper"
+        return False if self.S is not None or self.gamma_search == "bisection" else None
 
     @property
     def own_inequality(self) -> bool:

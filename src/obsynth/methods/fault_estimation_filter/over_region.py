@@ -30,7 +30,7 @@ from obsynth.verification.over_region import WITNESSES, rows_to_forget
 
 #: Options of the filter of a constant plant that the one over a region does not have.
 NOT_OVER_REGION = (
-    "S", "constraints", "free_residual_weight", "mean", "objective", "prove_least", "region", "residual_weight_limit",
+    "S", "constraints", "mean", "objective", "prove_least", "region", "residual_weight_limit",
     "weight",
 )  # fmt: skip
 

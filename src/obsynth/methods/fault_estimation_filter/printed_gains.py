@@ -20,7 +20,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import Scaling
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.checks import Check, nothing_wrong
+from obsynth.results.checks import Check, nothing_wrong, upper_bound_check
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.identities import Identity, equality, tracking_totals, worst
 
@@ -29,6 +29,9 @@ NEEDED = ("T", "N", "L", "W", "Psi", "Upsilon")
 
 RESTRICTED, WEIGHT = "gains: T and N", "gains: W"
 
+
+#: W repeats the pseudoinverse to this share of its rows.
+PSEUDOINVERSE_SHARE = 1e-8
 
 #: The gains that are printed; Psi, Upsilon and R follow from them.
 PRINTED = "TNLW"
@@ -85,8 +88,6 @@ def gain_rows(
     equations: Equations,
     scaling: Scaling,
     allowances: Mapping[str, FloatArray],
-    *,
-    fixed_weight: bool,
 ) -> Iterator[Check]:
     """Yield the rows on the gain set, which must fit."""
     identities = gain_identities(work, gains, equations, scaling)
@@ -111,9 +112,8 @@ def gain_rows(
     if "R" in gains:
         yield equality(
             "gains: R",
-            "R is the free part of L: R Upsilon = 0, and L - R = T A Psi G with G Upsilon = I"
-            + (", G = W" if fixed_weight else ""),
-            worst([identity.residual() for identity in _free_part_identities(work, gains, scaling, fixed_weight)]),
+            "R is the free part of L: R Upsilon = 0, and L - R = T A Psi G with G Upsilon = I",
+            worst([identity.residual() for identity in _free_part_identities(work, gains, scaling)]),
             "Wang 2015, eq. (60)",
         )
     formed = equations.realised(gains)
@@ -131,10 +131,8 @@ def gain_rows(
     )
 
 
-def _free_part_identities(
-    work: DescriptorSystem, gains: Mapping[str, FloatArray], scaling: Scaling, fixed_weight: bool
-) -> list[Identity]:
-    # Beside a free weight, which left inverse G of Upsilon is taken depends on the units of the outputs: any is right.
+def _free_part_identities(work: DescriptorSystem, gains: Mapping[str, FloatArray], scaling: Scaling) -> list[Identity]:
+    # Which left inverse G of Upsilon is taken depends on the units of the outputs: any is right.
     outputs, fixed, free = 1.0 / scaling.outputs, gains["L"] - gains["R"], gains["R"]
     moved = gains["T"] @ work.A @ gains["Psi"]
     # The columns of L - R are combinations of those of T A Psi: nothing is left beside their span.
@@ -150,12 +148,27 @@ def _free_part_identities(
     formed = parts + np.abs(gains["T"]) @ np.abs(work.A) @ np.abs(gains["Psi"]) @ np.abs(gains["W"])
     # The projection mixes the rows in balanced units.
     mixed = scaling.states[:, None] * np.max(formed / scaling.states[:, None], axis=0, initial=0.0)
-    found = [
+    return [
         Identity((free @ upsilon,), products),
         Identity((fixed @ upsilon, -moved), products),
         Identity((fixed, -span @ (shares @ fixed)), ((mixed,),), outputs),
     ]
-    return [*found, Identity((fixed, -moved @ gains["W"]), ((mixed,),), outputs)] if fixed_weight else found
+
+
+def paper_weight_row(gains: Mapping[str, FloatArray]) -> Check:
+    """Return the row that W is the paper's, the left inverse of Upsilon of least norm."""
+    upsilon = gains["Upsilon"]
+    units = np.linalg.norm(upsilon, axis=0)
+    wanted = np.linalg.pinv(upsilon / units) / units[:, None]
+    size = np.max(np.abs(wanted), axis=1, initial=0.0, keepdims=True)
+    return upper_bound_check(
+        "gains: paper's W",
+        "W is the pseudoinverse of Upsilon, for the outputs as they are: relative difference",
+        float(np.max(np.abs(gains["W"] - wanted) / size, initial=0.0)),
+        PSEUDOINVERSE_SHARE,
+        source="Wang 2015, eq. (47)",
+        kind="equality",
+    )
 
 
 def printed_allowances(

@@ -139,7 +139,7 @@ class PrintedInequality:
             added["gamma"] = found.variables["gamma_squared"] <= level**2
         if decay < 1.0:
             added["decay"] = region(found.data["A1"], P, disk(0.0, decay), Y=Y, Cy=found.data["C1"])[1]
-        if problem.states_noise:
+        if self.plant.nw:
             work = with_sensor_faults_as_states(self.plant)
             entering, free = noise_paths(self.plant, found, work.Bw, work.Dw)
         else:

@@ -34,6 +34,7 @@ from obsynth.methods.fault_estimation_filter.convex_problem import (
     centred,
     gain_problem,
     gains_in_given_units,
+    with_output_noise,
     with_weight_limit,
 )
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
@@ -43,6 +44,7 @@ from obsynth.methods.fault_estimation_filter.search import NOMINAL_GAIN, FoundGa
 from obsynth.methods.fault_estimation_filter.small_gains import PrintedInequality
 from obsynth.methods.method import Synthesis
 from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.central_filter import search_least_gain
 from obsynth.observers.linear.means import averaged
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -52,6 +54,12 @@ from obsynth.results.design import Certificate
 
 #: Gains that take the outputs.
 _OF_OUTPUTS = ("N", "L", "W", "R")
+
+#: A free weight is taken by default where it lowers the least gain by this share: it may add noise.
+WORTH_A_FREE_WEIGHT = 0.05
+
+#: A least gain below this share of what disturbances can do is printed as zero.
+AS_NOTHING = 1e-9
 
 #: Coordinates in which a certificate is looked for before the gain is judged again.
 FIRST_TRIES = 4
@@ -109,15 +117,15 @@ def _synthesised(
     s = None if asked.S is None else as_matrix(asked.S, "S")
     prepared = prepare(plant, s) if prepared is None or s is not None else prepared
     limit = asked.residual_weight_limit
-    free = asked.asks_for_free_weight
-    if free is None:
-        free = plant.nw > 0 or limit is not None
+    free, told = weight_by_gain(plant, prepared, asked)
     problem, parts = gain_problem(prepared, free_weight=free)
     # Where nothing disturbs the estimates, a small share of what disturbances could do is proved.
     nominal = NOMINAL_GAIN * max(problem.disturbance_size, NOMINAL_GAIN)
-    if s is not None or limit is not None or asked.weight == "paper":
-        # With the paper's S the weight is its W = Upsilon^+ too, which is that of the outputs as given.
+    if not free or limit is not None:
+        # The paper's W = Upsilon^+ is that of the outputs as given, not of balanced ones.
         problem, parts = centred(problem, prepared, parts)
+    elif plant.nw == 0:
+        problem = with_output_noise(problem, parts)
     limited = None if limit is None else with_weight_limit(problem, prepared, parts, limit)
     printed = PrintedInequality(plant, prepared, parts, free, asked.solver)
     search = partial(found_within, problem, limited, asked, printed=printed, progress=progress)
@@ -138,17 +146,17 @@ def _synthesised(
         claims = {"gamma": level, "gamma_min": least["gamma_min"]} | claims | least
         witnesses |= proof
     records = [*found.least.records, *found.records]
-    resolved = asked.as_plain() | {"free_residual_weight": free, "S": None if s is None else s.tolist()}
+    resolved = asked.as_plain() | {"weight": "free" if free else "paper", "S": None if s is None else s.tolist()}
     if asked.mean > 1:
         # Registers hold estimates, which see no state: nothing of the plant is tracked there.
         zeros = np.zeros(((asked.mean - 1) * plant.nf, tracking.shape[1]))
         witnesses["tracking"] = np.vstack([tracking, zeros])
         observer = averaged(observer, asked.mean)
-    told = []
     if plant.nd and asked.gamma is not None and level < asked.gamma:
-        told.append(
+        told = (
+            *told,
             f"gamma = {asked.gamma:.6g} was asked for, and {level:.6g} is proved: a larger gamma would only make the "
-            "gains worse conditioned."
+            "gains worse conditioned.",
         )
     return Synthesis(
         resolved,
@@ -158,6 +166,31 @@ def _synthesised(
         {"engine": "lmi" if any("settings" in record for record in records) else "riccati", "runs": records},
         (*told, *notes(plant, prepared.detectability, observer, largest_zero=held[-1].value)),
     )
+
+
+def weight_by_gain(
+    plant: DescriptorSystem, prepared: PreparedPlant, asked: FaultEstimationFilter
+) -> tuple[bool, tuple[str, ...]]:
+    """Return whether W is free, and what a free W and the paper's give where both were compared.
+
+    By default W is free where the plant states noise, or where that lowers the least gain by `WORTH_A_FREE_WEIGHT`.
+    """
+    if asked.asks_for_free_weight is not None:
+        return asked.asks_for_free_weight, ()
+    if plant.nw or not plant.nd:
+        return plant.nw > 0, ()
+    free, _ = gain_problem(prepared, free_weight=True)
+    fixed, parts = gain_problem(prepared, free_weight=False)
+    fixed, _ = centred(fixed, prepared, parts)
+    if not free.measured:
+        return False, ()
+    lower, upper = (search_least_gain(problem).gain for problem in (free, fixed))
+    taken = bool(lower <= (1.0 - WORTH_A_FREE_WEIGHT) * upper)
+    nothing = AS_NOTHING * max(free.disturbance_size, upper)
+    figures = [f"{gain:.5g}" if gain > nothing else "0" for gain in (lower, upper)]
+    taken_for = "the free W is taken" if taken else "the paper's W is taken"
+    told = f"Least gamma with these T and N: {figures[0]} with a free W, {figures[1]} with the paper's W; {taken_for}."
+    return taken, (told,)
 
 
 def _least(
