@@ -479,7 +479,7 @@ PRECONDITIONS = [
     Case("sampling of a discrete plant", put("plant", "transform", {"sample_time": 0.1}), "discrete in time already"),
     Case(
         "gamma below the optimum",
-        put("method", "options", "gamma", 1.0),
+        put("method", "options", {"weight": "paper", "gamma": 1.0}),
         "1.46472",
         InfeasibleError,
         details={"necessary": False},

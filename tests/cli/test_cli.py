@@ -122,7 +122,8 @@ class TestDesign:
 
     def test_options_of_the_spec_are_used(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         text = WANG.read_text(encoding="utf-8").replace("plant.yaml", str(WANG.parent / "plant.yaml"))
-        (tmp_path / "spec.yaml").write_text(f"{text}  options: {{gamma: 2.5}}\n", encoding="utf-8")
+        text = text.replace("{weight: paper}", "{weight: paper, gamma: 2.5}")
+        (tmp_path / "spec.yaml").write_text(text, encoding="utf-8")
         assert main(["design", "--system", "spec.yaml", "--quiet", "--json"]) == 0
         found = json.loads(capsys.readouterr().out)["gain_set"]["design"]
         assert found["options"]["gamma"] == 2.5

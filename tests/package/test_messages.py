@@ -49,7 +49,7 @@ def test_a_gain_far_above_what_is_useful_is_not_shipped_and_the_report_says_so()
 
 
 def test_a_run_that_is_mostly_warm_up_says_why_nothing_was_raised(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    design = obsynth.fault_estimation_filter(obsynth.DescriptorSystem(**PLANT))
+    design = obsynth.fault_estimation_filter(obsynth.DescriptorSystem(**PLANT), weight="paper")
     design.save(tmp_path / "gains.json")
     for rows, told in ((3, True), (400, False)):
         log = "time,y1,y2\n" + "".join(f"{0.1 * row:.1f},0,0\n" for row in range(rows))

@@ -38,7 +38,7 @@ def test_one_vertex_is_the_filter_of_the_paper() -> None:
     point = wang().center.replace(A=WANG_A)
     one = obsynth.fault_estimation_filter(PolytopicSystem([point]), gamma_margin=0.01)
     assert one.certificate.claims["gamma_min"] == pytest.approx(WANG_LEAST, rel=1e-6)
-    paper = obsynth.fault_estimation_filter(point, gamma_margin=0.01)
+    paper = obsynth.fault_estimation_filter(point, weight="paper", gamma_margin=0.01)
     assert one.certificate.claims["gamma"] == pytest.approx(paper.certificate.claims["gamma"], rel=1e-6)
 
 
