@@ -100,7 +100,7 @@ def test_two_specs_of_one_name_keep_their_gain_sets(tmp_path, monkeypatch, capsy
     monkeypatch.chdir(tmp_path)
     text = (DESIGNS / "wang2015" / "spec.yaml").read_text().replace("plant.yaml", str(DESIGNS / "wang2015/plant.yaml"))
     for name, gamma in (("first", 2.5), ("second", 3.0)):
-        (tmp_path / f"{name}.yaml").write_text(f"{text}  options: {{gamma: {gamma}}}\n")
+        (tmp_path / f"{name}.yaml").write_text(text.replace("weight: paper", f"gamma: {gamma}"))
         assert main(["design", "--system", f"{name}.yaml", "--quiet"]) == 0
     assert "wang2015.second.gains.json" in capsys.readouterr().out
     files = {path.name: obsynth.load(path).options["gamma"] for path in tmp_path.glob("*.json")}
