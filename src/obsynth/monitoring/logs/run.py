@@ -17,6 +17,7 @@ from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.tolerant import rows_before
 from obsynth.monitoring.alarms.events import AlarmEvent
+from obsynth.monitoring.logs.followed import FollowedLog
 from obsynth.monitoring.logs.log_run import LogRun, resume_state, save_state
 from obsynth.monitoring.logs.signals import TIME_HEADER
 from obsynth.monitoring.logs.sinks import FrameSink, Sink, sink_for
@@ -274,7 +275,9 @@ def run_on_data(
     save = None
     if not (state is None or out is None or isinstance(out, str | Path)):
         save = partial(save_state, Path(state), run, digest)
-    rows = chunks(data, run.signals, stamps, chunk_rows)
+    # A log that is followed begins with the rows that the state has, and may have had many.
+    after = run.clock.stamp if resumed and isinstance(data, FollowedLog) else None
+    rows = chunks(data, run.signals, stamps, chunk_rows, after=after)
     if not hasattr(data, "readline"):
         # What cannot be read leaves no header behind; of a stream the header comes before the first row.
         rows = chain(list(islice(rows, 1)), rows)

@@ -70,10 +70,14 @@ LARGEST_SHIFT = 0.5
 _BEGINNINGS = {".parquet": b"PAR1", ".tdms": b"TDSm", ".mf4": b"MDF ", ".mdf": b"MDF ", ".dat": b"MDF "}
 
 
-def chunks(data: Data, signals: LogSignals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
+def chunks(
+    data: Data, signals: LogSignals, stamps: Stamps, rows: int, *, after: float | None = None
+) -> Iterator[FloatArray]:
     """Yield ``(rows, 1 + nu + ny)``: time and signals, in order; NaN where a sample is missing.  Inputs are those that
-    act in a row as the design takes it."""
+    act in a row as the design takes it.  The first rows are left out up to the time ``after``."""
     found = _without_days(_chunks(data, signals, stamps, rows), stamps)
+    if after is not None:
+        found = _later(found, after)
     if not signals.delay or not signals.inputs:
         yield from found
     elif signals.delay > 0:
@@ -90,6 +94,16 @@ def _without_days(found: Iterator[FloatArray], stamps: Stamps) -> Iterator[Float
         if not count:
             stamps.require_no_days(chunk[:, 0])
         yield chunk
+
+
+def _later(found: Iterator[FloatArray], after: float) -> Iterator[FloatArray]:
+    """Yield rows from the first one on whose time is later."""
+    is_begun = False
+    for chunk in found:
+        first = 0 if is_begun else int(np.argmax(chunk[:, 0] > after))
+        is_begun = is_begun or bool(chunk[first, 0] > after)
+        if is_begun:
+            yield chunk[first:]
 
 
 def _delayed(found: Iterator[FloatArray], signals: LogSignals, stamps: Stamps) -> Iterator[FloatArray]:

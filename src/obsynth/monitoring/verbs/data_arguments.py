@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any, TextIO
 
 from obsynth.errors import SpecError
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from obsynth.monitoring.thresholds.monitor import Monitor
     from obsynth.plants.uncertainty import Uncertainty
     from obsynth.results.design import ObserverDesign
+
+#: Seconds between the lines in which a run on a log that grows says that it is alive.
+HEALTH_SECONDS = 60.0
 
 #: Rows from the alarm on at whose windows a proof is tried, in windows.
 _LATER = (0.0, 0.1, 0.25, 0.5, 0.95)
@@ -48,13 +52,21 @@ def run_of(
     **more: Any,
 ) -> DataRun:
     """Return a run of a design on the data of the command line, with its table where it is not written to ``out``."""
+    from obsynth.monitoring.logs.followed import FollowedLog
     from obsynth.monitoring.logs.run import run_on_data
 
     design = with_input_delay(design, options)
-    with rows_done(options.data, quiet=getattr(options, "quiet", True) or out is sys.stdout) as progress:
+    is_quiet, is_followed = getattr(options, "quiet", True), getattr(options, "follow", None) is not None
+    log: Any = sys.stdin if options.data == STREAM else Path(options.data)
+    with (
+        closing(FollowedLog(options.follow)) if is_followed else nullcontext(log) as data,
+        nullcontext(None if is_quiet else health())
+        if is_followed
+        else rows_done(options.data, quiet=is_quiet or out is sys.stdout) as progress,
+    ):
         found = run_on_data(
             design,
-            sys.stdin if options.data == STREAM else Path(options.data),
+            data,
             out,
             columns=columns_of(options),
             scales=numbers_of(options.scale),
@@ -68,6 +80,20 @@ def run_of(
     for text in found.warnings:
         print(f"Warning: {text}", file=sys.stderr)
     return found
+
+
+def health() -> Callable[[int], None]:
+    """Return what says on stderr every `HEALTH_SECONDS` how many rows are done, as long as rows come."""
+    begun = monotonic()
+    next_time = begun
+
+    def said(rows: int) -> None:
+        nonlocal next_time
+        if monotonic() >= next_time:
+            next_time = monotonic() + HEALTH_SECONDS
+            print(f"{rows} rows in {monotonic() - begun:.0f} s.", file=sys.stderr, flush=True)
+
+    return said
 
 
 def stated_delay(options: argparse.Namespace) -> int | None:

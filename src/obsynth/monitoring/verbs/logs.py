@@ -26,6 +26,9 @@ from obsynth.results.registered import registered
 
 def run_run(options: argparse.Namespace) -> int:
     """Run ``run``: gain set and data in, estimates out."""
+    if options.follow is not None:
+        _require_followable(options)
+        options.data = options.follow
     if options.gains.is_dir():
         if options.input_delay is not None:
             raise SpecError(
@@ -78,6 +81,23 @@ def run_run(options: argparse.Namespace) -> int:
         if proof is not None:
             print(proof["statement"], *(["Certificate:", proof["file"]] if proof["file"] else []), file=stream)
     return 0
+
+
+def _require_followable(options: argparse.Namespace) -> None:
+    """Refuse what a log without an end cannot be run with."""
+    from obsynth.monitoring.logs.sources import TEXT_SUFFIXES
+
+    refused = {
+        "--out": options.out != STREAM and "a file is written when the log ends, as this one does not: leave --out out",
+        "--prove": options.prove is not None and "it reads a log twice: give --data",
+        "--smooth": options.smooth and "it needs the whole log: give --lag, or --data",
+        "--gains": options.gains.is_dir() and "one log is followed by one gain set: give its file",
+        "--follow": (options.follow == STREAM or Path(options.follow).suffix.lower() not in TEXT_SUFFIXES)
+        and f"a text log is needed ({', '.join(TEXT_SUFFIXES)}); a stream is followed by --data -",
+    }
+    for name, why in refused.items():
+        if why:
+            raise SpecError(f"--follow does not go with {name} here: {why}.", path=name)
 
 
 def _recovered(names: list[str] | None) -> str | list[str] | None:

@@ -136,7 +136,19 @@ VERBS = {
         (
             GAINS,
             UNVERIFIED,
-            option("--data", "FILE", _LOG, required=True),
+            Group(
+                "",
+                (
+                    option("--data", "FILE", _LOG),
+                    option(
+                        "--follow",
+                        "FILE",
+                        "a text log that grows: wait for its rows, over rotations of the file; a saved --state goes on "
+                        "after the rows that it has",
+                    ),
+                ),
+                required=True,
+            ),
             option(
                 "--out",
                 "FILE",
