@@ -2,7 +2,18 @@
 
 from __future__ import annotations
 
-from obsynth.monitoring.alarms.events import NOT_VALID, AlarmLog, alarm_notes, alarm_rows
+import math
+from dataclasses import replace
+
+from obsynth.monitoring.alarms.events import (
+    NOT_VALID,
+    AlarmEvent,
+    AlarmLog,
+    alarm_notes,
+    alarm_rows,
+    rows_in_alarm,
+    time_in_alarm,
+)
 
 COLUMNS = ("fhat[leak]", "fhat[clog]", "sd fhat[leak]", "sd fhat[clog]")
 
@@ -55,3 +66,14 @@ def test_an_interval_that_its_own_alarm_contradicts_is_told_as_not_valid() -> No
     assert marked == {"nis", "learned"}
     assert alarm_notes([events["nis"]]) == [NOT_VALID]
     assert alarm_notes([events["fhat[leak]"], events["pointwise"], events["cusum"]]) == []
+
+
+def test_the_share_of_time_in_alarm_is_told_beside_the_events():
+    one = AlarmEvent("nis", "", 0.0, 9.0, 1, 10, 7, math.nan, math.nan, math.nan, 2.0)
+    both = (one, replace(one, first_row=41, last_row=41, rows=1), replace(one, by="fhat[f]", rows=3))
+    assert rows_in_alarm(both) == {"nis": 8, "fhat[f]": 3}
+    assert time_in_alarm(both, 80) == [
+        "In alarm by nis: 8 of 80 rows (10 %), 2 alarms, the longest over 10 rows.",
+        "In alarm by fhat[f]: 3 of 80 rows (3.75 %), 1 alarm, the longest over 10 rows.",
+    ]
+    assert time_in_alarm((), 80) == []

@@ -194,6 +194,26 @@ def alarm_rows(events: Sequence[AlarmEvent], shown: Callable[[float], str]) -> t
     return [tuple(row[i] for i in kept) for row in rows], len(events) - len(rows) + 1
 
 
+def rows_in_alarm(events: Sequence[AlarmEvent]) -> dict[str, int]:
+    """Return how many rows were above the threshold of each column and monitor that alarmed."""
+    found = Counter[str]()
+    for event in events:
+        found[event.by] += event.rows
+    return dict(found)
+
+
+def time_in_alarm(events: Sequence[AlarmEvent], rows: int) -> list[str]:
+    """Return what share of so many ``rows`` was in alarm: an alarm that stands for hours is one event."""
+    found = []
+    for by, count in rows_in_alarm(events).items():
+        own = [event for event in events if event.by == by]
+        longest = max(event.last_row - event.first_row + 1 for event in own)
+        alarms, lasting = (f"{n} {what}{'s' if n != 1 else ''}" for n, what in ((len(own), "alarm"), (longest, "row")))
+        told = f"{alarms}, the longest over {lasting}"
+        found.append(f"In alarm by {by}: {count} of {rows} rows ({100.0 * count / rows:.3g} %), {told}.")
+    return found
+
+
 def alarm_notes(events: Sequence[AlarmEvent]) -> list[str]:
     """Return what a reader of the table has to know about its intervals."""
     return [NOT_VALID] if any(not math.isnan(event.low) and not event.valid for event in events) else []

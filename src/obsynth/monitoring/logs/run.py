@@ -16,7 +16,7 @@ from obsynth.files.signals import HeldSignals, ending_signals
 from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.tolerant import rows_before
-from obsynth.monitoring.alarms.events import AlarmEvent
+from obsynth.monitoring.alarms.events import AlarmEvent, rows_in_alarm
 from obsynth.monitoring.logs.followed import FollowedLog
 from obsynth.monitoring.logs.log_run import LogRun, resume_state, save_state
 from obsynth.monitoring.logs.signals import TIME_HEADER
@@ -111,6 +111,7 @@ class DataRun:
             "alarm_rows": dict(self.alarm_rows),
             "alarm_stamps": {name: self.stamps.shown(time) for name, time in self.alarms.items()},
             "events": [event.as_dict() for event in self.events],
+            "rows_in_alarm": rows_in_alarm(self.events),
             "silent": dict(self.silent),
             "isolated": self.isolated,
             "recovered": dict(self.recovered),

@@ -174,7 +174,7 @@ def monitor_of(design: ObserverDesign, options: argparse.Namespace, *, has_scena
 
 def summary_of_run(found: DataRun, watched: Monitor | None) -> str:
     """Return what a run was, in a few lines."""
-    from obsynth.monitoring.alarms.events import alarm_notes, alarm_rows, silence
+    from obsynth.monitoring.alarms.events import alarm_notes, alarm_rows, silence, time_in_alarm
 
     counts = ", ".join(f"{count} {status}" for status, count in found.statuses.items())
     lines = [f"{found.rows} rows: {counts}."]
@@ -193,7 +193,7 @@ def summary_of_run(found: DataRun, watched: Monitor | None) -> str:
         lines.append(f"First alarm {found.stamps.shown(time)} ({by}).{fault}")
     rows, more = alarm_rows(found.events, found.stamps.shown)
     table = [*(text_table(rows) if rows else []), *([f"and {more} more"] if more else [])]
-    lines += [*(f"  {line}" for line in table), *alarm_notes(found.events)]
+    lines += [*(f"  {line}" for line in table), *alarm_notes(found.events), *time_in_alarm(found.events, found.rows)]
     if watched is not None or found.thresholds:
         lines += silence(found, watched.kind if watched else "any threshold")
     if watched is not None:
