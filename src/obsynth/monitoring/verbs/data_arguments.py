@@ -58,15 +58,17 @@ def run_of(
     design = with_input_delay(design, options)
     is_quiet, is_followed = getattr(options, "quiet", True), getattr(options, "follow", None) is not None
     log: Any = sys.stdin if options.data == STREAM else Path(options.data)
+    if is_followed:
+        log = FollowedLog(options.follow)
     with (
-        closing(FollowedLog(options.follow)) if is_followed else nullcontext(log) as data,
+        closing(log) if is_followed else nullcontext(),
         nullcontext(None if is_quiet else health())
         if is_followed
         else rows_done(options.data, quiet=is_quiet or out is sys.stdout) as progress,
     ):
         found = run_on_data(
             design,
-            data,
+            log,
             out,
             columns=columns_of(options),
             scales=numbers_of(options.scale),
