@@ -97,9 +97,11 @@ def test_from_a_time_invariant_plant() -> None:
     found = TimeVaryingDescriptorSystem.from_descriptor(plant)
     assert (found.parameter_names, found.dt, found.units) == (("leak",), 0.5, {"leak": "kg/s"})
     np.testing.assert_array_equal(found.Psi.at(3), [[0], [3]])
+    direct = TimeVaryingDescriptorSystem.from_descriptor(plant.replace(D=[[1], [0]]))
+    np.testing.assert_array_equal(direct.D.at(2), [[1], [0]])
+    assert TimeVaryingDescriptorSystem(**direct.as_dict()).D.at(1).tolist() == [[1], [0]]
     for changes, part in (
         ({"dt": 0.0}, "continuous"),
-        ({"D": [[1], [0]]}, "feedthrough"),
         ({"Bd": [[1], [1]], "Dd": [[0], [0]]}, "disturbances"),
     ):
         with pytest.raises(SpecError, match=part):

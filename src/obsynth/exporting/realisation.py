@@ -209,8 +209,8 @@ def _constant_plant(plant: Any) -> DescriptorSystem | None:
     names = ("state_names", "input_names", "output_names", "operating_point", "units")
     try:
         return DescriptorSystem(
-            parts["E"], parts["A"], B=parts["B"], C=parts["C"], Bf=parts["Phi"], Df=parts["Psi"], dt=plant.dt,
-            fault_names=plant.parameter_names, **{name: getattr(plant, name) for name in names},
+            parts["E"], parts["A"], B=parts["B"], C=parts["C"], Bf=parts["Phi"], Df=parts["Psi"], D=parts["D"],
+            dt=plant.dt, fault_names=plant.parameter_names, **{name: getattr(plant, name) for name in names},
         )  # fmt: skip
     except SpecError:
         # More or fewer equations than states.

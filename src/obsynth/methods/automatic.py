@@ -89,7 +89,7 @@ def candidate(
         return _refused(method, "for nonlinear plants")
     begun = perf_counter()
     try:
-        in_own_time = continuous or known.time == "continuous" or _loses_by_elimination(plant, sampled, known)
+        in_own_time = continuous or known.time == "continuous"
         made = maker(plant if in_own_time else sampled, method, options)
         observer = _sampled(made, sampled.dt)
     except ObsynthError as error:
@@ -99,13 +99,6 @@ def candidate(
         what = "estimates the state, but no fault" if observer.state_names else "detects faults, but estimates none"
         return _refused(method, what, spent)
     return Candidate(method, made, observer, fault_figures(sampled, observer, steps), spent, "")
-
-
-def _loses_by_elimination(plant: DescriptorSystem, sampled: DescriptorSystem, known: type[Method]) -> bool:
-    """Whether a recursive filter takes a sampled plant as written, but not without its algebraic states, whose place
-    in the outputs is taken by a feedthrough of the known inputs."""
-    recursive = "time-varying" in known.plants
-    return recursive and plant.dt == sampled.dt and not np.any(plant.D) and bool(np.any(sampled.D))
 
 
 def _sampled(design: ObserverDesign, dt: float) -> LinearObserver:

@@ -31,9 +31,10 @@ LAYOUT = (
     ("B", "e", "u", 0),
     ("Phi", "e", "p", 0),
     ("Psi", "y", "p", 0),
+    ("D", "y", "u", 1),
 )
 
-#: E and C are needed at k = 1 ... N for N steps: as stacks they have N + 1 entries, of which the first is not used.
+#: E, C and D are needed at k = 1 ... N for N steps: as stacks they have N + 1 entries, of which the first is not used.
 _FIRST_INDEX = {name: first for name, *_, first in LAYOUT}
 
 
@@ -229,9 +230,10 @@ def completed(found: Mapping[str, MatrixSequence | None], problems: Problems) ->
     a, c = found["A"], found["C"]
     if a is None or c is None:
         return {}
-    b, phi, psi = found.get("B"), found.get("Phi"), found.get("Psi")
+    b, d, phi, psi = (found.get(name) for name in ("B", "D", "Phi", "Psi"))
+    inputs = next((m.shape[1] for m in (b, d) if m is not None and 0 not in m.shape), 0)
     columns = next((m.shape[1] for m in (phi, psi) if m is not None and 0 not in m.shape), 0)
-    sizes = {"e": a.shape[0], "x": a.shape[1], "y": c.shape[0], "u": 0 if b is None else b.shape[1], "p": columns}
+    sizes = {"e": a.shape[0], "x": a.shape[1], "y": c.shape[0], "u": inputs, "p": columns}
     if 0 in (sizes["e"], sizes["x"]):
         problems.note(f"A is {a.shape[0]} by {a.shape[1]}, but at least 1 by 1 is needed.", "A")
     completed = {}

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
@@ -35,7 +34,8 @@ class TimeVaryingDescriptorSystem:
 
     .. math::
         E_{k+1} x(k+1) = A_k x(k) + B_k u(k) + \Phi_k \theta + \mu(k), \qquad
-        y(k+1) = C_{k+1} x(k+1) + \Psi_k \theta + \nu(k)
+        y(k+1) = C_{k+1} x(k+1) + D_{k+1} u(k+1) + \Psi_k \theta
+        + \nu(k)
 
     Each matrix is a constant, a stack (a three-dimensional array, one matrix per k), a callable from k to a matrix
     (``E(k)`` is :math:`E_k`), or rows of numbers and expressions in ``k`` such as ``"k / (k + 1)"``.
@@ -50,6 +50,8 @@ class TimeVaryingDescriptorSystem:
         Known inputs ``(ne, nu)``.
     C : MatrixLike
         Outputs ``(ny, nx)``.  Needed at k = 1 ... N.
+    D : MatrixLike, optional
+        Known inputs in the outputs ``(ny, nu)``.  Needed at k = 1 ... N.
     Phi, Psi : MatrixLike, optional
         Parameters in the equations ``(ne, nq)`` and in the outputs ``(ny, nq)``.
     dt : float
@@ -90,6 +92,7 @@ class TimeVaryingDescriptorSystem:
     C: MatrixSequence
     Phi: MatrixSequence
     Psi: MatrixSequence
+    D: MatrixSequence
     dt: float
     horizon: int | None
     constants: Mapping[str, float]
@@ -110,6 +113,7 @@ class TimeVaryingDescriptorSystem:
         *,
         Phi: MatrixLike = None,
         Psi: MatrixLike = None,
+        D: MatrixLike = None,
         dt: float,
         horizon: int | None = None,
         constants: Mapping[str, float] | None = None,
@@ -124,7 +128,7 @@ class TimeVaryingDescriptorSystem:
         problems = Problems()
         known = problems.collect(lambda: checked_constants(constants))
         problems.raise_if_any()
-        asked = {"E": E, "A": A, "B": B, "C": C, "Phi": Phi, "Psi": Psi}
+        asked = {"E": E, "A": A, "B": B, "C": C, "Phi": Phi, "Psi": Psi, "D": D}
         found: dict[str, MatrixSequence | None] = {}
         for name, _, _, first in LAYOUT:
             if asked[name] is not None:
@@ -171,17 +175,15 @@ class TimeVaryingDescriptorSystem:
         Parameters
         ----------
         plant : DescriptorSystem
-            Discrete time, without feedthrough of inputs (D) and without disturbances.
+            Discrete time, without disturbances.
 
         Raises
         ------
         SpecError
-            It is continuous in time, has feedthrough, or has disturbances.
+            It is continuous in time or has disturbances.
         """
         if not plant.is_discrete:
             raise SpecError("The plant is continuous in time: discretise it first (transform.sample_time).", path="dt")
-        if np.any(plant.D):
-            raise SpecError("The plant has feedthrough: pass y - D u as its output, with D = 0.", path="D")
         if plant.nd:
             raise SpecError(
                 "The plant has unknown disturbances, which this method does not cover: remove Bd and Dd, or make them "
@@ -196,6 +198,7 @@ class TimeVaryingDescriptorSystem:
             plant.C,
             Phi=plant.Bf,
             Psi=plant.Df,
+            D=plant.D,
             dt=plant.dt,
             state_names=plant.state_names,
             input_names=plant.input_names,
@@ -259,7 +262,10 @@ class TimeVaryingDescriptorSystem:
         **changes
             Any argument of the constructor.
         """
-        return TimeVaryingDescriptorSystem(**{**self.matrices, **self._labels(), **changes})
+        kept = self.matrices
+        if self.D.is_constant and not self.D.at(1).any():
+            del kept["D"]  # none, whatever the number of inputs and outputs is then
+        return TimeVaryingDescriptorSystem(**{**kept, **self._labels(), **changes})
 
     def _labels(self) -> dict[str, Any]:
         names = ("state_names", "input_names", "output_names", "parameter_names")

@@ -345,6 +345,6 @@ def varying_runs(
             )
         x = np.asarray(np.linalg.solve(matrix, value), dtype=np.float64)
         states[k + 1] = x.T
-        known = plant.Psi.at(k) @ parameters[k]
+        known = plant.Psi.at(k) @ parameters[k] + plant.D.at(k + 1) @ inputs[k + 1]
         outputs[k + 1] = (plant.C.at(k + 1) @ x + known[:, None]).T + output_noise[k]
     return states, outputs

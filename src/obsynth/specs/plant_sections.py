@@ -129,7 +129,12 @@ def _read(
 def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> TimeVaryingDescriptorSystem:
     names = ("state_names", "input_names", "output_names", "parameter_names")
     arguments = _read(
-        section, source, prefix, ("dt", "horizon", "constants", *_LABELS), ("E", "A", "B", "C", "Phi", "Psi"), names
+        section,
+        source,
+        prefix,
+        ("dt", "horizon", "constants", *_LABELS),
+        ("E", "A", "B", "C", "D", "Phi", "Psi"),
+        names,
     )
     return _placed(lambda: TimeVaryingDescriptorSystem(**arguments), source, prefix)
 

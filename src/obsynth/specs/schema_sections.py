@@ -41,6 +41,7 @@ class TimeVaryingSection(Section):
     C: VaryingMatrix
     Phi: VaryingMatrix | None = None
     Psi: VaryingMatrix | None = None
+    D: VaryingMatrix | None = None
     state_names: Names | None = None
     input_names: Names | None = None
     output_names: Names | None = None

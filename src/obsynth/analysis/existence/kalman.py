@@ -116,6 +116,7 @@ def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
         np.hstack([plant.C, direct]),
         Phi=equations @ plant.Bf,
         Psi=plant.Df,
+        D=plant.D,
         dt=plant.dt,
         state_names=(*plant.state_names, *names),
         input_names=plant.input_names,

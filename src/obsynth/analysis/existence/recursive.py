@@ -56,7 +56,7 @@ def recursive_conditions(
     except SpecError as error:
         yield Condition(
             "plant of this kind",
-            "discrete time, no feedthrough, no unknown disturbance",
+            "discrete time, no unknown disturbance",
             False,
             0.0,
             1.0,

@@ -28,7 +28,7 @@ class AdaptiveObserver(DescriptorKalman):
     ----------
     plant : TimeVaryingDescriptorSystem or DescriptorSystem
         ``E (ne, nx)``, ``C (ny, nx)``, ``Phi (ne, nq)``, ``Psi (ny, nq)``; the faults of a DescriptorSystem are taken
-        as parameters (it must be discrete in time, without feedthrough and without disturbances).
+        as parameters (it must be discrete in time, without disturbances).
     Q, R : MatrixLike, optional
         As for `descriptor_kalman`.
     forgetting : float, optional, dimensionless

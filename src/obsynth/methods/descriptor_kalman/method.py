@@ -27,9 +27,10 @@ class DescriptorKalman(Method):
     Parameters
     ----------
     plant : TimeVaryingDescriptorSystem or DescriptorSystem
-        ``E (ne, nx)``, ``C (ny, nx)``; a DescriptorSystem must be discrete in time and without feedthrough of inputs.
-        Its parameters are taken as zero.  Nothing is assumed about its unknown inputs: those that show in the outputs
-        at once become states of the filter, and are estimated; the equations that the others enter are left out.
+        ``E (ne, nx)``, ``C (ny, nx)``; a DescriptorSystem must be discrete in time.  What known inputs do to the
+        outputs at once, ``D u``, is subtracted.  Its parameters are taken as zero.  Nothing is assumed about its
+        unknown inputs: those that show in the outputs at once become states of the filter, and are estimated; the
+        equations that the others enter are left out.
     Q : MatrixLike, optional
         Covariance ``(ne, ne)`` of mu(k): constant, stack, callable, or rows of expressions in ``k``; a number stands
         for that multiple of the identity.  By default ``Bw Bw'`` of a DescriptorSystem with noise, else the identity

@@ -164,7 +164,7 @@ def stacked_steps(
     # The triangular factors of the rotated noise.
     known = np.asarray(np.linalg.qr(np.matmul(step.noise.transpose(0, 2, 1), turned), mode="r"))
     known = np.pad(known, ((0, 0), (0, rows - known.shape[1]), (0, 0)))
-    right = np.concatenate((_products(step.B, before), y, _products(step.Dn, u)), axis=1)
+    right = np.concatenate((_products(step.B, before), y - _products(step.D, u), _products(step.Dn, u)), axis=1)
     data = _products(turned.transpose(0, 2, 1), right)
     head, data = np.ascontiguousarray(triangle[:, :n]), np.ascontiguousarray(data[:count])
     return np.ascontiguousarray(moved), np.ascontiguousarray(known), head, data
@@ -184,7 +184,8 @@ def stacked_matrices(model: StepModel, first: int, count: int) -> StepMatrices:
         for k in range(first, last)
     ]
     A, B, Phi, Psi = (_stack(sequence, first, count) for sequence in (plant.A, plant.B, plant.Phi, plant.Psi))
-    return StepMatrices(H, A, B, Phi, Psi, np.zeros((1, 0, plant.nu)), np.array(noise))
+    D = _stack(plant.D, first + 1, count)
+    return StepMatrices(H, A, B, Phi, Psi, np.zeros((1, 0, plant.nu)), D, np.array(noise))
 
 
 def _stack(sequence: MatrixSequence, first: int, count: int) -> FloatArray:

@@ -155,7 +155,8 @@ def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = N
     for k, gains in enumerate(gain_steps(observer, samples - 1), 0 if early else 1):
         step, arriving = gains.step, outputs[:, k] if k else outputs[:, k, :0]
         before = inputs[:, k - 1] if k else np.zeros((trials, observer.plant.nu))
-        data = np.concatenate((x @ step.A.T + before @ step.B.T, arriving, inputs[:, k] @ step.Dn.T), axis=1)
+        measured = arriving - inputs[:, k] @ step.D.T
+        data = np.concatenate((x @ step.A.T + before @ step.B.T, measured, inputs[:, k] @ step.Dn.T), axis=1)
         x, theta = data @ gains.gain.T, theta @ gains.retain.T + data @ gains.learn.T
         keep(k, gains.Upsilon)
         innovations.append(data @ gains.parity.T)
@@ -260,19 +261,25 @@ def _realised(observer: RecursiveObserver, found: GainStep) -> tuple[LinearObser
     gain, parity = [found.gain[:, part] for part in parts], [found.parity[:, part] for part in parts]
     learn, q = [found.learn[:, part] for part in parts], len(found.retain)
     random_walk = found.gain.shape[0] - nx
-    # With z(k) = A x(k-1) + B u(k-1) and the gains [L K M] of the rows [z; y; Dn u] (the last with early constraints):
-    # xbar = L z + K y + M Dn u, z(k+1) = A xbar + B u, and theta = retain theta(k-1) + learn [z; y; Dn u] by least
-    # squares, x = xbar + Upsilon theta.  States: z, then the parameters of one sample before.
+    # With z(k) = A x(k-1) + B u(k-1) and the gains [L K M] of the rows [z; y - D u; Dn u] (the last with early
+    # constraints): xbar = L z + K (y - D u) + M Dn u, z(k+1) = A xbar + B u, and theta = retain theta(k-1) + learn
+    # [z; y - D u; Dn u] by least squares, x = xbar + Upsilon theta. States: z, then the parameters one sample before.
     state = np.hstack([gain[0], np.zeros((len(gain[0]), q))])
     theta = np.hstack([learn[0], found.retain])
     az = np.vstack([step.A @ state, theta])
     by = np.vstack([step.A @ gain[1], learn[1]])
-    bu = np.vstack([step.B + step.A @ gain[2] @ early, learn[2] @ early])
+
+    def of_inputs(measured: FloatArray, constrained: FloatArray) -> FloatArray:
+        """Return what the inputs do through what is subtracted from the outputs, and through early constraints."""
+        return np.asarray(constrained @ early - measured @ step.D)
+
+    bu = np.vstack([step.B + step.A @ of_inputs(gain[1], gain[2]), of_inputs(learn[1], learn[2])])
     # Rows of output: x (with Upsilon theta), theta, innovation less its regressor times theta of before.
     upsilon = found.Upsilon[:nx]
     shown = [state[:nx] + upsilon @ theta, np.vstack([state[nx:], theta]), np.hstack([parity[0], -found.G])]
     seen = [gain[1][:nx] + upsilon @ learn[1], np.vstack([gain[1][nx:], learn[1]]), parity[1]]
-    fed = [(gain[2][:nx] + upsilon @ learn[2]) @ early, np.vstack([gain[2][nx:], learn[2]]) @ early, parity[2] @ early]
+    constrained = [gain[2][:nx] + upsilon @ learn[2], np.vstack([gain[2][nx:], learn[2]]), parity[2]]
+    fed = [of_inputs(measured, direct) for measured, direct in zip(seen, constrained, strict=True)]
     residuals = tuple(f"innovation {i + 1}" for i in range(len(found.parity)))
     names = observer.fault_names if random_walk or q else ()
     realisation = LinearObserver(

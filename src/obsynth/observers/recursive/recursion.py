@@ -115,7 +115,7 @@ class Recursion:
         except PreconditionError:
             # Equations without noise contradict each other within rounding: they judge nothing.
             return nothing, np.diag(np.full(plant.ny, np.inf))
-        return self._outputs(self._estimate(corrected, v, G, v, nothing)._replace(k=k))
+        return self._outputs(self._estimate(corrected, v, G, v, nothing)._replace(k=k), taken_now(state, u))
 
     def predicted(self, state: RecursiveState, received: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean ``(ny,)`` and covariance of outputs from what is received of the next sample. The variance is
@@ -123,15 +123,18 @@ class Recursion:
         plant, k = self.settings.plant, state.k
         if k == 0:
             return np.zeros(plant.ny), np.diag(np.full(plant.ny, np.inf))
-        return self._outputs(self.plain(state, received, u)[1])
+        return self._outputs(self.plain(state, received, u)[1], taken_now(state, u))
 
-    def _outputs(self, row: RawEstimate) -> tuple[FloatArray, FloatArray]:
+    def _outputs(self, row: RawEstimate, known: TakenInputs) -> tuple[FloatArray, FloatArray]:
         """Return mean ``(ny,)`` and covariance of outputs at what is known; the variance is infinite where nothing
         is."""
         plant, k = self.settings.plant, row.k
         C = plant.C.at(k)
-        mean, reach = C @ row.x, C @ row.factor
+        D = plant.D.at(k)
+        mean, reach = C @ row.x + D @ known.u, C @ row.factor
         covariance = reach @ reach.T + self.settings.R.at(k)
+        if known.missing is not None:
+            covariance = covariance + (D * known.missing) @ D.T
         if len(row.parameters.theta):
             Psi = plant.Psi.at(k - 1)
             moved = Psi @ row.parameters.spread
@@ -153,7 +156,7 @@ class Recursion:
     def plain(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
         """Take a sample as it is."""
         theta = state.parameters.theta
-        known = taken_inputs(state.inputs, state.u, u, is_first=state.k == 0)
+        known = taken_now(state, u)
         u = known.u
         if state.k > 0:
             after, v, G = self._stepped(state, self.step_of(state, known), y, u)
@@ -317,3 +320,8 @@ def posterior_residual(
     weighted = np.linalg.solve(triangle, np.hstack((gaps, spread)))
     regressor, end = slice(columns, gaps.shape[1]), gaps.shape[1]
     return weighted[:, :columns], -weighted[:, regressor], weighted[:, end:]
+
+
+def taken_now(state: RecursiveState, u: FloatArray) -> TakenInputs:
+    """Return what the inputs of the next sample are taken as."""
+    return taken_inputs(state.inputs, state.u, u, is_first=state.k == 0)

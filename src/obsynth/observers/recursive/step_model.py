@@ -33,7 +33,8 @@ MANY_ROWS = 100
 
 
 class StepMatrices(NamedTuple):
-    """One step ``E x(k+1) = A x(k) + B u(k) + Phi theta + q``, ``[y(k+1); Dn u(k+1)] = C x(k+1) + Psi theta + r``."""
+    """One step ``E x(k+1) = A x(k) + B u(k) + Phi theta + q``, ``[y(k+1) - D u(k+1); Dn u(k+1)] = C x(k+1) + Psi theta
+    + r``."""
 
     H: FloatArray  # ``(ne + ny, nx)``: E above C
     A: FloatArray  # A, B, Phi: ``(ne, nx)``, ``(ne, nu)``, ``(ne, nq)``
@@ -41,6 +42,7 @@ class StepMatrices(NamedTuple):
     Phi: FloatArray
     Psi: FloatArray  # ``(ny, nq)``
     Dn: FloatArray  # ``(ny - measured, nu)``: outputs that are made of the next input
+    D: FloatArray  # ``(measured, nu)``
     noise: FloatArray  # ``(ne + ny, any)``: square root of the covariance of q and r
 
 
@@ -51,7 +53,7 @@ def right_side(
     ne, nq = len(step.A), Upsilon.shape[1]
     right = np.empty((len(step.H), 1 + nq), order="F")
     right[:ne, 0] = step.A.dot(x) + step.B.dot(before)
-    right[ne : ne + len(y), 0] = y
+    right[ne : ne + len(y), 0] = y - step.D.dot(u)
     if len(step.Dn):
         right[ne + len(y) :, 0] = step.Dn @ u
     if nq:
@@ -160,7 +162,7 @@ class StepModel:
         if self.early:
             Psi, Dn = np.vstack([Psi, plant.Phi.at(k + 1)[late]]), -plant.B.at(k + 1)[late]
         A, B, Phi = (self._other(matrix.at(k)) for matrix in (plant.A, plant.B, plant.Phi))
-        found = StepMatrices(H, A, B, Phi, Psi, Dn, noise)
+        found = StepMatrices(H, A, B, Phi, Psi, Dn, plant.D.at(k + 1), noise)
         self._constant = found if self._is_constant else None
         return found
 
@@ -204,6 +206,7 @@ class StepModel:
             np.zeros((plant.nx, plant.nq)),
             plant.Phi.at(k)[late],
             -plant.B.at(k)[late],
+            np.zeros((0, plant.nu)),
             stacked_noise(np.zeros((plant.nx, 0)), self._factors(k)[1]),
         )
         self._correction = found if self._is_constant else None
@@ -230,6 +233,7 @@ def with_walking_parameters(step: StepMatrices, walk: FloatArray, *, early: bool
         np.zeros((ne + nq, 0)),
         np.zeros((len(step.Psi), 0)),
         step.Dn,
+        step.D,
         noise,
     )
 
@@ -241,6 +245,9 @@ def with_missing_inputs(step: StepMatrices, before: FloatArray | float, now: Flo
     acting[:ne, :nu] = step.B * np.sqrt(before)
     if now is not None and len(step.Dn):
         acting[len(step.H) - len(step.Dn) :, nu:] = step.Dn * np.sqrt(now)
+    if now is not None and len(step.D):
+        measured = len(step.H) - len(step.Dn) - len(step.D)
+        acting[measured : measured + len(step.D), nu:] = -step.D * np.sqrt(now)
     return step._replace(noise=np.hstack((step.noise, acting[:, acting.any(axis=0)])))
 
 

@@ -62,7 +62,8 @@ def _terms(
     """Return the terms of deviation and regressor ``(nx, 1 + nq)``: what tends to zero rounds as they do."""
     (x, factor, upsilon), (y, u, after) = before, data
     driven = np.abs(step.A) @ np.abs(x) + np.abs(step.B) @ np.abs(u)
-    values = np.concatenate([driven, np.abs(y), np.abs(step.Dn) @ np.abs(after)]) + data_deviations(step, factor)
+    outputs = np.abs(y) + np.abs(step.D) @ np.abs(after)
+    values = np.concatenate([driven, outputs, np.abs(step.Dn) @ np.abs(after)]) + data_deviations(step, factor)
     nq = upsilon.shape[1]
     regressors = np.vstack([np.abs(step.A) @ np.abs(upsilon) + np.abs(step.Phi[:, :nq]), np.abs(step.Psi[:, :nq])])
     return state_terms(step, np.hstack([values[:, None], regressors]))
@@ -124,7 +125,7 @@ def _data(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> FloatArr
     parts = [np.hstack([start.x[:, None], np.zeros((n, nq))])]
     for k in range(len(y) - 1):
         step = model.at(k)
-        values = np.concatenate([step.B @ u[k], y[k + 1], step.Dn @ u[k + 1]])
+        values = np.concatenate([step.B @ u[k], y[k + 1] - step.D @ u[k + 1], step.Dn @ u[k + 1]])
         parts.append(np.hstack([values[:, None], np.vstack([step.Phi, -step.Psi])[:, :nq]]))
     if (first := model.first()) is not None:
         parts.append(np.hstack([(first.Dn @ u[0])[:, None], -first.Psi[:, :nq]]))
