@@ -10,8 +10,8 @@ What is possible
     check, analyse_structure, diagnose, identifiability.
 Designs
     design, and one function for each method: fault_estimation_filter, pd_observer, ui_pi_observer, descriptor_kalman,
-    adaptive_observer, dae_adaptive_observer, region_observer, guaranteed_test; verify, load; optimal_filter: the least
-    gain possible.
+    adaptive_observer, dae_adaptive_observer, extended_kalman, region_observer, guaranteed_test; verify, load;
+    optimal_filter: the least gain possible.
 On data
     run_on_data, smooth, learn_thresholds, online_monitor, plotting.plot_data, html_report, export.
 In simulation
@@ -44,7 +44,7 @@ _PUBLIC_NAMES = {
     "methods.detection_filter.public": "detection_filter",
     "observers.recursive.steady_filter": "steady_state_filter",
     "methods.functions": (
-        "adaptive_observer dae_adaptive_observer descriptor_kalman "
+        "adaptive_observer dae_adaptive_observer descriptor_kalman extended_kalman "
         "fault_estimation_filter functional_filter pd_observer region_observer ui_pi_observer"
     ),
     "methods.guaranteed_test.result": "GuaranteedTest guaranteed_test",

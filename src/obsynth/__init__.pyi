@@ -19,6 +19,7 @@ from obsynth.methods.detection_filter.public import detection_filter as detectio
 from obsynth.methods.functions import adaptive_observer as adaptive_observer
 from obsynth.methods.functions import dae_adaptive_observer as dae_adaptive_observer
 from obsynth.methods.functions import descriptor_kalman as descriptor_kalman
+from obsynth.methods.functions import extended_kalman as extended_kalman
 from obsynth.methods.functions import fault_estimation_filter as fault_estimation_filter
 from obsynth.methods.functions import functional_filter as functional_filter
 from obsynth.methods.functions import pd_observer as pd_observer

@@ -49,15 +49,22 @@ TANK = obsynth.DAEModel(
     states={"level": 1.0}, inputs={"inflow": 0.5}, parameters={"leak": 0.5}, constants={"area": 2.0},
     units={"level": "m", "inflow": "m3/s", "leak": "m2.5/s", "gauge": "m"},
 )  # fmt: skip
+KNOWN_TANK = obsynth.DAEModel(
+    {"tank": "area * der(level) = inflow - leak * sqrt(level)"},
+    {"gauge": "level"},
+    states={"level": 1.0}, inputs={"inflow": 0.5}, constants={"area": 2.0, "leak": 0.5},
+    units={"level": "m", "inflow": "m3/s", "gauge": "m"},
+)  # fmt: skip
 MEASURED = obsynth.DescriptorSystem(None, [[1.1, 0.1], [0.0, 0.9]], [[0.0], [1.0]], np.eye(2), dt=0.1)
 NOISY = CONTINUOUS.replace(Bd=[[0.3], [0.0], [0.1]], Dd=[[0.2], [0.0]], Bw=np.zeros((3, 2)), Dw=0.3 * np.eye(2))
 #: Plants in the order in which a method takes the first that it has an observer for.
-PLANTS: tuple[Any, ...] = (DISCRETE, CONTINUOUS, TANK, MEASURED, NOISY)
+PLANTS: tuple[Any, ...] = (DISCRETE, CONTINUOUS, TANK, KNOWN_TANK, MEASURED, NOISY)
 #: What a method cannot do without.
 OPTIONS: dict[str, dict[str, Any]] = {
     "descriptor-kalman": {"Q": 0.01, "R": 0.01},
     "adaptive-observer": {"Q": 0.01, "R": 0.01},
     "dae-adaptive-observer": {"dt": 0.1, "Q": 1e-4, "R": 1e-4},
+    "extended-kalman": {"dt": 0.1, "Q": 1e-4, "R": 1e-4},
     "region-observer": {
         "region": {"level": [0.2, 2.0], "leak": [0.3, 0.7]},
         "sample_time": 0.1,

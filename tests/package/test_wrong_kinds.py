@@ -17,8 +17,9 @@ from obsynth import SpecError, conditions, plotting
 OPEN = ("Any", "Data", "LogData", "Logs", "Picked")
 #: Functions made from the classes of methods, whose fields are checked, and those of one argument that may be anything.
 NOT_CHECKED = {
-    "adaptive_observer", "dae_adaptive_observer", "descriptor_kalman", "detection_filter", "fault_estimation_filter",
-    "fault_model", "functional_filter", "guaranteed_test", "pd_observer", "region_observer", "ui_pi_observer",
+    "adaptive_observer", "dae_adaptive_observer", "descriptor_kalman", "detection_filter", "extended_kalman",
+    "fault_estimation_filter", "fault_model", "functional_filter", "guaranteed_test", "pd_observer", "region_observer",
+    "ui_pi_observer",
 }  # fmt: skip
 
 

@@ -86,6 +86,8 @@ descriptor_kalman = design_function(method_class("descriptor-kalman"))
 
 adaptive_observer = design_function(method_class("adaptive-observer"))
 
+extended_kalman = design_function(method_class("extended-kalman"))
+
 dae_adaptive_observer = design_function(method_class("dae-adaptive-observer"))
 
 region_observer = design_function(method_class("region-observer"))

@@ -151,6 +151,23 @@ def dae_adaptive_observer(
     reset: float = ...,
     name: str = ...,
 ) -> ObserverDesign: ...
+def extended_kalman(
+    plant: Plant | Transformation,
+    *,
+    dt: float | None = ...,
+    Q: Any = ...,
+    R: Any = ...,
+    integration: Literal["backward-euler", "radau", "auto"] = ...,
+    initial_state: Any = ...,
+    initial_covariance: Any = ...,
+    largest_move: float | None = ...,
+    outliers: Literal["none", "gate", "huber"] | None = ...,
+    outlier_limit: float | None = ...,
+    outlier_sizes: Any = ...,
+    sensors: Any = ...,
+    state_bounds: Any = ...,
+    name: str = ...,
+) -> ObserverDesign: ...
 def region_observer(
     plant: Plant | Transformation,
     *,

@@ -24,6 +24,7 @@ OWN = {
     "descriptor-kalman": "obsynth.methods.descriptor_kalman.method:DescriptorKalman",
     "adaptive-observer": "obsynth.methods.adaptive_observer.method:AdaptiveObserver",
     "dae-adaptive-observer": "obsynth.methods.dae_adaptive_observer.method:DaeAdaptiveObserver",
+    "extended-kalman": "obsynth.methods.extended_kalman.method:ExtendedKalman",
     "region-observer": "obsynth.methods.region_observer.method:RegionObserverMethod",
     "guaranteed-test": "obsynth.methods.guaranteed_test.method:GuaranteedTestMethod",
 }

@@ -53,12 +53,12 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
         detail,
         signals=found.states,
     )
-    if found.index == 1:
-        told = _unidentified(model, dt) if model.nq else ""
+    if found.index == 1 and model.nq:
+        told = _unidentified(model, dt)
         yield Condition(
             "parameters",
             "the plant has parameters to estimate",
-            model.nq > 0,
+            True,
             float(model.nq),
             1.0,
             f"{SOURCE}, (3)",

@@ -5,7 +5,7 @@ Source of the claims: Moussa Ali, Zhang 2013 (DAE), (7)-(9), (26); the bands are
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from obsynth.errors import ObsynthError, SolverError
 from obsynth.methods.engines.recursive.checks import CLAIM_TOLERANCE, claims_row, failed_run, refinement_rows
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.newton import LARGEST_RESIDUAL
-from obsynth.numerics.ranks import SINGULAR_CONDITION, covariance_factor
+from obsynth.numerics.ranks import RANK_TOLERANCE, SINGULAR_CONDITION, covariance_factor
 from obsynth.observers.batches import run_dae_batch
 from obsynth.observers.nonlinear.building import (
     FEWEST_STEPS,
@@ -213,6 +213,8 @@ def _proved_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
         status="proved" if proved else "assumed",
         detail=f"{len(facts.kept)} steps, outward rounding, {told}" if proved else "not proved to be below one",
     )
+    if not len(facts.deviations):
+        return
     deviations = np.where(facts.deviations > 0.0, facts.deviations, 1.0)
     inverse = np.diag(np.exp2(-np.round(np.log2(deviations))))
     proof = prove_positive_definite(inverse @ facts.parameter_covariance @ inverse)
@@ -267,12 +269,14 @@ def _consistency_rows(design: ObserverDesign, shipped: DAEObserver, steps: int) 
             raise
         yield from _consistency_rows(design, shipped, steps // 2)
         return
+    plant = design.nonlinear[0]
+    of = "parameters" if plant.nq else "states"
     for name, claim, mean, count in (
         (
             "NEES",
-            "squared errors of the parameters per degree of freedom are one, within a factor",
+            f"squared errors of the {of} per degree of freedom are one, within a factor",
             float(np.mean(errors)),
-            float(errors.size * design.nonlinear[0].nq),
+            float(errors.size * (plant.nq or plant.nx)),
         ),
         ("NIS", "squared innovations per degree of freedom are one, within a factor", squares / degrees, degrees),
     ):
@@ -295,8 +299,8 @@ def _consistency_rows(design: ObserverDesign, shipped: DAEObserver, steps: int) 
 
 
 def _squared_errors(design: ObserverDesign, shipped: DAEObserver, steps: int) -> tuple[FloatArray, float, float]:
-    """Return squared errors of the parameters per degree of freedom of each run, and the sum of squared innovations of
-    all with their number."""
+    """Return squared errors of the parameters (of the states, where there are none) per degree of freedom of each run,
+    and the sum of squared innovations of all with their number."""
     stated = dae_observer_from_options(design.nonlinear[0], design.options)
     rng = np.random.default_rng(MONTE_CARLO_SEED)
     errors, squares, degrees = np.zeros(0), 0.0, 0.0
@@ -317,7 +321,8 @@ def _ratio(mean: float) -> float:
 def _trials(
     stated: DAEObserver, shipped: DAEObserver, rng: np.random.Generator, trials: range, steps: int
 ) -> tuple[FloatArray, float, float]:
-    """Return squared errors of the parameters per degree of freedom, and squared innovations with their number."""
+    """Return squared errors of the parameters (of the states, where there are none) per degree of freedom, and squared
+    innovations with their number."""
     roots = [
         covariance_factor(stated.initial_parameter_covariance, "initial_parameter_covariance"),
         covariance_factor(stated.initial_covariance, "initial_covariance"),
@@ -326,7 +331,7 @@ def _trials(
     walk = np.zeros((stated.model.nq, stated.model.nq))
     if stated.form != "forgetting":
         walk = covariance_factor(stated.random_walk, "random_walk")
-    parameters, outputs = [], []
+    parameters, states, outputs = [], [], []
     for trial in trials:
         theta = stated.initial_parameters + roots[0] @ rng.standard_normal(stated.model.nq)
         path = np.tile(theta, (steps + 1, 1))
@@ -347,13 +352,29 @@ def _trials(
             integration=stated.integration,
             seed=MONTE_CARLO_SEED + trial,
         )
+        states.append(truth.states[-1])
         outputs.append(truth.outputs)
     # As C it would be faster, but the compiler takes longer than all of this.
     found = run_dae_batch(shipped, np.array(outputs), u, compiled=False, progress=False)
-    gaps = found.parameters[:, -1] - np.array(parameters)
-    weighted = np.linalg.solve(found.parameter_covariances[:, -1], gaps[:, :, None])[:, :, 0]
-    errors = np.sum(gaps * weighted, axis=1) / gaps.shape[1]
+    if stated.model.nq:
+        gaps = found.parameters[:, -1] - np.array(parameters)
+        weighted = np.linalg.solve(found.parameter_covariances[:, -1], gaps[:, :, None])[:, :, 0]
+        errors = np.sum(gaps * weighted, axis=1) / gaps.shape[1]
+    else:
+        ends = [shipped.run(y, u, progress=False).state_covariances[-1] for y in outputs]
+        errors = _state_errors(found.states[:, -1] - np.array(states), ends, stated)
     return errors, float(found.nis[:, 1:].sum()), float(found.nis_degrees[:, 1:].sum())
+
+
+def _state_errors(gaps: FloatArray, covariances: Sequence[FloatArray], stated: DAEObserver) -> FloatArray:
+    """Return squared errors of states per degree of freedom ``(trials,)``: in the directions that are uncertain, as
+    algebraic equations without noise leave none in others."""
+    units, found = stated.model.state_scales, np.zeros(len(gaps))
+    for trial, (gap, covariance) in enumerate(zip(gaps / units, covariances, strict=True)):
+        values, vectors = np.linalg.eigh(covariance / np.outer(units, units))
+        kept = values > RANK_TOLERANCE * values[-1]
+        found[trial] = np.mean((vectors[:, kept].T @ gap) ** 2 / values[kept])
+    return found
 
 
 def _band(count: float) -> tuple[float, float]:

@@ -28,7 +28,8 @@ class DaeAdaptiveObserver(Method):
     Parameters
     ----------
     plant : DAEModel
-        Index 1, with parameters: ``nx`` states, ``ny`` outputs, ``nq`` parameters.
+        Index 1: ``nx`` states, ``ny`` outputs, ``nq`` parameters.  Without parameters the observer is the extended
+        Kalman filter of the states.
     dt : float
         Seconds between samples; must be given, as Q and R.
     Q : array_like or mapping
@@ -84,7 +85,7 @@ class DaeAdaptiveObserver(Method):
     SpecError
         An option is missing, out of range, or names no signal.
     PreconditionError
-        The index is not 1 (the equations involved are named), or there are no parameters.
+        The index is not 1 (the equations involved are named).
     SolverError
         A step at nominal inputs has no solution.
     VerificationError

@@ -88,7 +88,13 @@ def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DA
     states, parameters = model.state_names, model.parameter_names
     form, integration = options["form"], options["integration"]
     if form == "auto":
-        form = "forgetting" if options["random_walk"] is None else "random-walk"
+        form = "forgetting" if options["random_walk"] is None or not model.nq else "random-walk"
+    if form != "forgetting" and not model.nq:
+        raise SpecError(
+            f"form is {form!r}, but the plant has no parameters: leave it out, and the observer is the extended Kalman "
+            "filter of the states.",
+            path="method.options.form",
+        )
     if integration == "auto":
         turns_far = largest_turn(model, step_length(options["dt"])) > LARGEST_TURN
         integration = "radau" if turns_far else "backward-euler"
