@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -21,6 +21,7 @@ from obsynth.analysis.diagnosis.explanations import (
     state_sensors,
 )
 from obsynth.analysis.diagnosis.fault_columns import DecoupledFault, Removal, dc_point, others
+from obsynth.analysis.diagnosis.margins import fault_margins
 from obsynth.analysis.diagnosis.sensor_search import SensorResponses
 from obsynth.analysis.diagnosis.verdicts import MOST_PATTERN_FAULTS, Diagnosis, FaultDiagnosis, residual_bank
 from obsynth.errors import SpecError
@@ -134,6 +135,16 @@ def diagnose(
     )
     report_stage("deciding which faults can be isolated")
     weak, strong, pairs = _isolability(plant, shown, decoupled)
+    margins = fault_margins(plant, weak, strong)
+    faults = tuple(
+        replace(
+            fault,
+            margin=float(margins.all_others[i]),
+            least_step=None if margins.least_steps is None else float(margins.least_steps[i]),
+            sentences=(*fault.sentences, *filter(None, (margins.sentence(plant.fault_names, i),))),
+        )
+        for i, fault in enumerate(faults)
+    )
     bank = residual_bank(decoupled, whole_bank)
     part = () if whole_bank or plant.nf <= MOST_PATTERN_FAULTS else (_PART_OF_THE_BANK.format(count=plant.nf),)
     return Diagnosis(
@@ -145,6 +156,7 @@ def diagnose(
         "; ".join(dict.fromkeys(model.descriptions)),
         exactly,
         (*_warnings(plant, [*shown, *free, *pairs]), *part),
+        margins.pairs,
     )
 
 
@@ -182,6 +194,8 @@ def _verdict(
         sentences=tuple(_sentences(plant, shown, free, candidates)),
         exact=shown.exactly,
         gap=min(shown.gap, free.gap),
+        margin=np.inf,
+        least_step=None,
     )
 
 

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.diagnosis.exact_fault_columns import DecoupledFaults
+from obsynth.analysis.diagnosis.margins import NEARLY_ALIKE
 from obsynth.files.tables import html_table, text_table
-from obsynth.numerics.arrays import ComplexArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray
 
 #: With more faults only residuals that are blind to one fault, or see one, are looked for unless all are asked for.
 MOST_PATTERN_FAULTS = 6
@@ -108,6 +109,12 @@ class FaultDiagnosis:
         Whether all this was decided over the rational numbers; orders of larger plants are not.
     gap : float
         How clear the least clear decision was, kept over dropped; infinite for exact ones.
+    margin : float
+        By how much it has to be larger to be distinguished from all other faults, of any size, than to be seen; as a
+        constant where it can be, else as a sinusoid.  Infinite where it cannot be.
+    least_step : float or None
+        In its unit: the step that stands out by three standard deviations of the sensors' noise in the mean of 100
+        samples, whatever the other faults are; ``None`` where no noise is stated on every output.
     """
 
     name: str
@@ -125,6 +132,8 @@ class FaultDiagnosis:
     sentences: tuple[str, ...]
     exact: bool
     gap: float
+    margin: float
+    least_step: float | None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdicts as plain data, zeros as ``[real, imaginary]``."""
@@ -135,6 +144,8 @@ class FaultDiagnosis:
             "blocking": _pairs(self.blocking),
             "sentences": list(self.sentences),
             "gap": None if np.isinf(self.gap) else self.gap,
+            "margin": None if np.isinf(self.margin) else self.margin,
+            "least_step": None if self.least_step is None or np.isinf(self.least_step) else self.least_step,
         }
 
 
@@ -162,6 +173,9 @@ class Diagnosis:
         Whether the verdicts were decided over the rational numbers.
     warnings : tuple of str
         Thin decisions and what else a reader should know.
+    margins : FloatArray
+        ``(nf, nf)``, dimensionless: entry (i, j) by how much fault i has to be larger to be distinguished from fault j
+        than to be seen; infinite where it cannot be.
     """
 
     faults: tuple[FaultDiagnosis, ...]
@@ -172,6 +186,7 @@ class Diagnosis:
     model: str
     exact: bool
     warnings: tuple[str, ...]
+    margins: FloatArray
 
     def __getitem__(self, name: str) -> FaultDiagnosis:
         for fault in self.faults:
@@ -203,9 +218,13 @@ class Diagnosis:
         return (header, *rows)
 
     def isolability_rows(self) -> tuple[tuple[str, ...], ...]:
-        """Return the isolability table as texts: 'yes', 'changing' (not at rest) or 'no', row from column."""
+        """Return the isolability table as texts: 'yes', 'changing' (not at rest) or 'no', row from column; with the
+        margin where it is worth a word."""
         names = [fault.name for fault in self.faults]
         words = np.where(self.isolable_at_rest, "yes", np.where(self.isolable, "changing", "no")).tolist()
+        far = [[NEARLY_ALIKE <= value < np.inf for value in row] for row in self.margins.tolist()]
+        for i, j in np.argwhere(far).tolist():
+            words[i][j] += f" (margin {self.margins[i, j]:.2g})"
         rows = ((name, *row) for name, row in zip(names, words, strict=True))
         return (("fault", *(f"from {name}" for name in names)), *rows)
 
@@ -228,6 +247,7 @@ class Diagnosis:
             "model": self.model,
             "exact": self.exact,
             "warnings": list(self.warnings),
+            "margins": [[None if np.isinf(value) else value for value in row] for row in self.margins.tolist()],
         }
 
     @property
