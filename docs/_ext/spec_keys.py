@@ -174,6 +174,7 @@ KEYS: Keys = {
         "C": ("", "Outputs, ny by nx, needed at k = 1, ..., N.", "[[1, 0]]"),
         "Phi": ("", "Parameters (faults) in the equations, ne by nq.", '[["1 + 0.5*cos(0.1*k)"], [0.1]]'),
         "Psi": ("", "Parameters (faults) on the outputs, ny by nq.", "[[1]]"),
+        "D": ("", "Known inputs on the outputs, ny by nu; needed from k = 1 on.", "[[1]]"),
         **{name: _NAMES[name] for name in ("state_names", "input_names", "output_names", "parameter_names")},
         **_SIGNALS,
     },

@@ -218,6 +218,9 @@ SMALL_UNITS = obsynth.DAEModel(
 )  # fmt: skip
 
 
+KNOWN_IN_SMALL_UNITS = SMALL_UNITS.replace(parameters={}, constants={"area": 2.0, "leak": 0.5}, units={})
+
+
 def in_other_units(method: str) -> tuple[Any, dict[str, Any]]:
     """Return the method's plant with outputs, equations and states in other units; noise and starts follow them."""
     plant, options = plant_of(method), dict(OPTIONS.get(method, {}))
@@ -225,7 +228,8 @@ def in_other_units(method: str) -> tuple[Any, dict[str, Any]]:
         small = {"region": {"level": [200, 2000], "leak": [0.3, 0.7]}, "noise": {"gauge": 1.0, "leak": 1e-3}}
         return SMALL_UNITS, {**options, **small}
     if isinstance(plant, obsynth.DAEModel):
-        return SMALL_UNITS, {**options, "Q": 1e6 * options["Q"], "R": 1e6 * options["R"]}
+        changed = SMALL_UNITS if plant.nq else KNOWN_IN_SMALL_UNITS
+        return changed, {**options, "Q": 1e6 * options["Q"], "R": 1e6 * options["R"]}
     rng = np.random.default_rng(3)
     rows, states = (np.diag(10.0 ** rng.uniform(-4, 4, plant.nx)) for _ in range(2))
     outputs = np.diag(10.0 ** rng.uniform(-4, 4, plant.ny))

@@ -66,6 +66,37 @@ def test_the_minimal_form_is_that_of_the_construction(index, in_constraints, see
     assert np.allclose(plant.E @ (speed + back.from_input @ rate), plant.A @ states + plant.B @ u + plant.Bf @ f)
 
 
+@pytest.mark.parametrize("in_constraints", [False, True])
+@pytest.mark.parametrize("index", [2, 3, 4])
+@pytest.mark.parametrize("seed", range(3))
+def test_computed_numbers_are_reduced_in_floating_point(index, in_constraints, seed):
+    rng = np.random.default_rng([seed, index, in_constraints, 7])
+    plant, (a, b, c, d) = scrambled(rng, index, in_constraints=in_constraints)
+    # Equations and unknowns turned, and in units that differ by decades: nothing is exactly singular any more.
+    turns = [np.linalg.qr(rng.standard_normal((plant.nx, plant.nx)))[0] for _ in range(2)]
+    rows, columns = (
+        turns[0] * 10.0 ** rng.uniform(-3, 3, plant.nx)[:, None],
+        turns[1] * 10.0 ** rng.uniform(-2, 2, plant.nx),
+    )
+    turned = obsynth.DescriptorSystem(
+        E=rows @ plant.E @ columns, A=rows @ plant.A @ columns, B=rows @ plant.B, Bf=rows @ plant.Bf,
+        C=plant.C @ columns,
+    )  # fmt: skip
+    found = reduced_index(turned)
+    assert found.plant.nx == len(a)
+    for s in (0.7, 1.0 + 2.0j, -0.3 + 5.0j):
+        wanted = c @ np.linalg.solve(s * np.eye(len(a)) - a, b) + d
+        assert np.allclose(transfer(found.plant, s, "u"), wanted[:, :1], rtol=1e-7, atol=1e-7)
+        assert np.allclose(transfer(found.plant, s, "f"), wanted[:, 1:], rtol=1e-7, atol=1e-7)
+    back, new = found.recovery, found.plant
+    x, u, f, rate = rng.standard_normal(new.nx), *rng.standard_normal((2, 1)), np.zeros(1)
+    states = back.from_state @ x + back.from_input @ u + back.from_fault @ f
+    speed = back.from_state @ (new.A @ x + new.B @ u + new.Bf @ f) + back.from_input @ rate
+    right = turned.A @ states + turned.B @ u + turned.Bf @ f
+    sizes = np.abs(turned.A) @ np.abs(states) + np.abs(turned.E) @ np.abs(speed)
+    assert (np.abs(turned.E @ speed - right) <= 1e-8 * sizes).all()
+
+
 def test_an_output_that_needs_a_derivative_names_the_signal():
     """The speed is measured of a mass whose position is moved by an unknown signal."""
     plant = obsynth.DescriptorSystem(

@@ -66,6 +66,22 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
         )
 
 
+def known_parameters(plant: DAEModel) -> Condition:
+    """Return the condition that a plant has no parameters to estimate."""
+    names = ", ".join(plant.parameter_names)
+    told = f"{names}. Make them constants, or take dae-adaptive-observer, which estimates them." if names else "none"
+    return Condition(
+        "known parameters",
+        "a plant without unknown parameters",
+        not names,
+        float(plant.nq),
+        0.0,
+        "this method",
+        told,
+        signals=plant.parameter_names,
+    )
+
+
 def _unidentified(model: DAEModel, dt: float) -> str:
     """Return what the outputs do not tell at nominal constant inputs: no condition, since others may excite it."""
     theta = model.nominal_parameters

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from obsynth.analysis.existence.moussaali_dae import known_parameters
 from obsynth.methods.dae_adaptive_observer.checks import checks as adaptive_checks
 from obsynth.methods.dae_adaptive_observer.method import DaeAdaptiveObserver
-from obsynth.methods.extended_kalman.method import known_parameters
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.plant import condition_rows

@@ -12,8 +12,6 @@ from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Syn
 from obsynth.numerics.arguments import Positive, WrittenAs, field_types
 from obsynth.observers.outliers import Outliers
 from obsynth.plants.dae import DAEModel
-from obsynth.results.checks import Check
-from obsynth.results.design import ObserverDesign
 
 
 @dataclass(frozen=True)
@@ -123,7 +121,7 @@ class ExtendedKalman(Method):
 
     def existence(self, plant: DAEModel, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions; the list ends at the first failure."""
-        from obsynth.analysis.existence.moussaali_dae import dae_conditions
+        from obsynth.analysis.existence.moussaali_dae import dae_conditions, known_parameters
 
         found = tuple(condition for condition in dae_conditions(plant, self.dt or 1.0) if condition.name == "index")
         if not found or not found[0].holds:
@@ -147,26 +145,3 @@ class ExtendedKalman(Method):
         found = synthesise(plant, self.with_adaptation(), progress=progress)
         options = {name: value for name, value in found.options.items() if name in field_types(type(self))}
         return replace(found, options=options, gains={"K": found.gains["K"]})
-
-    @classmethod
-    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-        """Yield a row for each claim, from the plant and the shipped observer alone."""
-        from obsynth.methods.extended_kalman.checks import checks
-
-        return checks(design, printed_digits)
-
-
-def known_parameters(plant: DAEModel) -> Condition:
-    """Return the condition that a plant has no parameters to estimate."""
-    names = ", ".join(plant.parameter_names)
-    told = f"{names}. Make them constants, or take dae-adaptive-observer, which estimates them." if names else "none"
-    return Condition(
-        "known parameters",
-        "a plant without unknown parameters",
-        not names,
-        float(plant.nq),
-        0.0,
-        "this method",
-        told,
-        signals=plant.parameter_names,
-    )

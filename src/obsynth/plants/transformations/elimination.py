@@ -159,9 +159,10 @@ def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None)
     """Return the elimination in rational arithmetic, rounded once; ``None`` where it must be left to floating point.
     ``basis (nx, count)`` are the dynamic states to take, where they are combinations of those given."""
     exact = exact_elimination(plant)
-    if exact is not None and holds_computed(plant.E) and _dynamic_count(plant) != len(exact.pivots):
-        return None
     if exact is None:
+        return None
+    if holds_computed(plant.E) and plant.nx - sum(structure_of(plant).infinite_block_sizes) != len(exact.pivots):
+        # Singular only before it was rounded.
         return None
     count = len(exact.pivots)
     whole = int(np.sum(plant.E.any(axis=0))) == count

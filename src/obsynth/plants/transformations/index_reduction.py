@@ -1,4 +1,7 @@
-"""Reduction of a regular plant of index 2 or more to its minimal proper form, in rational arithmetic.
+"""Reduction of a regular plant of index 2 or more to its minimal proper form.
+
+Numbers as written are reduced in rational arithmetic, computed ones in floating point: there the counts of dynamic
+states are those of the pencil's structure, and what is small beside rounding is zero.
 
 With ``M = (s0 E - A)^-1 E`` at a rational s0 that is no eigenvalue, the states split into ``x = V z + W v``: V spans
 the image of a power of M (the dynamic part), W its kernel. There ``M V = V J``, ``M W = W N`` with J regular and N
@@ -13,15 +16,20 @@ positions and speeds is lost: z has as many entries as there are free initial va
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import scipy
 from flint import fmpq, fmpq_mat
 
 from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DECISIVE, DescriptorSystem, ExactNumbers
-from obsynth.plants.pencil import structure_of
+from obsynth.plants.pencil import in_own_units, structure_of
+from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.transformations.exact_elimination import MOST_STATES_EXACTLY
 from obsynth.plants.transformations.recovery import StateRecovery, Transformation, state_point, with_states
 from obsynth.proofs.exact_arithmetic import (
@@ -37,6 +45,9 @@ from obsynth.proofs.exact_arithmetic import (
     written_matrix,
 )
 
+#: Points, in the plant's own unit of time, of which the farthest from an eigenvalue is taken in floating point.
+_SHIFTS = (1.0, 0.7, 1.5, 0.3, 3.0)
+
 _SIGNALS = (("Bu", "B", "D", "input_names"), ("Bf", "Bf", "Df", "fault_names"), ("Bd", "Bd", "Dd", "disturbance_names"),
             ("Bw", "Bw", "Dw", "noise_names"))  # fmt: skip
 
@@ -47,7 +58,7 @@ def reduced_index(plant: DescriptorSystem) -> Transformation | None:
     Algebraic states and multipliers come back from states, inputs, faults, unknown inputs and noise; those that need
     the derivative of a signal and reach no output are `dropped`.
 
-    Returns ``None`` for more than 64 states, computed data, exact numbers from elsewhere, or no dynamic state.
+    Returns ``None`` for more than 64 states, or no dynamic state.
 
     Raises
     ------
@@ -58,7 +69,7 @@ def reduced_index(plant: DescriptorSystem) -> Transformation | None:
     if split is None:
         return None
     _require_proper(plant, split.differentiated_outputs)
-    return _transformation(plant, split) if split.A.nrows() else None
+    return _transformation(plant, split) if split.count else None
 
 
 def improper_outputs(plant: DescriptorSystem) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -69,21 +80,36 @@ def improper_outputs(plant: DescriptorSystem) -> tuple[tuple[str, ...], tuple[st
 
 @dataclass(frozen=True, eq=False)
 class _Split:
-    """The proper form ``z' = A z + B q, y = C z + D q, x = V z + X q + (terms in derivatives of q)``, rational."""
+    """The proper form ``z' = A z + B q, y = C z + D q, x = V z + X q + (terms in derivatives of q)``, in doubles."""
 
-    A: fmpq_mat
-    B: fmpq_mat
-    C: fmpq_mat
-    D: fmpq_mat
-    V: fmpq_mat
-    X: fmpq_mat
-    differentiated: fmpq_mat  # of the states, by what is differentiated once
-    differentiated_outputs: fmpq_mat
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    V: FloatArray
+    X: FloatArray
+    differentiated: FloatArray  # of the states, by what is differentiated once
+    differentiated_outputs: FloatArray
+    chosen: tuple[int, ...]  # states of which V has the rows of an identity
+    exact: Mapping[str, fmpq_mat] | None  # A, B, C, D as rational numbers
+
+    @property
+    def count(self) -> int:
+        """Number of dynamic states."""
+        return len(self.A)
 
 
 def _split(plant: DescriptorSystem) -> _Split | None:
-    if plant.nx > MOST_STATES_EXACTLY or plant.exact is not None:
+    if plant.nx > MOST_STATES_EXACTLY:
         return None
+    count = plant.nx - sum(structure_of(plant).infinite_block_sizes)
+    found = _split_exactly(plant, count) if plant.exact is None else None
+    return found or _split_in_floating_point(plant, count)
+
+
+def _split_exactly(plant: DescriptorSystem, wanted: int) -> _Split | None:
+    """Return the rational split; ``None`` where it has another number of dynamic states than the pencil within
+    rounding, as computed data are exactly singular only before they were rounded."""
     matrices = {name: written_matrix(getattr(plant, name)) for name in ("E", "A", "C")}
     shift, inverse = _regular_point(matrices["E"], matrices["A"])
     if inverse is None:
@@ -93,8 +119,7 @@ def _split(plant: DescriptorSystem) -> _Split | None:
     while (again := power * power).rank() < power.rank():
         power = again
     count = int(power.rank())
-    if count != plant.nx - sum(structure_of(plant).infinite_block_sizes):
-        # Computed data: what is exactly zero only before rounding.
+    if count != wanted:
         return None
     dynamic, nilpotent = _basis(power, count), null_basis(power)
     whole = blocks([[dynamic, nilpotent]])
@@ -109,16 +134,65 @@ def _split(plant: DescriptorSystem) -> _Split | None:
     differentiated, states = nilpotent * (g * n * algebraic), nilpotent * algebraic
     direct = blocks([[written_matrix(getattr(plant, name)) for _, _, name, _ in _SIGNALS]])
     c = matrices["C"]
+    exact = {
+        "A": shift * identity(count) - inverse_j,
+        "B": inverse_j * picked_rows(driven, at),
+        "C": c * dynamic,
+        "D": c * states + direct,
+    }
+    others = (dynamic, states, differentiated, c * differentiated)
+    chosen = tuple(int(row) for row in pivot_columns(dynamic.transpose()))
+    return _Split(*map(nearest_doubles, (*exact.values(), *others)), chosen, exact)
+
+
+def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | None:
+    """Return the same for computed numbers, in the plant's own units."""
+    units = PlantUnits.of(plant).rounded()
+    e, a = in_own_units(plant)
+    signals = [getattr(plant, name) for _, name, _, _ in _SIGNALS]
+    direct = np.hstack([getattr(plant, name) for _, _, name, _ in _SIGNALS])
+    entering, c = units.rate * units.equations[:, None] * np.hstack(signals), plant.C * units.states
+    shift = max(_SHIFTS, key=lambda point: float(np.linalg.svd(point * e - a, compute_uv=False)[-1]))
+    pencil = shift * e - a
+    moved = np.linalg.solve(pencil, e)
+    # The kernel of the power, and its image, which has the index as its exponent or more.
+    left, _, right = np.linalg.svd(np.linalg.matrix_power(moved, structure_of(plant).index or 1))
+    image, nilpotent = left[:, :count], right[count:].T
+    rows = sorted(int(row) for row in scipy.linalg.qr(image.T, mode="r", pivoting=True)[1][:count])
+    dynamic = np.linalg.solve(image[rows].T, image.T).T
+    whole = np.hstack([dynamic, nilpotent])
+    inner = np.linalg.solve(whole, moved @ whole)
+    back = np.linalg.inv(whole)
+    driven = back @ np.linalg.solve(pencil, entering)
+    terms = np.abs(back) @ np.abs(np.linalg.inv(pencil)) @ np.abs(entering)
+    constrained = _but_small(driven[count:], terms[count:])
+    j, n = inner[:count, :count], inner[count:, count:]
+    g = np.linalg.inv(np.eye(plant.nx - count) - shift * n)
+    algebraic = g @ constrained
+    own = shift * np.eye(count) - np.linalg.inv(j)
+    b = np.linalg.solve(j, driven[:count])
+    states = _but_small(nilpotent @ algebraic, np.abs(nilpotent) @ np.abs(g) @ np.abs(constrained))
+    later = np.abs(nilpotent) @ np.abs(g @ n) @ np.abs(algebraic)
+    differentiated = _but_small(nilpotent @ g @ n @ algebraic, later)
+    v, factor = units.states[:, None], units.states[rows]
     return _Split(
-        shift * identity(count) - inverse_j,
-        inverse_j * picked_rows(driven, at),
-        c * dynamic,
-        c * states + direct,
-        dynamic,
-        states,
-        differentiated,
-        c * differentiated,
+        own * factor[:, None] / factor / units.rate,
+        b * factor[:, None] / units.rate,
+        c @ dynamic / factor,
+        _but_small(c @ states, np.abs(c) @ np.abs(states)) + direct,
+        v * _but_small(dynamic, np.ones_like(dynamic)) / factor,
+        v * states,
+        v * differentiated,
+        _but_small(c @ differentiated, np.abs(c) @ np.abs(differentiated)),
+        tuple(rows),
+        None,
     )
+
+
+def _but_small(values: FloatArray, sizes: FloatArray) -> FloatArray:
+    """Return values without those that are only rounding beside the sizes of their terms."""
+    largest = float(np.max(sizes, initial=0.0))
+    return np.where(np.abs(values) > RANK_TOLERANCE * np.maximum(sizes, largest), values, 0.0)
 
 
 def _regular_point(e: fmpq_mat, a: fmpq_mat) -> tuple[fmpq, fmpq_mat | None]:
@@ -139,13 +213,14 @@ def _basis(power: fmpq_mat, count: int) -> fmpq_mat:
     return image * picked_rows(image, rows).inv()
 
 
-def _improper(plant: DescriptorSystem, differentiated: fmpq_mat) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _improper(plant: DescriptorSystem, differentiated: FloatArray) -> tuple[tuple[str, ...], tuple[str, ...]]:
     signals = [name for *_, field in _SIGNALS for name in getattr(plant, field)]
-    outputs = [name for row, name in enumerate(plant.output_names) if _is_reached(differentiated, row)]
-    return tuple(outputs), tuple(name for column, name in enumerate(signals) if _acts(differentiated, column))
+    acts = differentiated != 0.0
+    outputs = tuple(name for name, reached in zip(plant.output_names, acts.any(axis=1), strict=True) if reached)
+    return outputs, tuple(name for name, acting in zip(signals, acts.any(axis=0), strict=True) if acting)
 
 
-def _require_proper(plant: DescriptorSystem, differentiated: fmpq_mat) -> None:
+def _require_proper(plant: DescriptorSystem, differentiated: FloatArray) -> None:
     """Raise `PreconditionError` where an output needs a derivative, and name the signals."""
     outputs, needed = _improper(plant, differentiated)
     if needed:
@@ -160,49 +235,43 @@ def _require_proper(plant: DescriptorSystem, differentiated: fmpq_mat) -> None:
         )
 
 
-def _is_reached(matrix: fmpq_mat, row: int) -> bool:
-    return any(matrix[row, column] != 0 for column in range(int(matrix.ncols())))
-
-
-def _acts(matrix: fmpq_mat, column: int) -> bool:
-    return any(matrix[row, column] != 0 for row in range(int(matrix.nrows())))
-
-
 def _transformation(plant: DescriptorSystem, split: _Split) -> Transformation:
-    dynamic, states, differentiated = split.V, split.X, split.differentiated
-    a, b, c, d = split.A, split.B, split.C, split.D
-    count, ends = int(a.nrows()), np.cumsum([0, plant.nu, plant.nf, plant.nd, plant.nw]).tolist()
+    count, ends = split.count, np.cumsum([0, plant.nu, plant.nf, plant.nd, plant.nw]).tolist()
 
-    def parts(matrix: fmpq_mat) -> list[fmpq_mat]:
-        return [picked_columns(matrix, range(first, last)) for first, last in pairwise(ends)]
+    def parts(matrix: FloatArray) -> list[FloatArray]:
+        return [matrix[:, first:last] for first, last in pairwise(ends)]
 
-    found = {"A": a, "C": c}
-    found |= dict(zip(("B", "Bf", "Bd", "Bw"), parts(b), strict=True))
-    found |= dict(zip(("D", "Df", "Dd", "Dw"), parts(d), strict=True))
-    pivots = pivot_columns(dynamic.transpose())
-    whole = not any(states[i, k] != 0 for i in pivots for k in range(int(states.ncols())))
-    names = [plant.state_names[i] for i in pivots] if whole else [f"xi {i + 1}" for i in range(count)]
-    computed = any(holds_computed(getattr(plant, name)) for name in ("E", "A", "C", "B", "Bf", "Bd"))
-    exact = {"E": identity(count), **found}
+    found = {"A": split.A, "C": split.C}
+    found |= dict(zip(("B", "Bf", "Bd", "Bw"), parts(split.B), strict=True))
+    found |= dict(zip(("D", "Df", "Dd", "Dw"), parts(split.D), strict=True))
+    whole = not split.X[list(split.chosen)].any()
+    names = [plant.state_names[i] for i in split.chosen] if whole else [f"xi {i + 1}" for i in range(count)]
     new = with_states(
         plant,
         names,
         E=None,
-        **{name: nearest_doubles(matrix) for name, matrix in found.items()},
-        exact=ExactNumbers({name: fractions_of(exact[name]) for name in DECISIVE}, computed=computed, states=plant.nx),
+        **found,
+        exact=_exact_numbers(plant, split, ends),
         uncertainty=None if plant.uncertainty is None else plant.uncertainty.left_behind("its index was reduced"),
     )
-    by_input, by_fault, by_disturbance, by_noise = (nearest_doubles(part) for part in parts(states))
-    recovery = StateRecovery(
-        plant.state_names,
-        nearest_doubles(dynamic),
-        by_input,
-        by_fault,
-        by_disturbance,
-        by_noise,
-        np.eye(plant.nw),
-        state_point(plant),
-    )
-    lost = tuple(name for row, name in enumerate(plant.state_names) if _is_reached(differentiated, row))
+    point = state_point(plant)
+    recovery = StateRecovery(plant.state_names, split.V, *parts(split.X), np.eye(plant.nw), point)
+    lost = split.differentiated.any(axis=1)
+    dropped = tuple(name for name, gone in zip(plant.state_names, lost, strict=True) if gone)
     text = f"reduced the index; {count} of {plant.nx} states are free, the others follow from constraints"
-    return Transformation(plant, new, text, recovery, dropped=lost, is_of_lower_index=True)
+    return Transformation(plant, new, text, recovery, dropped=dropped, is_of_lower_index=True)
+
+
+def _exact_numbers(plant: DescriptorSystem, split: _Split, ends: list[int]) -> ExactNumbers | None:
+    """Return the rational numbers that decide about the reduced plant."""
+    if split.exact is None:
+        return None
+    (first, last), (begin, end) = (ends[1:3], ends[2:4])
+    exact = {"E": identity(split.count), "A": split.exact["A"], "C": split.exact["C"]}
+    for names, matrix in ((("Bf", "Bd"), split.exact["B"]), (("Df", "Dd"), split.exact["D"])):
+        exact |= {
+            names[0]: picked_columns(matrix, range(first, last)),
+            names[1]: picked_columns(matrix, range(begin, end)),
+        }
+    computed = any(holds_computed(getattr(plant, name)) for name in ("E", "A", "C", "B", "Bf", "Bd"))
+    return ExactNumbers({name: fractions_of(exact[name]) for name in DECISIVE}, computed=computed, states=plant.nx)
