@@ -9,12 +9,13 @@ import scipy.linalg
 import obsynth
 from obsynth.plants.transformations.redundant_outputs import merged_outputs
 
-#: Row of C (as a share of the first), D and noise of the sensor that is added.
+#: Row of C (as a share of the first, and of a direction of its own), D and noise of the sensor that is added.
 MORE = {
-    "copy": (1.0, 0.0, 0.1),
-    "scaled": (10.0, 0.0, 1.0),
-    "dead": (0.0, 0.0, 0.1),
-    "of a known input": (0.0, 2.0, 0.1),
+    "copy": (1.0, 0.0, 0.0, 0.1),
+    "scaled": (10.0, 0.0, 0.0, 1.0),
+    "nearly equal": (1.0, 1e-3, 0.0, 0.1),
+    "dead": (0.0, 0.0, 0.0, 0.1),
+    "of a known input": (0.0, 0.0, 2.0, 0.1),
 }
 
 
@@ -24,10 +25,11 @@ def plants(seed, kind, dt=0.0):
     a = rng.standard_normal((n, n)) - 1.5 * np.eye(n)
     a = scipy.linalg.expm(0.1 * a).round(3) if dt else a.round(3)
     c, b, bf = (rng.standard_normal(shape).round(3) for shape in ((1, n), (n, 1), (n, 1)))
-    share, direct, noise = MORE[kind]
+    share, apart, direct, noise = MORE[kind]
+    own = rng.standard_normal((1, n)).round(3)
     one = obsynth.DescriptorSystem(A=a, B=b, C=c, Bf=bf, Dw=[[0.1]], dt=dt)
     both = obsynth.DescriptorSystem(
-        A=a, B=b, C=np.vstack([c, share * c]), D=[[0.0], [direct]], Bf=bf, Dw=np.diag([0.1, noise]), dt=dt
+        A=a, B=b, C=np.vstack([c, share * c + apart * own]), D=[[0.0], [direct]], Bf=bf, Dw=np.diag([0.1, noise]), dt=dt
     )
     return one, both
 
@@ -51,8 +53,19 @@ def test_placed_poles_have_no_more_noise_with_a_sensor_more(seed, kind):
     poles = list(-np.linspace(3, 4, one.nx + 1))
     alone, more = (obsynth.ui_pi_observer(plant, poles=poles) for plant in (one, both))
     assert noise_of(more) <= 1.001 * noise_of(alone)
-    expected = noise_of(alone) / (np.sqrt(2.0) if kind in ("copy", "scaled") else 1.0)
-    assert np.isclose(noise_of(more), expected, rtol=1e-3)
+    expected = noise_of(alone) / (np.sqrt(2.0) if kind in ("copy", "scaled", "nearly equal") else 1.0)
+    assert np.isclose(noise_of(more), expected, rtol=1e-2 if kind == "nearly equal" else 1e-3)
+
+
+@pytest.mark.parametrize("kind", MORE)
+@pytest.mark.parametrize("method", ["ui-pi-observer", "pd-observer", "functional-filter"])
+def test_no_method_is_slower_or_noisier_for_a_sensor_more(method, kind):
+    one, both = plants(5, kind)
+    options = {} if method == "ui-pi-observer" else {"decay": 0.3}
+    alone, more = (obsynth.design(plant, method, **options) for plant in (one, both))
+    assert more.report.passed
+    assert noise_of(more) <= 1.001 * noise_of(alone)
+    assert more.certificate.claims["decay"] >= alone.certificate.claims["decay"] / 1.001
 
 
 @pytest.mark.parametrize("kind", MORE)

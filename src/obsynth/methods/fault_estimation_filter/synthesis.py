@@ -27,7 +27,8 @@ from obsynth.analysis.existence.restricted_equivalent import PreparedPlant, prep
 from obsynth.analysis.existence.wang2015 import examine_fault_filter
 from obsynth.conditions.gamma_lower_bound import least_gain_certificate
 from obsynth.conditions.lmi import chosen_solver
-from obsynth.errors import PreconditionError
+from obsynth.errors import ObsynthError, PreconditionError
+from obsynth.methods.engines.sensor_noise import fault_deviation
 from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
 from obsynth.methods.fault_estimation_filter.convex_problem import (
     GainParts,
@@ -49,7 +50,7 @@ from obsynth.observers.linear.means import averaged
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
-from obsynth.plants.transformations.redundant_outputs import merged_outputs
+from obsynth.plants.transformations.redundant_outputs import MergedOutputs, merged_outputs, nearly_merged_outputs
 from obsynth.results.design import Certificate
 
 #: Gains that take the outputs.
@@ -81,8 +82,11 @@ def synthesise(
     held, prepared = examine_fault_filter(plant)
     require_all(held)
     merged = merged_outputs(plant)
-    if merged is None or not _is_prepared_without(plant, prepared):
-        return _synthesised(plant, held, prepared, asked, progress)
+    dependent = merged is not None and _is_prepared_without(plant, prepared)
+    near = nearly_merged_outputs(plant) if asked.S is None and not plant.nd else None
+    if merged is None or not dependent:
+        made = _synthesised(plant, held, prepared, asked, progress)
+        return made if near is None else _less_noisy(plant, near, made, asked, progress)
     if asked.S is not None:
         raise PreconditionError(
             f"S is for independent outputs (Wang 2015, below eq. (1), assumes rank C = {plant.ny}), but "
@@ -90,7 +94,32 @@ def synthesise(
             "outputs are merged by their noise then.",
             condition="rank C",
         )
-    found = _synthesised(merged.plant, held, prepared, asked, progress)
+    made = _of_merged(plant, merged, _synthesised(merged.plant, held, prepared, asked, progress))
+    return made if near is None else _less_noisy(plant, near, made, asked, progress)
+
+
+def _less_noisy(
+    plant: DescriptorSystem,
+    near: MergedOutputs,
+    made: Synthesis,
+    asked: FaultEstimationFilter,
+    progress: Callable[[str], None],
+) -> Synthesis:
+    """Return the filter with nearly dependent outputs merged where that exists and is less noisy, else the other."""
+    held, prepared = examine_fault_filter(near.plant)
+    if prepared is None or not all(condition.holds for condition in held):
+        return made
+    try:
+        other = _of_merged(plant, near, _synthesised(near.plant, held, prepared, asked, progress))
+    except ObsynthError:
+        return made
+    assert isinstance(other.observer, LinearObserver)
+    assert isinstance(made.observer, LinearObserver)
+    return other if fault_deviation(plant, other.observer) < fault_deviation(plant, made.observer) else made
+
+
+def _of_merged(plant: DescriptorSystem, merged: MergedOutputs, found: Synthesis) -> Synthesis:
+    """Return the filter of a plant from that of it with merged outputs."""
     observer, weights = found.observer, merged.weights
     assert isinstance(observer, LinearObserver)
     return replace(

@@ -18,18 +18,20 @@ from obsynth.analysis.existence.filasova import explicit_form, pd_observer_condi
 from obsynth.analysis.structure import analyse_structure
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.options import own_terms
-from obsynth.errors import InfeasibleError, SolverError
+from obsynth.errors import InfeasibleError, ObsynthError, SolverError
+from obsynth.methods.engines.sensor_noise import fault_deviation
 from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
 from obsynth.methods.pd_observer.closed_form import closed_form
 from obsynth.methods.pd_observer.gains import PdGains, certified
 from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve
 from obsynth.methods.pd_observer.limits import default_delta, fastest_mode, require_possible
 from obsynth.methods.pd_observer.method import PdObserver
-from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
+from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.scaling import balancing_factors
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import FAR_UNITS, PlantUnits
+from obsynth.plants.transformations.redundant_outputs import MergedOutputs, merged_outputs, nearly_merged_outputs
 from obsynth.results.design import Certificate
 
 #: Beside the given units of signals that of time is the power of two nearest to this many times the inverse of the
@@ -72,7 +74,37 @@ class _Units(NamedTuple):
 
 
 def design_gains(plant: DescriptorSystem, asked: PdObserver) -> tuple[PdGains, list[Mapping[str, Any]]]:
-    """Return the gains to ship and the records of all solver runs.
+    """Return the gains to ship and the records of all solver runs: of the plant with dependent outputs merged, and of
+    nearly dependent ones the least noisy.  Bounds on gains and noise are about the outputs as they are."""
+    as_they_are = asked.gain_bound is not None or asked.noise_gain is not None
+    choices = [None] if as_they_are else [merged_outputs(plant), nearly_merged_outputs(plant)]
+    first, records = _of_merged(plant, asked, choices[0])
+    for merged in choices[1:]:
+        if merged is None:
+            continue
+        try:
+            other, more = _of_merged(plant, asked, merged)
+        except ObsynthError:
+            continue  # what the merged outputs leave unused is needed
+        if fault_deviation(plant, other.observer) < fault_deviation(plant, first.observer):
+            first, records = other, [*records, *more]
+    return first, records
+
+
+def _of_merged(
+    plant: DescriptorSystem, asked: PdObserver, merged: MergedOutputs | None
+) -> tuple[PdGains, list[Mapping[str, Any]]]:
+    """Return the gains of a plant from those of it with outputs merged."""
+    if merged is None:
+        return _gains_and_records(plant, asked)
+    found, records = _gains_and_records(merged.plant, asked)
+    J, L = found.J @ merged.weights, found.L @ merged.weights
+    observer = realise_pd_observer(plant, with_faults_as_states(plant), J, L)
+    return replace(found, J=J, L=L, observer=observer), records
+
+
+def _gains_and_records(plant: DescriptorSystem, asked: PdObserver) -> tuple[PdGains, list[Mapping[str, Any]]]:
+    """Return the gains and the records of all solver runs.
 
     What decays as asked is small in the given units.  A rate that is ours to choose is chosen, with its gains, in the
     plant's own units, so that it is the same in any; only a higher one may come from the given units.

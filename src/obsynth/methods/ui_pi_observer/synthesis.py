@@ -18,9 +18,10 @@ from obsynth.analysis.existence.augmented_pencils import number, numbers
 from obsynth.analysis.existence.sharepasand import Existence, existence
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.options import own_terms
-from obsynth.errors import PreconditionError, SolverError
+from obsynth.errors import ObsynthError, PreconditionError, SolverError
 from obsynth.methods.engines.kalman_problem import NOISE_PRICE, KalmanProblem, compromise
 from obsynth.methods.engines.region import Region, region_gain
+from obsynth.methods.engines.sensor_noise import fault_deviation
 from obsynth.methods.method import Synthesis
 from obsynth.methods.refusals import require_all_conditions
 from obsynth.methods.ui_pi_observer.assembly import assembled
@@ -32,9 +33,15 @@ from obsynth.numerics.invariant_zeros import is_outside
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE
 from obsynth.numerics.spectra import decay_rates
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.faults import exosystem
+from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.plants.polytopic import PolytopicSystem
-from obsynth.plants.transformations.redundant_outputs import merged_outputs
+from obsynth.plants.transformations.redundant_outputs import MergedOutputs, merged_outputs, nearly_merged_outputs
+
+#: Rates below this, in 1/s, are those of an observer that does not settle.
+SLOWEST = 1e-300
+
+#: A filter is as fast as another one where its slowest error needs this many times as long.
+AS_FAST = 1.001
 
 #: A default this many times slower than the plant itself is worth a note.
 SLOW_DEFAULT = 1000.0
@@ -108,7 +115,10 @@ def synthesise(
     working = found.plant
     progress("decoupling the unknown inputs")
     given = asked.given_decoupling()
-    merged = None if given is not None or isinstance(weights.get("measurement"), Mapping) else merged_outputs(working)
+    as_they_are = given is not None or isinstance(weights.get("measurement"), Mapping)
+    merged = None if as_they_are else merged_outputs(working)
+    if asked.decay is None and region is None and not as_they_are:
+        merged = _without_likeness(found, model, asked, merged, weights)
     designed = working if merged is None else merged.plant
     problem = placement_problem(designed, model, found.fixed_modes, joint=asked.joint, given=given)
     if asked.G is not None:
@@ -139,6 +149,36 @@ def synthesise(
         tuple(notes(found, problem, asked, synthesis.certificate.claims)),
         found.transformation,
     )
+
+
+def _without_likeness(
+    found: Existence, model: Exosystem, asked: UiPiObserver, merged: MergedOutputs | None, weights: Mapping[str, Any]
+) -> MergedOutputs | None:
+    """Return which outputs to merge where some nearly depend on others.  Placed poles do not see the noise, and the
+    default is as fast as the noise of the quietest filter allows: with these merged it is no slower."""
+    near = nearly_merged_outputs(found.plant)
+    if near is None:
+        return merged
+    costs = []
+    for choice in (merged, near):
+        try:
+            problem = placement_problem(
+                found.plant if choice is None else choice.plant, model, found.fixed_modes, joint=asked.joint, given=None
+            )
+            gain = _chosen(asked, problem, None, weights, found.plant.dt)[0]
+        except ObsynthError:
+            costs.append(np.inf)
+            continue
+        U, D, K = problem.gains(gain)
+        means = np.eye(found.plant.ny) if choice is None else choice.weights
+        observer = assembled(
+            found.plant, model, (U, D @ means, K @ means), None, {}, structured=not asked.joint
+        ).observer
+        if asked.poles is not None:
+            costs.append(fault_deviation(found.plant, observer))
+        else:
+            costs.append(1.0 / max(float(np.min(decay_rates(np.linalg.eigvals(observer.Az), observer.dt))), SLOWEST))
+    return near if costs[1] <= AS_FAST * costs[0] and np.isfinite(costs[1]) else merged
 
 
 def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str) -> Choice:

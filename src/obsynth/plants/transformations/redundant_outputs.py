@@ -4,6 +4,9 @@
 the merged plant are ``y_p = M y`` with ``M = (Q' R^-1 Q)^-1 Q' R^-1`` (Gauss and Markov: the least variance of all
 unbiased means; R is the noise of the outputs, the identity where none is stated). A sensor that shows nothing, or only
 a known input, has a row of zeros in Q and no weight in M.
+
+Any M makes outputs of the plant: those that nearly depend on others may be merged in the same way, and the merged plant
+is exact, ``C_p = M C``.  What the small differences between them show, at the price of their noise, is left unused.
 """
 
 from __future__ import annotations
@@ -21,6 +24,11 @@ from obsynth.proofs.exact_arithmetic import pivot_columns, written_matrix
 #: White noise that is added to noise without any in some direction, as a share of its largest: perfect sensors have a
 #: weight of nearly one then, and a mean stays unbiased to as many digits.
 LEAST_NOISE_SHARE = 1e-6
+
+
+#: Directions of the outputs below this share of the largest, in units of their own, are of outputs that nearly depend
+#: on each other: an estimate that uses them has as many times the noise as this is small.
+NEARLY_DEPENDENT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +61,34 @@ def merged_outputs(plant: DescriptorSystem) -> MergedOutputs | None:
         output_names=names,
     )
     return MergedOutputs(merged, read_only(weights), exact)
+
+
+@remembered
+def nearly_merged_outputs(plant: DescriptorSystem) -> MergedOutputs | None:
+    """Return the plant with outputs merged that nearly depend on others; ``None`` where there are none but those of
+    `merged_outputs`."""
+    if is_sparse(plant.C) or plant.ny < 2:
+        return None
+    shown = np.hstack([plant.C, plant.Df, plant.Dd])
+    lengths = np.linalg.norm(shown, axis=1)
+    moving = np.flatnonzero(lengths)
+    if not len(moving):
+        return None
+    units = shown[moving] / lengths[moving, None]
+    values = np.linalg.svd(units, compute_uv=False)
+    count = int(np.sum(values > NEARLY_DEPENDENT * values[0]))
+    if count == rounding_rank(units):
+        return None
+    from scipy.linalg import qr
+
+    picked = sorted(int(moving[place]) for place in qr(units.T, mode="r", pivoting=True)[1][:count])
+    found = np.linalg.lstsq((shown[picked] / lengths[picked, None]).T, units.T, rcond=None)[0].T
+    q = np.zeros((len(shown), count))
+    q[moving] = found * lengths[moving, None] / lengths[picked]
+    weights = _weights(q, plant.Dw)
+    merged = {name: weights @ getattr(plant, name) for name in ("C", "D", "Df", "Dd", "Dw")}
+    names = [plant.output_names[i] for i in picked]
+    return MergedOutputs(plant.replace(**merged, output_names=names), read_only(weights), False)
 
 
 def _independent(shown: FloatArray) -> tuple[list[int], FloatArray, bool]:

@@ -1,0 +1,33 @@
+"""The deviation of fault estimates under the noise of the sensors alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy
+
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+
+
+def fault_deviation(plant: DescriptorSystem, observer: LinearObserver) -> float:
+    """Return the largest standard deviation of a fault estimate, in units in which the faults act alike; infinite for
+    an observer that is not stable.  Without stated noise every output has a deviation of one."""
+    noise = plant.Dw if plant.Dw.any() else np.eye(plant.ny)
+    rows, into = observer.fault_rows, observer.By @ noise
+    sizes = np.linalg.norm(np.vstack([plant.Bf, plant.Df]), axis=0)
+    scale = np.where(sizes > 0.0, sizes, 1.0)[:, None]
+    shown, direct = scale * observer.Cz[rows], scale * observer.Dy[rows] @ noise
+    if not len(shown):
+        return 0.0
+    poles = np.linalg.eigvals(observer.Az) if len(observer.Az) else np.zeros(0)
+    stable = np.all(np.abs(poles) < 1.0) if observer.dt else np.all(poles.real < 0.0)
+    if not stable or (not observer.dt and direct.any()):
+        return np.inf if not stable else float(np.max(np.linalg.norm(direct, axis=1)))
+    if not len(poles):
+        return float(np.max(np.linalg.norm(direct, axis=1)))
+    if observer.dt:
+        spread = scipy.linalg.solve_discrete_lyapunov(observer.Az, into @ into.T)
+    else:
+        spread = scipy.linalg.solve_continuous_lyapunov(observer.Az, -into @ into.T)
+    variances = np.diag(shown @ spread @ shown.T) + np.sum(direct * direct, axis=1)
+    return float(np.sqrt(np.max(np.maximum(variances, 0.0))))
