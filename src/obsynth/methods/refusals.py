@@ -16,6 +16,7 @@ from obsynth.analysis.existence.condition import Condition
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.method import Method
+from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.spectra import pole_text
 from obsynth.observers.linear.observer import LinearObserver
@@ -24,6 +25,9 @@ from obsynth.proofs.balls import UNIT_ROUNDOFF
 
 #: Plants with more states are not searched for pairs, and those with more still not at all.
 MOST_FOR_PAIRS, MOST_FOR_ONE = 16, 48
+
+#: How a refusal begins where nothing of the kind exists, see `Condition.require`.
+NONE_OF_THIS_KIND = "No observer of this kind exists: "
 
 #: Conditions on the kind of plant, whose messages say what to do: no sensor changes it.
 OF_THE_KIND = ("continuous time", "discrete time", "plant of this kind")
@@ -76,6 +80,7 @@ def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method
 
     if holds(plant):
         return error
+    error = _named_assumption(error, plant, asked)
     sets = least_additions(plant, state_sensors(plant), holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
     if sets:
         text = f"Measure one of: {listed_sets(sets)}."
@@ -93,6 +98,43 @@ def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method
         add=sets,
         unclear=error.unclear,
     )
+
+
+def _named_assumption(error: PreconditionError, plant: DescriptorSystem, asked: Method) -> PreconditionError:
+    """Return the refusal as one of this method alone where others estimate the faults of the plant: they are named."""
+    if not str(error).startswith(NONE_OF_THIS_KIND) or plant.nx > MOST_FOR_ONE or "faults" not in asked.purposes:
+        return error
+    others = [name for name in _methods_for_faults(asked) if _takes(name, plant)]
+    if not others:
+        return error
+    text = str(error).removeprefix(NONE_OF_THIS_KIND)
+    exist = "exists" if len(others) == 1 else "exist"
+    return PreconditionError(
+        f"{asked.id} assumes more than this plant has: {text} The faults can be estimated: {', '.join(others)} "
+        f"{exist}.",
+        condition=error.condition,
+        mode=error.mode,
+        signals=error.signals,
+        unclear=error.unclear,
+    )
+
+
+def _methods_for_faults(asked: Method) -> list[str]:
+    found = {name: method_class(name) for name in REGISTRY}
+    return [
+        name
+        for name, method in found.items()
+        if name != asked.id and "faults" in method.purposes and "time-invariant" in method.plants
+    ]
+
+
+def _takes(name: str, plant: DescriptorSystem) -> bool:
+    """Whether a method exists for a plant, decided on the numbers as written."""
+    method = method_class(name)
+    try:
+        return all(condition.holds for condition in method.of(method.placeholders).existence(plant))
+    except (ObsynthError, np.linalg.LinAlgError):
+        return False
 
 
 def _drops(plant: DescriptorSystem, holds: Callable[[DescriptorSystem], bool]) -> list[str]:
