@@ -125,7 +125,7 @@ def _whitening(plant: DescriptorSystem, units: PlantUnits) -> tuple[FloatArray, 
 def _own_point(plant: DescriptorSystem, units: PlantUnits) -> complex:
     """Return the point of sinusoids at the plant's own speed, of at most a quarter of a turn in a sample."""
     if plant.dt == 0.0:
-        return 1j * units.rate
+        return 1j / units.rate
     return complex(np.exp(0.5j))
 
 
@@ -146,10 +146,10 @@ def _responses(
 def _left(column: ComplexArray, beside: ComplexArray) -> tuple[float, ComplexArray]:
     """Return the length of what is left of a column beside others of any size, and the sizes that come nearest."""
     if not beside.shape[1]:
-        return float(np.linalg.norm(column)), np.zeros(0)
+        return float(np.linalg.norm(column)), np.zeros(0, dtype=np.complex128)
     lengths = np.linalg.norm(beside, axis=0)
     scale = np.where(lengths > 0.0, lengths, 1.0)
-    sizes = np.linalg.lstsq(beside / scale, column, rcond=RANK_TOLERANCE)[0]
+    sizes = np.asarray(np.linalg.lstsq(beside / scale, column, rcond=RANK_TOLERANCE)[0], dtype=np.complex128)
     return float(np.linalg.norm(column - (beside / scale) @ sizes)), sizes / scale
 
 

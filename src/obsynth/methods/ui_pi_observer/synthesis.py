@@ -32,6 +32,7 @@ from obsynth.numerics.eigenstructure import checked_poles, place
 from obsynth.numerics.invariant_zeros import is_outside
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE
 from obsynth.numerics.spectra import decay_rates
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.plants.polytopic import PolytopicSystem
@@ -174,10 +175,12 @@ def _without_likeness(
         observer = assembled(
             found.plant, model, (U, D @ means, K @ means), None, {}, structured=not asked.joint
         ).observer
+        assert isinstance(observer, LinearObserver)
         if asked.poles is not None:
             costs.append(fault_deviation(found.plant, observer))
         else:
-            costs.append(1.0 / max(float(np.min(decay_rates(np.linalg.eigvals(observer.Az), observer.dt))), SLOWEST))
+            poles = np.linalg.eigvals(observer.Az).astype(np.complex128)
+            costs.append(1.0 / max(float(np.min(decay_rates(poles, observer.dt))), SLOWEST))
     return near if costs[1] <= AS_FAST * costs[0] and np.isfinite(costs[1]) else merged
 
 

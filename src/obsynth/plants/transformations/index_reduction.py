@@ -142,7 +142,8 @@ def _split_exactly(plant: DescriptorSystem, wanted: int) -> _Split | None:
     }
     others = (dynamic, states, differentiated, c * differentiated)
     chosen = tuple(int(row) for row in pivot_columns(dynamic.transpose()))
-    return _Split(*map(nearest_doubles, (*exact.values(), *others)), chosen, exact)
+    a, b, seen, through, v, x, later, outputs = map(nearest_doubles, (*exact.values(), *others))
+    return _Split(a, b, seen, through, v, x, later, outputs, chosen, exact)
 
 
 def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | None:
@@ -255,8 +256,11 @@ def _transformation(plant: DescriptorSystem, split: _Split) -> Transformation:
         uncertainty=None if plant.uncertainty is None else plant.uncertainty.left_behind("its index was reduced"),
     )
     point = state_point(plant)
-    recovery = StateRecovery(plant.state_names, split.V, *parts(split.X), np.eye(plant.nw), point)
-    lost = split.differentiated.any(axis=1)
+    by_input, by_fault, by_disturbance, by_noise = parts(split.X)
+    recovery = StateRecovery(
+        plant.state_names, split.V, by_input, by_fault, by_disturbance, by_noise, np.eye(plant.nw), point
+    )
+    lost = (split.differentiated != 0.0).any(axis=1).tolist()
     dropped = tuple(name for name, gone in zip(plant.state_names, lost, strict=True) if gone)
     text = f"reduced the index; {count} of {plant.nx} states are free, the others follow from constraints"
     return Transformation(plant, new, text, recovery, dropped=dropped, is_of_lower_index=True)
