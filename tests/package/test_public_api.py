@@ -134,7 +134,8 @@ def test_all_names_resolve_and_are_listed():
 
 
 def test_types_are_in_a_module_of_their_own_and_names_are_few():
-    assert len(obsynth.__all__) <= 100
+    # Each method of obsynth has its function among them.
+    assert len(obsynth.__all__) <= 105
     assert not set(obsynth.__all__) & set(obsynth.types.__all__)
     assert set(dir(obsynth.types)) == set(obsynth.types.__all__)
     assert not hasattr(obsynth, "Simulation")

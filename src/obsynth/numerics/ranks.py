@@ -23,6 +23,10 @@ WINDOW_RANK_TOLERANCE = 1e-9
 #: A gap between kept and dropped singular values smaller than this is reported as unclear.
 CLEAR_GAP = 1e3
 
+#: Directions of the outputs below this share of the largest, in units of their own, are of outputs that nearly depend
+#: on each other: an estimate that uses them has as many times the noise as this is small.
+NEARLY_DEPENDENT = 0.1
+
 #: Distance from the stability boundary below which an eigenvalue or zero counts as lying on it.
 BOUNDARY_TOLERANCE = 1e-8
 

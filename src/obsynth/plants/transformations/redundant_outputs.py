@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, read_only, remembered
-from obsynth.numerics.ranks import but_rounding, rounding_rank
+from obsynth.numerics.ranks import NEARLY_DEPENDENT, but_rounding, rounding_rank
 from obsynth.numerics.sparse import is_sparse
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import pivot_columns, written_matrix
@@ -24,11 +24,6 @@ from obsynth.proofs.exact_arithmetic import pivot_columns, written_matrix
 #: White noise that is added to noise without any in some direction, as a share of its largest: perfect sensors have a
 #: weight of nearly one then, and a mean stays unbiased to as many digits.
 LEAST_NOISE_SHARE = 1e-6
-
-
-#: Directions of the outputs below this share of the largest, in units of their own, are of outputs that nearly depend
-#: on each other: an estimate that uses them has as many times the noise as this is small.
-NEARLY_DEPENDENT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
