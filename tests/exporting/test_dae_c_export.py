@@ -67,10 +67,13 @@ def run_c(
     subprocess.run([compiler, *flags, source, folder / "main.c", "-o", folder / "run", "-lm"], check=True)
     done = subprocess.run([folder / "run"], input=np.hstack([u, y]).tobytes(), capture_output=True, check=True)
     nx, nq = design.plant.nx, design.plant.nq
-    fields = {"states": nx, "state_deviations": nx, "parameters": nq, "parameter_deviations": nq, "innovations": ny,
+    # C has no empty arrays.
+    some = max(nq, 1)
+    fields = {"states": nx, "state_deviations": nx, "parameters": some, "parameter_deviations": some, "innovations": ny,
               "nis": 1, "residual": 1, "returned": 1}  # fmt: skip
     table = np.frombuffer(done.stdout).reshape(len(y), sum(fields.values()))
-    return dict(zip(fields, np.split(table, np.cumsum(list(fields.values()))[:-1], axis=1), strict=True))
+    found = dict(zip(fields, np.split(table, np.cumsum(list(fields.values()))[:-1], axis=1), strict=True))
+    return found | {name: found[name][:, :nq] for name in ("parameters", "parameter_deviations")}
 
 
 def as_run(design: obsynth.ObserverDesign) -> DAEObserver:
