@@ -357,6 +357,18 @@ def _proved_witness(
     return excess(exact, witness.radius), found if constant or found >= size else np.nan
 
 
+def _is_lasting(
+    problem: WindowProblem, programmes: WindowProgrammes, shipped: Mapping[str, FloatArray], k: int
+) -> bool:
+    """Whether the shipped witness of a programme is a course of a plant that runs before and after the window."""
+    window = programmes.windows[k].inner
+    columns = len(window.bar)
+    if "witness" not in shipped or shipped["witness"].shape[1] < columns:
+        return False
+    point, radius = (shipped[name][k][:columns] for name in ("witness", "witness_radius"))
+    return problem.is_of_a_running_plant(window, programmes.first[k], point, radius)
+
+
 def _of_the_least(
     design: ObserverDesign,
     shipped: Mapping[str, FloatArray],
@@ -375,7 +387,7 @@ def _of_the_least(
     proofs = [_proved_witness(programmes.windows[k], shipped, k, constant=constant) for k in shown]
     away = max((_worst(one) for one, _ in proofs), default=0.0)
     sizes = [size for _, size in proofs]
-    going_on = all(problem.continues(programmes.windows[k], programmes.first[k]) for k in shown)
+    going_on = all(_is_lasting(problem, programmes, shipped, k) for k in shown)
     best = np.nan if not going_on or np.isnan(sizes).any() else max(sizes, default=0.0)
     if away != 0.0:
         yield upper_bound_check(

@@ -31,6 +31,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.moving_disturbances import moving_columns
 from obsynth.plants.transformations.remainders import continuous_model
 from obsynth.proofs.exact_pencils import ExactPencil
+from obsynth.proofs.nonsingular import is_nonsingular_exactly
 
 #: What each course covers, and what not.
 COURSES: Mapping[str, str] = {
@@ -130,11 +131,42 @@ class WindowProblem:
             found[k] = found[k + 1] and _continues(plant.E.at(k), plant.A.at(k), plant.E.at(k + 1))
         return found
 
+    @cached_property
+    def _preceded(self) -> np.ndarray:
+        """By k, whether every state there has a past: equations before a window of a running plant say nothing of it.
+
+        They do where A is singular, as that of a delay: what it holds is what went into it.
+        """
+        plant = self.plant
+        if isinstance(plant, DescriptorSystem):
+            return np.array([is_nonsingular_exactly(plant.A)])
+        if plant.A.is_constant:
+            return np.full((plant.horizon or 1) + 1, is_nonsingular_exactly(plant.A.at(0)))
+        alone = [is_nonsingular_exactly(plant.A.at(k)) for k in range(plant.horizon or 1)]
+        return np.array([True, *np.logical_and.accumulate(alone)])
+
+    def has_past(self, row: int, samples: int) -> bool:
+        """Whether every state at the first sample of a window is one of a plant that has been running.
+
+        With bounds of the first state the plant starts with the window, by assumption.
+        """
+        if np.isfinite(self.bounds.first).any():
+            return True
+        found = self._preceded
+        return bool(found[0 if self.horizon is None else min(row - samples + 1, len(found) - 1)])
+
     def continues(self, window: Window, row: int) -> bool:
         """Whether what satisfies the equations of a window satisfies those after it, with some later states."""
         found = self._continuing
         after = 1 if self.horizon is None else row - window.question.samples + 1 + window.equations
         return bool(found[min(after, len(found) - 1)])
+
+    def is_of_a_running_plant(self, window: Window, row: int, point: FloatArray, radius: FloatArray) -> bool:
+        """Whether a point within a radius of this one ``(columns,)`` satisfies equations before and after a window."""
+        first = [place for place, label in enumerate(window.labels) if label[:2] == ("x", 0)]
+        # A plant that starts at rest, exactly, has been at rest.
+        at_rest = not np.any(point[first]) and not np.any(radius[first])
+        return self.continues(window, row) and (at_rest or self.has_past(row, window.question.samples))
 
 
 def _continues(before: FloatArray, a: FloatArray, after: FloatArray) -> bool:
@@ -225,7 +257,7 @@ class WindowProgrammes:
                 digest.update(np.ascontiguousarray(part).tobytes() + b"|")
             for _, _, inputs in window.model.equations:
                 digest.update(np.ascontiguousarray(inputs).tobytes())
-            key = digest.digest() + bytes([problem.continues(window, row)])
+            key = digest.digest() + bytes([problem.continues(window, row), problem.has_past(row, samples)])
             if key not in numbers:
                 numbers[key] = len(windows)
                 windows.append(window)

@@ -301,7 +301,7 @@ def _by_programme(
     windows, empty = programmes.windows, Repaired(np.zeros(1), np.zeros(1))
     tests = [empty if one is None else one.test for one in shipped]
     continued = [
-        one if one is not None and problem.continues(window, row) else None
+        one if one is not None and _is_lasting(problem, window, row, one.witness) else None
         for window, one, row in zip(windows, shipped, programmes.first, strict=True)
     ]
     witnesses = [empty if one is None or one.witness is None else one.witness for one in continued]
@@ -330,6 +330,13 @@ def padded(rows: Sequence[FloatArray], width: int = 1) -> FloatArray:
     return np.array([np.pad(row, (0, width - len(row))) for row in rows])
 
 
+def _is_lasting(problem: WindowProblem, window: Window, row: int, witness: Repaired | None) -> bool:
+    """Whether a witness, where there is one to show, is a course of a plant that runs before and after the window."""
+    if witness is None:
+        return problem.continues(window, row)
+    return problem.is_of_a_running_plant(window.inner, row, witness.values, witness.radius)
+
+
 def _notes(
     problem: WindowProblem, asked: TestOptions, window: Window, claims: Mapping[str, float], table: FloatArray
 ) -> list[str]:
@@ -354,6 +361,11 @@ def _notes(
                 "As states have bounds, the latter is about intervals: no function of the samples estimates the fault "
                 "to within less, but a fault of less than twice that size may be detectable."
             )
+    elif not problem.has_past(0, question.samples):
+        words.append(
+            "That there is no smaller threshold is not claimed: A is singular, as with a delay, so that what went "
+            "before the window says more of its first state."
+        )
     else:
         words.append("That there is no smaller threshold could not be proved on these numbers: least is not claimed.")
     words.append(f"The course {question.course} is {COURSES[question.course]}.")
@@ -400,7 +412,7 @@ def _notes_of_rows(
             "nothing that is free."
         )
     if "least" not in claims:
-        yield "That there is no smaller threshold is not claimed: equations after the window may reduce it."
+        yield "That there is no smaller threshold is not claimed: equations before or after the window may reduce it."
     elif np.isnan(matrices["leasts"]).any():
         yield "At some rows it is not claimed that there is no smaller threshold."
     yield f"The course {question.course} is {COURSES[question.course]}."
