@@ -73,22 +73,24 @@ def decouple(plant: DescriptorSystem) -> Decoupled:
     nu, nd = null[:, :left_over], null[:, left_over:]
     # What A leaves open a fixed matrix decides, and not the orientation of somebody's singular vectors.
     generic = np.random.default_rng(0).standard_normal((nx, nx))
-    z = _completing(ut, nu, plant.A.T @ kept.T, generic @ kept.T)
+    # Where no equation has a derivative, ut is the rounding of the whole inverse.
+    size = largest_singular_value(inverse) if inverse.size else 0.0
+    z = _completing(ut, nu, plant.A.T @ kept.T, generic @ kept.T, size)
     return Decoupled((ut + z @ nu) @ kept, (dt + z @ nd) @ seen, nu @ kept, nd @ seen, seen, injection)
 
 
-def _completing(ut: FloatArray, nu: FloatArray, wanted: FloatArray, generic: FloatArray) -> FloatArray:
+def _completing(ut: FloatArray, nu: FloatArray, wanted: FloatArray, generic: FloatArray, size: float) -> FloatArray:
     """Return Z such that ``ut + Z nu`` has full column rank; ``[ut; nu]`` has, so what ut lacks, nu sees.
 
     Kernel directions of ut go outside its range, near where ``wanted`` sends them, or else ``generic``: no choice hangs
-    on rounding.
+    on rounding.  ``size``: of what ut is a part of.
     """
     rows, columns = ut.shape
     if columns == 0 or nu.shape[0] == 0:
         return np.zeros((rows, nu.shape[0]))
     left, values, right = np.linalg.svd(ut)
-    largest = float(values[0]) if values.size and values[0] > 0.0 else 1.0
-    rank = numerical_rank(values)
+    rank = numerical_rank(values, scale=size)
+    largest = float(values[0]) if rank else 1.0
     lacking = columns - rank
     if lacking == 0:
         return np.zeros((rows, nu.shape[0]))
