@@ -1,7 +1,9 @@
 """The papers' conditions as problems of cvxpy, to read, to change and to solve; and the inequalities they are made of.
 
 ``wang2015``, ``filasova_theorem1``, ``filasova_theorem2``, ``sharepasand`` and ``kalman`` return `Conditions`;
-``vertex_inequalities`` returns those of an `ErrorPolytope`, whose matrices lie in the hull of vertices;
+``vertex_inequalities`` returns those of an `ErrorPolytope`, whose matrices lie in the hull of vertices,
+``slope_inequality`` those of `SlopedErrors` with a multiplier; ``nonlinear_region``, or ``region`` of a model, those of a
+nonlinear plant over a region;
 ``bounded_real``, ``h2``, ``region`` and ``admissible`` return constraints; ``disk``, ``half_plane`` and ``sector`` are
 regions for the eigenvalues.  ``Conditions.bisect`` returns a `Bisection` over a parameter.
 """
@@ -14,9 +16,11 @@ if TYPE_CHECKING:
     from obsynth.conditions.bisection import Bisection
     from obsynth.conditions.filasova import filasova_theorem1, filasova_theorem2
     from obsynth.conditions.kalman_gain import kalman
+    from obsynth.conditions.nonlinear_plants import nonlinear_region
     from obsynth.conditions.polytope import vertex_inequalities
     from obsynth.conditions.problem import Conditions
     from obsynth.conditions.share_pasand import sharepasand
+    from obsynth.conditions.slope_multipliers import SlopedErrors, slope_inequality
     from obsynth.conditions.wang import wang2015
     from obsynth.numerics.regions import LMIRegion, disk, half_plane, sector
     from obsynth.verification.error_polytope import ErrorPolytope
@@ -26,6 +30,7 @@ __all__ = [
     "Conditions",
     "ErrorPolytope",
     "LMIRegion",
+    "SlopedErrors",
     "admissible",
     "bounded_real",
     "disk",
@@ -34,9 +39,11 @@ __all__ = [
     "h2",
     "half_plane",
     "kalman",
+    "nonlinear_region",
     "region",
     "sector",
     "sharepasand",
+    "slope_inequality",
     "vertex_inequalities",
     "wang2015",
 ]
@@ -49,7 +56,9 @@ _HOMES = {
         "conditions.bisection": "Bisection",
         "conditions.filasova": "filasova_theorem1 filasova_theorem2",
         "conditions.kalman_gain": "kalman",
+        "conditions.nonlinear_plants": "nonlinear_region",
         "conditions.polytope": "vertex_inequalities",
+        "conditions.slope_multipliers": "SlopedErrors slope_inequality",
         "conditions.problem": "Conditions",
         "conditions.share_pasand": "sharepasand",
         "conditions.wang": "wang2015",

@@ -18,6 +18,7 @@ from obsynth.errors import SpecError, a_kind
 from obsynth.numerics.arguments import arguments_checked, real_array, real_number, require_shape
 from obsynth.numerics.arrays import require_no_overflow
 from obsynth.numerics.regions import LMIRegion, checked_region
+from obsynth.plants.dae import DAEModel
 
 if TYPE_CHECKING:
     import cvxpy
@@ -199,8 +200,46 @@ def h2(
     return [lmi.at_least(first, margin), lmi.at_least(second, margin)]
 
 
+def region(A: Any, P: Any, *given: Any, **options: Any) -> Any:
+    """Return the inequality that puts every eigenvalue of A into a region, `eigenvalue_region`; of a nonlinear plant
+    and its operating region the inequalities of an observer, `obsynth.conditions.nonlinear_region`.
+
+    Parameters
+    ----------
+    A : array_like or DAEModel
+        ``(n, n)``, or the plant.
+    P : cvxpy.Variable or mapping
+        ``(n, n)``, or ranges of signals.
+    *given, **options
+        As those functions take them.
+
+    Returns
+    -------
+    list of cvxpy.Constraint or Conditions
+        Of the one or the other.
+
+    Raises
+    ------
+    SpecError
+        Shapes that do not fit, or options of the other.
+
+    Examples
+    --------
+    >>> import cvxpy as cp
+    >>> import numpy as np
+    >>> from obsynth.conditions import disk, region
+    >>> len(region(np.array([[0.5]]), cp.Variable((1, 1), symmetric=True), disk(0, 0.6)))
+    2
+    """
+    if isinstance(A, DAEModel):
+        from obsynth.conditions.nonlinear_plants import nonlinear_region
+
+        return nonlinear_region(A, P, *given, **options)
+    return eigenvalue_region(A, P, *given, **options)
+
+
 @arguments_checked
-def region(
+def eigenvalue_region(
     A: Any, P: Any, where: LMIRegion, *, Y: Any = None, Cy: Any = None, margin: float = HOMOGENEOUS_MARGIN
 ) -> list[cvxpy.Constraint]:
     r"""Return the inequality that puts every eigenvalue of A into a region: ``L x P + M x (PA) + M' x (PA)' < 0``.

@@ -219,7 +219,7 @@ class _Forms:
         t = cp.Variable(nonneg=True, name="t") if errors.ball else None
         below = 0 if k is None else n - k
         if below:
-            P, G = _descriptor_variables(n, n - below)
+            P, G = descriptor_variables(n, n - below)
             Ps, Gs = [P] * count, [G] * count
         else:
             Ps = [cp.Variable((n, n), symmetric=True, name=f"P[{i + 1}]") for i in range(count)] if several else []
@@ -366,7 +366,7 @@ class _Forms:
         return {"t": np.atleast_2d(values["t"])} if self.t is not None else {}
 
 
-def _descriptor_variables(n: int, k: int) -> tuple[Any, Any]:
+def descriptor_variables(n: int, k: int) -> tuple[Any, Any]:
     """Return ``diag(P1, 0)`` and ``[[P1, 0], [P2, P3]]``, P1 ``(k, k)`` symmetric."""
     P1 = cp.Variable((k, k), symmetric=True, name="P1")
     P2, P3 = cp.Variable((n - k, k), name="P2"), cp.Variable((n - k, n - k), name="P3")

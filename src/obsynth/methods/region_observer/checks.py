@@ -8,7 +8,6 @@ import numpy as np
 
 from obsynth.analysis.existence.nonlinear_region import region_conditions
 from obsynth.errors import ObsynthError
-from obsynth.methods.region_observer.drive import drive_of, in_words, wanted_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.spectra import abscissa
@@ -21,6 +20,7 @@ from obsynth.proofs.vertex_inequalities import Vertex, Witness, prove_decay
 from obsynth.results.checks import Check, fitting_check, information, nothing_wrong, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed
+from obsynth.verification.nonlinear_drive import drive_of, in_words, wanted_of
 from obsynth.verification.nonlinear_region import corner_errors
 from obsynth.verification.over_region import (
     GAIN_WITNESSES,

@@ -14,7 +14,6 @@ from obsynth.conditions.lmi import chosen_solver
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.engines.vertex_certificates import best_decay, certified
 from obsynth.methods.method import Synthesis
-from obsynth.methods.region_observer.drive import drive_of, wanted_of
 from obsynth.methods.region_observer.method import RegionObserverMethod
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.doubling import is_positive
@@ -27,6 +26,7 @@ from obsynth.plants.transformations.nonlinear_terms import NonlinearTerms, nonli
 from obsynth.proofs.vertex_inequalities import Witness, prove_decay, prove_gain, prove_mean_square
 from obsynth.results.design import Certificate
 from obsynth.verification.error_polytope import ErrorPolytope
+from obsynth.verification.nonlinear_drive import drive_of, wanted_of
 from obsynth.verification.nonlinear_region import corner_errors, corners_of, directions, fastest_decay, whole_gain
 from obsynth.verification.over_region import GAIN_WITNESSES, WITNESSES, rows_of_euler
 

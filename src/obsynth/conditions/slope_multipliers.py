@@ -1,0 +1,185 @@
+r"""Observers of plants with slopes between bounds by one inequality with a multiplier, in continuous time.
+
+``E e' = (A + W diag(d) V - L (C + Wy diag(d) V)) e + (B - L D) w``, ``z = Cz e``, every ``|d_k| <= 1`` as it likes, one
+gain L, ``Y = G' L``:
+
+.. math::
+    \begin{bmatrix} \mathrm{He}(G^T A - Y C) + V^T Q V + C_z^T C_z & G^T W - Y W_y + V^T S & G^T B - Y D \\
+    * & R & 0 \\ * & * & -\gamma^2 I \end{bmatrix} < 0
+
+A diagonal multiplier is ``Q = T = -R >= 0``, ``S = 0`` (M1); a full one has ``Q + S d + d S' + d R d >= 0`` at the
+corners of d and ``R_kk <= 0``, so that the corners suffice (M2).  By the S-procedure the inequality then holds for every
+d: it is of order n + q, where those at the corners are ``2^q`` of order n.
+
+References: Scherer, Weiland, *Linear Matrix Inequalities in Control*, chapter 6; Boyd et al. 1994, chapter 5.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.conditions import lazy_cvxpy as cp
+from obsynth.conditions import lmi
+from obsynth.conditions.atoms import MARGIN
+from obsynth.conditions.polytope import MOST_ROOM, TRACE, descriptor_variables
+from obsynth.conditions.problem import Conditions, Values
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import arguments_checked, chosen, shown
+from obsynth.numerics.arrays import FloatArray
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_polytope import ErrorPolytope
+
+#: Slopes of a full multiplier, whose conditions stand at 2 ** 6 corners; more take a diagonal one.
+MOST_IN_FULL_MULTIPLIER = 6
+
+
+@dataclass(frozen=True, eq=False)
+class SlopedErrors:
+    """An error system with slopes between -1 and 1.
+
+    Parameters
+    ----------
+    nominal : ErrorPolytope
+        One vertex, in continuous time.
+    W, Wy, V : FloatArray
+        ``(n, q)``, ``(m, q)`` and ``(q, n)``.
+    """
+
+    nominal: ErrorPolytope
+    W: FloatArray
+    Wy: FloatArray
+    V: FloatArray
+
+    @property
+    def count(self) -> int:
+        """Number of slopes."""
+        return int(self.W.shape[1])
+
+
+@arguments_checked
+def slope_inequality(
+    errors: SlopedErrors,
+    *,
+    goal: str = "gain",
+    multiplier: str = "full",
+    decay: float | None = None,
+    margin: float = MARGIN,
+) -> Conditions:
+    """Return the inequality with a multiplier, in P and Y.
+
+    Parameters
+    ----------
+    errors : SlopedErrors
+        In continuous time.
+    goal : {"gain", "power", "decay"}, optional
+        The least L2 gain, the least mean square for unit white w, or the largest slack of ``decay``.
+    multiplier : {"full", "diagonal"}, optional
+        A full one for up to six slopes.
+    decay : float, optional
+        Errors decay at least like ``exp(-decay t)``.
+    margin : float, optional
+        What the inequalities keep to the boundary of the cone.
+
+    Returns
+    -------
+    Conditions
+        Variables ``P1``, ``P2``, ``P3``, ``Y`` and ``gamma_squared``, ``mean_square`` or ``room``; gains ``L[1]``.
+
+    Raises
+    ------
+    SpecError
+        An option is out of range, or a full multiplier has too many slopes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> nominal = ErrorPolytope([[[0, 1], [-2.0, -1]]], np.zeros((0, 2)), dt=0.0)
+    >>> spring = SlopedErrors(nominal, np.array([[0], [1.0]]), np.zeros((0, 1)), np.array([[1.0, 0]]))
+    >>> found = slope_inequality(spring, goal="decay", decay=0.0)
+    >>> found.solve("CLARABEL", {})
+    >>> bool(found.variables["room"].value > 1e-3)
+    True
+    """
+    chosen(goal, "goal", ("gain", "power", "decay"))
+    chosen(multiplier, "multiplier", ("full", "diagonal"))
+    if multiplier == "full" and errors.count > MOST_IN_FULL_MULTIPLIER:
+        raise SpecError(
+            f"A full multiplier for {errors.count} slopes stands at 2 ** {errors.count} corners: take "
+            "multiplier='diagonal'.",
+            path="multiplier",
+        )
+    if decay is not None and not decay >= 0.0:
+        raise SpecError(f"decay is {shown(decay)}: give a rate, 0 or more.", path="decay")
+    if goal == "decay" and decay is None:
+        raise SpecError("goal 'decay' needs the rate: give decay.", path="decay")
+    own = errors.nominal
+    n, k, m, p = own.order, own.differential or own.order, own.outputs, own.inputs
+    P, G = descriptor_variables(n, k)
+    above = cp.Variable((k, m), name="Y")
+    Y = cp.vstack([above, np.zeros((n - k, m))]) if k < n else above
+    room = cp.Variable(name="room") if goal == "decay" else None
+    kept: Any = margin if room is None else room
+    level = cp.Variable(nonneg=True, name="gamma_squared" if goal == "gain" else "mean_square")
+    constraints: dict[str, Any] = {"P": lmi.at_least(P[:k, :k], kept)}
+    GA, GW = G.T @ own.A[0] - Y @ own.C[0], G.T @ errors.W - Y @ errors.Wy
+    GB, Z = G.T @ own.B[0] - Y @ own.D[0], own.Cz[0]
+
+    def with_multiplier(name: str, first: Any, *, driven: bool) -> None:
+        Q, S, R, more = _multiplier(errors.count, multiplier, name)
+        constraints.update(more)
+        lower = [[-(2.0 * GA + first + errors.V.T @ Q @ errors.V)], [-(GW + errors.V.T @ S).T, -R]]
+        if driven:
+            lower.append([-GB.T, np.zeros((p, errors.count)), level * np.eye(p)])
+        constraints[name] = lmi.at_least(lmi.symmetric_blocks(lower), kept)
+
+    if goal == "gain":
+        with_multiplier("gain", Z.T @ Z, driven=True)
+    if goal == "power":
+        with_multiplier("power", Z.T @ Z, driven=False)
+        noise = cp.Variable((p, p), symmetric=True)
+        constraints["trace"] = cp.trace(noise) + kept <= level
+        constraints["noise"] = lmi.at_least(lmi.symmetric_blocks([[noise], [GB[:k], P[:k, :k]]]), 0.0)
+    if decay is not None:
+        with_multiplier("decay", 2.0 * decay * P, driven=False)
+    if room is not None:
+        constraints |= {"room": room <= MOST_ROOM, "trace": cp.trace(P) <= TRACE * n}
+    objective = cp.Minimize(level) if room is None else cp.Maximize(room)
+    variables = {part.name(): part for part in (*P.variables(), *G.variables(), above)}
+    variables |= {"room": room} if room is not None else {level.name(): level}
+
+    def gains(_: Values) -> dict[str, FloatArray]:
+        found = np.linalg.solve(np.asarray(G.value).T, np.asarray(Y.value))
+        return {"L[1]": found, "P": np.asarray(P.value), "G": np.asarray(G.value)}
+
+    def unsupported(_: dict[str, FloatArray], name: str) -> ObserverDesign:
+        raise SpecError(f"The error system of {name!r} has no plant: design by obsynth.region_observer.", path="errors")
+
+    return Conditions(
+        f"one inequality with a {multiplier} multiplier",
+        cp.Problem(objective, list(constraints.values())),
+        variables,
+        {},
+        {"A": own.A[0], "W": errors.W, "V": errors.V, "Wy": errors.Wy},
+        constraints,
+        tuple,
+        gains,
+        unsupported,
+    )
+
+
+def _multiplier(q: int, kind: str, name: str) -> tuple[Any, Any, Any, dict[str, Any]]:
+    """Return Q, S and R with what they must satisfy."""
+    if kind == "diagonal":
+        T = cp.Variable(q, nonneg=True)
+        return cp.diag(T), np.zeros((q, q)), -cp.diag(T), {}
+    Q, R = cp.Variable((q, q), symmetric=True), cp.Variable((q, q), symmetric=True)
+    S = cp.Variable((q, q))
+    more: dict[str, Any] = {f"concave, {name}": cp.diag(R) <= 0}
+    for place, corner in enumerate(itertools.product((-1.0, 1.0), repeat=q)):
+        d = np.diag(corner)
+        more[f"corner {place + 1}, {name}"] = lmi.at_least(Q + S @ d + d @ S.T + d @ R @ d, 0.0)
+    return Q, S, R, more
