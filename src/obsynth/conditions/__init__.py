@@ -2,8 +2,8 @@
 
 ``wang2015``, ``filasova_theorem1``, ``filasova_theorem2``, ``sharepasand`` and ``kalman`` return `Conditions`;
 ``vertex_inequalities`` returns those of an `ErrorPolytope`, whose matrices lie in the hull of vertices,
-``slope_inequality`` those of `SlopedErrors` with a multiplier; ``nonlinear_region``, or ``region`` of a model, those of a
-nonlinear plant over a region;
+``slope_inequality`` those of `SlopedErrors` with a multiplier; ``nonlinear_region``, or ``region`` of a model, those of
+a nonlinear plant over a region;
 ``bounded_real``, ``h2``, ``region`` and ``admissible`` return constraints; ``disk``, ``half_plane`` and ``sector`` are
 regions for the eigenvalues.  ``Conditions.bisect`` returns a `Bisection` over a parameter.
 """

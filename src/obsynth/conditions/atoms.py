@@ -200,7 +200,7 @@ def h2(
     return [lmi.at_least(first, margin), lmi.at_least(second, margin)]
 
 
-def region(A: Any, P: Any, *given: Any, **options: Any) -> Any:
+def region(A: Any, P: Any, where: Any = None, *, Y: Any = None, Cy: Any = None, **options: Any) -> Any:
     """Return the inequality that puts every eigenvalue of A into a region, `eigenvalue_region`; of a nonlinear plant
     and its operating region the inequalities of an observer, `obsynth.conditions.nonlinear_region`.
 
@@ -210,7 +210,7 @@ def region(A: Any, P: Any, *given: Any, **options: Any) -> Any:
         ``(n, n)``, or the plant.
     P : cvxpy.Variable or mapping
         ``(n, n)``, or ranges of signals.
-    *given, **options
+    where, Y, Cy, **options
         As those functions take them.
 
     Returns
@@ -234,8 +234,8 @@ def region(A: Any, P: Any, *given: Any, **options: Any) -> Any:
     if isinstance(A, DAEModel):
         from obsynth.conditions.nonlinear_plants import nonlinear_region
 
-        return nonlinear_region(A, P, *given, **options)
-    return eigenvalue_region(A, P, *given, **options)
+        return nonlinear_region(A, P, **options)
+    return eigenvalue_region(A, P, where, Y=Y, Cy=Cy, **options)
 
 
 @arguments_checked

@@ -8,8 +8,8 @@ gain L, ``Y = G' L``:
     * & R & 0 \\ * & * & -\gamma^2 I \end{bmatrix} < 0
 
 A diagonal multiplier is ``Q = T = -R >= 0``, ``S = 0`` (M1); a full one has ``Q + S d + d S' + d R d >= 0`` at the
-corners of d and ``R_kk <= 0``, so that the corners suffice (M2).  By the S-procedure the inequality then holds for every
-d: it is of order n + q, where those at the corners are ``2^q`` of order n.
+corners of d and ``R_kk <= 0``, so that the corners suffice (M2).  By the S-procedure the inequality then holds for
+every d: it is of order n + q, where those at the corners are ``2^q`` of order n.
 
 References: Scherer, Weiland, *Linear Matrix Inequalities in Control*, chapter 6; Boyd et al. 1994, chapter 5.
 """
