@@ -20,3 +20,30 @@ def test_no_gain_of_an_observer_without_dynamics_is_rounding() -> None:
     y = STATIC.C @ np.linalg.solve(STATIC.A, -STATIC.Bf[:, 0])
     said = design.observer.run(np.tile(y, (200, 1)), np.zeros((200, 0)))
     assert abs(said.faults[-1, 0] - 1.0) < 1e-9
+
+
+def static_plant(seed: int) -> DescriptorSystem:
+    """Whole numbers, two or three algebraic states, one fault and one disturbance, which two outputs tell apart."""
+    rng = np.random.default_rng([46, seed])
+    n = int(rng.integers(2, 4))
+    while True:
+        a, c, bf, bd = (rng.integers(-2, 3, shape) for shape in ((n, n), (2, n), (n, 1), (n, 1)))
+        if abs(np.linalg.det(a)) > 0.5:
+            seen = c @ np.linalg.solve(a, np.hstack([bf, bd]))
+            if abs(np.linalg.det(seen)) > 0.1:
+                return DescriptorSystem(E=np.zeros((n, n)), A=a, C=c, Bf=bf, Bd=bd, dt=0.5)
+
+
+def test_every_verified_observer_tells_a_constant_fault() -> None:
+    designed = 0
+    for seed in range(24):
+        plant = static_plant(seed)
+        try:
+            design = obsynth.ui_pi_observer(plant)
+        except obsynth.PreconditionError:
+            continue
+        designed += 1
+        y = plant.C @ np.linalg.solve(plant.A, -plant.Bf[:, 0])
+        said = design.observer.run(np.tile(y, (300, 1)), np.zeros((300, 0)))
+        assert abs(said.faults[-1, 0] - 1.0) < 1e-6, seed
+    assert designed >= 8
