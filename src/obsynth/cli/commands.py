@@ -188,26 +188,36 @@ def run_verify(options: argparse.Namespace) -> int:
     emit(
         options,
         {
-            "file": str(options.gains), "kind": kind, "passed": report.passed, "statement": statement,
+            "file": str(options.gains),
+            "kind": kind,
+            "passed": report.passed,
+            "statement": statement,
             "report": report.as_dict(),
         },
         lambda: print_checks(report.checks, console=stdout_console()),
-    )  # fmt: skip
+    )
     return 0 if report.passed else VerificationError.exit_code
 
 
 def _require_fitting(options: argparse.Namespace, kind: str) -> None:
     """Refuse options that do nothing for a kind of certificate."""
-    meant = {"data": ("alarm", "comparison", "calibration"), "calibration": ("gain set", "alarm", "robustness"),
-             "system": ("calibration",), "printed_digits": ("gain set",)}  # fmt: skip
+    meant = {
+        "data": ("alarm", "comparison", "calibration"),
+        "calibration": ("gain set", "alarm", "robustness"),
+        "system": ("calibration",),
+        "printed_digits": ("gain set",),
+    }
     for name, kinds in meant.items():
         if getattr(options, name) is not None and kind not in kinds:
             option = f"--{name.replace('_', '-')}"
-            raise SpecError(f"{options.gains} is a certificate of the kind {kind!r}: {option} is for "
-                            f"{' and '.join(kinds)}.", path=option)  # fmt: skip
+            raise SpecError(
+                f"{options.gains} is a certificate of the kind {kind!r}: {option} is for {' and '.join(kinds)}.",
+                path=option,
+            )
     if kind == "calibration" and (options.data is None) != (options.system is None):
-        raise SpecError("A calibration is done again from plant and log: give both --system and --data.",
-                        path="--system")  # fmt: skip
+        raise SpecError(
+            "A calibration is done again from plant and log: give both --system and --data.", path="--system"
+        )
 
 
 def _calibrated_again(options: argparse.Namespace) -> dict[str, Any]:
@@ -266,11 +276,14 @@ def _verify_gain_set(options: argparse.Namespace) -> int:
     emit(
         options,
         {
-            "file": str(options.gains), "name": design.name, "method": design.method, "passed": report.passed,
+            "file": str(options.gains),
+            "name": design.name,
+            "method": design.method,
+            "passed": report.passed,
             "report": report.as_dict(),
         },
         lambda: _print_design(design.replace(report=report), options.gains, verbose=options.verbose),
-    )  # fmt: skip
+    )
     return 0 if report.passed else VerificationError.exit_code
 
 

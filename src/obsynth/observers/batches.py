@@ -190,6 +190,8 @@ def _one_by_one(
     if is_linear:
         return replace(found[0], **stacked)
     width = max(each.innovations.shape[1] for each in found)
-    wide = [np.pad(each.innovations, ((0, 0), (0, width - each.innovations.shape[1])), constant_values=np.nan)
-            for each in found]  # fmt: skip
+    wide = [
+        np.pad(each.innovations, ((0, 0), (0, width - each.innovations.shape[1])), constant_values=np.nan)
+        for each in found
+    ]
     return replace(found[0], **stacked, innovations=read_only(np.stack(wide)))

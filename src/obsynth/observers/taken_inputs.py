@@ -84,13 +84,27 @@ def taken_inputs(history: FloatArray, held: FloatArray, u: FloatArray, *, is_fir
     missing = np.where(gone, total * total - off * off, 0.0)
     further = ~gone & (count > 0.0) & (moved > reach)
     returned = np.where(further, np.maximum((count * moved) ** 2 - off * off, 0.0), 0.0)
-    after = np.stack((np.minimum(lowest, used), np.maximum(highest, used), np.maximum(change, moved / (count + 1.0)),
-                      np.where(gone, count + 1.0, 0.0), np.where(gone, total, 0.0)))  # fmt: skip
+    after = np.stack(
+        (
+            np.minimum(lowest, used),
+            np.maximum(highest, used),
+            np.maximum(change, moved / (count + 1.0)),
+            np.where(gone, count + 1.0, 0.0),
+            np.where(gone, total, 0.0),
+        )
+    )
     return TakenInputs(used, after, missing, returned)
 
 
 def over_samples(history: FloatArray, held: FloatArray, u: FloatArray) -> FloatArray:
     """Return the history after samples in which all inputs ``(samples, nu)`` are known."""
     moved = np.abs(np.diff(u, axis=0, prepend=held[None])).max(axis=0)
-    return np.stack((np.minimum(history[0], u.min(axis=0)), np.maximum(history[1], u.max(axis=0)),
-                     np.maximum(history[2], moved), history[3], history[4]))  # fmt: skip
+    return np.stack(
+        (
+            np.minimum(history[0], u.min(axis=0)),
+            np.maximum(history[1], u.max(axis=0)),
+            np.maximum(history[2], moved),
+            history[3],
+            history[4],
+        )
+    )

@@ -272,8 +272,12 @@ class ConstantsBox:
         plain = {name: getattr(self, name) for name in ("variation", "source", "level", "digest")}
         constants = {name: item.as_dict() for name, item in self.constants.items()}
         more = {"calibrated": list(self.calibrated)} if self.calibrated else {}
-        return {"constants": constants, **plain, **more,
-                **({"calibration": self.calibration} if self.calibration else {})}  # fmt: skip
+        return {
+            "constants": constants,
+            **plain,
+            **more,
+            **({"calibration": self.calibration} if self.calibration else {}),
+        }
 
 
 def tolerance_share(value: Any, path: str) -> float:
@@ -369,6 +373,12 @@ def constants_box(
         if not isinstance(name, str) or not name:
             raise SpecError(f"{name!r} is no name of a constant.", path="constants")
         found[name] = constant_of(name, value, nominal=before[name].nominal if name in before else None)
-    more = {"variation": variation, "source": source, "level": level, "digest": digest, "calibrated": calibrated,
-            "calibration": calibration}  # fmt: skip
+    more = {
+        "variation": variation,
+        "source": source,
+        "level": level,
+        "digest": digest,
+        "calibrated": calibrated,
+        "calibration": calibration,
+    }
     return ConstantsBox(found, **{key: value for key, value in more.items() if value is not None})  # type: ignore[arg-type]

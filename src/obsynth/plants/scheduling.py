@@ -224,17 +224,27 @@ class Scheduling:
     def as_dict(self) -> dict[str, Any]:
         """Return the fields, as the constructor takes them."""
         return {
-            "names": list(self.names), "low": self.low, "high": self.high, "rates": list(self.rates),
-            "functions": list(self.functions), "columns": dict(self.columns), "units": dict(self.units),
-        }  # fmt: skip
+            "names": list(self.names),
+            "low": self.low,
+            "high": self.high,
+            "rates": list(self.rates),
+            "functions": list(self.functions),
+            "columns": dict(self.columns),
+            "units": dict(self.units),
+        }
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Scheduling:
         """Return what `as_dict` described."""
         return cls(
-            tuple(data["names"]), data["low"], data["high"], tuple(data["rates"]), tuple(data["functions"]),
-            dict(data["columns"]), dict(data["units"]),
-        )  # fmt: skip
+            tuple(data["names"]),
+            data["low"],
+            data["high"],
+            tuple(data["rates"]),
+            tuple(data["functions"]),
+            dict(data["columns"]),
+            dict(data["units"]),
+        )
 
 
 def _require_range(name: str, low: float, high: float) -> None:

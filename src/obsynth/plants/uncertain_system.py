@@ -197,8 +197,17 @@ def _kept_source(box: ConstantsBox, constants: Any, stated: Mapping[str, Any]) -
     if box.source != "calibrated":
         return {"source": box.source}
     left = tuple(name for name in box.calibrated or box.constants if name not in (constants or {}))
-    return {"source": "calibrated", "level": box.level, "digest": box.digest, "calibrated": left,
-            "calibration": box.calibration} if left else {}  # fmt: skip
+    return (
+        {
+            "source": "calibrated",
+            "level": box.level,
+            "digest": box.digest,
+            "calibrated": left,
+            "calibration": box.calibration,
+        }
+        if left
+        else {}
+    )
 
 
 def _boxed(

@@ -50,8 +50,11 @@ def read_calibration(path: Path, *, where: str = "") -> dict[str, Any]:
     """Return the content of a calibration file whose digest is right; raise `SpecError` for any other."""
     found, name = _calibration_in(path, where), path.name
     if "sha256" not in found:
-        raise SpecError(f"{name} holds no digest of itself, as files of older versions: calibrate again (obsynth "
-                        f"calibrate --out {name}).", path=where or name)  # fmt: skip
+        raise SpecError(
+            f"{name} holds no digest of itself, as files of older versions: calibrate again (obsynth "
+            f"calibrate --out {name}).",
+            path=where or name,
+        )
     if not _intact(found):
         raise SpecError(f"{name} was changed after it was written: its digest does not match.", path=where or name)
     wrong = _misfits(found)
@@ -99,10 +102,16 @@ def verify_calibration(path: str | Path, again: Mapping[str, Any] | None = None)
     log = found.get("log") if isinstance(found.get("log"), dict) else {}
     cited = str(log.get("digest", "")) if isinstance(log, dict) else ""
     if again is None:
-        rows.append(information(
-            "log", f"the ranges follow from the log with digest {cited}: assumed, as plant and log were not "
-            "given (--system, --data)", float("nan"), source=_SOURCE, status="assumed",
-        ))  # fmt: skip
+        rows.append(
+            information(
+                "log",
+                f"the ranges follow from the log with digest {cited}: assumed, as plant and log were not "
+                "given (--system, --data)",
+                float("nan"),
+                source=_SOURCE,
+                status="assumed",
+            )
+        )
     else:
         rows.append(
             nothing_wrong(
@@ -173,7 +182,10 @@ def box_row(box: Any, path: Path) -> Check:
     wrong += [] if box.digest == found["log"]["digest"] and box.level == found["level"] else ["log or level"]
     for name in box.calibrated or box.constants:
         item, stated = box.constants.get(name), constants.get(name)
-        if item is None or stated is None or [item.low, item.high, item.nominal] != [*stated["range"],
-                                                                                     stated["nominal"]]:  # fmt: skip
+        if (
+            item is None
+            or stated is None
+            or [item.low, item.high, item.nominal] != [*stated["range"], stated["nominal"]]
+        ):
             wrong.append(name)
     return nothing_wrong("calibration", f"the box is that of {path.name}", wrong, source=_SOURCE)

@@ -268,8 +268,12 @@ def boxed_constants(section: PlantSection | DAESection, folder: Path) -> tuple[d
     found = read_calibration(folder / file, where="box.file")
     if not found["stands"]:
         raise SpecError(f"{file}: {does_not_stand(found['level'])}", path="box.file")
-    options = {"source": "calibrated", "level": found["level"], "digest": found["log"]["digest"],
-               "calibration": found["sha256"]}  # fmt: skip
+    options = {
+        "source": "calibrated",
+        "level": found["level"],
+        "digest": found["log"]["digest"],
+        "calibration": found["sha256"],
+    }
     calibrated = {}
     for name, item in found["constants"].items():
         stated = constants.get(name)

@@ -126,9 +126,12 @@ def _rows(kind: str, body: dict[str, Any], log_file: Path | None) -> Iterator[Ch
     if kind == COMPARISON:
         yield nothing_wrong("plant", "every gain set is for the plant of the comparison", wrong, source=_SOURCE)
         yield information(
-            "other methods", "methods that are not in the table do not exist for this plant: assumed, as nothing is "
-            "designed again", float(len(designs)), source=_SOURCE, status="assumed",
-        )  # fmt: skip
+            "other methods",
+            "methods that are not in the table do not exist for this plant: assumed, as nothing is designed again",
+            float(len(designs)),
+            source=_SOURCE,
+            status="assumed",
+        )
     yield nothing_wrong("figures", "every figure is found again", differences(stored["result"], result), source=_SOURCE)
     yield nothing_wrong(
         "statement",
@@ -141,9 +144,12 @@ def _rows(kind: str, body: dict[str, Any], log_file: Path | None) -> Iterator[Ch
 def _log_row(log: LogReference | None, file: Path | None) -> Check:
     if log is not None and file is None:
         return information(
-            "log", f"errors are those on {log.name}, sha256 {log.sha256}: assumed, as the log was not given (--data)",
-            float("nan"), source=_SOURCE, status="assumed",
-        )  # fmt: skip
+            "log",
+            f"errors are those on {log.name}, sha256 {log.sha256}: assumed, as the log was not given (--data)",
+            float("nan"),
+            source=_SOURCE,
+            status="assumed",
+        )
     same = log is not None and file is not None and file_digest(file) == log.sha256
     return nothing_wrong(
         "log", "the log that is given is the one that the certificate names", [] if same else ["digest"], source=_SOURCE

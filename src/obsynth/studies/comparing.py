@@ -275,8 +275,9 @@ def compare(
     if unused:
         raise SpecError(f"{unused[0]} is for a log: give data.", path=unused[0])
     if scenario is not None and disturbance != 1.0:
-        raise SpecError("disturbance is for the default scenario: the scenario that is given states its own.",
-                        path="disturbance")  # fmt: skip
+        raise SpecError(
+            "disturbance is for the default scenario: the scenario that is given states its own.", path="disturbance"
+        )
     if plant.dt and sample_time not in (None, plant.dt):
         raise SpecError(f"sample_time is for continuous plants: this one has {plant.dt:g} s.", path="sample_time")
     known = [spec.id for spec in linear_methods()]
@@ -333,10 +334,17 @@ def side_by_side(
     ``of_samples``: options are for the sampled plant.
     """
     report_stage = progress or (lambda _: None)
-    asked = {"plant": plant.as_dict(), "scenario": None if scenario is None else scenario.as_dict(),
-             "sample_time": sample_time, "within": within, "tolerance": tolerance, "disturbance": disturbance,
-             "runs": runs, "false_alarms": false_alarms,
-             **({"input_delay": input_delay} if input_delay else {})}  # fmt: skip
+    asked = {
+        "plant": plant.as_dict(),
+        "scenario": None if scenario is None else scenario.as_dict(),
+        "sample_time": sample_time,
+        "within": within,
+        "tolerance": tolerance,
+        "disturbance": disturbance,
+        "runs": runs,
+        "false_alarms": false_alarms,
+        **({"input_delay": input_delay} if input_delay else {}),
+    }
     plant = plant.dense() if plant.is_sparse else plant
     stated = None if scenario is None else scenario.sample_time
     dt = plant.dt or sample_time or stated or settling_time(plant) / SCENARIO_SAMPLES

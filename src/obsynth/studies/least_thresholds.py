@@ -61,11 +61,17 @@ def _least(
     course = {"course": "constant"} if lag is None else {"course": "any", "lag": lag}
     samples = max(min(LONGEST_WINDOW, MOST_STATES // max(plant.nx, 1)), (lag or 0) + 2)
     try:
-        asked = GuaranteedTestMethod.of({
-            "fault": fault, "samples": samples, "free": blind, "noise_bound": DEVIATIONS if noisy else None,
-            "disturbance_bounds": dict(zip(plant.disturbance_names, bounds.tolist(), strict=True)),
-            "disturbance": "jump", **course,
-        })  # fmt: skip
+        asked = GuaranteedTestMethod.of(
+            {
+                "fault": fault,
+                "samples": samples,
+                "free": blind,
+                "noise_bound": DEVIATIONS if noisy else None,
+                "disturbance_bounds": dict(zip(plant.disturbance_names, bounds.tolist(), strict=True)),
+                "disturbance": "jump",
+                **course,
+            }
+        )
         size = largest_hidden_fault(problem_of(plant, asked).window(samples)).size
     except ObsynthError:
         return float("nan")

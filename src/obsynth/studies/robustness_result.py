@@ -29,9 +29,16 @@ LISTED_BLAME_SHARE = 5e-3
 
 #: What a certificate of robustness claims.
 ROBUSTNESS_CLAIMS = (
-    "regular", "stable", "breaking", "loop_radius", "largest_factor", "error_per_unit", "vertex_gains", "sharing",
+    "regular",
+    "stable",
+    "breaking",
+    "loop_radius",
+    "largest_factor",
+    "error_per_unit",
+    "vertex_gains",
+    "sharing",
     "untouched",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -305,10 +305,16 @@ def _by_threshold(
         )
     found = problem.minimal_sets(largest, most)
     rows = tuple(
-        SensorSet(tuple(sensors[i].name for i in chosen), sum(costs[i] for i in chosen), None, made.threshold,
-                  made.samples, made.linear[0].dt)
+        SensorSet(
+            tuple(sensors[i].name for i in chosen),
+            sum(costs[i] for i in chosen),
+            None,
+            made.threshold,
+            made.samples,
+            made.linear[0].dt,
+        )
         for chosen, made in found
-    )  # fmt: skip
+    )
     note = "Cheapest first; of each set the test with the shortest delay. More sensors never raise a least threshold."
     return SensorSets(f"find {fault} by a threshold of {size:g}", rows, len(found) < most, (), (), {}, (note,))
 

@@ -227,8 +227,10 @@ def silence(run: Any, by: str) -> list[str]:
         found.append(f"{NO_ALARM} by {by}{told}.")
     if silent:
         causes = {status: count for status, count in run.silent.items() if status != PARTIAL}
-        why = [f"{f'{count}: ' if len(causes) > 1 else ''}{REASONS.get(status, status)}"
-               for status, count in causes.items()]  # fmt: skip
+        why = [
+            f"{f'{count}: ' if len(causes) > 1 else ''}{REASONS.get(status, status)}"
+            for status, count in causes.items()
+        ]
         first = "the first " if set(causes) == {WARM_UP} else ""
         found.append(f"No decision in {first}{silent} of {run.rows} rows: {'; '.join(why)}.")
     return found

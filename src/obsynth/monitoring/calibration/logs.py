@@ -280,8 +280,9 @@ def _on_grid(
         wide = np.full((len(whole), y.shape[1]), np.nan)
         wide[places] = y
         y, time = wide, time[0] + step * whole
-    return RecordedLog(read_only(time), read_only(u), read_only(y), step, inputs, outputs, rows, source, tuple(notes),
-               held=missing)  # fmt: skip
+    return RecordedLog(
+        read_only(time), read_only(u), read_only(y), step, inputs, outputs, rows, source, tuple(notes), held=missing
+    )
 
 
 def _grid(time: FloatArray, dt: float | None, first: int) -> tuple[float, NDArray[np.int64], FloatArray]:

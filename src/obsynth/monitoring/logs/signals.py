@@ -190,8 +190,11 @@ def status_places(header: Sequence[str], places: Sequence[int]) -> list[int | No
     for place in places[1:]:
         unit = WITH_UNIT.fullmatch(lower[place])
         base = unit[1] if unit else lower[place]
-        own = [i for i, name in enumerate(lower)
-               if name.startswith(base) and name[len(base) :].strip(" ._-:()[]/") in _STATUS_NAMES]  # fmt: skip
+        own = [
+            i
+            for i, name in enumerate(lower)
+            if name.startswith(base) and name[len(base) :].strip(" ._-:()[]/") in _STATUS_NAMES
+        ]
         beside = [place + 1] if place + 1 < len(lower) and lower[place + 1] in _STATUS_NAMES else []
         found.append(next((i for i in (*own, *beside) if i not in places), None))
     return found

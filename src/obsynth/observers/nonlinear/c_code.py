@@ -165,8 +165,12 @@ def _option_constants(steps: Steps) -> list[str]:
     """Return what the options of an observer are in C."""
     settings, memory = steps.settings, steps.graph.memory
     bounds = np.zeros((0, 2)) if settings.state_bounds is None else settings.state_bounds
-    ends = [(i, sign, float(pair[side])) for side, sign in ((0, 1.0), (1, -1.0)) for i, pair in enumerate(bounds)
-            if np.isfinite(pair[side])]  # fmt: skip
+    ends = [
+        (i, sign, float(pair[side]))
+        for side, sign in ((0, 1.0), (1, -1.0))
+        for i, pair in enumerate(bounds)
+        if np.isfinite(pair[side])
+    ]
     most = RESET_WINDOW * settings.model.ny
     limits = [0.0, *(chi_square_limit(n, settings.reset) for n in range(1, most + 1))] if settings.reset else []
     timing = settings.timing

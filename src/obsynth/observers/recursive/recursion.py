@@ -169,8 +169,21 @@ class Recursion:
         k, regressors = state.k + 1, (*state.regressors, G)[-self.window :]
         # By place: `_replace` of two or three fields takes as long as a product.
         _, x, factor, Upsilon, diffuse, parameters, _, _, surprises, resets, refused, _, _ = after
-        taken = RecursiveState(k, x, factor, Upsilon, diffuse, parameters, u, regressors, surprises, resets, refused,
-                               known.history, known.missing)  # fmt: skip
+        taken = RecursiveState(
+            k,
+            x,
+            factor,
+            Upsilon,
+            diffuse,
+            parameters,
+            u,
+            regressors,
+            surprises,
+            resets,
+            refused,
+            known.history,
+            known.missing,
+        )
         return taken, row
 
     def step_of(self, state: RecursiveState, known: TakenInputs) -> StepMatrices:

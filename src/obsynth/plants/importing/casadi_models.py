@@ -72,9 +72,10 @@ def from_casadi(
     made = {name: function.size1_out(name) if name in function.name_out() else 0 for name in OUTPUTS}
     nx, nz = taken["x"], taken["z"]
     for what, count, wanted in (
-        ("states", len(states), nx + nz), ("inputs", len(inputs or {}), taken["u"]),
+        ("states", len(states), nx + nz),
+        ("inputs", len(inputs or {}), taken["u"]),
         ("parameters", len(parameters or {}), taken["p"]),
-    ):  # fmt: skip
+    ):
         if count != wanted:
             raise SpecError(f"{what} names {count} value(s), but the system has {wanted}.", path=what)
     if made["ode"] != nx or made["alg"] != nz or not made["y"]:
@@ -83,9 +84,7 @@ def from_casadi(
             f"and {made['y']} output(s) y: one ode for each x, one alg for each z, and at least one y are needed.",
             path="system",
         )
-    if "u" in function.name_in() and function.jac_sparsity(
-        function.index_out("y"), function.index_in("u")
-    ).nnz():  # fmt: skip
+    if "u" in function.name_in() and function.jac_sparsity(function.index_out("y"), function.index_in("u")).nnz():
         raise SpecError("y depends on u: outputs are of states and parameters alone.", path="system")
 
     def values(x: Any, u: Any, theta: Any) -> dict[str, Any]:
@@ -104,7 +103,7 @@ def from_casadi(
     output_names = [f"y{i + 1}" for i in range(made["y"])] if output_names is None else output_names
     return DAEModel(
         equations, outputs, states=states, inputs=inputs, parameters=parameters, units=units, output_names=output_names
-    )  # fmt: skip
+    )
 
 
 def _function(casadi: Any, system: Any) -> Any:
@@ -129,6 +128,7 @@ def _function(casadi: Any, system: Any) -> Any:
     if unknown:
         raise SpecError(
             f"The Function has an input or output {unknown[0]!r}: name them {', '.join(INTEGRATOR_INPUTS)} and "
-            f"{', '.join(OUTPUTS)}.", path="system",
-        )  # fmt: skip
+            f"{', '.join(OUTPUTS)}.",
+            path="system",
+        )
     return system
