@@ -6,8 +6,8 @@ hurts most in each of many parts of a sample, for the largest time that is looke
 plant as written, exact for such courses, and no code of obsynth.  No threshold may be passed by more than rounding, no
 fault-free record may be proved faulty, and no guaranteed test has a threshold more than 1.05 times its worst course.
 A case is one plant: a guaranteed test (a step, a constant fault, or a test over tolerances), the fault-estimation
-filter with its monitor, from a known start and over tolerances, and proofs of alarms of both, all with held
-disturbances too where these must be proved by their name.
+filter with its monitor, from a known start and over tolerances, and proofs of alarms of both.  Of held disturbances the
+test has a threshold of at most ``least`` of those that move.
 """
 
 from __future__ import annotations
