@@ -365,7 +365,7 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any], type[Exception], str]] 
     "no noise": ({}, {"noise_bound": None}, obsynth.SpecError, "noise_bound"),
     "no bounds": ({}, {"disturbance_bounds": None}, obsynth.SpecError, "mu1, and 0 where an equation holds"),
     "another name": ({}, {"disturbance_bounds": {"d1": 1.0}}, obsynth.SpecError, "must name mu1; unknown: d1"),
-    "negative": ({}, {"disturbance_bounds": -1.0}, obsynth.SpecError, "disturbance_bounds is -1.0: give a finite number, 0 or more"),
+    "negative": ({}, {"disturbance_bounds": -1.0}, obsynth.SpecError, "disturbance_bounds is -1.0: give a finite"),
     "unknown fault": ({}, {"fault": "lek"}, obsynth.SpecError, "There is no fault 'lek'"),
     "isolate": ({}, {"isolate": True}, obsynth.SpecError, "isolate is for plants whose matrices do not change"),
     "exact": ({}, {"exact": True}, obsynth.SpecError, "exact is for plants whose matrices do not change"),
