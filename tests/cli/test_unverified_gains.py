@@ -29,7 +29,7 @@ VERBS = {
 def failing() -> obsynth.ObserverDesign:
     """Gains times 1.3: a spectral radius of 1.116."""
     plant = obsynth.load_spec(DESIGNS / "wang2015" / "spec.yaml").plant
-    gains = obsynth.fault_estimation_filter(plant).gains
+    gains = obsynth.fault_estimation_filter(plant, weight="paper").gains
     return obsynth.design_from_gains(
         plant, "fault-estimation-filter", T=gains["T"], N=gains["N"], L=1.3 * gains["L"], W=gains["W"], gamma=1.5,
         name="wrong",

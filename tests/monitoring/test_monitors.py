@@ -32,7 +32,7 @@ BOUNDS = {"disturbance_bounds": {"w": 0.11}, "initial_error": 0.55}
 def wang() -> tuple[obsynth.ObserverDesign, obsynth.Scenario]:
     spec = load_spec(DESIGNS / "wang2015" / "spec.yaml")
     assert spec.scenario is not None
-    return obsynth.fault_estimation_filter(spec.plant), spec.scenario
+    return obsynth.fault_estimation_filter(spec.plant, weight="paper"), spec.scenario
 
 
 @pytest.fixture(scope="module")

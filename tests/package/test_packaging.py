@@ -47,7 +47,9 @@ def test_casadi_is_for_nonlinear_plants_only():
 
 
 def test_the_readme_is_short():
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 900
+    # The table of methods grows with the methods.
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert sum(len(line.split()) for line in lines if not line.startswith("|")) <= 700
 
 
 def test_dir_is_the_public_names_only():
