@@ -14,6 +14,7 @@ Diagnosis Problems*, 2017, sections 5.2 and 7.4 to 7.9 (null-space method).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -28,6 +29,8 @@ from obsynth.numerics.standard_form import cayley_point, reachable_basis, standa
 
 #: Where the normal rank of a transfer matrix is taken, beyond all poles.
 GENERIC_POINT = 1.3717
+#: Most windows that suffice are this short: longer ones are looked for by doubling.
+LENGTHS_ONE_BY_ONE = 8
 #: An identity of the windows holds to this.
 WINDOW_IDENTITY = 1e-7
 #: Modes of a core beyond this modulus count as not asymptotically stable where what nobody sees is taken out.
@@ -150,7 +153,6 @@ def _decoupling_window(
     """Return the shortest window in which faults and unknown inputs can be told; raise where there is none."""
     n, (bh, dh) = len(a), hidden
     nh = bh.shape[1]
-    moved = told = True
     if nh and _normal_rank(a, bh, c, dh) < nh:
         raise PreconditionError(
             "The unknown inputs and faults cannot be reconstructed together from the outputs, with whatever delay: the "
@@ -158,31 +160,86 @@ def _decoupling_window(
             "as noise (leave it out of decoupled), or measure more.",
             condition="decoupling",
         )
-    for length in range(lag if estimated else 0, n + lag + 2):
-        observed = np.vstack([c @ np.linalg.matrix_power(a, j) for j in range(length + 1)])
-        th = _stacked(a, c, bh, dh, length)
-        inverse = np.linalg.pinv(th, rcond=WINDOW_RANK_TOLERANCE) if nh else np.zeros((0, len(th)))
-        first = np.hstack([bh, np.zeros((n, nh * length))])
-        chosen = np.zeros((nf, nh * (length + 1)))
-        if estimated:
-            chosen[:, (length - lag) * nh : (length - lag) * nh + nf] = np.eye(nf)
-        G, Mf = (first @ inverse, chosen @ inverse) if nh else (np.zeros((n, len(th))), np.zeros((nf, len(th))))
-        moved = not nh or bool(np.linalg.norm(G @ th - first) <= WINDOW_IDENTITY * (1.0 + np.linalg.norm(bh)))
-        told = not estimated or bool(np.linalg.norm(Mf @ th - chosen) <= WINDOW_IDENTITY)
-        if (moved and told) or dt == 0.0:
-            break
-    if not moved:
+    shortest, longest = lag if estimated else 0, n + lag + 1
+    window = _first_window(
+        lambda length: _tried_window(a, c, hidden, estimated, lag, length, nf),
+        shortest,
+        shortest if dt == 0.0 else longest,
+    )
+    if not window.moved:
         raise PreconditionError(
             "The unknown inputs and faults cannot be reconstructed from the outputs by a window of any length: no "
             "filter of this form decouples them. Let a disturbance count as noise (leave it out of decoupled).",
             condition="decoupling",
         )
-    if not told:
+    if not window.told:
         raise PreconditionError(
             f"No causal filter has the exact fault map with a delay of {lag} samples: allow a longer delay.",
             condition="delay",
         )
-    return _Window(observed, th, _stacked(a, c, *noise, length), np.asarray(G), np.asarray(Mf), length)
+    return _Window(
+        window.observed, window.Th, _stacked(a, c, *noise, window.length), window.G, window.Mf, window.length
+    )
+
+
+class _TriedWindow(NamedTuple):
+    """A window, and whether it decouples the states and reconstructs the faults."""
+
+    observed: FloatArray
+    Th: FloatArray
+    G: FloatArray
+    Mf: FloatArray
+    length: int
+    moved: bool
+    told: bool
+
+    @property
+    def suffices(self) -> bool:
+        return self.moved and self.told
+
+
+def _first_window(tried: Callable[[int], _TriedWindow], shortest: int, longest: int) -> _TriedWindow:
+    """Return the shortest window that suffices, or the longest one.
+
+    What a window reconstructs a longer one does too: after `LENGTHS_ONE_BY_ONE` the lengths double, and the last
+    interval is halved.
+    """
+    for length in range(shortest, min(shortest + LENGTHS_ONE_BY_ONE, longest) + 1):
+        window = tried(length)
+        if window.suffices:
+            return window
+    too_short = window.length
+    while too_short < longest and not window.suffices:
+        too_short = window.length
+        window = tried(min(2 * too_short - shortest, longest))
+        if window.length == longest and not window.suffices:
+            return window
+    while window.length - too_short > 1:
+        middle = tried((too_short + window.length) // 2)
+        if middle.suffices:
+            window = middle
+        else:
+            too_short = middle.length
+    return window
+
+
+def _tried_window(
+    a: FloatArray, c: FloatArray, hidden: tuple[FloatArray, FloatArray], estimated: int, lag: int, length: int, nf: int
+) -> _TriedWindow:
+    n, (bh, dh) = len(a), hidden
+    nh, rows = bh.shape[1], [c]
+    for _ in range(length):
+        rows.append(rows[-1] @ a)
+    th = _stacked(a, c, bh, dh, length)
+    inverse = np.linalg.pinv(th, rcond=WINDOW_RANK_TOLERANCE) if nh else np.zeros((0, len(th)))
+    first = np.hstack([bh, np.zeros((n, nh * length))])
+    chosen = np.zeros((nf, nh * (length + 1)))
+    if estimated:
+        chosen[:, (length - lag) * nh : (length - lag) * nh + nf] = np.eye(nf)
+    G, Mf = (first @ inverse, chosen @ inverse) if nh else (np.zeros((n, len(th))), np.zeros((nf, len(th))))
+    moved = not nh or bool(np.linalg.norm(G @ th - first) <= WINDOW_IDENTITY * (1.0 + np.linalg.norm(bh)))
+    told = not estimated or bool(np.linalg.norm(Mf @ th - chosen) <= WINDOW_IDENTITY)
+    return _TriedWindow(np.vstack(rows), th, np.asarray(G), np.asarray(Mf), length, moved, told)
 
 
 def _normal_rank(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> int:
