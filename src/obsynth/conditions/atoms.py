@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.conditions import lmi
+from obsynth.conditions.lmi import MARGIN
 from obsynth.errors import SpecError, a_kind
 from obsynth.numerics.arguments import arguments_checked, real_array, real_number, require_shape
 from obsynth.numerics.arrays import require_no_overflow
@@ -23,9 +24,6 @@ from obsynth.plants.dae import DAEModel
 if TYPE_CHECKING:
     import cvxpy
 
-
-#: How far inside the cone the inequalities hold by default.
-MARGIN = 1e-9
 
 #: The same of inequalities that are homogeneous in P, whose scale is free: a margin below the tolerances of solvers
 #: keeps nothing, and a feasible P can be as large as one likes.

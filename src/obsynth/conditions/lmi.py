@@ -18,6 +18,9 @@ from obsynth.conditions.options import ChosenSolver
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray
 
+#: How far inside the cone the inequalities hold by default.
+MARGIN = 1e-9
+
 #: Statuses that come with numbers; whether they count is decided by verification, not here.
 USABLE_STATUSES = ("optimal", "optimal_inaccurate")
 

@@ -35,7 +35,7 @@ import numpy as np
 
 from obsynth.conditions import lazy_cvxpy as cp
 from obsynth.conditions import lmi
-from obsynth.conditions.atoms import MARGIN
+from obsynth.conditions.lmi import MARGIN
 from obsynth.conditions.problem import Conditions, Values
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, chosen, real_number, shown

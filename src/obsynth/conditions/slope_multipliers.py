@@ -24,7 +24,7 @@ import numpy as np
 
 from obsynth.conditions import lazy_cvxpy as cp
 from obsynth.conditions import lmi
-from obsynth.conditions.atoms import MARGIN
+from obsynth.conditions.lmi import MARGIN
 from obsynth.conditions.polytope import MOST_ROOM, TRACE, descriptor_variables
 from obsynth.conditions.problem import Conditions, Values
 from obsynth.errors import SpecError

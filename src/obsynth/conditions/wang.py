@@ -29,8 +29,8 @@ from obsynth.analysis.existence.restricted_equivalent import (
 from obsynth.analysis.existence.wang2015 import examine_fault_filter
 from obsynth.conditions import atoms, lmi
 from obsynth.conditions import lazy_cvxpy as cp
-from obsynth.conditions.atoms import MARGIN
 from obsynth.conditions.gamma_lower_bound import proved_lower_bound
+from obsynth.conditions.lmi import MARGIN
 from obsynth.conditions.problem import Conditions, Values, design_of, require_data
 from obsynth.conditions.wang_over_region import wang_over_region
 from obsynth.errors import SpecError

@@ -16,6 +16,7 @@ import numpy as np
 from obsynth.numerics.arrays import SMALLEST, largest_singular_value
 from obsynth.numerics.central_equation import CentralEquation, central_injection
 from obsynth.numerics.injection_problem import GainProblem, Injection, NormalisedProblem, normalise
+from obsynth.numerics.lapack import least_squares
 from obsynth.numerics.least_level import NEXT_TO, GammaIteration
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencil_points import GENERIC_POINTS
@@ -191,12 +192,10 @@ def _follows_from_measurements(problem: GainProblem) -> bool:
 
 def _combined(problem: GainProblem, point: float) -> tuple[float, float]:
     """Return the size of the combination at a point of the z-plane, and what it leaves, as a share of xi."""
-    from scipy.linalg import lstsq
-
     shifted = problem.A - point * np.eye(problem.order)
     known = np.vstack([np.hstack([shifted, problem.B]), np.hstack([problem.C, problem.D])])
     wanted = np.hstack([problem.Z, problem.Zd])
-    solved = lstsq(known.T, wanted.T, lapack_driver="gelsy", check_finite=False)[0]
+    solved = least_squares(known.T, wanted.T)
     left = float(np.linalg.norm(known.T @ solved - wanted.T))
     return float(np.linalg.norm(solved)), left / max(float(np.linalg.norm(wanted)), SMALLEST)
 

@@ -73,6 +73,27 @@ def pencil_eigenvalues(a: FloatArray, b: FloatArray) -> tuple[ComplexArray, Floa
     return np.asarray(real + 1j * imaginary), np.asarray(beta)
 
 
+def least_squares(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the shortest x with the least ``a x - b``, by a complete orthogonal factorisation.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        LAPACK refuses the numbers.
+    """
+    routines, epsilon = library(), float(np.finfo(np.float64).eps)
+    (rows, columns), width = a.shape, b.shape[1]
+    padded = np.zeros((max(rows, columns), width))
+    padded[:rows] = b
+    room, failed = routines.dgelsy_lwork(rows, columns, width, epsilon)
+    if not failed:
+        pivots = np.zeros((columns, 1), dtype=np.int32)
+        _, solution, _, _, failed = routines.dgelsy(a, padded, pivots, epsilon, int(room), False, False)
+    if failed:
+        raise np.linalg.LinAlgError(f"dgelsy ends with {failed}.")
+    return np.asarray(solution[:columns])
+
+
 def eigenvalues(a: FloatArray, b: FloatArray) -> ComplexArray:
     """Return the eigenvalues ``(n,)`` of ``a - z b``: infinite where b is singular alone, NaN where a is as well."""
     alpha, beta = pencil_eigenvalues(a, b)

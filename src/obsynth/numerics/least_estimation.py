@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from obsynth.errors import PreconditionError, SolverError
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.decoupling_windows import EstimationProblem, Model
+from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_riccati, discrete_riccati
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.ranks import BOUNDARY_RANK_TOLERANCE, WINDOW_RANK_TOLERANCE
 from obsynth.numerics.standard_form import reachable_basis, uncayley
@@ -159,7 +160,7 @@ def least_mean_square(problem: EstimationProblem) -> ContinuousFilter:
             condition="finite mean square",
         )
     try:
-        covariance = scipy.linalg.solve_continuous_are(a.T, c.T, b @ b.T, d @ d.T, s=b @ d.T)
+        covariance = continuous_riccati(a.T, c.T, b @ b.T, d @ d.T, s=b @ d.T)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise PreconditionError(
             "Some output is measured without noise, or the faults have a zero that is not strictly stable: the filter "
@@ -168,7 +169,7 @@ def least_mean_square(problem: EstimationProblem) -> ContinuousFilter:
         ) from None
     K = np.asarray(np.linalg.solve(d @ d.T, c @ covariance + d @ b.T).T)
     closed, entering, shown = a - K @ c, b - K @ d, wanted - Z0 @ c
-    spread = scipy.linalg.solve_continuous_lyapunov(closed, -entering @ entering.T) if len(a) else np.zeros((0, 0))
+    spread = continuous_lyapunov(closed, -entering @ entering.T) if len(a) else np.zeros((0, 0))
     deviation = float(np.sqrt(max(np.trace(shown @ spread @ shown.T), 0.0)))
     half = np.linalg.solve(np.eye(len(problem.A)) + problem.A, problem.G)
     moved, through = np.sqrt(2.0 * problem.alpha) * half, np.vstack([problem.C, problem.L]) @ half
@@ -178,7 +179,7 @@ def least_mean_square(problem: EstimationProblem) -> ContinuousFilter:
 
 def _riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> FloatArray:
     with warnings.catch_warnings(action="ignore"):
-        found = scipy.linalg.solve_discrete_are(a, b, q, r, s=s) if len(a) else np.zeros((0, 0))
+        found = discrete_riccati(a, b, q, r, s=s) if len(a) else np.zeros((0, 0))
     return np.asarray(0.5 * (found + found.T))
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy
 
+from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -26,8 +26,8 @@ def fault_deviation(plant: DescriptorSystem, observer: LinearObserver) -> float:
     if not len(poles):
         return float(np.max(np.linalg.norm(direct, axis=1)))
     if observer.dt:
-        spread = scipy.linalg.solve_discrete_lyapunov(observer.Az, into @ into.T)
+        spread = discrete_lyapunov(observer.Az, into @ into.T)
     else:
-        spread = scipy.linalg.solve_continuous_lyapunov(observer.Az, -into @ into.T)
+        spread = continuous_lyapunov(observer.Az, -into @ into.T)
     variances = np.diag(shown @ spread @ shown.T) + np.sum(direct * direct, axis=1)
     return float(np.sqrt(np.max(np.maximum(variances, 0.0))))

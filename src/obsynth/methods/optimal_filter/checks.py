@@ -6,12 +6,12 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 
 from obsynth.errors import PreconditionError
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
+from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball
 from obsynth.results.checks import Check, fitting_check, lower_bound_check, upper_bound_check
@@ -262,9 +262,9 @@ def _bound_row(name: str, claim: str, bound: float | None, stated: float, detail
 def _deviation(channel: ErrorChannel, stated: float, plant: DescriptorSystem) -> Check:
     (a, b, c, d), direct = channel.middle, channel(Ball)[3]
     if plant.is_discrete:
-        covariance = scipy.linalg.solve_discrete_lyapunov(a, b @ b.T) if len(a) else np.zeros((0, 0))
+        covariance = discrete_lyapunov(a, b @ b.T) if len(a) else np.zeros((0, 0))
     else:
-        covariance = scipy.linalg.solve_continuous_lyapunov(a, -b @ b.T) if len(a) else np.zeros((0, 0))
+        covariance = continuous_lyapunov(a, -b @ b.T) if len(a) else np.zeros((0, 0))
         # White noise that passes, by more than rounding, has no mean square.
         d = np.where(np.abs(d) > ROUNDED_UNITS * direct.radius, np.inf, 0.0)
     found = float(np.sqrt(max(np.trace(c @ covariance @ c.T + d @ d.T), 0.0)))
