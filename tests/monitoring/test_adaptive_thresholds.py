@@ -96,7 +96,7 @@ def test_constants_that_vary_need_the_varying_mode() -> None:
     """With q new at each sample the threshold for constant q is passed; that for varying q is not."""
     found = {}
     for variation in ("constant", "varying"):
-        design = obsynth.fault_estimation_filter(wang("5 %", variation=variation))
+        design = obsynth.fault_estimation_filter(wang("5 %", variation=variation), weight="paper")
         plant, observer = design.linear
         plan = adaptive_plan(design, np.array([0.0]), 1.0, initial_error=None, initial_set=start_set(design))[0]
         generator = np.random.default_rng(3)

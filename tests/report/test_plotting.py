@@ -253,7 +253,8 @@ def test_gains_to_the_states_are_errors_and_peak_at_their_norm() -> None:
 
 
 def test_a_short_axis_of_frequencies_has_plain_numbers_that_do_not_touch() -> None:
-    panel = plot_gains(obsynth.fault_estimation_filter(load_spec(DESIGNS / "wang2015" / "spec.yaml").plant))
+    plant = load_spec(DESIGNS / "wang2015" / "spec.yaml").plant
+    panel = plot_gains(obsynth.fault_estimation_filter(plant, weight="paper"))
     panel.get_figure().draw_without_rendering()
     low, high = panel.get_xlim()
     for minor in (False, True):

@@ -55,7 +55,9 @@ def test_a_notebook_shows_the_picture(bicycle: obsynth.Comparison) -> None:
 
 
 def test_refused_methods_say_why_in_one_line(bicycle: obsynth.Comparison) -> None:
-    assert bicycle["pd-observer"].refused.startswith("the condition 'continuous time' fails")
+    assert bicycle["pd-observer"].refused.startswith(
+        "pd-observer assumes more than this plant has: the condition 'continuous time' fails"
+    )
     assert bicycle["descriptor-kalman"].refused == "estimates the state, but no fault"
     assert all("\n" not in text for text in bicycle.refusals)
 

@@ -26,7 +26,7 @@ SPEC = """\
 schema_version: 1
 name: small
 plant: {file: plant.yaml}
-method: {id: fault-estimation-filter}
+method: {id: fault-estimation-filter, options: {weight: paper}}
 """
 
 
@@ -51,7 +51,7 @@ def test_all_combinations_of_options_and_sensors(spec):
     assert all(r.condition == "rank [E; C]" for r in found.results if r.status == "impossible")
     table = found.table()
     assert list(table["gamma_margin"]) == [0.05, 0.05, 0.5, 0.5]
-    alone = obsynth.fault_estimation_filter(found.results[0].design.plant)
+    alone = obsynth.fault_estimation_filter(found.results[0].design.plant, weight="paper")
     np.testing.assert_array_equal(found.results[0].design.observer.Az, alone.observer.Az)
     assert found.results[2].claims["gamma"] > found.results[0].claims["gamma"]
     with pytest.raises(obsynth.SpecError, match="has no design"):

@@ -171,7 +171,7 @@ def test_the_root_of_a_sum_of_powers_is_triangular_and_none_where_powers_grow() 
 def test_an_inequality_is_proved_once_for_the_same_numbers_and_again_for_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    design = obsynth.fault_estimation_filter(PLANTS["sampled"])
+    design = obsynth.fault_estimation_filter(PLANTS["sampled"], weight="paper")
     plain, tried = inequalities.prove_positive_definite, []
     monkeypatch.setattr(inequalities, "prove_positive_definite", lambda given: tried.append(given) or plain(given))
 

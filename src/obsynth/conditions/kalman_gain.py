@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from obsynth.analysis.existence.condition import Condition
 from obsynth.analysis.existence.kalman import kalman_conditions, with_stated_noise, without_unknown_inputs
 from obsynth.analysis.time_varying import as_time_varying
-from obsynth.conditions import atoms
+from obsynth.conditions import atoms, lmi
 from obsynth.conditions import lazy_cvxpy as cp
 from obsynth.conditions.problem import Conditions, Values, design_of, require_data
 from obsynth.errors import ObsynthError
@@ -44,7 +44,7 @@ def kalman(
     *,
     Q: ArrayLike | None = None,
     R: ArrayLike | None = None,
-    margin: float = atoms.MARGIN,
+    margin: float = lmi.MARGIN,
 ) -> Conditions:
     """Return the steady descriptor Kalman gain as the H2 inequalities in P, Y and Z.
 

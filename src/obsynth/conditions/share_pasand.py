@@ -70,7 +70,7 @@ def sharepasand(
     E_sharp: ArrayLike | None = None,
     C_sharp: ArrayLike | None = None,
     G: ArrayLike | None = None,
-    margin: float = atoms.MARGIN,
+    margin: float = lmi.MARGIN,
 ) -> Conditions:
     """Return the unknown-input PI observer: the decoupling as data, and the gain by a region or by poles.
 

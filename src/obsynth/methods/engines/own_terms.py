@@ -17,7 +17,7 @@ from obsynth.analysis.existence.filasova import explicit_form, pd_observer_condi
 from obsynth.analysis.existence.restricted_equivalent import with_sensor_faults_as_states
 from obsynth.analysis.existence.sharepasand import existence
 from obsynth.analysis.existence.wang2015 import fault_filter_conditions
-from obsynth.conditions import atoms
+from obsynth.conditions import atoms, lmi
 from obsynth.conditions import lazy_cvxpy as cp
 from obsynth.conditions.filasova import filasova_theorem1, filasova_theorem2
 from obsynth.conditions.lmi import SOLVER_SETTINGS, USABLE_STATUSES, semidefinite_solvers
@@ -77,7 +77,7 @@ def filter_by_inequality(
                 condition="region",
                 mode=0j,
             )
-        added["region"] = atoms.region(found.data["A1"], P, where, Y=Y, Cy=found.data["C1"], margin=atoms.MARGIN)[1]
+        added["region"] = atoms.region(found.data["A1"], P, where, Y=Y, Cy=found.data["C1"], margin=lmi.MARGIN)[1]
     if asked.gamma is not None:
         added["gamma"] = squared <= asked.gamma**2
     goal: Any = None
