@@ -77,7 +77,9 @@ def made(name: str, variation: str) -> tuple[Any, Any]:
     design = obsynth.design(plant, spec.method, **dict(spec.options))
     dbar, noise, start = BOUNDS[name]
     states = dict(zip(plant.state_names, start, strict=True))
-    return design, adaptive_plan(design, np.array([dbar]), noise, initial_error=None, initial_set=states)[0]
+    # As they are simulated here; those that move between samples are the campaign between_samples.
+    plans = adaptive_plan(design, np.array([dbar]), noise, initial_error=None, initial_set=states, disturbance="held")
+    return design, plans[0]
 
 
 @cache

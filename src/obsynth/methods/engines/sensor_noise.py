@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
+from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -25,9 +26,8 @@ def fault_deviation(plant: DescriptorSystem, observer: LinearObserver) -> float:
         return np.inf if not stable else float(np.max(np.linalg.norm(direct, axis=1)))
     if not len(poles):
         return float(np.max(np.linalg.norm(direct, axis=1)))
-    if observer.dt:
-        spread = discrete_lyapunov(observer.Az, into @ into.T)
-    else:
-        spread = continuous_lyapunov(observer.Az, -into @ into.T)
+    a, factors = balanced_matrix(observer.Az)
+    shown, into = shown * factors, into / factors[:, None]
+    spread = discrete_lyapunov(a, into @ into.T) if observer.dt else continuous_lyapunov(a, -into @ into.T)
     variances = np.diag(shown @ spread @ shown.T) + np.sum(direct * direct, axis=1)
     return float(np.sqrt(np.max(np.maximum(variances, 0.0))))

@@ -56,6 +56,9 @@ MANY_UNKNOWN_STATES = 100
 #: By default a decay rate is never closer to that of an unobservable mode, which nothing moves.
 HIDDEN_SHARE = 0.5
 
+#: Decay rates within this factor count as equal where outputs are merged or not.
+AS_FAST = 1.001
+
 
 _CLOSED_FORM = "a Riccati equation (engine 'riccati'), with L = 0 and N = 0."
 
@@ -74,8 +77,11 @@ class _Units(NamedTuple):
 
 
 def design_gains(plant: DescriptorSystem, asked: PdObserver) -> tuple[PdGains, list[Mapping[str, Any]]]:
-    """Return the gains to ship and the records of all solver runs: of the plant with dependent outputs merged, and of
-    nearly dependent ones the least noisy.  Bounds on gains and noise are about the outputs as they are."""
+    """Return the gains to ship and the records of all solver runs.
+
+    Dependent outputs are merged; nearly dependent ones where that is as fast and less noisy. Bounds on gains and noise
+    are about the outputs as they are.
+    """
     as_they_are = asked.gain_bound is not None or asked.noise_gain is not None
     choices = [None] if as_they_are else [merged_outputs(plant), nearly_merged_outputs(plant)]
     first, records = _of_merged(plant, asked, choices[0])
@@ -86,7 +92,8 @@ def design_gains(plant: DescriptorSystem, asked: PdObserver) -> tuple[PdGains, l
             other, more = _of_merged(plant, asked, merged)
         except ObsynthError:
             continue  # what the merged outputs leave unused is needed
-        if fault_deviation(plant, other.observer) < fault_deviation(plant, first.observer):
+        as_fast = AS_FAST * other.abscissa <= first.abscissa
+        if as_fast and fault_deviation(plant, other.observer) < fault_deviation(plant, first.observer):
             first, records = other, [*records, *more]
     return first, records
 

@@ -167,7 +167,7 @@ def _without_likeness(
                 found.plant if choice is None else choice.plant, model, found.fixed_modes, joint=asked.joint, given=None
             )
             gain = _chosen(asked, problem, None, weights, found.plant.dt)[0]
-        except ObsynthError:
+        except (ObsynthError, np.linalg.LinAlgError):
             costs.append(np.inf)
             continue
         U, D, K = problem.gains(gain)

@@ -19,6 +19,7 @@ from obsynth.numerics.arrays import FloatArray, read_only, remembered
 from obsynth.numerics.ranks import NEARLY_DEPENDENT, but_rounding, rounding_rank
 from obsynth.numerics.sparse import is_sparse
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.plant_units import PlantUnits
 from obsynth.proofs.exact_arithmetic import pivot_columns, written_matrix
 
 #: White noise that is added to noise without any in some direction, as a share of its largest: perfect sensors have a
@@ -64,7 +65,9 @@ def nearly_merged_outputs(plant: DescriptorSystem) -> MergedOutputs | None:
     `merged_outputs`."""
     if is_sparse(plant.C) or plant.ny < 2:
         return None
-    shown = np.hstack([plant.C, plant.Df, plant.Dd])
+    # What is nearly dependent, and by how much a sensor counts without stated noise, is no matter of units.
+    own = PlantUnits.of(plant)
+    shown = own.outputs[:, None] * np.hstack([plant.C * own.states, plant.Df * own.faults, plant.Dd * own.disturbances])
     lengths = np.linalg.norm(shown, axis=1)
     moving = np.flatnonzero(lengths)
     if not len(moving):
@@ -80,7 +83,7 @@ def nearly_merged_outputs(plant: DescriptorSystem) -> MergedOutputs | None:
     found = np.linalg.lstsq((shown[picked] / lengths[picked, None]).T, units.T, rcond=None)[0].T
     q = np.zeros((len(shown), count))
     q[moving] = found * lengths[moving, None] / lengths[picked]
-    weights = _weights(q, plant.Dw)
+    weights = _weights(q, own.outputs[:, None] * plant.Dw) * own.outputs / own.outputs[picked, None]
     merged = {name: weights @ getattr(plant, name) for name in ("C", "D", "Df", "Dd", "Dw")}
     names = [plant.output_names[i] for i in picked]
     return MergedOutputs(plant.replace(**merged, output_names=names), read_only(weights), False)
