@@ -38,6 +38,15 @@ def test_what_is_not_finite_is_refused_and_nothing_has_no_eigenvalues() -> None:
     assert lapack.eigenvalues(np.zeros((0, 0)), np.zeros((0, 0))).shape == (0,)
 
 
+@pytest.mark.parametrize("shape", [(5, 8), (8, 5), (6, 6), (0, 3), (3, 0)])
+def test_least_squares_are_the_shortest_ones(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(sum(shape))
+    a, b = rng.standard_normal(shape), rng.standard_normal((shape[0], 2))
+    if a.size:
+        a[-1] = a[0]
+    np.testing.assert_allclose(lapack.least_squares(a, b), np.linalg.pinv(a) @ b, rtol=0, atol=1e-13)
+
+
 def test_an_unknown_routine_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="no_such_routine"):
         _ = lapack.no_such_routine

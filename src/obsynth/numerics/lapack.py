@@ -83,6 +83,8 @@ def least_squares(a: FloatArray, b: FloatArray) -> FloatArray:
     """
     routines, epsilon = library(), float(np.finfo(np.float64).eps)
     (rows, columns), width = a.shape, b.shape[1]
+    if 0 in (rows, columns, width):
+        return np.zeros((columns, width))
     padded = np.zeros((max(rows, columns), width))
     padded[:rows] = b
     room, failed = routines.dgelsy_lwork(rows, columns, width, epsilon)
