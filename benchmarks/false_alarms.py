@@ -19,7 +19,7 @@ from typing import get_args
 import numpy as np
 
 import obsynth
-from obsynth.observers.decisions import Statistic
+from obsynth.monitoring.thresholds.parameter_decisions import Statistic
 
 STATISTICS = get_args(Statistic)
 SAMPLES, MISSING, ASKED = 300, 0.1, (0.01, 0.05, 0.2)

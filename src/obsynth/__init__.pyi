@@ -42,10 +42,10 @@ from obsynth.monitoring.logs.smoothing import smooth as smooth
 from obsynth.monitoring.thresholds.learned import load_thresholds as load_thresholds
 from obsynth.monitoring.thresholds.learning import learn_thresholds as learn_thresholds
 from obsynth.monitoring.thresholds.online_monitor import online_monitor as online_monitor
+from obsynth.monitoring.thresholds.parameter_decisions import ParameterMonitor as ParameterMonitor
+from obsynth.monitoring.thresholds.parameter_decisions import decide as decide
 from obsynth.monitoring.thresholds.residual_monitor import monitor as monitor
 from obsynth.observers.batches import run_batch as run_batch
-from obsynth.observers.decisions import ParameterMonitor as ParameterMonitor
-from obsynth.observers.decisions import decide as decide
 from obsynth.observers.linear.observer import LinearObserver as LinearObserver
 from obsynth.observers.linear.sampled import sample_observer as sample_observer
 from obsynth.observers.nonlinear.observer import DAEObserver as DAEObserver

@@ -13,11 +13,11 @@ from obsynth.monitoring.calibration.validity import Validity as Validity
 from obsynth.monitoring.logs.run import DataRun as DataRun
 from obsynth.monitoring.thresholds.learned import LearnedThresholds as LearnedThresholds
 from obsynth.monitoring.thresholds.monitor import Monitor as Monitor
+from obsynth.observers.detection import Alarm as Alarm
+from obsynth.observers.detection import Decision as Decision
 from obsynth.observers.detection import Detection as Detection
 from obsynth.observers.estimates import Estimates as Estimates
 from obsynth.observers.nonlinear.region_observer import RegionObserver as RegionObserver
-from obsynth.observers.parameter_alarms import Alarm as Alarm
-from obsynth.observers.parameter_alarms import Decision as Decision
 from obsynth.observers.recursive.steady_filter import SteadyState as SteadyState
 from obsynth.observers.running import RunningObserver as RunningObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver as ScheduledObserver

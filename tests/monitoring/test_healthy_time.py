@@ -112,15 +112,6 @@ def test_a_folder_of_logs_is_the_logs_in_it_and_the_command_says_the_share(
         obsynth.learn_thresholds(design(), [])
 
 
-def test_files_of_an_earlier_kind_are_refused_with_what_to_do(tmp_path: Path) -> None:
-    file = obsynth.learn_thresholds(design(), log(0)).save(tmp_path / "t.json")
-    text = json.loads(file.read_text())
-    text["schema_version"] = 1
-    file.write_text(json.dumps(text))
-    with pytest.raises(obsynth.SpecError, match="learn the thresholds again"):
-        obsynth.load_thresholds(file)
-
-
 def test_rows_that_were_not_learned_from_decide_whether_thresholds_hold() -> None:
     """One part in five is unlike the others: its rows are in alarm by levels of the others."""
     rng = np.random.default_rng(0)

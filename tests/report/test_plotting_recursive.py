@@ -10,7 +10,7 @@ import pytest
 from time_varying_plants import observer_for, record, varying
 
 from obsynth import SpecError
-from obsynth.observers.decisions import decide
+from obsynth.monitoring.thresholds.parameter_decisions import decide
 from obsynth.observers.estimates import BAND_WIDTH
 from obsynth.plotting import plot_decision, plot_parameters, plot_states
 

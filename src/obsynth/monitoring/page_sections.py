@@ -17,8 +17,11 @@ from obsynth.monitoring.calibration.validating import states_innovations, valida
 from obsynth.monitoring.logs.log_observer import DECIDING
 from obsynth.monitoring.logs.run import DataRun
 from obsynth.monitoring.plots.data import panel_count, plot_data
+from obsynth.monitoring.thresholds.parameter_decisions import decide
 from obsynth.monitoring.thresholds.residual_monitor import monitor
-from obsynth.observers.detection import Detection
+from obsynth.observers.detection import Decision, Detection
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.report.page_tables import copied_table, fact_rows, listed, table_lines
 from obsynth.report.pictures import stacked
 from obsynth.results.design import ObserverDesign
@@ -150,9 +153,12 @@ def _statistics(design: ObserverDesign, run: DataRun) -> Iterator[str]:
     yield from copied_table(table)
 
 
-def detections(design: ObserverDesign, scenario: Scenario, simulation: Simulation) -> Iterator[Detection]:
-    """Yield what the first monitor sees that this linear design and this scenario have; nothing where they have
-    none."""
+def detections(design: ObserverDesign, scenario: Scenario, simulation: Simulation) -> Iterator[Detection | Decision]:
+    """Yield what the first monitor sees that this design and this scenario have; nothing where they have none."""
+    if isinstance(design.observer, RecursiveObserver) and design.observer.fault_names:
+        yield decide(design.observer, simulation.estimates)
+    if not isinstance(design.observer, LinearObserver):
+        return
     for kind in ("pointwise", "chi-square"):
         try:
             yield monitor(design, scenario, kind).watch(simulation.estimates)

@@ -10,11 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from obsynth.errors import ObsynthError
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
-from obsynth.observers.decisions import decide
-from obsynth.observers.detection import Detection
+from obsynth.observers.detection import Decision, Detection
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.parameter_alarms import Decision
-from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.report.demonstration import EDGE, HALF_WIDTH, PANEL, WIDE, demonstration_scenario
 from obsynth.report.plots.estimates import plot_states
 from obsynth.report.plots.frequency import plot_gains
@@ -159,11 +156,8 @@ def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Pict
 
 def _watched(design: ObserverDesign, scenario: Scenario, simulation: Simulation) -> Iterator[Detection | Decision]:
     """Yield what the first monitor sees that this design and this scenario have; nothing where they have none."""
-    if isinstance(design.observer, LinearObserver):
-        if is_registered("detections"):
-            yield from registered("detections")(design, scenario, simulation)
-    elif isinstance(design.observer, RecursiveObserver) and design.observer.fault_names:
-        yield decide(design.observer, simulation.estimates)
+    if is_registered("detections"):
+        yield from registered("detections")(design, scenario, simulation)
 
 
 def _story(scenario: Scenario, *, given: bool, linear: bool) -> str:

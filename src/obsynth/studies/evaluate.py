@@ -13,9 +13,9 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.monitor import Monitor
+from obsynth.monitoring.thresholds.parameter_decisions import ParameterMonitor
 from obsynth.numerics.arguments import OpenUnitInterval, arguments_checked, whole_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.decisions import ParameterMonitor
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.observer import DAEObserver

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from obsynth.observers.decisions import ParameterMonitor
+from obsynth.monitoring.thresholds.parameter_decisions import ParameterMonitor
 from obsynth.report.scenarios import worst_rows
 from obsynth.results.layout import headed_table, number, print_section
 

@@ -73,7 +73,7 @@ NO_HEALTHY_TIME = HealthyTime(0.0, 0.0, 1.0)
 
 LEARNED_KIND = "obsynth learned thresholds"
 
-LEARNED_VERSION = 2
+LEARNED_VERSION = 1
 
 LEARNED = FileKind(
     "learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"', suffix=".json"

@@ -17,9 +17,10 @@ from obsynth.monitoring.thresholds.learned import LearnedThresholds, learned_mon
 from obsynth.monitoring.thresholds.learning import learn_thresholds
 from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
 from obsynth.monitoring.thresholds.options import DISTURBANCES, LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options
+from obsynth.monitoring.thresholds.parameter_rule import parameter_monitor
 from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.monitoring.thresholds.residual_monitor import RESIDUAL_ROUNDING_SHARE, bounds_of
-from obsynth.monitoring.thresholds.rules import ANY_LENGTH, NormRule, WhitenedRule, parameter_monitor
+from obsynth.monitoring.thresholds.rules import ANY_LENGTH, NormRule, WhitenedRule
 from obsynth.monitoring.thresholds.stated_noise import samples_of, scaled_inputs, unlimited_bound, unlimited_paper
 from obsynth.monitoring.thresholds.whitening import steady_mean, whitened
 from obsynth.numerics.arguments import arguments_checked, chosen, is_finite_number

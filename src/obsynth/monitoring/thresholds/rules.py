@@ -1,27 +1,20 @@
-"""Rules of monitors: norms and whitened windows of residuals; parameters and innovations."""
+"""Rules of monitors of residuals: norms, and windows in the metric of their covariance."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from obsynth.errors import SpecError
 from obsynth.monitoring.thresholds.between_samples import InputResponse
+from obsynth.monitoring.thresholds.change_statistics import two_sided_sums
 from obsynth.monitoring.thresholds.gap_growth import GapGrowth, GapState
-from obsynth.monitoring.thresholds.monitor import Monitor, Rule, RuleOutput, Sample
+from obsynth.monitoring.thresholds.monitor import Rule, RuleOutput, Sample
 from obsynth.monitoring.thresholds.stated_noise import UnlimitedHorizonBound
-from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.decisions import NIS_WINDOW, WALKING_FORMS
-from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.outliers import chi_square_limit
-from obsynth.observers.parameter_alarms import alone, two_sided_sums
-from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.plants.signal_names import index_of
 
 #: Share of an interval by which the data's sampling may differ from the one that a threshold is for.
 FITTING_SHARE = 0.01
@@ -40,18 +33,7 @@ COUNT_ROUNDING = 1e-9
 NOT_DECIDED = RuleOutput(math.nan, math.nan)
 
 
-PARAMETER_KINDS = ("chi-square", "cusum", "nis")
-
 ANY_LENGTH = " (the run may have any length)"
-
-_PARAMETER_STATEMENTS = {
-    "chi-square": "distance of the parameters from their nominal values in the metric of their covariance: passed in a "
-    "run without a change with a probability of {} at most, for Gaussian noise as stated",
-    "cusum": "cumulative sum of the whitened innovation for a change of the stated size: passed in a run without a "
-    "change with a probability of {} at most, for Gaussian noise as stated",
-    "nis": "squared innovations of 20 samples: passed in a run of the plant as modelled with a probability of {} at "
-    "most, for Gaussian noise as stated",
-}
 
 
 def share_of_look(look: int) -> float:
@@ -266,106 +248,3 @@ def _finite(values: FloatArray) -> FloatArray:
     """Return numbers that have overflowed as the largest there is: one of them must not silence all that follow."""
     largest = np.finfo(np.float64).max
     return np.nan_to_num(values, nan=largest, posinf=largest, neginf=-largest)
-
-
-class ParameterRuleState(NamedTuple):
-    """The state of `ParameterRule`."""
-
-    levels: FloatArray  # ``(2 nq,)``: cumulative sums
-    looks: int = 0
-    squares: tuple[float, ...] = ()  # of the latest innovations, and how many numbers each has
-    degrees: tuple[int, ...] = ()
-
-
-class ParameterRule(Rule):
-    """Parameters against nominal values, or innovations against what noise explains, in a run of any length.
-    ``chi-square`` of theta by its covariance; ``cusum`` of the innovations for a ``change (nq,)``; ``nis``, squares of
-    the innovations over 20 samples, for all that the model does not explain."""
-
-    def __init__(self, kind: str, nominal: FloatArray, change: FloatArray, false_alarms: float) -> None:
-        self._kind, self._nominal, self._change, self._probability = kind, nominal, change, false_alarms
-
-    def init(self) -> ParameterRuleState:
-        """Return the state before the first sample."""
-        return ParameterRuleState(np.zeros(2 * len(self._nominal)))
-
-    def step(self, state: ParameterRuleState, sample: Sample) -> tuple[ParameterRuleState, RuleOutput]:
-        """Return the state after a sample, statistic, threshold, and the number of the parameter if it is known."""
-        if not sample.deciding:
-            return state, NOT_DECIDED
-        found: Any = sample.said
-        looked = state._replace(looks=state.looks + 1)
-        share = self._probability * share_of_look(looked.looks)
-        if self._kind == "cusum":
-            along, information = found.score - found.information @ self._nominal, np.diag(found.information)
-            levels = two_sided_sums(state.levels, along, information, self._change)
-            which = int(np.argmax(levels)) % len(self._nominal)
-            return looked._replace(levels=levels), RuleOutput(float(levels.max()), math.log(len(levels) / share), which)
-        if self._kind == "chi-square":
-            away = found.theta - self._nominal
-            weights = np.linalg.pinv(found.parameter_covariance, hermitian=True)
-            value, limit = float(away @ weights @ away), chi_square_limit(len(away), share)
-            return looked, RuleOutput(value, limit, alone(weights @ away, np.diag(weights)))
-        gap = found.whitened
-        if found.regressor.size:
-            gap = gap - found.regressor @ self._nominal
-        squares, degrees = (*state.squares, float(gap @ gap))[-NIS_WINDOW:], (*state.degrees, len(gap))[-NIS_WINDOW:]
-        if not sum(degrees):
-            return state._replace(squares=squares, degrees=degrees), NOT_DECIDED
-        looked = looked._replace(squares=squares, degrees=degrees)
-        return looked, RuleOutput(sum(squares), chi_square_limit(sum(degrees), share))
-
-    def restart(self, state: ParameterRuleState, skipped: int = 0) -> ParameterRuleState:
-        """Clear the sums; the covariance of the filter accounts for missing rows."""
-        return self.init()._replace(looks=state.looks)
-
-    def options(self) -> list[Any]:
-        """Return kind, probability, nominal values and change."""
-        return [self._kind, self._probability, self._nominal.tolist(), self._change.tolist()]
-
-
-def _whole_record(observer: RecursiveObserver | DAEObserver) -> str:
-    """Return why a likelihood ratio is not among the monitors, and what to use instead."""
-    why = " glr compares every time at which a change may have begun, which takes a whole record"
-    if isinstance(observer, DAEObserver):
-        return f"{why}, and regressors, which a nonlinear design does not have: chi-square, cusum or nis serve here."
-    if observer.form in ("", "random-walk"):
-        return f"{why}, and regressors, which this design does not have: chi-square or nis serve here."
-    return f"{why}: obsynth.decide(..., statistic='glr') has it for recorded estimates; row by row, use cusum."
-
-
-def parameter_monitor(
-    observer: RecursiveObserver | DAEObserver,
-    kind: str,
-    nominal: Mapping[str, float],
-    change: float,
-    false_alarms: float,
-) -> Monitor:
-    """Return the monitor of parameters, or of innovations, for data of any length."""
-    if kind not in PARAMETER_KINDS:
-        hint = _whole_record(observer) if kind == "glr" else ""
-        raise SpecError(
-            f"The monitor {kind!r} is not for a recursive or nonlinear design: use one of "
-            f"{', '.join(PARAMETER_KINDS)}, learned.{hint}",
-            path="kind",
-        )
-    names = observer.fault_names
-    theta = np.array(observer.initial_parameters, dtype=np.float64)
-    for name, value in nominal.items():
-        place = index_of(name, names, what="nominal")
-        theta[place] = real_number(value, f"The nominal value of {name!r}", "a finite number", path="nominal")
-    if kind != "nis" and not len(theta):
-        raise SpecError(f"{kind} monitors parameters, and this design estimates none: use nis.", path="kind")
-    if kind == "cusum" and observer.form in WALKING_FORMS:
-        raise SpecError(
-            f"cusum needs regressors, which a {observer.form} design does not have: use chi-square or nis.", path="kind"
-        )
-    rule = ParameterRule(kind, theta, np.full(len(theta), float(change)), false_alarms)
-    return Monitor(
-        kind,
-        _PARAMETER_STATEMENTS[kind].format(f"{false_alarms:g}") + ANY_LENGTH,
-        rule,
-        residuals=observer.innovation_count,
-        fault_names=names,
-        fault_scales=np.ones(len(names)),
-    )

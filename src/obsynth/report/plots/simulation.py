@@ -9,8 +9,7 @@ import numpy as np
 
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.detection import Detection
-from obsynth.observers.parameter_alarms import Decision
+from obsynth.observers.detection import Decision, Detection
 from obsynth.report.plots.estimates import plot_faults, plot_parameters
 from obsynth.report.plots.panels import (
     RESIDUAL_STYLE,

@@ -21,7 +21,7 @@ from obsynth.studies.verbs.sweeps import chosen_executor
 
 if TYPE_CHECKING:
     from obsynth.monitoring.thresholds.monitor import Monitor
-    from obsynth.observers.decisions import ParameterMonitor
+    from obsynth.monitoring.thresholds.parameter_decisions import ParameterMonitor
 
 
 def _run_tolerances(options: argparse.Namespace) -> int:
@@ -83,8 +83,8 @@ def _tolerance(text: str) -> float | str:
 
 def run_evaluate(options: argparse.Namespace) -> int:
     """Run ``evaluate``: spec in, table of rates and errors out."""
+    from obsynth.monitoring.thresholds.parameter_decisions import ParameterMonitor
     from obsynth.monitoring.thresholds.residual_monitor import monitor
-    from obsynth.observers.decisions import ParameterMonitor
     from obsynth.observers.linear.observer import LinearObserver
     from obsynth.studies.evaluate import evaluate
 

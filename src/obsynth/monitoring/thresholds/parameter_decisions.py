@@ -7,38 +7,29 @@ that a run of N samples raises a false alarm with at most about the stated proba
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from functools import cached_property
+from typing import Literal, TypeAlias, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from obsynth.errors import SpecError
+from obsynth.monitoring.thresholds.change_statistics import alone, tail, weighted_squares
+from obsynth.monitoring.thresholds.jump_likelihood import initial_parameter_response, likelihood_ratio
+from obsynth.monitoring.thresholds.parameter_rule import (
+    WALKING_FORMS,
+    ParameterObserver,
+    ParameterRule,
+    ParameterRuleState,
+)
 from obsynth.numerics.arguments import arguments_worded, check_fields, real_array, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.detection import Alarm, Decision
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.nonlinear.observer import DAEObserver
-from obsynth.observers.parameter_alarms import (
-    Alarm,
-    Decision,
-    alone,
-    initial_parameter_response,
-    likelihood_ratio,
-    quantile,
-    tail,
-    two_sided_sums,
-)
 from obsynth.observers.recursive.observer import RecursiveObserver
 
 Statistic: TypeAlias = Literal["chi-square", "cusum", "glr", "nis"]
-
-#: Forms whose parameters are states: their samples say nothing of parameters that stay as they are.
-WALKING_FORMS = ("random-walk", "augmented-kalman")
-
-#: Samples that the NIS sums up: the choice that its threshold was tried with.
-NIS_WINDOW = 20
-
-#: Correlated looks count as this share of independent ones: measured false-alarm rates stay below what is asked.
-NIS_LOOKS = 1.0 / 2.0
 
 
 @arguments_worded(
@@ -47,7 +38,7 @@ NIS_LOOKS = 1.0 / 2.0
     "...) for data of any length"
 )
 def decide(
-    observer: RecursiveObserver | DAEObserver,
+    observer: ParameterObserver,
     estimates: Estimates,
     *,
     statistic: Statistic = "chi-square",
@@ -106,7 +97,7 @@ def decide(
     'leak'
     """
     theta, size = _nominal_and_change(observer, statistic, nominal, false_alarms, change)
-    nq, false_alarms = len(theta), float(false_alarms)
+    false_alarms = float(false_alarms)
     if (estimates.state_names, estimates.parameter_names) != (observer.state_names, observer.fault_names):
         raise SpecError(
             "The estimates are of other states or parameters than this observer's: give the run of this very observer.",
@@ -114,27 +105,16 @@ def decide(
         )
     if not len(estimates.states):
         return Decision(statistic, read_only(np.zeros(0)), read_only(np.zeros(0)), None)
-    if statistic == "chi-square":
-        return _chi_square(observer, estimates, theta, false_alarms)
-    if isinstance(observer, DAEObserver):
-        if statistic == "nis":
-            return _nis(estimates, np.array(estimates.nis), false_alarms)
-        along = estimates.scores - estimates.informations @ theta
-        return _cusum(estimates, along, np.einsum("kqq->kq", estimates.informations), size, false_alarms)
-    gaps = estimates.innovations
-    if nq and observer.form != "random-walk":
-        gaps = gaps - estimates.regressors @ theta
-    if statistic == "nis":
-        return _nis(estimates, np.nansum(gaps**2, axis=1), false_alarms)
-    if statistic == "cusum":
-        regressors = np.nan_to_num(estimates.regressors)
-        along = np.einsum("kmq,km->kq", regressors, np.nan_to_num(gaps))
-        return _cusum(estimates, along, np.einsum("kmq,kmq->kq", regressors, regressors), size, false_alarms)
-    return likelihood_ratio(observer, estimates, gaps, false_alarms)
+    if statistic == "glr":
+        gaps = estimates.innovations - estimates.regressors @ theta
+        return likelihood_ratio(cast(RecursiveObserver, observer), estimates, gaps, false_alarms)
+    rule = ParameterRule(statistic, theta, size, false_alarms, samples=len(estimates.states))
+    judged = {"chi-square": _chi_square, "cusum": _cusum, "nis": _nis}[statistic]
+    return judged(rule, observer, estimates)
 
 
 def _nominal_and_change(
-    observer: RecursiveObserver | DAEObserver,
+    observer: ParameterObserver,
     statistic: str,
     nominal: ArrayLike | None,
     false_alarms: float,
@@ -199,7 +179,7 @@ class ParameterMonitor:
         if self.change is not None and self.statistic != "cusum":
             raise SpecError(f"change is for cusum, not for {self.statistic}: leave it out.", path="change")
 
-    def watch(self, observer: RecursiveObserver | DAEObserver, estimates: Estimates) -> Decision:
+    def watch(self, observer: ParameterObserver, estimates: Estimates) -> Decision:
         """Return the decision on one run.
 
         Parameters
@@ -217,11 +197,10 @@ class ParameterMonitor:
         return decide(observer, estimates, **{name: value for name, value in vars(self).items() if value is not None})
 
 
-def _chi_square(
-    observer: RecursiveObserver | DAEObserver, estimates: Estimates, nominal: FloatArray, false_alarms: float
-) -> Decision:
-    gaps, nq = estimates.parameters - nominal, len(nominal)
-    start = observer.initial_parameters - nominal
+def _chi_square(rule: ParameterRule, observer: ParameterObserver, estimates: Estimates) -> Decision:
+    """Decide by the distance of the parameters from their nominal values, in the metric of their covariance."""
+    gaps, nq = estimates.parameters - rule.nominal, len(rule.nominal)
+    start = observer.initial_parameters - rule.nominal
     if start.any():
         # Where the observer starts is no evidence: only what data have said since may raise an alarm.
         if isinstance(observer, DAEObserver):
@@ -231,57 +210,116 @@ def _chi_square(
                 path="nominal",
             )
         gaps = gaps - initial_parameter_response(observer, estimates, start)
-    values = np.einsum("ki,kij,kj->k", gaps, np.linalg.pinv(estimates.parameter_covariances, hermitian=True), gaps)
-    looks = len(values)
-    thresholds = np.full(looks, float(quantile(np.array(float(nq)), false_alarms / looks)))
-    found = Decision("chi-square", read_only(values), read_only(thresholds), None)
-    hits = np.flatnonzero(values > thresholds)
-    if not hits.size:
+    values = weighted_squares(gaps, estimates.parameter_covariances)
+    found, k = _passed("chi-square", values, np.full(len(values), rule.limit(rule.init())))
+    if k is None:
         return found
-    k = int(hits[0])
-    weights = np.linalg.pinv(estimates.parameter_covariances[k], hermitian=True)
     # The last sample at which the statistic was what it is without a change, on average or less.
     quiet = np.flatnonzero(values[:k] <= nq)
     onset = int(quiet[-1]) + 1 if quiet.size else 0
-    confidence = 1.0 - min(1.0, looks * float(tail(np.array(float(nq)), values[k])))
-    name = estimates.parameter_names[alone(weights @ gaps[k], np.diag(weights))]
+    confidence = 1.0 - min(1.0, rule.looks_of_record * float(tail(np.array(float(nq)), values[k])))
+    name = estimates.parameter_names[rule.moved(gaps[k], estimates.parameter_covariances[k])]
     return replace(found, alarm=Alarm(k, name, onset, confidence, float(values[k])))
 
 
-def _nis(estimates: Estimates, squares: FloatArray, false_alarms: float) -> Decision:
-    samples = len(squares)
-    window = np.ones(min(NIS_WINDOW, samples))
-    values = np.convolve(squares, window)[:samples]
-    degrees = np.convolve(estimates.nis_degrees, window)[:samples]
-    looks = max(samples * NIS_LOOKS, 1.0)
-    thresholds = quantile(degrees, min(false_alarms / looks, 1.0))
-    hits = np.flatnonzero(values > thresholds)
-    alarm = None
-    if hits.size:
-        k = int(hits[0])
-        confidence = 1.0 - min(1.0, looks * float(tail(degrees[k], values[k])))
-        first = max(k - NIS_WINDOW + 1, 0)
-        # The split of the window after which the squares are largest against their degrees of freedom.
-        excess = np.cumsum((squares - estimates.nis_degrees)[first : k + 1][::-1])[::-1]
-        alarm = Alarm(k, "", first + int(np.argmax(excess)), confidence, float(values[k]))
-    return Decision("nis", read_only(values), read_only(thresholds), alarm)
+def _nis(rule: ParameterRule, observer: ParameterObserver, estimates: Estimates) -> Decision:
+    """Decide by the squared innovations of the latest samples."""
+    states, values = _scanned(rule, observer, estimates)
+    found, k = _passed("nis", values, np.array([rule.limit(state) for state in states]))
+    if k is None:
+        return found
+    state = states[k]
+    confidence = 1.0 - min(1.0, rule.looks_of_record * float(tail(np.array(float(sum(state.degrees))), values[k])))
+    # The split of the window after which the squares are largest against their degrees of freedom.
+    excess = np.cumsum((np.array(state.squares) - state.degrees)[::-1])[::-1]
+    onset = k + 1 - len(state.squares) + int(np.argmax(excess))
+    return replace(found, alarm=Alarm(k, "", onset, confidence, float(values[k])))
 
 
-def _cusum(
-    estimates: Estimates, along: FloatArray, squares: FloatArray, change: FloatArray, false_alarms: float
-) -> Decision:
+def _cusum(rule: ParameterRule, observer: ParameterObserver, estimates: Estimates) -> Decision:
     """Decide by sums of log likelihood ratios, from scores at the nominal parameters and their variances."""
-    samples, nq = along.shape
-    threshold = float(np.log(2.0 * nq * samples / false_alarms))
-    level, started, values, alarm = np.zeros(2 * nq), np.zeros(2 * nq, dtype=np.int64), np.zeros(samples), None
-    for k in range(samples):
-        level = two_sided_sums(level, along[k], squares[k], change)
-        started[level == 0.0] = k + 1
-        values[k] = level.max()
-        if alarm is None and values[k] > threshold:
-            which = int(np.argmax(level))
-            confidence = 1.0 - min(1.0, 2.0 * nq * samples * float(np.exp(-values[k])))
-            since = slice(int(started[which]), k + 1)
-            name = estimates.parameter_names[alone(along[since].sum(axis=0), squares[since].sum(axis=0))]
-            alarm = Alarm(k, name, int(started[which]), confidence, float(values[k]))
-    return Decision("cusum", read_only(values), read_only(np.full(samples, threshold)), alarm)
+    states, values = _scanned(rule, observer, estimates)
+    found, k = _passed("cusum", values, np.full(len(values), rule.limit(rule.init())))
+    if k is None:
+        return found
+    levels = np.stack([state.levels for state in states[: k + 1]])
+    which = int(np.argmax(levels[k]))
+    onset = int(np.max(np.flatnonzero(levels[:, which] == 0.0), initial=-1)) + 1
+    confidence = 1.0 - min(1.0, levels.shape[1] * rule.looks_of_record * float(np.exp(-values[k])))
+    rows = [RecordedRow(observer, estimates, i) for i in range(onset, k + 1)]
+    along = sum((row.score - row.information @ rule.nominal for row in rows), np.zeros(len(rule.nominal)))
+    squares = sum((np.diag(row.information) for row in rows), np.zeros(len(rule.nominal)))
+    name = estimates.parameter_names[alone(along, squares)]
+    return replace(found, alarm=Alarm(k, name, onset, confidence, float(values[k])))
+
+
+def _scanned(
+    rule: ParameterRule, observer: ParameterObserver, estimates: Estimates
+) -> tuple[list[ParameterRuleState], FloatArray]:
+    """Return the states of a rule after each sample of a record, and its statistic ``(samples,)``."""
+    states, values, state = list[ParameterRuleState](), np.zeros(len(estimates.states)), rule.init()
+    for k in range(len(values)):
+        state, (values[k], _) = rule.fold(state, RecordedRow(observer, estimates, k))
+        states.append(state)
+    return states, values
+
+
+def _passed(statistic: str, values: FloatArray, thresholds: FloatArray) -> tuple[Decision, int | None]:
+    """Return a decision without its alarm, and the first sample at which the threshold is passed."""
+    hits = np.flatnonzero(values > thresholds)
+    found = Decision(statistic, read_only(values), read_only(thresholds), None)
+    return found, int(hits[0]) if hits.size else None
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedRow:
+    """A sample of recorded estimates, as `ParameterRule` takes what an observer says of it."""
+
+    observer: ParameterObserver
+    estimates: Estimates
+    k: int
+
+    @property
+    def theta(self) -> FloatArray:
+        """The estimates of the parameters ``(nq,)``."""
+        return np.asarray(self.estimates.parameters[self.k])
+
+    @property
+    def parameter_covariance(self) -> FloatArray:
+        """Their covariance ``(nq, nq)``."""
+        return np.asarray(self.estimates.parameter_covariances[self.k])
+
+    @cached_property
+    def _known(self) -> NDArray[np.bool_]:
+        """Which innovations of a recursive observer are there."""
+        return np.asarray(~np.isnan(self.estimates.innovations[self.k]))
+
+    @property
+    def whitened(self) -> FloatArray:
+        """The innovation in units of its standard deviations; of a nonlinear observer one of the same length."""
+        if isinstance(self.observer, DAEObserver):
+            white = np.zeros(int(self.estimates.nis_degrees[self.k]))
+            white[:1] = np.sqrt(self.estimates.nis[self.k])
+            return white
+        return np.asarray(self.estimates.innovations[self.k][self._known])
+
+    @property
+    def regressor(self) -> FloatArray:
+        """How the parameters enter it ``(m, nq)``; ``(m, 0)`` where they are in the model."""
+        if isinstance(self.observer, DAEObserver) or self.observer.form == "random-walk":
+            return np.zeros((len(self.whitened), 0))
+        return np.asarray(self.estimates.regressors[self.k][self._known])
+
+    @property
+    def score(self) -> FloatArray:
+        """What the sample says of the parameters ``(nq,)``."""
+        if isinstance(self.observer, DAEObserver):
+            return np.asarray(self.estimates.scores[self.k])
+        return np.asarray(self.regressor.T @ self.whitened)
+
+    @property
+    def information(self) -> FloatArray:
+        """How much it says of them ``(nq, nq)``."""
+        if isinstance(self.observer, DAEObserver):
+            return np.asarray(self.estimates.informations[self.k])
+        return np.asarray(self.regressor.T @ self.regressor)

@@ -11,7 +11,7 @@ import pytest
 from time_varying_plants import observer_for, printed, textbook, varying
 
 from obsynth import PreconditionError, SpecError, TimeVaryingDescriptorSystem
-from obsynth.observers.decisions import Statistic, decide
+from obsynth.monitoring.thresholds.parameter_decisions import Statistic, decide
 from obsynth.simulation.linear import simulate_time_varying
 
 SAMPLES, CHANGE = 160, 90
