@@ -47,7 +47,7 @@ STATEMENTS: Mapping[str, str] = {
 BOUNDS_BETWEEN_SAMPLES = "; disturbances move within their bounds between samples, which are {dt} s apart"
 
 #: The assumption of a sampled design: what happens between its samples is not in its model.
-HELD = "; inputs, disturbances held between samples"
+HELD = "; inputs, disturbances are held between samples"
 
 BOUNDS_AND_HELD_INPUTS = BOUNDS_BETWEEN_SAMPLES + "; known inputs are held between samples"
 

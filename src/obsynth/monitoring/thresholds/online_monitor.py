@@ -38,7 +38,7 @@ _AFTER_WARM_UP = "; it holds once the initial-condition response has settled (th
 
 _AFTER_A_GAP = " (after a gap likewise)"
 
-_FROM_THE_FIRST = "; from the first row on; after a gap, once settled"
+_FROM_THE_FIRST = "; from the first row on; after gaps, once settled"
 
 #: A note of every monitor whose noise is none that somebody stated.
 NOISE_ASSUMED = "; noise of deviation 1 is assumed on every sensor, as none is stated"
