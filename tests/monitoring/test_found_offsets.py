@@ -167,3 +167,37 @@ def test_a_start_that_is_stated_has_room_for_states_that_a_calibration_adds(meth
         # Of the noise that was found, and not of that which was stated.
         np.testing.assert_allclose(design.observer.R.at(0), spec.plant.Dw @ spec.plant.Dw.T, rtol=1e-12)
     assert obsynth.run_on_data(design, data).table is not None
+
+
+def lagging(seed, offset, n=100):
+    """Return a log of a first-order lag whose sensor reads so many deviations too much."""
+    rng = np.random.default_rng(seed)
+    u, x, y = np.repeat(rng.uniform(0.0, 2.0, n // 10 + 1), 10)[:n], 0.5, []
+    for j in range(n):
+        if j:
+            x = np.exp(-0.5 / 2.2) * x + (1.0 - np.exp(-0.5 / 2.2)) * 1.3 * u[j] + 0.002 * rng.normal()
+        y.append(x + 0.02 * (offset + rng.normal()))
+    return {"time": 0.5 * np.arange(n), "u": u, "y": np.array(y)}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("offset", [0.0, 1.0, 2.0])
+def test_boxes_hold_beside_offsets_that_are_too_small_to_be_seen(offset, share):
+    model = obsynth.DAEModel(
+        {"balance": "T * der(x) = k * u - x"}, {"y": "x"}, states={"x": 0.5}, inputs={"u": 1.0},
+        constants={"T": 3.0, "k": 1.0}, units=dict.fromkeys(("x", "u", "k", "y", "T"), "1"),
+    )  # fmt: skip
+    bounds = {"T": (0.5, 10.0), "k": (0.2, 5.0)}
+    found = [
+        obsynth.calibrate(model, lagging(6_100 + seed, offset), bounds, input_delay=0, starts=1)
+        for seed in share(range(10), 2)
+    ]
+    held = [one.box.holds({"T": 2.2, "k": 1.3}) for one in found]
+    assert np.mean(held) >= 0.8
+    # Where the offset has no state of its own the verdict says what the box holds for.
+    assert all(one.offset or any("too small to be seen" in line for line in one.verdict) for one in found)
+    stated = obsynth.calibrate(model, lagging(6_100, offset), bounds, input_delay=0, starts=1, offset={})
+    assert not any("too small to be seen" in line for line in stated.verdict)
+    if not found[0].offset:
+        widths = [one.box.high["k"] - one.box.low["k"] for one in (stated, found[0])]
+        assert widths[0] < widths[1]

@@ -9,13 +9,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.errors import PreconditionError, SpecError
+from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.monitoring.calibration.diagnostics import STANDS_OUT, standing_out, wrong_samples
 from obsynth.monitoring.calibration.innovations_fit import InnovationsFit, chosen_timing, innovations_fit
 from obsynth.monitoring.calibration.integration_error import IntegrationError, integration_error
 from obsynth.monitoring.calibration.linear_plant import LinearPlant
 from obsynth.monitoring.calibration.logs import LogData, RecordedLog, read_log, told_rows
-from obsynth.monitoring.calibration.noise_proposals import proposed_states
+from obsynth.monitoring.calibration.noise_proposals import like_problem, proposed_states
 from obsynth.monitoring.calibration.noise_states import NoiseStates, PlantWithNoise, asked_states
 from obsynth.monitoring.calibration.plants import CalibrationPlant, NonlinearPlant
 from obsynth.monitoring.calibration.problem import CalibrationProblem, calibration_problem, require_variation
@@ -33,11 +33,25 @@ from obsynth.numerics.arguments import Seed, arguments_checked, is_whole, whole_
 from obsynth.numerics.arrays import read_only
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.noise import offset_state
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.delays import require_no_delays
 
 #: How often samples that stand out are left out: each time the others are known better.
 OUTLIER_ROUNDS = 3
+
+#: Deviations of an innovation that an offset may have which the innovations do not show: of one at twice this size most
+#: logs do, and the model gets a state for it.
+UNSEEN_OFFSET = 2.0
+
+#: What is said of these.
+OFFSETS_ALLOWED = (
+    "The box holds beside offsets of {} too small to be seen (a deviation of {:g} innovations each): where the sensors "
+    "have none, state this (offset: {{}}), and it is narrower."
+)
+OFFSETS_UNTRIED = (
+    "The box holds where no sensor has an offset: the fit beside offsets that are too small to be seen failed."
+)
 
 #: What is said of an offset without which the model follows nothing.
 OFFSET_TAKEN = "Without an offset of the sensor {} the model does not follow the log: it has a state for it."
@@ -246,6 +260,8 @@ def calibrate(
     open_kinds = tuple(kind for kind, given in kinds if given is None)
     if found.fit is not None and open_kinds:
         found = fitting.with_proposals(found, found.fit, asked, open_kinds, told)
+    if offset is None:
+        found = fitting.with_unseen_offsets(found)
     return reported(
         found.problem, found.fits[0], found.fit, level=level, losses=found.losses, error=found.error, digest=digest
     )
@@ -363,6 +379,39 @@ class _Fitting:
         # What is white beside coloured noise is less than both: more samples stand out.
         problem = again.problem.with_notes(*before, *told)
         return self.without_outliers(replace(again, problem=problem, losses=found.losses))
+
+    def with_unseen_offsets(self, found: _Found) -> _Found:
+        """Return the fit with boxes that hold beside offsets of sensors which are too small to be seen: the wider of
+        those without and with offsets of `UNSEEN_OFFSET` deviations."""
+        problem, fit = found.problem, found.fit
+        states = problem.plant.states if isinstance(problem.plant, PlantWithNoise) else NoiseStates()
+        unseen = [name for name in problem.output_names if name not in states.offsets]
+        if fit is None or not unseen or not problem.names:
+            return found
+        self.note("boxes beside offsets")
+        wide = like_problem(
+            problem, self.problem_with(replace(states, offsets=(*states.offsets, *unseen)), problem.log)
+        )
+        P0, spread = wide.P0.copy(), np.sqrt(np.nanmean(fit.innovations**2, axis=0))
+        for name in unseen:
+            place = wide.plant.state_names.index(offset_state(name))
+            P0[place, place] = (UNSEEN_OFFSET * spread[problem.output_names.index(name)]) ** 2
+        wide = wide.with_start(P0)
+        try:
+            again = innovations_fit(
+                wide, simulation_fits(wide, 1, self.seed, self.note, start=fit.t), self.level, self.note
+            )[0]
+        except (PreconditionError, SolverError):
+            again = None
+        if again is None:
+            told = problem.with_notes(OFFSETS_UNTRIED)
+            return replace(found, problem=told)
+        sides = [
+            (min(low, other_low, key=lambda side: side.value), max(high, other_high, key=lambda side: side.value))
+            for (low, high), (other_low, other_high) in zip(fit.sides, again.sides, strict=True)
+        ]
+        told = problem.with_notes(OFFSETS_ALLOWED.format(", ".join(unseen), UNSEEN_OFFSET))
+        return replace(found, problem=told, fit=replace(fit, sides=sides))
 
     def without_outliers(self, found: _Found) -> _Found:
         """Return the fit again without samples that stand out alone or a few in a row: they would make R a multiple of

@@ -76,7 +76,7 @@ def proposed_states(
             if (kind, name) not in asking:
                 continue
             note(f"{kind} of {name}")
-            reached, place = known.best(_like(problem, problem_with(tried)))
+            reached, place = known.best(like_problem(problem, problem_with(tried)))
             gain = value - reached - 0.5 * ADDED_NUMBERS[kind] * np.log(problem.log.samples)
             least = LEAST_NATS[kind]
             if kind == "offset" and least < gain < LEAST_EXPLANATION and hidden_faults(problem, fit, tried):
@@ -161,7 +161,7 @@ def _candidates(
             yield "walk", name, replace(states, loads=(*states.loads, name))
 
 
-def _like(problem: CalibrationProblem, new: CalibrationProblem) -> CalibrationProblem:
+def like_problem(problem: CalibrationProblem, new: CalibrationProblem) -> CalibrationProblem:
     """Return a problem with the steps, the inputs and the start of another one, as far as it goes."""
     if (new.integration, new.substeps) != (problem.integration, problem.substeps):
         new = new.integrated(problem.integration, problem.substeps)
