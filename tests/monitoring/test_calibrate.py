@@ -62,8 +62,8 @@ def test_a_kink_of_the_model_at_the_maximum_spoils_no_box(measured, share) -> No
     """With a start between the pairs of levels the likelihood's slope jumps at its maximum (abs of a difference)."""
     # With --whole the variances are found as well.
     for noise in share(({"Q": measured.Q, "R": measured.R}, {}), 2):
-        # White: which of two models of the noise is more likely is another question.
-        options = {"rows": "0:56", "starts": 1, "input_delay": 1, "sensor_noise": {}, **noise}
+        # White, and without offsets: which of two models of the noise is more likely is another question.
+        options = {"rows": "0:56", "starts": 1, "input_delay": 1, "sensor_noise": {}, "offset": {}, **noise}
         found = calibrate(tanks(), LOG, BOUNDS, **options)
         stated = calibrate(tanks(), LOG, BOUNDS, **options, initial_covariance=1e-4)
         assert found.undetermined == ()
