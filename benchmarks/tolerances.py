@@ -21,9 +21,8 @@ import numpy as np
 
 import obsynth
 from obsynth.monitoring.thresholds.adaptive_monitor import adaptive_plan
-from obsynth.monitoring.thresholds.adaptive_rule import AdaptiveState, adaptive_step
 from obsynth.specs.loader import load_spec
-from obsynth.verification.over_tolerances.adaptive_record import thresholds_of_records
+from obsynth.verification.over_tolerances.adaptive_recursion import AdaptiveState, adaptive_step, thresholds_of_records
 
 REPEATS, SAMPLES = 5, 4000
 DESIGNS = Path(__file__).parents[1] / "designs"

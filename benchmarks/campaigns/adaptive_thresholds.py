@@ -27,7 +27,7 @@ from obsynth.monitoring.alarms.certificates import verify_alarm
 from obsynth.monitoring.alarms.proof_file import proved_alarm
 from obsynth.monitoring.thresholds.adaptive_monitor import adaptive_plan
 from obsynth.specs.loader import load_spec
-from obsynth.verification.over_tolerances.adaptive_record import AdaptivePlan, thresholds_of_records
+from obsynth.verification.over_tolerances.adaptive_recursion import AdaptivePlan, thresholds_of_records
 
 NAMES = ("wang2015", "smib", "drive")
 #: Cases of each design, by kind, and proofs of a fault on wang2015 after them.

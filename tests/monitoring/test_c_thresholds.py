@@ -14,7 +14,7 @@ from uncertain_plants import drive, wang
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.verification.over_tolerances.adaptive_record import thresholds_of_records
+from obsynth.verification.over_tolerances.adaptive_recursion import thresholds_of_records
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 

@@ -36,7 +36,7 @@ from obsynth.plants.dae import DAEModel
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import gain_set_digest
 from obsynth.verification.over_tolerances.adaptive_bound import AdaptiveBound
-from obsynth.verification.over_tolerances.adaptive_record import THRESHOLD_ROUNDING
+from obsynth.verification.over_tolerances.adaptive_recursion import THRESHOLD_ROUNDING
 
 
 def write_dae_c(

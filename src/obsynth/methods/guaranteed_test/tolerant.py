@@ -20,7 +20,7 @@ from obsynth.plants.transformations.moving_disturbances import with_moving_distu
 from obsynth.plants.transformations.uncertain_plant import AffinePlant, affine_plant
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.over_tolerances.adaptive_bound import Start, adaptive_bound
-from obsynth.verification.over_tolerances.adaptive_record import Thresholds, thresholds_of_records
+from obsynth.verification.over_tolerances.adaptive_recursion import Thresholds, thresholds_of_records
 from obsynth.verification.over_tolerances.error_structure import ErrorStructure, Tracking, error_structure
 
 #: Windows of the record that count, at most: evenly spread.

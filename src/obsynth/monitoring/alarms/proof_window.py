@@ -25,7 +25,7 @@ from obsynth.proofs.balls import gamma
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.assumptions import Assumptions
 from obsynth.verification.over_tolerances.adaptive_bound import adaptive_bound
-from obsynth.verification.over_tolerances.adaptive_record import thresholds_of_records
+from obsynth.verification.over_tolerances.adaptive_recursion import thresholds_of_records
 
 #: Roundings of a computed right side beside those of its products and sums.
 MORE_ROUNDINGS = 8

@@ -40,7 +40,7 @@ from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.signals import resolve
 from obsynth.verification.assumptions import Assumptions
 from obsynth.verification.over_tolerances.adaptive_bound import Start, adaptive_bound
-from obsynth.verification.over_tolerances.adaptive_record import AdaptivePlan
+from obsynth.verification.over_tolerances.adaptive_recursion import AdaptivePlan
 from obsynth.verification.over_tolerances.error_structure import ErrorStructure, Tracking, error_structure
 from obsynth.verification.over_tolerances.plants_of_the_box import EXACT_MODEL, with_tolerances
 from obsynth.verification.over_tolerances.responses import loop_radius

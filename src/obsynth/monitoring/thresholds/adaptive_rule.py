@@ -1,10 +1,10 @@
-"""The adaptive threshold as a rule: row by row with its state as plain arrays, and over many runs at once."""
+"""The adaptive threshold as a rule of a monitor: row by row, and over many runs at once."""
 
 from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,89 +14,16 @@ from obsynth.monitoring.thresholds.monitor import LinearSample, Rule, RuleOutput
 from obsynth.monitoring.thresholds.rules import FITTING_SHARE, NormRule, NormState, norm_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.simulation.benches import Runs
-from obsynth.verification.over_tolerances.adaptive_bound import AdaptiveBound
-from obsynth.verification.over_tolerances.adaptive_record import THRESHOLD_ROUNDING, AdaptivePlan, Thresholds
+from obsynth.verification.over_tolerances.adaptive_recursion import (
+    THRESHOLD_ROUNDING,
+    AdaptivePlan,
+    AdaptiveState,
+    Thresholds,
+    adaptive_step,
+)
 
 #: Rings after which an error that nothing is known of has decayed to a millionth.
 FORGETTING_RINGS = 3
-
-
-class AdaptiveState(NamedTuple):
-    """What goes from sample to sample, rings with the oldest first."""
-
-    psi: FloatArray  # ``(p, nz)``: sensitivities
-    ring: FloatArray  # ``(L, w)``
-    eps: FloatArray  # ``(L, nz)``
-    largest: FloatArray
-    past: FloatArray  # ``(L, nv)``: signals, for varying constants
-    moved: FloatArray  # ``(L, nz)``: bounds, for varying constants
-    k: int = 0  # samples since the start
-
-    @classmethod
-    def of(cls, bound: AdaptiveBound) -> AdaptiveState:
-        """Return the state before the first sample."""
-        (p, nz, *_), length = bound.counts, bound.length
-        shapes = (p, nz), (length, bound.width), (length, nz)
-        largest = np.zeros(bound.rounding.shape[1])
-        largest[-1] = 1.0
-        memory = ((length, bound.drive.shape[2]), (length, nz)) if bound.varying else ((0, 0), (0, 0))
-        psi, ring, eps, past, moved = (np.zeros(shape) for shape in (*shapes, *memory))
-        return cls(psi, ring, eps, largest, past, moved)
-
-
-def adaptive_step(
-    bound: AdaptiveBound, state: AdaptiveState, estimates: FloatArray, inputs: FloatArray, outputs: FloatArray
-) -> tuple[AdaptiveState, Thresholds]:
-    """Take one sample: ``estimates (n,)`` as `ErrorStructure.reading` gives them; return the state after it as well."""
-    *_, m, no = bound.counts
-    v = np.concatenate([estimates, inputs])
-    if bound.first is not None and state.k == 0:
-        state = state._replace(psi=np.vstack([state.psi[:-1], bound.first @ inputs]))
-    moved, first, shift = np.zeros(bound.counts[2]), np.zeros((0, no)), np.zeros(no)
-    if bound.counts[0]:
-        state, moved, first, shift = (_varying if bound.varying else _constant)(bound, state, v)
-    sizes = np.abs(np.concatenate([inputs, outputs, estimates, np.ones(1)]))
-    state = state._replace(largest=np.maximum(state.largest, sizes))
-    known = bound.known(estimates, inputs)
-    start = bound.start_at(state.k)
-    rounding = bound.rounding @ state.largest
-    older = state.ring.reshape(-1) @ bound.kernels + bound.tail @ state.eps[0]
-    fixed = rounding + known @ bound.same + bound.nominal + start
-    h = known.copy()
-    h[:m] += older[:m] + fixed[:m] + bound.solved @ bound.structure.seen(moved)
-    rest = older[m : m + no] + rounding[m:] + h @ bound.same[:, m:]
-    total = (bound.nominal[m:] + start[m:] + first.sum(axis=0) + np.abs(shift) + rest) * THRESHOLD_ROUNDING
-    ring, eps = np.vstack([state.ring[1:], h]), np.vstack([state.eps[1:], older[m + no :]])
-    after = state._replace(ring=ring, eps=eps, k=state.k + 1)
-    return after, Thresholds(total, first, shift, start[m:], rest)
-
-
-_First: TypeAlias = tuple[AdaptiveState, FloatArray, FloatArray, FloatArray]
-
-
-def _constant(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _First:
-    _, nz, rows, _, no = bound.counts
-    w = bound.drive @ v
-    seen = w[:, nz:] + state.psi @ bound.shown.T
-    state = state._replace(psi=state.psi @ bound.structure.Az.T + w[:, :nz])
-    sizes, offsets = np.abs(seen), bound.structure.offsets
-    moved, shift = sizes[:, :rows].sum(axis=0), np.zeros(no)
-    if offsets.any():
-        middle = offsets @ seen
-        moved, shift = moved + np.abs(middle[:rows]), -middle[rows:]
-    return state, moved, sizes[:, rows:], shift
-
-
-def _varying(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _First:
-    p, nz, rows, _, no = bound.counts
-    eps = np.abs(np.einsum("jprv,jv->jpr", bound.memory, state.past)).sum(axis=0) * bound.spans[:, None]
-    sizes = np.abs(bound.drive[:, nz:] @ v) * bound.spans[:, None] + eps[:, : rows + no]
-    older = state.moved[0]
-    into = eps[:, rows + no :].sum(axis=0) + bound.responses.tail_eps @ older
-    state = state._replace(past=np.vstack([state.past[1:], v]), moved=np.vstack([state.moved[1:], into]))
-    tail = bound.tail_rows @ older
-    first = sizes[:, rows:] + (bound.responses.tail_outputs @ older) / p
-    return state, sizes[:, :rows].sum(axis=0) + tail, first, np.zeros(no)
 
 
 class AdaptiveRuleState(NamedTuple):

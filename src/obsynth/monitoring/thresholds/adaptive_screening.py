@@ -16,10 +16,9 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.contraction import inverse_bound
 from obsynth.simulation.benches import Runs
 from obsynth.verification.over_tolerances.adaptive_bound import AdaptiveBound
-from obsynth.verification.over_tolerances.adaptive_record import (
+from obsynth.verification.over_tolerances.adaptive_recursion import (
     THRESHOLD_ROUNDING,
     AdaptivePlan,
-    filtered,
     thresholds_of_records,
 )
 
@@ -257,3 +256,28 @@ def first_passed(
     # What comes after the first that surely passes does not count.
     left &= np.arange(len(candidates))[:, None] < first
     return above, left
+
+
+def filtered(az: FloatArray, w: FloatArray) -> FloatArray:
+    """Return ``psi(k+1) = Az psi(k) + w(k)`` from zero, ``(runs, steps, p, nz)``; blocks side by side."""
+    runs, steps, p, nz = w.shape
+    size = max(1, int(np.sqrt(steps)))
+    blocks = -(-steps // size)
+    padded = np.zeros((runs, blocks * size, p, nz))
+    padded[:, :steps] = w
+    inside = np.ascontiguousarray(padded.reshape(runs, blocks, size, p, nz).transpose(2, 0, 1, 3, 4))
+    found = np.zeros((size + 1, runs, blocks, p, nz))
+    turned = np.ascontiguousarray(az.T)
+    for k in range(size):
+        found[k + 1] = inside[k]
+        found[k + 1] += (found[k].reshape(-1, nz) @ turned).reshape(found[k].shape)
+    power = np.linalg.matrix_power(turned, size)
+    begins = np.zeros((runs, blocks, p, nz))
+    for b in range(1, blocks):
+        begins[:, b] = (begins[:, b - 1].reshape(-1, nz) @ power).reshape(runs, p, nz) + found[size, :, b - 1]
+    step = begins
+    for k in range(size):
+        found[k] += step
+        step = (step.reshape(-1, nz) @ turned).reshape(step.shape)
+    whole = found[:size].transpose(1, 2, 0, 3, 4).reshape(runs, blocks * size, p, nz)
+    return np.ascontiguousarray(whole[:, :steps])
