@@ -245,8 +245,8 @@ def mean_noise_rows(design: ObserverDesign) -> Iterator[Check]:
     if mean == 1 or not plant.nw or tracking is None or len(tracking) != observer.order:
         return
     rows = observer.fault_rows
-    entering = observer.By @ plant.Dw - tracking[:, : plant.nx] @ plant.Bw
-    found = certain_noise_covariance(observer.Az, entering, observer.Cz[rows], observer.Dy[rows] @ plant.Dw, plant.dt)
+    errors = ErrorModel(plant, observer, tracking)
+    found = certain_noise_covariance(errors.Az, errors.noise, -observer.Cz[rows], errors.output(rows)[3], plant.dt)
     for name, variance in zip(observer.fault_names, np.diag(found), strict=True):
         yield information(
             f"noise in the mean of fhat[{name}]",

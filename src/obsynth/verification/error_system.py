@@ -223,19 +223,20 @@ class ErrorModel:
     @cached_property
     def fault(self) -> FloatArray:
         """``(nz, nf)``: faults, whatever their time course, to e."""
-        return self._driven(self.plant.Bf, self.plant.Df)
+        return self.driven_by(self.plant.Bf, self.plant.Df)
 
     @cached_property
     def disturbance(self) -> FloatArray:
         """``(nz, nd)``."""
-        return self._driven(self.plant.Bd, self.plant.Dd)
+        return self.driven_by(self.plant.Bd, self.plant.Dd)
 
     @cached_property
     def noise(self) -> FloatArray:
         """``(nz, nw)``."""
-        return self._driven(self.plant.Bw, self.plant.Dw)
+        return self.driven_by(self.plant.Bw, self.plant.Dw)
 
-    def _driven(self, b: FloatArray, d: FloatArray) -> FloatArray:
+    def driven_by(self, b: FloatArray, d: FloatArray) -> FloatArray:
+        """Return ``T b - By d (nz, any)``: what drives e where a signal enters the plant by b and its outputs by d."""
         return np.asarray(self.own @ b - self.observer.By @ d)
 
     def output(self, rows: slice) -> Output:

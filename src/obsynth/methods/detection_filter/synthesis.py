@@ -22,6 +22,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.results.design import Certificate
+from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.norm_proofs import Transfer, added_gain, error_transfer, gain_is_proved, sensitivity_is_proved
 
 #: The grid of frequencies begins at this share of its end, where the band begins at zero.
@@ -206,13 +207,13 @@ def _gains(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
 
 def _sensitivity(plant: DescriptorSystem, observer: LinearObserver, low: float, high: float) -> tuple[float, float]:
     """Return the least singular value from the faults to the residuals on a band, and where."""
-    entering = plant.Bf - observer.By @ plant.Df
-    shown, direct = -observer.Cz, observer.Dy @ plant.Df
+    errors = ErrorModel(plant, observer, np.eye(plant.nx))
+    shown, direct, _, _ = errors.residual_output
 
     def least(points: FloatArray) -> FloatArray:
         if plant.nf > plant.ny:
             return np.zeros(len(points))
-        found = response(observer.Az, entering, shown, direct, np.asarray(1j * points, dtype=np.complex128))
+        found = response(errors.Az, errors.fault, -shown, direct, np.asarray(1j * points, dtype=np.complex128))
         return np.asarray(np.linalg.svd(found, compute_uv=False)[:, -1])
 
     grid = np.unique(

@@ -18,7 +18,7 @@ from obsynth.plants.plant_units import PlantUnits
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import listed_gains
-from obsynth.verification.error_system import natural_scaling
+from obsynth.verification.error_system import ErrorModel, natural_scaling
 from obsynth.verification.identities import Identity, equality, relative_tolerance
 from obsynth.verification.inequalities import decay_row, stability_row
 from obsynth.verification.plant import condition_rows, plant_information
@@ -262,14 +262,14 @@ def _tracking(
     """Yield what the estimates make of faults that follow their models: each its own, and no other."""
     matrices = design.certificate.matrices
     pi, phi, cw = matrices["tracking"], matrices["Phi"], matrices["Cw"]
-    entering = observer.By @ plant.Df - matrices["T"] @ plant.Bf
-    direct = observer.Dy @ plant.Df - matrices["T0"] @ plant.Bf
+    errors = ErrorModel(plant, observer, matrices["T"], -matrices["T0"])
+    direct = errors.output(slice(None))[1]
     # The filter's states are of like size: an entry that is nothing but rounding is judged beside them.
     largest = np.full_like(pi, np.max(np.abs(pi), initial=0.0))
     yield (
         "motion with the fault model",
         "Az Pi + (By Df - T Bf) Cw = Pi Phi",
-        Identity((observer.Az @ pi, entering @ cw, -pi @ phi), ((observer.Az, largest), (largest, phi))),
+        Identity((errors.Az @ pi, -errors.fault @ cw, -pi @ phi), ((observer.Az, largest), (largest, phi))),
     )
     if not observer.fault_names:
         return

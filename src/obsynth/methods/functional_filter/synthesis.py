@@ -37,6 +37,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.plants.noise import assumed_noise_names
 from obsynth.results.design import Certificate
+from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.inequalities import slowest_decay, stability_factor
 
 #: Errors that need longer than so many times the settling time are mentioned.
@@ -70,7 +71,7 @@ def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Ca
         "Cw": model.Cw,
         "walks": np.diag(walks),
         "stability": stability_factor(observer),
-        "tracking": tracking_map(plant, observer, t, model.Phi, model.Cw),
+        "tracking": tracking_map(ErrorModel(plant, observer, t), model.Phi, model.Cw),
     }
     matrices["deviations"] = estimate_deviations(noisy, observer, matrices)
     slowest = slowest_decay(observer.Az, plant.dt)

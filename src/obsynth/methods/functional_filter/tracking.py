@@ -19,17 +19,15 @@ from obsynth.verification.error_system import ErrorModel
 MOST_RATIONAL_UNKNOWNS = 100
 
 
-def tracking_map(
-    plant: DescriptorSystem, observer: LinearObserver, t: FloatArray, phi: FloatArray, cw: FloatArray
-) -> FloatArray:
+def tracking_map(errors: ErrorModel, phi: FloatArray, cw: FloatArray) -> FloatArray:
     """Return Pi ``(nz, nw)``: where eps goes when every fault follows its model, ``Az Pi + b Cw = Pi Phi``."""
     from scipy.linalg import solve_sylvester
 
-    entering = (observer.By @ plant.Df - t @ plant.Bf) @ cw
+    entering = -errors.fault @ cw
     if not entering.size:
         return np.zeros(entering.shape)
-    exact = _with_digits_to_spare(observer.Az, phi, entering) if entering.size <= MOST_RATIONAL_UNKNOWNS else None
-    return np.asarray(solve_sylvester(observer.Az, -phi, -entering)) if exact is None else exact
+    exact = _with_digits_to_spare(errors.Az, phi, entering) if entering.size <= MOST_RATIONAL_UNKNOWNS else None
+    return np.asarray(solve_sylvester(errors.Az, -phi, -entering)) if exact is None else exact
 
 
 def _with_digits_to_spare(a: FloatArray, phi: FloatArray, entering: FloatArray) -> FloatArray | None:

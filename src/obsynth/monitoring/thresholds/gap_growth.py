@@ -50,7 +50,7 @@ class GapGrowth:
         nx, nf = plant.nx, plant.nf
         self._M = np.block([[plant.A, plant.Bf], [np.zeros((nf, nx)), np.eye(nf)]])
         self._H = np.hstack([plant.C, plant.Df])
-        powers, driven = model.powers(), errors.own @ self._Bq - observer.By @ self._Dq
+        powers, driven = model.powers(), errors.driven_by(self._Bq, self._Dq)
         self._last = powers[-1] @ model.A
         self._impulses = np.hstack([power @ driven for power in powers]) if len(model.A) else np.zeros((0, 0))
         self._powers, self._aged = np.stack(powers), float(np.linalg.norm(self._last @ driven, axis=0).sum())
