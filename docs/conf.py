@@ -41,7 +41,7 @@ suppress_warnings = ["myst.header", "config.cache"]
 #: From what everybody draws first to what few need.
 PICTURES = (
     "simulation", "data", "faults", "states", "parameters", "residuals", "detection", "decision", "compare", "trade_off",
-    "gains", "poles", "least_thresholds", "intervals", "hidden_course", "tolerances",
+    "delays", "gains", "poles", "least_thresholds", "intervals", "hidden_course", "tolerances",
 )  # fmt: skip
 sphinx_gallery_conf = {
     "examples_dirs": "gallery",

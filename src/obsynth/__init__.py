@@ -167,6 +167,12 @@ def _robustness(design: Any) -> Any:
     return robustness(design)
 
 
+def _plot_delays(design: Any, **options: Any) -> Any:
+    from obsynth.report.plots.trade_off import plot_delays
+
+    return plot_delays(design, **options)
+
+
 def _plot_least_thresholds(test: Any, **options: Any) -> Any:
     from obsynth.report.plots.guaranteed import plot_least_thresholds
 
@@ -177,6 +183,7 @@ def _plot_least_thresholds(test: Any, **options: Any) -> Any:
 register(
     conditions_of_design=_conditions_of_design,
     design_of_conditions=_design_of_conditions,
+    plot_delays=_plot_delays,
     plot_least_thresholds=_plot_least_thresholds,
     summary_of_design=_summary_of_design,
 )

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from obsynth.report.plots.simulation import plot_detection as plot_detection
     from obsynth.report.plots.simulation import plot_simulation as plot_simulation
     from obsynth.report.plots.spectra import plot_poles as plot_poles
+    from obsynth.report.plots.trade_off import plot_delays as plot_delays
     from obsynth.report.plots.trade_off import plot_trade_off as plot_trade_off
     from obsynth.studies.plots.tolerances import plot_tolerances as plot_tolerances
 
@@ -32,7 +33,7 @@ _PICTURES = {
     "report.plots.guaranteed": "plot_hidden_course plot_intervals plot_least_thresholds",
     "report.plots.simulation": "plot_decision plot_detection plot_simulation",
     "report.plots.spectra": "plot_poles",
-    "report.plots.trade_off": "plot_trade_off",
+    "report.plots.trade_off": "plot_delays plot_trade_off",
     "studies.plots.tolerances": "plot_tolerances",
 }
 _PICTURE_HOMES = {name: f"obsynth.{module}" for module, names in _PICTURES.items() for name in names.split()}

@@ -36,6 +36,7 @@ def matched(reference) -> dict:
 
 
 ONE = {"D": [[1.0]]}
+ONE_LAG = {"bandwidth": 5.0}
 ONE_SAMPLE_LATE = ([[0.0]], [[1.0]], [[1.0]], [[0.0]])
 STATIC = plant(A=[[0.0]], Bf=[[0]], Bw=[[0]], C=[[0]], Df=[[1]], Dw=[[1]])
 TWO = plant(A=[[0.0]], Bf=[[0]], Bw=[[0, 0]], C=[[0], [0]], Df=[[1], [1]], Dw=np.eye(2))
@@ -157,6 +158,50 @@ def test_the_papers_plant_has_exactly_1_and_with_one_more_sample_0() -> None:
     assert none.delay == 2
     assert none.gain < 1e-8
     assert [(row.delay, round(row.gain, 8)) for row in none.trade_off] == [(1, 1.0), (2, 0.0)]
+
+
+def test_the_statement_has_bounds_one_more_sample_and_the_limit() -> None:
+    design = obsynth.optimal_filter(ZERO_AT_2, delay=1)
+    assert design.notes[0] == (
+        "Least gain over all causal filters, linear or not, with this exact fault map and delay 1: between 0.66666666 "
+        "and 0.66666668, proved; this filter: 0.66666668. With delay 2: 0.33333."
+    )
+    assert "No delay brings it below 0.9999" in obsynth.optimal_filter(WALK).notes[0]
+    zero = obsynth.optimal_filter(WANG, delay=2).notes[0]
+    assert zero.endswith("and delay 2: 0; this filter: 0 but for rounding.")
+    assert obsynth.optimal_filter(WANG, delay=1).notes[0].endswith("With delay 2: 0.")
+    matching = obsynth.optimal_filter(HALF, **matched(ONE)).notes[0]
+    assert matching.startswith("Least gain over all causal filters, matching this reference model: between 0.447213")
+
+
+def test_a_gain_that_falls_with_every_sample_is_followed_and_said() -> None:
+    design = obsynth.optimal_filter(ZERO_AT_2)
+    assert [row.delay for row in design.trade_off] == list(range(9))
+    assert [row.gain for row in design.trade_off] == pytest.approx([4 / 3 / 2**k for k in range(9)], rel=1e-7)
+    assert design.delay == 8
+    assert "Longer delays were not tried" in design.notes[0]
+
+
+@pytest.mark.parametrize("norm", ["hinf", "h2"])
+def test_the_trade_off_has_both_norms_whichever_counts(norm: str) -> None:
+    """The deviations are known in closed form; no gain is below the limit of all delays, which is 1."""
+    design = obsynth.optimal_filter(WALK, norm=norm)
+    assert [row.deviation for row in design.trade_off] == pytest.approx([walk_deviation(k) for k in range(5)], rel=1e-9)
+    assert [row.gain for row in design.trade_off] == pytest.approx([1.0] * 5, rel=1e-7)
+    assert design.delay == (0 if norm == "hinf" else 1)
+    header, *rows = str(design.trade_off).splitlines()
+    assert header.split() == ["delay", "least", "gain", "least", "deviation"]
+    assert rows[0].split() == ["0", "1", "0.7862"]
+
+
+def test_the_delays_are_drawn_with_the_one_that_is_chosen() -> None:
+    design = obsynth.optimal_filter(WALK)
+    drawn = {line.get_label(): line for line in design.plot().get_lines()}
+    np.testing.assert_array_equal(drawn["least gain of any filter"].get_ydata(), [row.gain for row in design.trade_off])
+    assert list(drawn["this filter: delay 0"].get_xdata()) == [0]
+    assert any("no delay falls below" in label for label in drawn)
+    with pytest.raises(obsynth.SpecError, match="no delay to choose"):
+        obsynth.plotting.plot_delays(obsynth.optimal_filter(SLOW, reference=ONE_LAG))
 
 
 def test_the_error_of_a_simulation_is_within_the_gain_and_reaches_it() -> None:

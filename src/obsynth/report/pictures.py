@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from obsynth.errors import ObsynthError
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
+from obsynth.methods.optimal_filter.method import OptimalFilterMethod
+from obsynth.methods.optimal_filter.public import OptimalFilter
 from obsynth.observers.detection import Decision, Detection
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.report.demonstration import EDGE, HALF_WIDTH, PANEL, WIDE, demonstration_scenario
@@ -19,6 +21,7 @@ from obsynth.report.plots.guaranteed import plot_hidden_course
 from obsynth.report.plots.panels import data_url, image_of
 from obsynth.report.plots.simulation import plot_simulation
 from obsynth.report.plots.spectra import plot_poles
+from obsynth.report.plots.trade_off import plot_delays
 from obsynth.results.design import ObserverDesign
 from obsynth.results.registered import is_registered, registered
 from obsynth.simulation.scenario import Scenario
@@ -54,6 +57,9 @@ def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> 
     yield from _at_work(design, scenario)
     if design.method == GuaranteedTestMethod.id:
         yield from _hidden(GuaranteedTest.of(design))
+    if design.method == OptimalFilterMethod.id and len(OptimalFilter.of(design).trade_off) > 1:
+        text = "The least gain and the least deviation of any filter with an exact fault map against its delay."
+        yield Picture("Delay", text, drawn((HALF_WIDTH, 4.2), 1, lambda axes: plot_delays(design, axes=axes[0])))
     if not isinstance(design.observer, LinearObserver):
         return
     sampled = design.observer.dt > 0.0

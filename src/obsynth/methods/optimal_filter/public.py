@@ -3,20 +3,47 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from obsynth.errors import SpecError
+from obsynth.files.tables import html_table, text_table
 from obsynth.methods.functions import design_function
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.results.design import ObserverDesign
+from obsynth.results.layout import number
+from obsynth.results.registered import registered
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 class DelayChoice(NamedTuple):
-    """A row of the trade-off: the least gain (or root mean square) of any filter with an exact map of this delay."""
+    """A row of the trade-off: what no filter with an exact fault map of this delay has less of.
+
+    ``gain``: from noise to error, of energies; ``deviation``: root mean square for white noise of unit intensity.
+    """
 
     delay: int
     gain: float
+    deviation: float
+
+
+class TradeOff(tuple[DelayChoice, ...]):
+    """Least gain and least deviation by delay in samples; printed as a table."""
+
+    __slots__ = ()
+
+    def rows(self) -> tuple[tuple[str, ...], ...]:
+        """Return the table as texts, the header first."""
+        header = ("delay", "least gain", "least deviation")
+        return (header, *((str(row.delay), number(row.gain), number(row.deviation)) for row in self))
+
+    def __str__(self) -> str:
+        return "\n".join(text_table(self.rows()))
+
+    def _repr_html_(self) -> str:
+        return html_table(self.rows())
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -68,10 +95,26 @@ class OptimalFilter(ObserverDesign):
         return int(self.certificate.claims.get("delay", 0))
 
     @property
-    def trade_off(self) -> tuple[DelayChoice, ...]:
-        """Least gain against delay in samples, as far as the search looked; computed, not proved."""
+    def trade_off(self) -> TradeOff:
+        """Least gain and deviation against delay in samples, as far as the search looked; computed, not proved."""
         rows = self.solver.get("trade_off", ())
-        return tuple(DelayChoice(int(delay), float(gain)) for delay, gain in rows if delay is not None)
+        return TradeOff(DelayChoice(int(delay), float(gain), float(deviation)) for delay, gain, deviation in rows)
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Plot least gain and least deviation against delay; see `obsynth.plotting.plot_delays`.
+
+        Parameters
+        ----------
+        axes : Axes, optional
+            Where; new ones by default.
+
+        Returns
+        -------
+        Axes
+            The delay of this filter is marked.
+        """
+        found: Axes = registered("plot_delays")(self, axes=axes)
+        return found
 
 
 # Its parameters are those of every design.

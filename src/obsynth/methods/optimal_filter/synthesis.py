@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+import math
+from collections.abc import Callable, Mapping
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from obsynth.analysis.existence.condition import OPTIONS_PATH
 from obsynth.errors import PreconditionError, SpecError
@@ -21,8 +25,10 @@ from obsynth.verification.invisible_faults import seen_plant
 
 #: A delay is taken when its least gain is at most this much above that of the longest one that was tried.
 DELAY_ROOM = 1.05
-#: Delays that are tried after the first one that exists.
-MORE_DELAYS = 4
+#: Delays that are tried after the first one that exists, and at most where each is better than that by `DELAY_ROOM`.
+MORE_DELAYS, MOST_MORE_DELAYS = 4, 8
+#: Significant digits of a bound in words.
+FEWEST_DIGITS, MOST_DIGITS = 4, 8
 
 
 def synthesise(plant: DescriptorSystem, asked: OptimalFilterMethod, *, progress: Callable[[str], None]) -> Synthesis:
@@ -58,49 +64,109 @@ def synthesise(plant: DescriptorSystem, asked: OptimalFilterMethod, *, progress:
     solver = {
         "engine": "filtering Riccati equation",
         "added_noise": chosen.added_noise,
-        "trade_off": [[one.fault_map.delay, 0.0 if one.is_nothing else one.gain] for one in curve],
+        "trade_off": [[row.found.fault_map.delay, row.gain, row.deviation] for row in curve],
     }
     gains = {"T": found.T, "T0": found.T0}
-    notes = tuple(_notes(curve, chosen, asked.norm))
+    notes = tuple(_notes(curve, chosen, asked, claims))
     return Synthesis(options, gains, observer, Certificate(matrices, claims), solver=solver, notes=notes)
 
 
-def _chosen(plant: DescriptorSystem, asked: OptimalFilterMethod) -> tuple[list[Designed], Designed]:
-    """Return the delays that were looked at, and the one that is taken; a reference model has none."""
+class _Row(NamedTuple):
+    """A delay that was looked at: the filter of the norm that counts, and the least of both norms."""
+
+    found: Designed
+    gain: float
+    deviation: float
+
+    @property
+    def counts(self) -> float:
+        return 0.0 if self.found.is_nothing else self.found.gain
+
+
+def _chosen(plant: DescriptorSystem, asked: OptimalFilterMethod) -> tuple[list[_Row], Designed]:
+    """Return the delays that were looked at, and the filter of the one that is taken; a reference model has none."""
     fault_map, _ = first_problem(plant, asked)
-    curve = [designed(plant, fault_map, asked.norm)]
+    first = designed(plant, fault_map, asked.norm)
     if fault_map.delay is None:
-        return curve, curve[0]
+        return [], first
+    curve = [_row(plant, first, asked.norm)]
     # A delay that was asked for is printed with what one sample more would give.
-    more = MORE_DELAYS if asked.delay == "auto" else 1
-    for delay in range(fault_map.delay + 1, fault_map.delay + 1 + more):
-        if curve[-1].is_nothing:
+    more, most = (MORE_DELAYS, MOST_MORE_DELAYS) if asked.delay == "auto" else (1, 1)
+    for delay in range(fault_map.delay + 1, fault_map.delay + 1 + most):
+        falling = len(curve) < 2 or DELAY_ROOM * curve[-1].counts < curve[-2].counts
+        if curve[-1].found.is_nothing or (len(curve) > more and not falling):
             break
         try:
-            curve.append(designed(plant, FaultMap(delay, None, True), asked.norm))
+            curve.append(_row(plant, designed(plant, FaultMap(delay, None, True), asked.norm), asked.norm))
         except PreconditionError:
             break
     if asked.delay != "auto":
-        return curve, curve[0]
-    enough = max(DELAY_ROOM * min(one.gain for one in curve), curve[0].nothing)
-    return curve, next(one for one in curve if one.gain <= enough)
+        return curve, first
+    enough = max(DELAY_ROOM * min(row.counts for row in curve), first.nothing)
+    return curve, next(row.found for row in curve if row.found.gain <= enough)
 
 
-def _notes(curve: list[Designed], chosen: Designed, norm: str) -> list[str]:
-    notes = []
-    if chosen.fault_map.delay is not None:
-        listed = "; ".join(
-            f"delay {one.fault_map.delay}: {'0' if one.is_nothing else f'{one.gain:.6g}'}" for one in curve
-        )
-        notes.append(f"Least {'gain' if norm == 'hinf' else 'root mean square'} by delay in samples: {listed}.")
+def _row(plant: DescriptorSystem, found: Designed, norm: str) -> _Row:
+    """Return the row of a filter, with the least of the norm that it is not for."""
+    if found.is_nothing:
+        return _Row(found, 0.0, 0.0)
+    other = designed(plant, found.fault_map, "h2" if norm == "hinf" else "hinf")
+    least = 0.0 if other.is_nothing else other.gain
+    return _Row(found, found.gain, least) if norm == "hinf" else _Row(found, least, found.gain)
+
+
+def _notes(curve: list[_Row], chosen: Designed, asked: OptimalFilterMethod, claims: Mapping[str, float]) -> list[str]:
+    notes = [_statement(curve, chosen, asked, claims)]
+    if len(curve) > 1:
+        listed = "; ".join(f"delay {row.found.fault_map.delay}: {row.gain:.6g}, {row.deviation:.6g}" for row in curve)
+        notes.append(f"Least gain, and least deviation for white noise of unit intensity, by delay: {listed}.")
     if chosen.added_noise:
         notes.append(
             "An output, or a combination of outputs, has no noise: the filter is the one for "
             f"{chosen.added_noise:g} of the plant's own sizes more on every output. State the noise of every sensor "
             "(sensor_noise) to close the gap between the gain and the least gain."
         )
-    if chosen.is_nothing and norm == "hinf":
+    if chosen.is_nothing and asked.norm == "hinf":
         notes.append(
             "The least gain is zero: with exact numbers nothing reaches the error; what is claimed is rounding."
         )
     return notes
+
+
+def _statement(curve: list[_Row], chosen: Designed, asked: OptimalFilterMethod, claims: Mapping[str, float]) -> str:
+    """Return what no filter beats, how near this one is to it, and what more delay would give."""
+    fault_map = chosen.fault_map
+    if not fault_map.exact:
+        of = "over all causal filters, matching this reference model"
+    elif fault_map.delay is None:
+        of = "over all causal filters, linear or not, with this exact fault map"
+    else:
+        of = f"over all causal filters, linear or not, with this exact fault map and delay {fault_map.delay}"
+    if asked.norm == "h2":
+        of = of.replace("causal filters, linear or not,", "causal linear filters")
+        text = f"Least deviation {of}: {chosen.gain:.8g}, reached by this filter."
+    elif chosen.is_nothing:
+        text = f"Least gain {of}: 0; this filter: 0 but for rounding."
+    else:
+        low, high = bracketed(claims.get("least", 0.0), claims["gain"])
+        text = f"Least gain {of}: between {low} and {high}, proved; this filter: {high}."
+    later = next((row for row in curve if row.found.fault_map.delay == (fault_map.delay or 0) + 1), None)
+    if later is not None:
+        text += f" With delay {later.found.fault_map.delay}: {later.counts:.5g}."
+    elif len(curve) > 1 and not chosen.is_nothing:
+        text += " Longer delays were not tried, and each sample more still lowered it: give a delay to go on."
+    if "non_causal_limit" in claims:
+        low, _ = bracketed(claims["non_causal_limit"], np.inf)
+        text += f" No delay brings it below {low}."
+    return text
+
+
+def bracketed(low: float, high: float) -> tuple[str, str]:
+    """Return both ends of an interval as texts, rounded outwards, in the digits that agree and two more."""
+    gap = (high - low) / high if np.isfinite(high) and high > 0.0 else 1.0
+    agreeing = -math.log10(gap) if gap > 0.0 else MOST_DIGITS
+    digits = int(np.clip(agreeing + 2.0, FEWEST_DIGITS, MOST_DIGITS))
+    ends = ((low, ROUND_FLOOR), (high, ROUND_CEILING))
+    rounded = (float(Context(digits, way).create_decimal(repr(float(end)))) for end, way in ends)
+    below, above = (f"{end:.{digits}g}" for end in rounded)
+    return below, above

@@ -9,9 +9,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.methods.optimal_filter.public import OptimalFilter
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arguments import arguments_checked, is_number
-from obsynth.report.plots.panels import PANEL_HEIGHT, WIDE_AXIS, WIDTH, new_panels, plain_decades, tidy, with_unit
+from obsynth.report.plots.panels import (
+    PANEL_HEIGHT,
+    WIDE_AXIS,
+    WIDTH,
+    finish,
+    new_panels,
+    one_panel,
+    plain_decades,
+    tidy,
+    with_unit,
+)
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:
@@ -91,6 +102,69 @@ def plot_trade_off(
     if panels:
         panels[-1].set_xlabel(_claim_label(along, [design.method for design in designs]))
     return panels
+
+
+@arguments_checked
+def plot_delays(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
+    """Plot the least gain and the least deviation of any filter with an exact fault map against its delay.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        By `obsynth.optimal_filter`, in discrete time, with a delay and not a reference model.
+    axes : Axes, optional
+        Where; new ones by default.
+
+    Returns
+    -------
+    Axes
+        Both against the delay in samples; the delay of this filter is marked, and what no delay falls below is dashed.
+
+    Raises
+    ------
+    SpecError
+        The design is by another method, or follows a reference model: it has no delay to choose.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.DescriptorSystem(
+    ...     A=[[0.5]], C=[[1], [1]], Bf=[[0]], Df=[[1], [1]], Bw=[[0, 0]], Dw=[[1, 0], [0, 1]], dt=1.0
+    ... )
+    >>> obsynth.plotting.plot_delays(obsynth.optimal_filter(plant)).get_xlabel()
+    'delay of the fault map (samples)'
+    """
+    found = OptimalFilter.of(design)
+    table = found.trade_off
+    if not table:
+        raise SpecError(
+            f"Design {design.name!r} follows a reference model: there is no delay to choose.", path="design"
+        )
+    panel = one_panel(axes, size=(WIDTH, 1.6 * PANEL_HEIGHT))
+    delays = [row.delay for row in table]
+    lines = (
+        ("least gain of any filter", [row.gain for row in table], "o", "-"),
+        ("least deviation, white noise of unit intensity", [row.deviation for row in table], "s", ":"),
+    )
+    for label, values, marker, style in lines:
+        panel.plot(delays, values, color="black", marker=marker, markersize=4, linestyle=style, label=label)
+    gain = next(row.gain for row in table if row.delay == found.delay)
+    deviation = next(row.deviation for row in table if row.delay == found.delay)
+    panel.plot(
+        found.delay,
+        gain if found.options["norm"] == "hinf" else deviation,
+        marker="s",
+        markersize=9,
+        color="tab:red",
+        linestyle="none",
+        zorder=0,
+        label=f"this filter: delay {found.delay}",
+    )
+    if found.non_causal_limit > 0.0:
+        panel.axhline(found.non_causal_limit, color="0.5", linestyle="--", label="gain that no delay falls below")
+    panel.set_xticks(delays)
+    panel.set_ylim(bottom=0.0)
+    return finish(panel, "error per unit of noise", below="delay of the fault map (samples)")
 
 
 def _claim_label(name: str, methods: Sequence[str]) -> str:
