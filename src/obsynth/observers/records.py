@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_number, real_array, real_number, require_kind
+from obsynth.numerics.arguments import is_number, is_whole, real_array, real_number, require_kind
 from obsynth.numerics.arrays import FloatArray, as_given, as_matrix
 from obsynth.plants.dae import finite_vector
 from obsynth.plants.signal_names import index_of, suggestion
@@ -28,6 +28,13 @@ def require_names(names: Any, field: str) -> None:
         raise SpecError(
             f"{field} of the observer repeats {', '.join(map(repr, repeated))}: names must be unique.", path=field
         )
+
+
+def require_delays(names: tuple[str, ...], delays: Any) -> None:
+    """Raise `SpecError` unless there is a delay of 0 or more samples for each signal."""
+    whole = isinstance(delays, tuple) and all(is_whole(delay) and delay >= 0 for delay in delays)
+    if not whole or len(names) != len(delays):
+        raise SpecError("The observer needs one delay >= 0, in samples, for each signal.", path="delays")
 
 
 def require_horizon(horizon: int | None, samples: int, *, early: bool) -> None:

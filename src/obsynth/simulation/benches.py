@@ -13,7 +13,7 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.linear.observer import LinearObserver, split_rows
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampled import sample_observer
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.nonlinear.region_observer import RegionObserver
@@ -63,7 +63,7 @@ class Runs:
         """What the observer says, one per run."""
         if not isinstance(self.observer, LinearObserver):
             return self.kept
-        return tuple(split_rows(self.observer, self.rows[:, run]) for run in range(self.rows.shape[1]))
+        return tuple(self.observer.split(self.rows[:, run]) for run in range(self.rows.shape[1]))
 
 
 @dataclass(frozen=True, eq=False)

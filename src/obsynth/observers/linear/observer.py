@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, is_whole, real_array, require_kind, require_shape, shown
+from obsynth.numerics.arguments import is_finite_number, real_array, require_kind, require_shape, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.observers.estimate_rows import EstimateRows
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.records import NAME_FIELDS, checked_sample, require_names, whole_record
+from obsynth.observers.records import NAME_FIELDS, checked_sample, require_delays, require_names, whole_record
 from obsynth.observers.running import Observer, RunningObserver
 
 
@@ -24,7 +25,7 @@ class LinearState(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class LinearObserver(Observer[LinearState, FloatArray]):
+class LinearObserver(EstimateRows, Observer[LinearState, FloatArray]):
     r"""A realisation from known inputs and outputs to estimates.
 
     .. math::
@@ -90,36 +91,13 @@ class LinearObserver(Observer[LinearState, FloatArray]):
             raise SpecError(
                 f"dt of the observer is {shown(self.dt)}: give seconds, or 0 for continuous time.", path="dt"
             )
-        for names, delays in ((self.state_names, self.state_delays), (self.fault_names, self.fault_delays)):
-            whole = isinstance(delays, tuple) and all(is_whole(delay) and delay >= 0 for delay in delays)
-            if not whole or len(names) != len(delays):
-                raise SpecError("The observer needs one delay >= 0, in samples, for each signal.", path="delays")
+        require_delays(self.state_names, self.state_delays)
+        require_delays(self.fault_names, self.fault_delays)
 
     @property
     def order(self) -> int:
         """Number of observer states ``nz``."""
         return int(self.Az.shape[0])
-
-    @property
-    def row_names(self) -> tuple[str, ...]:
-        """Names of the rows of ``Cz``: ``xhat[...]``, ``fhat[...]``, ``r[...]``."""
-        kinds = (("xhat", self.state_names), ("fhat", self.fault_names), ("r", self.residual_names))
-        return tuple(f"{kind}[{name}]" for kind, names in kinds for name in names)
-
-    @property
-    def state_rows(self) -> slice:
-        """Rows of ``Cz`` that hold the state estimates."""
-        return slice(0, len(self.state_names))
-
-    @property
-    def fault_rows(self) -> slice:
-        """Rows of ``Cz`` that hold the fault estimates."""
-        return slice(len(self.state_names), len(self.state_names) + len(self.fault_names))
-
-    @property
-    def residual_rows(self) -> slice:
-        """Rows of ``Cz`` that hold the residuals."""
-        return slice(len(self.state_names) + len(self.fault_names), int(self.Cz.shape[0]))
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field, as the constructor takes it."""
@@ -197,7 +175,7 @@ class LinearObserver(Observer[LinearState, FloatArray]):
         outputs = checked_sample(y, len(self.output_names), "y")
         inputs = checked_sample(u, len(self.input_names), "u")
         after, row = self.advance(state, outputs, inputs)
-        return after, split_rows(self, row[None, :])
+        return after, self.split(row[None, :])
 
     @cached_property
     def _is_delay_line(self) -> bool:
@@ -239,22 +217,8 @@ class LinearObserver(Observer[LinearState, FloatArray]):
         outputs, inputs = whole_record(y, u, len(self.output_names), len(self.input_names), complete=True)
         state = self.init(initial_state)
         if self._is_delay_line:
-            return split_rows(self, self._weighted(outputs, inputs, state.z))
+            return self.split(self._weighted(outputs, inputs, state.z))
         rows = np.empty((len(outputs), self.Cz.shape[0]))
         for k in range(len(outputs)):
             state, rows[k] = self.advance(state, outputs[k], inputs[k])
-        return split_rows(self, rows)
-
-
-def split_rows(observer: LinearObserver, rows: FloatArray) -> Estimates:
-    """Return the estimates in the output rows ``(..., samples, nx + nf + nr)`` of an observer."""
-    return Estimates(
-        read_only(rows[..., observer.state_rows]),
-        read_only(rows[..., observer.fault_rows]),
-        read_only(rows[..., observer.residual_rows]),
-        observer.state_names,
-        observer.fault_names,
-        observer.residual_names,
-        observer.state_delays,
-        observer.fault_delays,
-    )
+        return self.split(rows)

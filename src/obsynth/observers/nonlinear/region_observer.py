@@ -23,6 +23,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind, shown
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.estimate_rows import EstimateRows
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.records import checked_sample, whole_record
 from obsynth.observers.running import Observer
@@ -43,7 +44,7 @@ class RegionState(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class RegionObserver(Observer[RegionState, FloatArray]):
+class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
     """An observer of a nonlinear plant with a certificate over a region.
 
     Parameters
@@ -185,12 +186,6 @@ class RegionObserver(Observer[RegionState, FloatArray]):
         """Number of states and faults."""
         return len(self.terms.names)
 
-    @property
-    def row_names(self) -> tuple[str, ...]:
-        """Names of the rows: ``xhat[...]``, ``fhat[...]``, ``r[...]``."""
-        kinds = (("xhat", self.state_names), ("fhat", self.faults), ("r", self.output_names))
-        return tuple(f"{kind}[{name}]" for kind, names in kinds for name in names)
-
     @cached_property
     def places(self) -> FloatArray:
         """Where each state of the model, then each fault, stands in z."""
@@ -258,16 +253,6 @@ class RegionObserver(Observer[RegionState, FloatArray]):
     @cached_property
     def _limits(self) -> tuple[FloatArray, FloatArray, FloatArray, tuple[tuple[int, int, float], ...]]:
         return (*self.operating_region.matrices(), self.operating_region.measured())
-
-    @property
-    def fault_rows(self) -> slice:
-        """Rows that hold the fault estimates."""
-        return slice(len(self.state_names), len(self.state_names) + len(self.faults))
-
-    @property
-    def residual_rows(self) -> slice:
-        """Rows that hold the residuals."""
-        return slice(self.fault_rows.stop, self.fault_rows.stop + len(self.output_names))
 
     def is_inside(self, z: FloatArray, u: FloatArray, y: FloatArray) -> bool:
         """Whether inputs, measurements and an estimate are in the region, as far as they tell.
@@ -365,26 +350,6 @@ class RegionObserver(Observer[RegionState, FloatArray]):
             state, rows[k] = self.advance(state, outputs[k], known[k])
             claimed[k] = not state.unclaimed
         return rows, claimed
-
-    def split(self, rows: FloatArray) -> Estimates:
-        """Return the estimates in rows ``(..., samples, nx + nf + ny)``.
-
-        Parameters
-        ----------
-        rows : FloatArray
-            What `advance` returned, one below the other.
-        """
-        nx, nf = len(self.state_names), len(self.faults)
-        return Estimates(
-            read_only(rows[..., :nx]),
-            read_only(rows[..., nx : nx + nf]),
-            read_only(rows[..., nx + nf :]),
-            self.state_names,
-            self.faults,
-            self.output_names,
-            self.state_delays,
-            self.fault_delays,
-        )
 
 
 def _times(matrix: FloatArray, column: Any) -> Any:

@@ -32,9 +32,10 @@ from numpy.typing import ArrayLike, NDArray
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind, shown
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.estimate_rows import EstimateRows
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.records import NAME_FIELDS, checked_sample, require_names, whole_record
+from obsynth.observers.records import NAME_FIELDS, checked_sample, require_delays, require_names, whole_record
 from obsynth.observers.running import Observer
 from obsynth.plants.scheduling import RATE_TOLERANCE, Scheduling
 
@@ -55,7 +56,7 @@ class ScheduledState(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ScheduledObserver(Observer[ScheduledState, FloatArray]):
+class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
     """An observer whose matrices change with measured parameters.
 
     Parameters
@@ -137,9 +138,8 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
             raise SpecError("forgetting must be a whole number of rows (or seconds), 0 or more.", path="forgetting")
         if self.dt == 0.0 and not self.effectiveness_is_one:
             raise SpecError("effectiveness is for discrete time: leave it one.", path="effectiveness")
-        for names, delays in ((self.state_names, self.state_delays), (self.fault_names, self.fault_delays)):
-            if len(names) != len(delays) or not all(is_whole(delay) and delay >= 0 for delay in delays):
-                raise SpecError("The observer needs one delay >= 0, in samples, for each signal.", path="delays")
+        require_delays(self.state_names, self.state_delays)
+        require_delays(self.fault_names, self.fault_delays)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
@@ -167,22 +167,6 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
     def inputs(self) -> int:
         """Number of known inputs, without the scheduling parameters."""
         return len(self.input_names) - len(self.scheduling.names)
-
-    @property
-    def row_names(self) -> tuple[str, ...]:
-        """Names of the rows: ``xhat[...]``, ``fhat[...]``, ``r[...]``."""
-        kinds = (("xhat", self.state_names), ("fhat", self.fault_names), ("r", self.residual_names))
-        return tuple(f"{kind}[{name}]" for kind, names in kinds for name in names)
-
-    @property
-    def fault_rows(self) -> slice:
-        """Rows that hold the fault estimates."""
-        return slice(len(self.state_names), len(self.state_names) + len(self.fault_names))
-
-    @property
-    def residual_rows(self) -> slice:
-        """Rows that hold the residuals."""
-        return slice(self.fault_rows.stop, len(self.Cz))
 
     @cached_property
     def effectiveness_is_one(self) -> bool:
@@ -400,23 +384,3 @@ class ScheduledObserver(Observer[ScheduledState, FloatArray]):
             state, rows[k] = self.advance(state, y_k, u_k, elapsed if k else 0.0)
             claimed[k] = not state.unclaimed
         return rows, claimed
-
-    def split(self, rows: FloatArray) -> Estimates:
-        """Return the estimates in rows ``(..., samples, nx + nf + nr)``.
-
-        Parameters
-        ----------
-        rows : FloatArray
-            What `advance` returned, one below the other.
-        """
-        states, faults = len(self.state_names), self.fault_rows
-        return Estimates(
-            read_only(rows[..., :states]),
-            read_only(rows[..., faults]),
-            read_only(rows[..., faults.stop :]),
-            self.state_names,
-            self.fault_names,
-            self.residual_names,
-            self.state_delays,
-            self.fault_delays,
-        )
