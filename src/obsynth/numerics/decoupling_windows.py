@@ -40,6 +40,10 @@ SEEN_SHARE = 1e-6
 
 Model = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
+_Core = tuple[
+    FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray
+]
+
 
 class Channels(NamedTuple):
     """A descriptor plant by its arrays: ``E x+ = A x + B u + Bf f + Bd d + Bw w``, ``y`` likewise, dt."""
@@ -247,11 +251,6 @@ def _normal_rank(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> 
     n = len(a)
     point = GENERIC_POINT * (1.0 + float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)))
     return decide_rank(np.block([[point * np.eye(n) - a, -b], [c, d]])).rank - n
-
-
-_Core = tuple[
-    FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray
-]
 
 
 def _core(a: FloatArray, noise: tuple[FloatArray, FloatArray], window: _Window, ny: int) -> _Core:

@@ -81,6 +81,9 @@ SIGNAL_NAMES = ("state_names", "input_names", "output_names", "fault_names", "di
 
 ALL_MATRICES = tuple(name for name, *_ in MATRIX_LAYOUT)
 
+#: Larger plants as written are not stored with a design: their elimination is checked where it is done.
+MOST_STORED_STATES = 500
+
 
 @dataclass(frozen=True, eq=False)
 class ExactNumbers:
@@ -172,10 +175,6 @@ def _fraction(text: str) -> Fraction:
 
     found = fmpq(text)
     return Fraction(int(found.p), int(found.q))
-
-
-#: Larger plants as written are not stored with a design: their elimination is checked where it is done.
-MOST_STORED_STATES = 500
 
 
 def note_source(source: DescriptorSystem, new: DescriptorSystem, *, sample_time: float | None = None) -> None:

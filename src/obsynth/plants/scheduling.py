@@ -38,6 +38,9 @@ PARAMETER_KEYS = ("range", "rate", "column", "unit", "measured")
 #: Functions that have one name in formulas and in numpy.
 _NAMES = ["sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "log10", "sqrt", "abs", "sign", "floor", "ceil"]
 
+#: A name, a number, or one call whose argument has no brackets of its own.
+_FACTOR = re.compile(r"[A-Za-z_]\w*(\([^()]*\))?|\d+(\.\d+)?")
+
 
 @dataclass(frozen=True, eq=False)
 class Scheduling:
@@ -365,10 +368,6 @@ def _linear_operation(operation: Callable[..., Any]) -> Callable[..., Any]:
 def _number(value: Fraction) -> str:
     number = float(value)
     return str(int(number)) if number.is_integer() and abs(number) < LARGEST_WHOLE else repr(number)
-
-
-#: A name, a number, or one call whose argument has no brackets of its own.
-_FACTOR = re.compile(r"[A-Za-z_]\w*(\([^()]*\))?|\d+(\.\d+)?")
 
 
 def _bracketed(text: str) -> str:

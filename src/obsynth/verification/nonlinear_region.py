@@ -24,6 +24,9 @@ MOST_CORNERS = 4096
 #: Halvings towards the fastest decay that a certificate proves.
 _HALVINGS = 24
 
+#: Where the search for a rate ends, as a share of it.
+_NEAR = 1e-3
+
 
 def directions(terms: NonlinearTerms, slopes: Sequence[Slope]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return w ``(n, q)``, w_y ``(ny, q)`` and v ``(q, n)`` of every slope."""
@@ -87,7 +90,3 @@ def fastest_decay(vertices: Sequence[Vertex], witness: Witness, limit: float) ->
         if high - low <= _NEAR * high:
             break
     return low
-
-
-#: Where the search for a rate ends, as a share of it.
-_NEAR = 1e-3
