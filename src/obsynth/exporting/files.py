@@ -164,21 +164,11 @@ def export(
         )
         as_designed = sample_time is None and outliers is None and not unverified
         return _write_proof(design, target, checker=checker, as_designed=as_designed)
-    require_fixed(design, suffix)
-    if isinstance(design.observer, RecursiveObserver):
-        require_plain(design.observer, "An export")
+    _require_writable(design, suffix, outliers)
     _require_fitting_options(
         suffix, fmi=fmi, thresholds=thresholds, warm_up=warm_up, monitor=monitor, precision=precision
     )
     numbers = precision or "double"
-    if outliers is not None and not isinstance(design.observer, DAEObserver):
-        raise SpecError("outliers is for nonlinear designs: exports of others use every sample.", path="outliers")
-    if isinstance(design.observer, RegionObserver):
-        raise SpecError(
-            f"Design {design.name!r} is for a region of a nonlinear plant, whose steps are not written as files yet: "
-            "it runs in Python (design.observer) and on logs (obsynth.run_on_data).",
-            path="path",
-        )
     if isinstance(design.observer, ScheduledObserver):
         return _write_scheduled(design, target, suffix, monitor, thresholds, warm_up, sample_time, numbers)
     written: ExportedMonitor | None = None if monitor is None else registered("monitor_in_c")(monitor, design)
@@ -210,12 +200,7 @@ def export(
     if suffix != ".c":
         return (write_atomically(target, _as_arrays(found, design, suffix)),)
     if is_window(design):
-        if monitor is not None or thresholds or warm_up is not None or numbers != "double":
-            raise SpecError(
-                "A guaranteed test has its own threshold, in doubles: leave monitor, thresholds, warm-up and precision "
-                "out.",
-                path="monitor",
-            )
+        _require_own_threshold(monitor, thresholds, warm_up, numbers)
         return _write_window(found, target, numbers)
     if found.observer.dt == 0.0:
         raise SpecError(
@@ -288,6 +273,33 @@ def _write_window(found: Realisation, target: Path, numbers: str) -> tuple[Path,
     prefix, header = c_identifier(target.stem), target.with_suffix(".h")
     source, declared = (in_precision(text, numbers) for text in window_c_texts(found, prefix, header.name))
     return write_together({target: source, header: with_c_linkage(declared, prefix)})
+
+
+def _require_writable(design: ObserverDesign, suffix: str, outliers: Outliers | None) -> None:
+    """Raise `SpecError` where no file of this kind can hold a design, or what is done with its outliers."""
+    require_fixed(design, suffix)
+    if isinstance(design.observer, RecursiveObserver):
+        require_plain(design.observer, "An export")
+    if outliers is not None and not isinstance(design.observer, DAEObserver):
+        raise SpecError("outliers is for nonlinear designs: exports of others use every sample.", path="outliers")
+    if isinstance(design.observer, RegionObserver):
+        raise SpecError(
+            f"Design {design.name!r} is for a region of a nonlinear plant, whose steps are not written as files yet: "
+            "it runs in Python (design.observer) and on logs (obsynth.run_on_data).",
+            path="path",
+        )
+
+
+def _require_own_threshold(
+    monitor: Monitor | None, thresholds: Mapping[str, float] | None, warm_up: float | None, numbers: str
+) -> None:
+    """Raise `SpecError` where a guaranteed test is given another threshold than its own."""
+    if monitor is not None or thresholds or warm_up is not None or numbers != "double":
+        raise SpecError(
+            "A guaranteed test has its own threshold, in doubles: leave monitor, thresholds, warm-up and precision "
+            "out.",
+            path="monitor",
+        )
 
 
 def _require_fitting_options(

@@ -68,20 +68,8 @@ def identities(
         residual(dy @ plant.Dd, factors=((dy, plant.Dd), (own_dy, plant.Dd))),
         "our extension",
     )
-    wanted = {
-        "state": (observer.state_rows, np.eye(plant.nx, augmented.order), "U_a E_a + D_a C_a = I, rows of the state"),
-        "fault": (
-            observer.fault_rows,
-            np.hstack([np.zeros((plant.nf, plant.nx)), model.Cw]),
-            "Cw (U_a E_a + D_a C_a) = Cw: the fault estimate follows the fault model",
-        ),
-        "residual": (
-            observer.residual_rows,
-            np.zeros((len(observer.residual_names), augmented.order)),
-            "neither the state nor a modelled fault has an effect on the residual",
-        ),
-    }
-    for name, (rows, goal, claim) in wanted.items():
+    goals = _goals(observer, model, augmented)
+    for name, (rows, goal, claim) in goals.items():
         factors = ((cz[rows], tracking, augmented.E), (dy[rows], augmented.C), (own_dy[rows], augmented.C))
         yield name, claim, residual(cz[rows] @ ve, dy[rows] @ augmented.C, -goal, factors=factors, units=units), _PAPER
     yield (
@@ -90,3 +78,23 @@ def identities(
         residual(du, dy @ plant.D, factors=((dy, plant.D),)),
         "our extension",
     )
+
+
+def _goals(
+    observer: LinearObserver, model: Exosystem, augmented: AugmentedPlant
+) -> dict[str, tuple[slice, FloatArray, str]]:
+    """Return what each kind of rows stands for in the augmented state: rows, matrix, claim."""
+    nx = augmented.order - model.order
+    return {
+        "state": (observer.state_rows, np.eye(nx, augmented.order), "U_a E_a + D_a C_a = I, rows of the state"),
+        "fault": (
+            observer.fault_rows,
+            np.hstack([np.zeros((len(model.Cw), nx)), model.Cw]),
+            "Cw (U_a E_a + D_a C_a) = Cw: the fault estimate follows the fault model",
+        ),
+        "residual": (
+            observer.residual_rows,
+            np.zeros((len(observer.residual_names), augmented.order)),
+            "neither the state nor a modelled fault has an effect on the residual",
+        ),
+    }

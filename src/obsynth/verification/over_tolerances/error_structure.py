@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
@@ -97,15 +98,8 @@ def error_structure(
     plant, count = affine.plant, affine.count
     t, t0 = tracking
     nz, n, nf = observer.order, plant.nx, plant.nf if faults else 0
-    shown = observer.fault_rows
     back = 2.0 * np.eye(n) - affine.coordinates
-    watched = list(range(n) if states else range(shown.start, shown.stop if faults else len(observer.Cz)))
-    picked = np.zeros((n + nf + len(watched), len(observer.Cz)))
-    picked[:n, observer.state_rows] = back if reading is None else reading
-    if faults:
-        _require_every_fault(observer, nf)
-        picked[n : n + nf, shown] = np.eye(nf)
-    picked[n + nf :, watched] = back if states else np.eye(len(watched))
+    picked = _picked_rows(observer, back if reading is None else reading, back, nf=nf, faults=faults, states=states)
     c, dy, du, algebraic = picked @ observer.Cz, picked @ observer.Dy, picked @ observer.Du, picked @ t0
 
     def stacked(inner: AffineMatrix, output: AffineMatrix) -> AffineMatrix:
@@ -130,9 +124,7 @@ def error_structure(
         earlier = np.array(observer.fault_delays, dtype=np.int64) > 0 if varying else np.zeros(nf, dtype=bool)
         if earlier.any():
             state, known, disturbances = (_with_more(item, count) for item in (state, known, disturbances))
-            columns = _with_more(columns, count)
-            columns.parts[count:, :, earlier] = columns.parts[:count, :, earlier]
-            columns.parts[:count, :, earlier] = 0.0
+            columns = _at_earlier_samples(columns, earlier, count)
             offsets = np.concatenate([offsets, offsets])
         state = affine_block([[state, columns]])
     if reading is not None:
@@ -228,6 +220,30 @@ def _fault_columns(
             "interval (a filter that estimates each sample of a fault on its own has one).",
             condition="fault interval",
         )
+    return found
+
+
+def _picked_rows(
+    observer: LinearObserver, reading: FloatArray, back: FloatArray, *, nf: int, faults: bool, states: bool
+) -> FloatArray:
+    """Return which rows of the observer's output are read ``(n + nf + watched, rows)``: its states, through
+    ``reading``; with ``faults`` all of these; then what is watched."""
+    n, shown = len(back), observer.fault_rows
+    watched = list(range(n) if states else range(shown.start, shown.stop if faults else len(observer.Cz)))
+    picked = np.zeros((n + nf + len(watched), len(observer.Cz)))
+    picked[:n, observer.state_rows] = reading
+    if faults:
+        _require_every_fault(observer, nf)
+        picked[n : n + nf, shown] = np.eye(nf)
+    picked[n + nf :, watched] = back if states else np.eye(len(watched))
+    return picked
+
+
+def _at_earlier_samples(columns: AffineMatrix, earlier: NDArray[np.bool_], count: int) -> AffineMatrix:
+    """Return columns of faults, of which late ones have the constants of an earlier sample: as many constants more."""
+    found = _with_more(columns, count)
+    found.parts[count:, :, earlier] = found.parts[:count, :, earlier]
+    found.parts[:count, :, earlier] = 0.0
     return found
 
 
