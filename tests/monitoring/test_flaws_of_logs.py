@@ -331,7 +331,7 @@ DIALECTS = {
 @pytest.mark.parametrize("dated", [False, True])
 def test_all_commands_read_the_same_logs(tmp_path: Path, dialect: str, dated: bool) -> None:
     from obsynth.monitoring.calibration.logs import read_log
-    from obsynth.studies.comparing import _log
+    from obsynth.studies.compared_records import ComparedLog
 
     data, plain = log(), log()
     if dated:
@@ -343,7 +343,8 @@ def test_all_commands_read_the_same_logs(tmp_path: Path, dialect: str, dated: bo
     read = read_log(file, ["u"], ["a", "b"], columns=columns)
     np.testing.assert_allclose(read.y, plain[["a", "b"]].to_numpy())
     np.testing.assert_allclose(read.dt, DT)
-    np.testing.assert_allclose(_log(file, heated(), columns, {"b": 2.0}).y, plain[["a", "b"]].to_numpy() * [1.0, 2.0])
+    compared = ComparedLog(file, columns, {"b": 2.0}).record(heated())
+    np.testing.assert_allclose(compared.y, plain[["a", "b"]].to_numpy() * [1.0, 2.0])
     found = obsynth.run_on_data(designed("ui-pi-observer"), file, columns=columns).measured
     assert found is not None
     np.testing.assert_allclose(found[["u", "a", "b"]], plain[["u", "a", "b"]])

@@ -19,9 +19,6 @@ from obsynth.methods.fault_figures import held, on_the_clock, step_responses
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.registry import method_class
 from obsynth.monitoring.logs.log_run import faults_on_rows
-from obsynth.monitoring.logs.log_tables import log_table
-from obsynth.monitoring.logs.signals import TIME_HEADER
-from obsynth.monitoring.logs.stuck_sensors import stuck_rows, stuck_texts
 from obsynth.monitoring.thresholds.residual_model import largest_disturbances
 from obsynth.numerics.arguments import (
     Count,
@@ -30,7 +27,6 @@ from obsynth.numerics.arguments import (
     Probability,
     arguments_checked,
     is_finite_number,
-    require_kind,
 )
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.continuous import driven
@@ -43,7 +39,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import duration
 from obsynth.simulation.profiles import Sine, Step
 from obsynth.simulation.scenario import Scenario, scenario_from
-from obsynth.simulation.signals import resolve
+from obsynth.studies.compared_records import ComparedLog, Record, drawn_runs
 from obsynth.studies.comparison import (
     ComparedMethod,
     Comparison,
@@ -53,12 +49,6 @@ from obsynth.studies.comparison import (
     rms,
 )
 from obsynth.studies.least_thresholds import thresholds_beside_least
-from obsynth.verification.assumptions import LogReference
-from obsynth.verification.over_tolerances.plants_of_the_box import plant_at
-
-#: Entries of A, B, Bf, Bd that tolerances do not touch: they are kinematics, not parameters.
-EXACT_ENTRIES = (0.0, 1.0, -1.0)
-
 
 #: Runs of the scenario, and samples and settling times where nothing is stated.
 RUNS, SCENARIO_SAMPLES, MOST_SCENARIO_SAMPLES = 20, 40, 6000
@@ -69,51 +59,51 @@ COMPARISON_SEED = 7
 PERIOD_SHARE = 0.2
 
 
-@dataclass(frozen=True, eq=False)
-class Record:
-    """What observers are run on, ``(.., steps, ..)``: many runs of drawn plants, or a log."""
+@dataclass(frozen=True)
+class ComparisonSettings:
+    """What designs are compared by: the options of `obsynth.compare` on which figures hang."""
 
-    times: FloatArray  # ``(steps,)``, seconds
-    u: FloatArray
-    y: FloatArray
-    truth: FloatArray  # ``(steps, nf)``: the faults, zero where a log has no column of one
-    known: tuple[str, ...] = ()  # the faults of which a log has a column
-    notes: tuple[str, ...] = ()  # what is to be said of a log
+    sample_time: float | None
+    within: float | None
+    tolerance: float
+    disturbance: float
+    runs: int
+    false_alarms: float
+    input_delay: int = 0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a certificate keeps of them."""
+        return {name: value for name, value in vars(self).items() if name != "input_delay" or value}
+
+    def in_words(self, plant: DescriptorSystem, dt: float, horizon: float, limit: float, *, stabilised: bool) -> str:
+        """Return the setting of a comparison as a sentence; ``horizon``, ``limit`` of the settling in seconds."""
+        parts = [f"{self.runs} runs of {duration(horizon)}, sampled every {dt:g} s, disturbances and noise drawn"]
+        parts += ["constants within their tolerances"] if plant.uncertainty is not None else []
+        parts += [f"parameters off by up to {self.tolerance:.0%}"] if self.tolerance else []
+        parts += ["a state feedback stabilises the plant"] if stabilised else []
+        return f"{', '.join(parts)}; 90 % of a step to be reached within {duration(limit)}"
 
 
-def drawn_runs(
-    source: DescriptorSystem,
-    sampled: DescriptorSystem,
-    scenario: Scenario,
-    *,
-    runs: int,
-    tolerance: float,
-    seed: int,
-    feedback: FloatArray,
-) -> tuple[Record, Record]:
-    """Return runs ``(runs, steps, ..)`` with the scenario's faults, and without any; plants are drawn before they are
-    sampled, and disturbances by a factor between -1 and 1."""
-    drive = resolve(sampled, scenario)
-    nu, nf = sampled.nu, sampled.nf
-    rng = np.random.default_rng(seed)
-    seeds = [int(value) for value in rng.integers(0, 2**31, size=runs)]
-    random, noise, sensors = drive.drawn(seeds, sampled.nw)
-    scales = rng.uniform(-1.0, 1.0, size=(runs, sampled.nd))
-    faults = drive.left[:, nu : nu + nf]
-    found: list[tuple[list[FloatArray], list[FloatArray]]] = [([], []), ([], [])]
-    off = tolerance > 0.0 or source.uncertainty is not None
-    for run in range(runs):
-        plant = on_the_clock(_drawn(source, tolerance, rng), sampled.dt) if off else sampled
-        signals = drive.left + random[:, run]
-        d = signals[:, nu + nf :] * scales[run]
-        shaken = noise[:, run] if noise.shape[2] == plant.nw else np.zeros((drive.steps, plant.nw))
-        for (inputs, outputs), f in zip(found, (signals[:, nu : nu + nf], np.zeros((drive.steps, nf))), strict=True):
-            measured, known = _outputs(plant, signals[:, :nu], d, f, shaken, feedback)
-            inputs.append(known)
-            outputs.append(measured + sensors[:, run])
-    times = _clock(drive.steps, drive.dt)
-    (u, y), (healthy_u, healthy_y) = ((np.array(inputs), np.array(outputs)) for inputs, outputs in found)
-    return Record(times, u, y, faults), Record(times, healthy_u, healthy_y, np.zeros_like(faults))
+@dataclass(frozen=True)
+class DesignSource:
+    """Where the designs come from: ``maker(plant, method, options)`` of each method."""
+
+    methods: Sequence[str]
+    maker: Maker
+    options: Mapping[str, Mapping[str, Any]]
+    of_samples: bool = True  # whether options are for the sampled plant
+
+    def candidates(
+        self, plant: DescriptorSystem, sampled: DescriptorSystem, steps: int, report_stage: Callable[[str], None]
+    ) -> list[Candidate]:
+        """Return the design of each method on the clock of the comparison, or why there is none."""
+        found = []
+        for method in self.methods:
+            report_stage(f"designing by {method}")
+            own = self.options.get(method, {})
+            in_own_time = bool(own) and not self.of_samples and method_class(method).time == "both"
+            found.append(candidate(method, plant, sampled, steps, self.maker, own, continuous=in_own_time))
+        return found
 
 
 def estimates(observer: LinearObserver, runs: Record) -> FloatArray:
@@ -123,37 +113,6 @@ def estimates(observer: LinearObserver, runs: Record) -> FloatArray:
     with np.errstate(over="ignore", invalid="ignore"):
         found = z @ observer.Cz[rows].T + y @ observer.Dy[rows].T + known @ observer.Du[rows].T + observer.added[rows]
     return np.ascontiguousarray(found.swapaxes(0, 1))
-
-
-def _outputs(
-    plant: DescriptorSystem, u: FloatArray, d: FloatArray, f: FloatArray, w: FloatArray, feedback: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return outputs and known inputs ``(steps, ..)`` of a plant at rest, with ``u - feedback x`` as its input."""
-    into = u @ plant.B.T + d @ plant.Bd.T + f @ plant.Bf.T + w @ plant.Bw.T
-    direct = u @ plant.D.T + d @ plant.Dd.T + f @ plant.Df.T + w @ plant.Dw.T
-    closed, seen = plant.A - plant.B @ feedback, plant.C - plant.D @ feedback
-    states = driven(closed, np.zeros(plant.nx), into)
-    return np.asarray(states @ seen.T + direct), np.asarray(u - states @ feedback.T)
-
-
-def _drawn(plant: DescriptorSystem, tolerance: float, rng: np.random.Generator) -> DescriptorSystem:
-    """Return a plant with its constants within their tolerances, and parameters off by up to one; equal stay equal."""
-    if plant.uncertainty is not None:
-        box = plant.uncertainty.box
-        plant = plant_at(plant, box.values(rng.uniform(-1.0, 1.0, size=len(box.names))))
-        if not tolerance:
-            return plant
-    factors: dict[float, float] = {}
-
-    def off(matrix: FloatArray) -> FloatArray:
-        changed = matrix.copy()
-        for index, value in np.ndenumerate(matrix):
-            if value not in EXACT_ENTRIES:
-                factor = factors.setdefault(abs(float(value)), 1.0 + tolerance * rng.uniform(-1.0, 1.0))
-                changed[index] = value * factor
-        return changed
-
-    return plant.replace(E=off(plant.E), A=off(plant.A), B=off(plant.B), Bf=off(plant.Bf), Bd=off(plant.Bd))
 
 
 def alarms(
@@ -288,104 +247,71 @@ def compare(
     for method in options or {}:
         if method not in ids:
             raise SpecError(f"options has {method!r}, which is not compared: {', '.join(ids)} are.", path="options")
-    return side_by_side(
-        plant,
-        scenario,
-        ids,
-        lambda given, method, own: design(given, method, **own),
-        sample_time=sample_time,
-        within=within,
-        tolerance=float(tolerance),
-        disturbance=float(disturbance),
-        runs=int(runs),
-        false_alarms=float(false_alarms),
-        input_delay=int(input_delay),
-        options=options or {},
-        of_samples=made.dt > 0.0,
-        data=data,
-        columns=columns,
-        scales=scales,
-        progress=progress,
+    settings = ComparisonSettings(
+        sample_time, within, float(tolerance), float(disturbance), int(runs), float(false_alarms), int(input_delay)
     )
+    source = DesignSource(ids, lambda given, method, own: design(given, method, **own), options or {}, made.dt > 0.0)
+    log = None if data is None else ComparedLog(data, columns, scales)
+    return side_by_side(plant, scenario, source, settings, log=log, progress=progress)
 
 
 def side_by_side(
     plant: DescriptorSystem,
     scenario: Scenario | None,
-    methods: Sequence[str],
-    maker: Maker,
+    source: DesignSource,
+    settings: ComparisonSettings,
     *,
-    sample_time: float | None,
-    within: float | None,
-    tolerance: float,
-    disturbance: float,
-    runs: int,
-    false_alarms: float,
-    input_delay: int = 0,
-    options: Mapping[str, Mapping[str, Any]] | None = None,
-    of_samples: bool = True,
-    data: Any = None,
-    columns: Mapping[str, str] | None = None,
-    scales: Mapping[str, float] | None = None,
+    log: ComparedLog | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Comparison:
-    """Return the designs that ``maker(plant, method, options)`` gives side by side; arguments as for `compare`.
-
-    ``of_samples``: options are for the sampled plant.
-    """
+    """Return designs side by side, on one clock and on the same draws."""
     report_stage = progress or (lambda _: None)
     asked = {
         "plant": plant.as_dict(),
         "scenario": None if scenario is None else scenario.as_dict(),
-        "sample_time": sample_time,
-        "within": within,
-        "tolerance": tolerance,
-        "disturbance": disturbance,
-        "runs": runs,
-        "false_alarms": false_alarms,
-        **({"input_delay": input_delay} if input_delay else {}),
+        **settings.as_dict(),
     }
     plant = plant.dense() if plant.is_sparse else plant
     stated = None if scenario is None else scenario.sample_time
-    dt = plant.dt or sample_time or stated or settling_time(plant) / SCENARIO_SAMPLES
+    dt = plant.dt or settings.sample_time or stated or settling_time(plant) / SCENARIO_SAMPLES
     sampled = on_the_clock(plant, dt)
-    happening = _scenario(plant, scenario, dt, disturbance)
+    happening = _scenario(plant, scenario, dt, settings.disturbance)
     steps = int(min(happening.horizon / dt, MOST_SCENARIO_SAMPLES)) + 1
     followed, feedback = held(sampled, steps)
     if followed < steps:
         steps, happening = followed, happening.replace(horizon=followed * dt)
-    found = []
-    for method in methods:
-        report_stage(f"designing by {method}")
-        own = (options or {}).get(method, {})
-        in_own_time = bool(own) and not of_samples and method_class(method).time == "both"
-        found.append(candidate(method, plant, sampled, steps, maker, own, continuous=in_own_time))
+    found = source.candidates(plant, sampled, steps, report_stage)
     report_stage("running the scenario")
     faulty, healthy = drawn_runs(
-        plant, sampled, happening, runs=runs, tolerance=tolerance, seed=COMPARISON_SEED, feedback=feedback
+        plant,
+        sampled,
+        happening,
+        runs=settings.runs,
+        tolerance=settings.tolerance,
+        seed=COMPARISON_SEED,
+        feedback=feedback,
     )
-    log = None if data is None else _log(data, sampled, columns, scales, input_delay)
-    limit = within if within is not None else settling_time(plant)
+    logged = None if log is None else log.record(sampled, settings.input_delay)
+    limit = settings.within if settings.within is not None else settling_time(plant)
     bounds = largest_disturbances(happening, sampled.disturbance_names, followed, dt)
     kept = followed, feedback
     compared = _sized(
-        [_compared(entry, sampled, faulty, healthy, log, kept, limit, false_alarms, bounds) for entry in found]
+        [
+            _compared(entry, sampled, faulty, healthy, logged, kept, limit, settings.false_alarms, bounds)
+            for entry in found
+        ]
     )
     compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.relative_error))
-    parts = [f"{runs} runs of {duration(happening.horizon)}, sampled every {dt:g} s, disturbances and noise drawn"]
-    parts += ["constants within their tolerances"] if plant.uncertainty is not None else []
-    parts += [f"parameters off by up to {tolerance:.0%}"] if tolerance else []
-    parts += ["a state feedback stabilises the plant"] if feedback.any() else []
-    setting = f"{', '.join(parts)}; 90 % of a step to be reached within {duration(limit)}"
-    shown, truth = (faulty, faulty.truth) if log is None else (log, np.array(log.truth))
-    if log is not None:
+    setting = settings.in_words(plant, dt, happening.horizon, limit, stabilised=bool(feedback.any()))
+    shown, truth = (faulty, faulty.truth) if logged is None else (logged, np.array(logged.truth))
+    if logged is not None:
         # Nobody says what these faults were in the log: zero would be drawn as the truth.
-        truth[:, [name not in log.known for name in plant.fault_names]] = np.nan
+        truth[:, [name not in logged.known for name in plant.fault_names]] = np.nan
     best = next((entry for entry in compared if not entry.refused), None)
     settling = settling_time(plant)
     among = [entry for entry in found if entry.figures and "faults" in method_class(entry.method).purposes]
     usual = min(among, key=lambda entry: entry.rank(sampled.nd > 0, settling), default=None)
-    from_file = isinstance(data, (str, Path))
+    reference = None if log is None else log.reference
     return Comparison(
         tuple(compared),
         "" if best is None else best.method,
@@ -395,9 +321,9 @@ def side_by_side(
         read_only(truth),
         plant.fault_names,
         setting,
-        asked if data is None or from_file else {},
-        LogReference.of(Path(data), columns, scales).as_dict() if from_file else None,
-        () if log is None else log.notes,
+        asked if log is None or reference is not None else {},
+        reference,
+        () if logged is None else logged.notes,
     )
 
 
@@ -408,14 +334,13 @@ def compared_again(
     asked = dict(body["asked"])
     plant = DescriptorSystem(**asked.pop("plant"))
     scenario = asked.pop("scenario")
-    read = {} if log is None else {"data": log, "columns": body["log"]["columns"], "scales": body["log"]["scales"]}
+    source = DesignSource(sorted(designs), lambda _, method, __: designs[method], {})
     found = side_by_side(
         plant,
         None if scenario is None else scenario_from(scenario),
-        sorted(designs),
-        lambda _, method, __: designs[method],
-        **asked,
-        **read,
+        source,
+        ComparisonSettings(**asked),
+        log=None if log is None else ComparedLog(log, body["log"]["columns"], body["log"]["scales"]),
     )
     result = found.claims()
     if log is None and body["log"] is not None:
@@ -458,59 +383,6 @@ def _scenario(plant: DescriptorSystem, given: Scenario | None, dt: float, distur
         if disturbance
         else {},
     )
-
-
-def _log(
-    data: Any,
-    plant: DescriptorSystem,
-    columns: Mapping[str, str] | None,
-    scales: Mapping[str, float] | None,
-    input_delay: int = 0,
-) -> Record:
-    """Return a log on the clock."""
-    import pandas as pd
-
-    if not isinstance(data, (str, Path)):
-        require_kind(data, pd.DataFrame, "data", "a file name or a pandas.DataFrame")
-    wanted = {
-        name: (columns or {}).get(name, name) for name in (*plant.input_names, *plant.output_names, *plant.fault_names)
-    }
-    table, _, said = log_table(data, list(wanted.values()), (columns or {}).get(TIME_HEADER, TIME_HEADER))
-    frame = {name: table[column] for name, column in wanted.items() if column in table}
-    shift = None if plant.uncertainty is None else plant.uncertainty.shift
-    if shift and frame:
-        # The input of a linearised plant that is one in every row has no column.
-        frame[shift] = np.ones(max(map(len, frame.values())))
-    missing = [wanted[name] for name in (*plant.input_names, *plant.output_names) if name not in frame]
-    if missing:
-        raise SpecError(f"The log has no column {', '.join(map(repr, missing))}.", path="data")
-    count = max(map(len, frame.values()), default=0)
-    if not count:
-        raise SpecError("The log has no rows.", path="data")
-    for name in (*plant.input_names, *plant.output_names):
-        if not np.isfinite(frame[name]).any():
-            raise SpecError(f"The column {wanted[name]!r} holds no number: {name!r} is never measured.", path="data")
-
-    def signals(names: Sequence[str]) -> FloatArray:
-        offsets = np.array([plant.operating_point.get(name, 0.0) for name in names])
-        factors = np.array([(scales or {}).get(name, plant.scales.get(name, 1.0)) for name in names])
-        values = np.column_stack([frame[name] for name in names]) if names else np.zeros((count, 0))
-        return np.asarray(values * factors - offsets)
-
-    there = [name for name in plant.fault_names if name in frame]
-    truth = np.zeros((count, plant.nf))
-    for name in there:
-        truth[:, plant.fault_names.index(name)] = frame[name]
-    u, y = signals(plant.input_names), signals(plant.output_names)
-    u = u[np.clip(np.arange(count) - input_delay, 0, count - 1)]
-    stamps = table.get((columns or {}).get(TIME_HEADER, TIME_HEADER))
-    stuck = {name: stuck_rows(values) for name, values in zip(plant.output_names, y.T, strict=True)}
-    times = _clock(count, plant.dt) if stamps is None else stamps
-    return Record(times, u, y, truth, tuple(there), (*said, *stuck_texts(stuck)))
-
-
-def _clock(samples: int, dt: float) -> FloatArray:
-    return np.asarray(np.arange(samples) * float(dt), dtype=np.float64)
 
 
 def _compared(
