@@ -298,13 +298,29 @@ class TestManyStates:
     def test_as_the_recursion_has_it(self, design, monkeypatch):
         few = gain_schedule_summary(design.observer)
         monkeypatch.setattr("obsynth.observers.recursive.gain_schedule_summary.MANY_STATES", 200)
-        monkeypatch.setattr("obsynth.observers.recursive.gain_schedule_summary.STEPS_WITHOUT_HORIZON", few.steps)
+        for followed in ("STEPS_WITHOUT_HORIZON", "FIRST_FOLLOWED"):
+            monkeypatch.setattr(f"obsynth.observers.recursive.gain_schedule_summary.{followed}", few.steps)
         whole = gain_schedule_summary(design.observer)
         assert whole.steps == few.steps
         np.testing.assert_allclose(whole.L, few.L, rtol=0.0, atol=1e-12)
         assert whole.contraction == pytest.approx(few.contraction, rel=1e-9)
         # Of many states the growth is a bound.
         assert whole.growth <= few.growth <= 20.0 * whole.growth
+
+
+def test_steps_are_followed_until_gains_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a plant that stays the same, as many steps as its slowest mode needs; the gains are those of all steps."""
+    for slow, steps in ((0.5, 100), (0.93, 300), (0.999, 1000)):
+        plant = DescriptorSystem(
+            None, np.diag([slow, 0.3]), C=np.eye(2), Bw=np.diag([1e-3 * (1.0 - slow), 0.1, 0.0, 0.0])[:2],
+            Dw=np.eye(2, 4, 2), dt=1.0,
+        )  # fmt: skip
+        design = obsynth.descriptor_kalman(plant)
+        with monkeypatch.context() as patched:
+            patched.setattr("obsynth.observers.recursive.gain_schedule_summary.FIRST_FOLLOWED", 10**6)
+            whole = gain_schedule_summary(design.observer)
+        assert design.certificate.claims["steps"] == steps
+        np.testing.assert_allclose(design.gains["K"], whole.K, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e6])

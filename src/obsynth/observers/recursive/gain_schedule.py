@@ -110,14 +110,19 @@ Gains: TypeAlias = Callable[[RecursiveObserver, int], Iterable[GainStep]]
 
 def gains_once() -> Gains:
     """Return `gain_steps` for several that look at the same gains, which are computed once if they are few numbers."""
-    known: dict[tuple[RecursiveObserver, int], list[GainStep]] = {}
+    known: dict[RecursiveObserver, tuple[int, list[GainStep], Iterator[GainStep]]] = {}
 
     def gains(observer: RecursiveObserver, steps: int) -> Iterable[GainStep]:
         if steps * (observer.plant.nx + observer.plant.nq) * (observer.plant.ne + observer.plant.ny) > MOST_KEPT_GAINS:
-            return gain_steps(observer, steps)
-        if (observer, steps) not in known:
-            known[observer, steps] = list(gain_steps(observer, steps))
-        return known[observer, steps]
+            yield from gain_steps(observer, steps)
+            return
+        if observer not in known or known[observer][0] < steps:
+            known[observer] = steps, [], gain_steps(observer, steps)
+        _, kept, further = known[observer]
+        for position in range(steps + int(observer.early_constraints)):
+            if position == len(kept):
+                kept.append(next(further))
+            yield kept[position]
 
     return gains
 

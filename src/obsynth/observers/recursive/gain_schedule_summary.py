@@ -23,13 +23,19 @@ GONE = 1e-200
 #: On shorter horizons an error need not have shrunk yet, so that the contraction only informs.
 STEPS_TO_CONTRACT = 50
 
-#: With more states, and a plant and noise that stay the same, fewer steps are followed, as work goes with the cube of
-#: the states; where errors do not shrink over these, so many times as many, until all were followed.
+#: With a plant and noise that stay the same so many steps are followed at first. Where errors do not shrink over these,
+#: or the gains still move, it is `FOLLOW_FURTHER` times as many, until all were followed.
+FIRST_FOLLOWED = 100
+
+#: With more states fewer steps are followed at first, as work goes with the cube of the states.
 MANY_STATES = 100
 
 FEWEST_FOLLOWED = 60
 
 FOLLOW_FURTHER = 3
+
+#: Gains that moved by less than this share of them over the second half of the steps have come to stay.
+STEADY_GAINS = 1e-9
 
 #: Spectral radius below which gains that are kept make errors decay, whatever rounding did to it.
 CLEARLY_STABLE = 1.0 - 1e-6
@@ -74,12 +80,18 @@ def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_st
     whole = steps + int(observer.early_constraints)
     product, regressors, last = ErrorProduct(observer.plant.nx, _first_end(observer, whole)), [], None
     kept: tuple[float, str] | None = None
+    middle: FloatArray | None = None
     for found in gains(plain, steps):
         last, kept = found, None
         regressors.append(found.G)
         product.move(found.gain[:, : len(found.step.A)] @ found.step.A)
+        if product.done == product.steps // 2:
+            middle = found.gain
         if product.done == product.steps < whole:
-            if product.contraction()[0] < 1.0 or (kept := product.contraction_of_kept_gains()) is not None:
+            shrinks = product.contraction()[0] < 1.0
+            if (shrinks or (kept := product.contraction_of_kept_gains()) is not None) and (
+                plain.plant.nx > MANY_STATES or _stays(found.gain, middle)
+            ):
                 break
             product.go_on_to(min(whole, FOLLOW_FURTHER * product.steps))
     if last is None:
@@ -113,12 +125,21 @@ def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_st
 
 
 def _first_end(observer: RecursiveObserver, steps: int) -> int:
-    """Return how many steps are followed at first: all, but for a filter of many states whose steps are all alike."""
+    """Return how many steps are followed at first: all, but for a filter whose steps are all alike."""
     plant = observer.plant
     alike = plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant
-    if not alike or plant.horizon or observer.adaptation is not None or plant.nx <= MANY_STATES:
+    if not alike or plant.horizon or observer.adaptation is not None:
         return steps
+    if plant.nx <= MANY_STATES:
+        return min(steps, FIRST_FOLLOWED)
     return min(steps, max(FEWEST_FOLLOWED, round(steps * (MANY_STATES / plant.nx) ** 3)))
+
+
+def _stays(gain: FloatArray, before: FloatArray | None) -> bool:
+    """Whether a gain is where it was some time before."""
+    if before is None or before.shape != gain.shape:
+        return False
+    return bool(np.abs(gain - before).max(initial=0.0) <= STEADY_GAINS * np.abs(gain).max(initial=0.0))
 
 
 class ErrorProduct:

@@ -154,7 +154,8 @@ def _dynamic_rows(
             detail=said,
         )
     # Where both hold the same matrices, they need not be recomputed.
-    proof = horizon_proof(observer if same else stated, observer, looked_at(observer), gains=gains)
+    followed = facts.steps - int(observer.early_constraints)
+    proof = horizon_proof(observer if same else stated, observer, followed, gains=gains)
     yield _contraction_row(facts, proof)
     if proof is not None:
         yield bias_row(proof, ranks.condition)
