@@ -98,7 +98,8 @@ def told(design: obsynth.ObserverDesign) -> LearnedThresholds:
     slow = getattr(design.observer, "sensors", None) or {}
     return LearnedThresholds(columns, statistics, levels, 500.0, 1000, 500, dt, np.zeros(nf), np.ones(nf),
                              gain_set_digest(design), settling=0 if m == 1 else 30, innovation=0.7,
-                             seldom=tuple(f"r[{name}]" for name in slow), initial_covariance=starts)  # fmt: skip
+                             seldom=tuple(f"r[{name}]" for name in slow), initial_covariance=starts,
+                             repeats=np.full(len(design.plant.output_names), 3.0))  # fmt: skip
 
 
 def designed(name: str) -> obsynth.ObserverDesign:
@@ -141,6 +142,8 @@ def log_of(design: obsynth.ObserverDesign) -> pd.DataFrame:
         moved = np.cumsum(rng.standard_normal((ROWS, nu + ny)), axis=0) * 0.05 + 0.1 * rng.standard_normal((ROWS, 1))
         point = [plant.operating_point.get(name, 0.0) for name in (*plant.input_names, *plant.output_names)]
         u, y = np.split(moved + point, [nu], axis=1)
+    # A sensor is stuck: from the third equal sample on it is not measured.
+    y[180:190, -1] = y[180, -1]
     for row, column in MISSING:
         if column is None:
             y[row] = np.nan

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from scipy.signal import lfilter
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.monitoring.logs.stuck_sensors import RepeatedValues, stuck_rows
+from obsynth.monitoring.logs.stuck_sensors import RepeatedValues, Unrepeated, longest_repeats, stuck_rows
 
 ROWS, EVENT = 1_500, slice(700, 709)
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
@@ -164,6 +166,73 @@ def test_what_a_stuck_sensor_repeats_is_not_learned_from() -> None:
     assert found.levels.tolist() == wanted.levels.tolist()
     assert found.rows == wanted.rows
     assert (len(found.notes), len(wanted.notes)) == (1, 0)
+
+
+def test_a_sensor_that_is_stuck_in_a_run_counts_as_not_measured_there_too(tmp_path: Path) -> None:
+    """It alarmed, as its repeats were blank in the rows that were learned from and taken for measured in runs."""
+    normal = learned(log(1))
+    assert normal.repeats.tolist() == [2.0, 2.0]
+    data = log(2)
+    data.loc[703:799, "ya"] = data.loc[703, "ya"]
+    blank = data.copy()
+    blank.loc[704:799, "ya"] = np.nan
+    design = heated()
+    both = (normal, replace(normal, repeats=None))
+    monitors = [obsynth.online_monitor(design, "learned", normal=one) for one in both]
+    run, as_measured = (obsynth.run_on_data(design, data, monitor=monitor) for monitor in monitors)
+    assert as_measured.events
+    assert not run.events
+    assert run.stuck == {"ya": ((704, 800),)}
+    pd.testing.assert_frame_equal(run.table, obsynth.run_on_data(design, blank, monitor=monitors[0]).table)
+    # In the middle of the repeats, and after one of them.
+    for cut in (704, 705, 750):
+        state = tmp_path / f"{cut}.json"
+        parts = [
+            obsynth.run_on_data(design, part, monitor=monitors[0], state=state).table
+            for part in (data[:cut], data[cut:])
+        ]
+        pd.testing.assert_frame_equal(pd.concat(parts, ignore_index=True), run.table)
+    file = normal.save(tmp_path / "t.json")
+    assert obsynth.load_thresholds(file).repeats.tolist() == [2.0, 2.0]
+
+
+def test_repeats_are_left_out_in_pieces_as_in_one() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        n, longest = int(rng.integers(1, 40)), np.array([3.0, rng.choice([4.0, np.inf])])
+        values, counted = rng.integers(0, 3, (n, 2)).astype(float), rng.random(n) < 0.8
+        values[rng.random(values.shape) < 0.2] = np.nan
+        wanted = values.copy()
+        for i in range(2):
+            last, equal = np.nan, 0
+            for k in np.flatnonzero(counted & np.isfinite(values[:, i])):
+                equal = equal + 1 if values[k, i] == last else 1
+                last = values[k, i]
+                if equal >= longest[i]:
+                    wanted[k, i] = np.nan
+        pieces, parts = Unrepeated(longest), []
+        for piece, taken in zip(np.array_split(values, 5), np.array_split(counted, 5), strict=True):
+            found, memory = pieces.of_rows(piece, taken)
+            pieces.memory = memory[-1] if len(memory) else pieces.memory
+            parts.append(found)
+        np.testing.assert_array_equal(np.vstack(parts), wanted)
+
+
+def test_from_which_repeat_on_a_sensor_is_stuck_follows_from_normal_logs() -> None:
+    rng = np.random.default_rng(4)
+    fine, coarse = rng.standard_normal((2, 2_000))
+    coarse = 2.0 * np.round(coarse / 2.0)
+    held = np.repeat(rng.standard_normal(200), 10)
+    ramp, still = np.arange(2_000.0), np.full(2_000, 5.0)
+    fine[500:560] = fine[500]
+    log = np.column_stack([fine, coarse, held, ramp, still])
+    longest = longest_repeats([log, log])
+    assert longest[0] == 2.0
+    usual = max(len(list(group)) for _, group in itertools.groupby(coarse.tolist()))
+    assert longest[1] == 3.0 * usual
+    assert longest[2] == 30.0
+    # Without noise a sensor may rest.
+    assert np.isinf(longest[3:]).all()
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -27,13 +27,14 @@ class LearnedMonitorInC:
     """Learned thresholds as C: an `obsynth.exporting.alarms.ExportedMonitor`.
 
     ``columns``: all outputs of a run that may be watched, fault estimates first; ``walk (nf, nf)``: the covariance by
-    which faults walk between samples.
+    which faults walk between samples; ``outputs``: how many the plant has.
     """
 
     learned: LearnedThresholds
     columns: tuple[str, ...]
     fault_names: tuple[str, ...]
     walk: FloatArray | None
+    outputs: int
 
     @property
     def statement(self) -> str:
@@ -75,11 +76,20 @@ class LearnedMonitorInC:
             f"    REAL means[{len(FORGETTING) * m}];",
             f"    REAL before[{(1 + width) * width}];",
             f"    REAL scores[{max(AGES) * 2 * width}];",
+            f"    REAL repeated[{max(self.outputs, 1)}];",
+            f"    long equal[{max(self.outputs, 1)}];",
             "    int at, quiet, to_wait;",
             "    long taken;",
             f"}} {prefix}_monitor;",
             "",
         ]
+
+    def longest(self) -> list[int]:
+        """Return from which equal sample on each output counts as not measured, 0 for never."""
+        repeats = self.learned.repeats
+        if repeats is None or not self.outputs:
+            return [0] * max(self.outputs, 1)
+        return [int(count) if np.isfinite(count) else 0 for count in repeats.tolist()]
 
     def source(self, prefix: str) -> str:
         """Return the tables and functions of the monitor."""
@@ -101,6 +111,7 @@ class LearnedMonitorInC:
             "MONITOR_ESTIMATES": faults_watched,
             "MONITOR_WIDTH": max(faults_watched, 1),
             "MONITOR_SETTLING": found.settling,
+            "MONITOR_OUTPUTS": self.outputs,
             "MONITOR_HOLD": HOLD,
             "MONITOR_WATCHED": sum(name.startswith(("fhat[", "r[")) for name in self.columns),
         }
@@ -133,6 +144,7 @@ class LearnedMonitorInC:
             f"#define MONITOR_APART ((REAL){DISTINGUISHED!r})",
             f"#define MONITOR_SHARE ((REAL){MODEL_SHARE!r})",
             *(line for name, table in tables.items() for line in table_lines(name, filled_table(table))),
+            *integer_table("monitor_longest", self.longest()),
             *integer_table("monitor_ages", AGES),
             *integer_table("monitor_places", [self.columns.index(name) for name in found.columns]),
             *integer_table("monitor_seldom", [int(name in found.seldom) for name in self.columns]),
@@ -155,7 +167,11 @@ def monitor_in_c(monitor: Monitor, design: ObserverDesign) -> LearnedMonitorInC 
             path="monitor",
         )
     return LearnedMonitorInC(
-        learned, watched_names(design), tuple(design.observer.fault_names), parameter_walk(design.observer)
+        learned,
+        watched_names(design),
+        tuple(design.observer.fault_names),
+        parameter_walk(design.observer),
+        len(design.plant.output_names),
     )
 
 

@@ -123,11 +123,14 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
         used[i] = is_known ? INPUT[i] : NAN;
         inputs_known = inputs_known && is_known;
     }
+    for (i = 0; i < NY; i++) {
+        seen[i] = isfinite(y[i]) ? y[i] : NAN;
+    }
+    MONITOR_UNREPEAT
     if (is_first && !inputs_known) {
         return waited(s, estimates);
     }
     for (i = 0; i < NY; i++) {
-        seen[i] = isfinite(y[i]) ? y[i] : NAN;
         none[i] = NAN;
         refused[i] = latest_of(&s->running)->refused[i];
     }

@@ -526,6 +526,7 @@ int PREFIX_step(STEP_ARGUMENTS)
     int i, missing;
     int unsure[LENGTH(V_COUNT)] = {0};
     COPY_IN
+    MONITOR_UNREPEAT
     s->time = (double)s->k * UPPER_DT;
     s->k++;
     for (i = 0; i < V_COUNT; i++) {

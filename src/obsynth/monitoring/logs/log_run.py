@@ -20,7 +20,7 @@ from obsynth.monitoring.logs.log_observer import DECIDING, GAP, RECOVERING, STAL
 from obsynth.monitoring.logs.recovered_states import FIRST_SECONDS, MOST_FIRST_ROWS, RecoveredStates
 from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals
 from obsynth.monitoring.logs.stamps import Stamps
-from obsynth.monitoring.logs.stuck_sensors import RepeatedValues
+from obsynth.monitoring.logs.stuck_sensors import RepeatedValues, Unrepeated, rising
 from obsynth.monitoring.thresholds.learned import LearnedRule, as_learned
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.monitor import LinearSample, Monitor, Sample
@@ -154,8 +154,12 @@ class LogRun:
         recovered: str | Sequence[str] | None = "none",
         stamps: Stamps | None = None,
     ) -> None:
+        #: Of thresholds that were learned: what leaves out the samples of sensors that may be stuck.
+        self.unrepeated: Unrepeated | None = None
         if monitor is not None and isinstance(monitor.rule, LearnedRule):
-            design = design.replace(observer=as_learned(design.observer, monitor.rule.learned))
+            learned = monitor.rule.learned
+            design = design.replace(observer=as_learned(design.observer, learned))
+            self.unrepeated = None if learned.repeats is None else Unrepeated(learned.repeats)
         self.observer = observer = log_observer(design, gap=gap, warm_up=warm_up, outliers=outliers)
         self.clock = Clock(observer.dt, gap, irregular=observer.takes_any_interval)
         self.signals = LogSignals.of(observer, columns, scales, getattr(design.plant, "units", {}))
@@ -232,7 +236,8 @@ class LogRun:
     def estimates(self, times: Sequence[float], values: FloatArray) -> list[Row]:
         """Return the estimates at rows as they come, deviations ``values (rows, nu + ny)``; those whose stamps do not
         rise are left out."""
-        found, at = list[Row](), list[float]()
+        found, at, read = list[Row](), list[float](), values
+        values, memory = self._unrepeated_rows(times, values)
         complete = np.asarray(np.isfinite(values).all(axis=1))
         while (done := len(found)) < len(times):
             status = self.clock.stale(times[done])
@@ -250,17 +255,34 @@ class LogRun:
                     self.clock.take(times[done : done + len(taken)], intervals[: len(taken)])
                     found += taken
                     at += own[: len(taken)]
+                    self._remember(memory, len(found))
                     continue
             found.append(self._single(times[done], values[done], self.rows + done + 1))
             at.append(self.clock.at(times[done]))
+            self._remember(memory, len(found))
         if found and self.rows == 0:
             self.first.status = found[0].status
         self.rows += len(found)
         self.first.take(times, values)
         return [
             row._replace(time=time, deviations=v, at=own)
-            for row, time, v, own in zip(found, times, values, at, strict=True)
+            for row, time, v, own in zip(found, times, read, at, strict=True)
         ]
+
+    def _unrepeated_rows(self, times: Sequence[float], values: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+        """Return rows ``(rows, nu + ny)`` without what sensors repeat that may be stuck, and what is remembered of that
+        after each."""
+        if self.unrepeated is None or not len(values):
+            return values, None
+        nu = values.shape[1] - len(self.unrepeated.longest)
+        earlier = -math.inf if self.clock.last is None else self.clock.stamp
+        outputs, memory = self.unrepeated.of_rows(values[:, nu:], rising(times, earlier))
+        return np.hstack([values[:, :nu], outputs]), memory
+
+    def _remember(self, memory: FloatArray | None, done: int) -> None:
+        """Keep what is remembered after so many rows of a piece."""
+        if self.unrepeated is not None and memory is not None:
+            self.unrepeated.memory = memory[done - 1]
 
     def _single(self, time: float, values: FloatArray, number: int) -> Row:
         """Take one row; one that is refused leaves nothing behind, so that a run may go on after it."""
@@ -412,12 +434,17 @@ class LogRun:
             "inputs": None if self.stamps is None else self.stamps.earlier,
             "numeric": None if self.stamps is None else sorted(self.stamps.numeric),
             "monitor": None if self.monitor is None else self.monitor.as_data(self._watching),
+            "repeated": None if self.unrepeated is None else self.unrepeated.memory,
         }
 
     def resume(self, data: dict[str, Any]) -> None:
         """Go on from what `as_dict` returned."""
         if (data["monitor"] is None) != (self.monitor is None):
             raise SpecError("The saved state is of a run with another monitor: use the same options.", path="state")
+        if (data.get("repeated") is None) != (self.unrepeated is None):
+            raise SpecError("The saved state is of a run with another monitor: use the same options.", path="state")
+        if self.unrepeated is not None:
+            self.unrepeated.memory = np.asarray(data["repeated"], dtype=np.float64)
         self.observer.resume(data["observer"])
         self.clock.resume(data["clock"])
         if self.stamps is not None:

@@ -1,6 +1,8 @@
 """Outputs that repeat one value for longer than the log itself makes probable: sensors that are stuck.
 
-What a log has shown is gathered row by row in constant memory, so that streams are told of as files are.
+What a log has shown is gathered row by row in constant memory, so that streams are told of as files are.  From normal
+logs follows after how many equal samples each sensor says nothing any more (`longest_repeats`), which is decided in the
+row itself, whatever comes later (`Unrepeated`).
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray
 
@@ -127,11 +130,9 @@ class _Output:
         coarse steps, which repeats its value often, has to repeat it for longer.  Where a few runs alone are long,
         these are compared with the rest.  What has no noise, or comes to rest, is not stuck.
         """
-        if self._run is None or not self._reversals >= NOISY_REVERSALS * max(self._pairs, 1):
+        if not self.is_noisy:
             return []
-        counts = self._lengths.copy()
-        counts[self._run.length] += 1
-        runs = self._longest([*self._long, *([self._run] if self._run.length >= LEAST_RUN else [])])
+        counts, runs = self._all_runs()
         for count in range(min(len(runs), counts.total() - LEAST_OTHER_RUNS), 0, -1):
             shortest, others = runs[count - 1].length, counts - Counter(run.length for run in runs[:count])
             least, mean, longest, size = _longest_tenth(others)
@@ -141,6 +142,29 @@ class _Output:
                 found = [run for run in runs[:count] if not self._rests(run)]
                 return [(run.first, run.last) for run in sorted(found, key=lambda run: run.first)]
         return []
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether its samples move as noise does."""
+        return self._run is not None and self._reversals >= NOISY_REVERSALS * max(self._pairs, 1)
+
+    def longest_usual(self) -> int:
+        """Return how many samples in a row have been equal at most, where it was not stuck; zero where too few runs
+        show that, or it has no noise."""
+        stuck = set(self.stuck())
+        if not self.is_noisy:
+            return 0
+        counts, runs = self._all_runs()
+        counts = counts - Counter(run.length for run in runs if (run.first, run.last) in stuck)
+        return max(counts) if counts.total() >= LEAST_OTHER_RUNS else 0
+
+    def _all_runs(self) -> tuple[Counter[int], list[_Repeats]]:
+        """Return how often runs of each length have been, and the longest of them, that which goes on among them."""
+        counts, runs = self._lengths.copy(), self._long
+        if self._run is not None:
+            counts[self._run.length] += 1
+            runs = [*self._long, *([self._run] if self._run.length >= LEAST_RUN else [])]
+        return counts, self._longest(runs)
 
     def _rests(self, run: _Repeats) -> bool:
         """Whether a run begins as that of a course without noise does that comes to rest, or was at rest before."""
@@ -224,6 +248,60 @@ def without_repeats(values: FloatArray, stuck: Iterable[Sequence[tuple[int, int]
         for first, last in runs:
             found[first + 1 : last + 1, i] = np.nan
     return found
+
+
+def rising(times: Sequence[float], earlier: float = -np.inf) -> NDArray[np.bool_]:
+    """Return which rows come later than all before them, and than a time ``earlier`` than these ``(n,)``: others are
+    left out."""
+    latest = np.maximum.accumulate([earlier, *times[:-1]])
+    return np.asarray(np.asarray(times) > latest)
+
+
+def longest_repeats(logs: Sequence[FloatArray]) -> FloatArray:
+    """Return from which equal sample in a row on each output says nothing any more ``(ny,)``, from normal logs
+    ``(n, ny)``: `TIMES_USUAL` times as many as there ever are where it is not stuck, or the second one where there are
+    never two; that costs one sample where it is chance. Infinite where it is not known."""
+    found = np.full(logs[0].shape[1], np.inf)
+    for i in range(len(found)):
+        outputs = [_Output() for _ in logs]
+        for output, log in zip(outputs, logs, strict=True):
+            seen = np.flatnonzero(np.isfinite(log[:, i]))
+            with np.errstate(over="ignore", invalid="ignore"):
+                output.take(seen.astype(np.float64), log[seen, i])
+        usual = [output.longest_usual() for output in outputs]
+        if all(usual):
+            found[i] = np.ceil(TIMES_USUAL * max(usual)) if max(usual) > 1 else 2.0
+    return found
+
+
+class Unrepeated:
+    """Leaves out what each output repeats after so many equal samples ``longest (ny,)``, row by row: from then on, its
+    sensor may be stuck, and says nothing.  A missing sample is no other one."""
+
+    def __init__(self, longest: FloatArray) -> None:
+        self.longest = np.array(longest)
+        #: The last value of each output, and how many samples in a row have had it ``(2, ny)``.
+        self.memory = np.zeros((2, len(self.longest)))
+
+    def of_rows(self, values: FloatArray, counted: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+        """Return outputs ``(n, ny)`` without what they repeat in rows that are ``counted (n,)``, and the memory after
+        each row ``(n, 2, ny)``; nothing is remembered yet."""
+        found, after = np.array(values), np.empty((len(values), 2, len(self.longest)))
+        rows = np.arange(1, len(values) + 1)
+        for i, (last, equal) in enumerate(self.memory.T.tolist()):
+            seen = np.flatnonzero(np.isfinite(values[:, i]) & counted)
+            own = values[seen, i]
+            place, goes_on = np.arange(len(own)), np.diff(own, prepend=last) == 0.0
+            if not equal:
+                goes_on[:1] = False
+            begun = np.maximum.accumulate(np.where(goes_on, -1, place))
+            counts = place - begun + np.where(begun < 0, equal, 1.0)
+            found[seen[counts >= self.longest[i]], i] = np.nan
+            # What is remembered after a row is what its last sample made it.
+            latest = np.searchsorted(seen + 1, rows, side="right")
+            after[:, 0, i] = np.concatenate([[last], own])[latest]
+            after[:, 1, i] = np.concatenate([[equal], counts])[latest]
+        return found, after
 
 
 def _rows(first: int, last: int) -> str:

@@ -22,12 +22,32 @@ static void monitor_reset(PREFIX_monitor *m)
     for (i = 0; i < OLDEST * 2 * MONITOR_WIDTH; i++) {
         m->scores[i] = 0;
     }
+    for (i = 0; i < MONITOR_OUTPUTS; i++) {
+        m->repeated[i] = 0;
+        m->equal[i] = 0;
+    }
     m->at = 0;
     m->taken = 0;
     m->to_wait = 0;
     m->statistic = NAN;
     m->alarm = m->event = m->quiet = 0;
     m->fault = -1;
+}
+
+/* Leave out what each output repeats for longer than it ever did: its sensor may be stuck. */
+static void monitor_unrepeat(PREFIX_monitor *m, REAL *y)
+{
+    int i;
+    for (i = 0; i < MONITOR_OUTPUTS; i++) {
+        if (!isfinite(y[i])) {
+            continue;
+        }
+        m->equal[i] = m->equal[i] > 0 && y[i] == m->repeated[i] ? m->equal[i] + 1 : 1;
+        m->repeated[i] = y[i];
+        if (monitor_longest[i] > 0 && m->equal[i] >= monitor_longest[i]) {
+            y[i] = NAN;
+        }
+    }
 }
 
 /* What the autoregression says of the next row. */

@@ -194,6 +194,9 @@ class LearnedThresholds:
         levels are those of a lower rate; otherwise zero.
     initial_covariance : FloatArray, optional
         ``(nx, nx)``: of the states at a start that is wherever the plant was in these rows, in place of the design's.
+    repeats : FloatArray, optional
+        ``(ny,)``: from which equal sample in a row on each output counts as not measured, as its sensor may be stuck;
+        infinite where these rows do not show that. Without it, never.
     logs : int
         How many logs these rows are from.
     healthy_time : HealthyTime
@@ -225,6 +228,7 @@ class LearnedThresholds:
     initial_covariance: FloatArray | None = None
     logs: int = 1
     healthy_time: HealthyTime = NO_HEALTHY_TIME
+    repeats: FloatArray | None = None
 
     @property
     def holds(self) -> bool:
@@ -324,6 +328,7 @@ class LearnedThresholds:
             "initial_covariance": self.initial_covariance,
             "logs": self.logs,
             "healthy_time": list(self.healthy_time),
+            "repeats": self.repeats,
         }
 
     def save(self, path: str | Path) -> Path:
@@ -451,6 +456,7 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         arrays["initial_covariance"],
         int(data["logs"]),
         HealthyTime(*map(float, data["healthy_time"])),
+        None if data.get("repeats") is None else read_only(np.asarray(data["repeats"], dtype=np.float64)),
     )
 
 
@@ -518,13 +524,15 @@ def thresholds_from_rows(
     like: LearnedThresholds | None = None,
     logs: Sequence[slice] = (),
     initial_covariance: FloatArray | None = None,
+    repeats: FloatArray | None = None,
     validated: bool = True,
 ) -> LearnedThresholds:
     """Return thresholds from ``rows (n, m)`` of all that may be watched, NaN where nothing is known; ``pairs``: what
     does not stand in them, but alarms; ``innovation``: how large innovations are in the observer's own deviations;
     ``scores``: what these rows say of faults, where that is known; ``outlier_sizes``: what the design is to say
     instead; ``like``: thresholds of which columns and directions are taken; ``logs``: which rows are of one log each;
-    ``initial_covariance``: that of the states at a start anywhere; ``validated``: whether the levels are those that
+    ``initial_covariance``: that of the states at a start anywhere; ``repeats``: from which equal sample on outputs
+    count as not measured; ``validated``: whether the levels are those that
     rows keep which are not learned from.
 
     Where the fault estimates remember more than the rows can tell, or nearly follow from the residuals (the gains of a
@@ -601,6 +609,7 @@ def thresholds_from_rows(
         initial_covariance=None if initial_covariance is None else read_only(initial_covariance),
         logs=max(len(logs), 1),
         healthy_time=time,
+        repeats=None if repeats is None else read_only(repeats),
     )
 
 

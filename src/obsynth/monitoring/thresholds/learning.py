@@ -18,7 +18,7 @@ from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals
 from obsynth.monitoring.logs.sources import CHUNK_ROWS, Data, Logs, chunks
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.step_observer import SteppingLogObserver
-from obsynth.monitoring.logs.stuck_sensors import stuck_rows, without_repeats
+from obsynth.monitoring.logs.stuck_sensors import Unrepeated, longest_repeats, rising, stuck_rows
 from obsynth.monitoring.thresholds.learned import (
     LEAST_NORMAL,
     NO_PAIRS,
@@ -158,7 +158,11 @@ def learn_thresholds(
         [(first + a, last + a) for a, b in ends for first, last in stuck_rows(column[a:b])]
         for column in log[:, before:].T
     ]
-    log = np.hstack([log[:, :before], without_repeats(log[:, before:], stuck)])
+    # As runs do it: a sample counts as not measured before it is known for how long it is repeated.
+    repeats = longest_repeats([log[a:b, before:] for a, b in ends])
+    parts = [log[a:b] for a, b in ends if a < b]
+    unrepeated = [Unrepeated(repeats).of_rows(part[:, before:], rising(part[:, 0].tolist()))[0] for part in parts]
+    log = np.hstack([log[:, :before], np.vstack(unrepeated)])
     said, sizes = _sized(design, started, log, ends)
     starts = started_anywhere(design.observer, said.starts)
     if starts is not None:
@@ -175,7 +179,8 @@ def learn_thresholds(
     places = np.searchsorted(said.numbers[chosen], borders)
     logs = tuple(slice(a, b) for a, b in zip(places[:-1].tolist(), places[1:].tolist(), strict=True))
     given: dict[str, Any] = {
-        "every": rows_per_alarm(false_alarms, dt), "dt": dt, "seed": seed, "pairs": pairs, "logs": logs
+        "every": rows_per_alarm(false_alarms, dt), "dt": dt, "seed": seed, "pairs": pairs, "logs": logs,
+        "repeats": repeats,
     }  # fmt: skip
     found = thresholds_from_rows(
         design,
