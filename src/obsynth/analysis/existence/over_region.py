@@ -61,18 +61,24 @@ def examine_over_region(plant: PolytopicSystem) -> tuple[tuple[Condition, ...], 
     return found, made[0] if made else None
 
 
-def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion]) -> Iterator[Condition]:
+def constant_outputs(plant: PolytopicSystem, product: str, source: str) -> Condition:
+    """Return the condition that outputs are the same at all vertices; ``product``: what has no vertices otherwise."""
     changing = [name for name in CONSTANT_MATRICES if not plant.is_constant(name)]
-    yield Condition(
+    return Condition(
         "constant outputs",
-        "C, D, Df, Dd and Dw are the same at all vertices: the product L(mu) C(mu) has no vertices",
+        f"C, D, Df, Dd and Dw are the same at all vertices: the product {product} has no vertices",
         not changing,
         float(len(changing)),
         0.0,
-        _SOURCE,
+        source,
         f"changing: {', '.join(changing)}" if changing else "",
     )
-    if changing:
+
+
+def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion]) -> Iterator[Condition]:
+    constant = constant_outputs(plant, "L(mu) C(mu)", _SOURCE)
+    yield constant
+    if not constant.holds:
         return
     for place, vertex in enumerate(plant.vertices):
         for condition in fault_filter_conditions(vertex, exactly=exactly):

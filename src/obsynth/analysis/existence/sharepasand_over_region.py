@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.existence.condition import Condition
-from obsynth.analysis.existence.over_region import CONSTANT_MATRICES
+from obsynth.analysis.existence.over_region import constant_outputs
 from obsynth.analysis.existence.sharepasand import existence
 from obsynth.analysis.existence.sharepasand_decoupling import decoupling_condition
 from obsynth.analysis.existence.statements import Evaluator
@@ -33,17 +33,9 @@ def pi_conditions_over_region(
 
 
 def _in_order(plant: PolytopicSystem, model: Exosystem, exactly: bool) -> Iterator[Condition]:
-    changing = [name for name in CONSTANT_MATRICES if not plant.is_constant(name)]
-    yield Condition(
-        "constant outputs",
-        "C, D, Df, Dd and Dw are the same at all vertices: the product K(mu) C(mu) has no vertices",
-        not changing,
-        float(len(changing)),
-        0.0,
-        _SOURCE,
-        f"changing: {', '.join(changing)}" if changing else "",
-    )
-    if changing:
+    constant = constant_outputs(plant, "K(mu) C(mu)", _SOURCE)
+    yield constant
+    if not constant.holds:
         return
     for place, vertex in enumerate(plant.vertices):
         found = existence(vertex, model, exactly=exactly)

@@ -1,68 +1,37 @@
-"""Scheduled observers on a log: parameters in columns of their own, and rows outside the region.
+"""Scheduled observers on a log: parameters in columns of their own.
 
-A row is ``out`` from one with a parameter that is missing, outside its range or faster than its rate, until a hundredth
-of the error that this may have left is left: nothing is claimed there, and nothing is decided.  Outputs and inputs that
-are missing count as they last were; such a row is a gap, and those after it are recovering as long.
+A row with a parameter that is missing, outside its range or faster than its rate is outside the region.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
+from numpy.typing import NDArray
 
-from obsynth.monitoring.logs.log_observer import GAP, OK, OUT, RECOVERING, WARM_UP, LogObserver, Row
-from obsynth.monitoring.thresholds.monitor import LinearSample
+from obsynth.monitoring.logs.claimed_observer import ClaimedLogObserver
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 
 
-class ScheduledLogObserver(LogObserver):
+class ScheduledLogObserver(ClaimedLogObserver):
     """A scheduled observer on a log."""
-
-    saved: ClassVar = {"observer": "state", "held": "held", "begun": "begun"}
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None) -> None:
         plant, observer = design.scheduled
-        super().__init__(observer, warm_up, observer.forgetting * (observer.dt or 1.0))
-        self.observer, self.columns = observer, observer.row_names
-        self.input_names, self.output_names = observer.input_names, observer.output_names
-        self.point, self.scales, self.input_delay = plant.operating_point, plant.scales, design.input_delay
-        self.state = observer.init()
-        self.held, self.begun = np.zeros(len(self.input_names) + len(self.output_names)), False
+        super().__init__(observer, warm_up, design.input_delay)
+        self.point, self.scales = plant.operating_point, plant.scales
 
-    def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
-        """Take one row."""
-        nu, known = len(self.input_names), np.isfinite(values)
-        parameters = slice(self.observer.inputs, nu)
-        needed = np.ones(len(values), dtype=bool)
-        needed[parameters] = False
-        whole = bool(known[needed].all())
-        if not self.begun and not whole:
-            return Row(GAP, np.full(len(self.columns), np.nan), missing)
-        if missing or not self.begun:
-            self.state, self.begun, seconds = self.observer.init(), True, 0.0
-            self.settled_at, self.phase = self._after(time, self.warm_up), WARM_UP
-        taken = np.where(known, values, self.held)
-        taken[parameters] = np.where(known[parameters], values[parameters], np.nan)
+    @property
+    def _needed(self) -> NDArray[np.bool_]:
+        needed = np.ones(len(self.held), dtype=bool)
+        needed[self.observer.inputs : len(self.input_names)] = False
+        return needed
+
+    def _advance(self, values: FloatArray, seconds: float) -> FloatArray:
+        nu, needed = len(self.input_names), self._needed
+        taken = np.where(needed & ~np.isfinite(values), self.held, values)
+        taken = np.where(np.isfinite(taken), taken, np.nan)
         self.held = np.where(needed, taken, 0.0)
         with np.errstate(over="ignore", invalid="ignore"):
             self.state, row = self.observer.advance(self.state, taken[nu:], taken[:nu], seconds)
-        if not whole:
-            # Warm-up goes on where it had not ended: nothing was known before.
-            settled = self._after(time, self.observer.forgetting * (self.dt or 1.0))
-            self.phase = self.phase if self.phase == WARM_UP else RECOVERING
-            self.settled_at = max(self.settled_at, settled)
-        status = self._status(time, whole=whole)
-        sample = LinearSample(row, values[:nu], values[nu:], len(self.state_names))
-        return Row(status, row if whole else np.full(len(row), np.nan), missing, sample if status == OK else None)
-
-    def _status(self, time: float, *, whole: bool) -> str:
-        if not whole:
-            return GAP
-        if self.state.unclaimed:
-            return OUT
-        if time < self.settled_at:
-            return self.phase
-        self.phase = OK
-        return OK
+        return np.asarray(row)
