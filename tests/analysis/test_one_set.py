@@ -15,9 +15,9 @@ import pytest
 import obsynth
 from obsynth import conditions
 from obsynth.analysis.existence.wang2015 import examine_fault_filter
+from obsynth.conditions import pd_inequalities
 from obsynth.conditions.wang import error_norm
 from obsynth.methods.fault_estimation_filter.convex_problem import centred, gain_problem, gains_in_given_units
-from obsynth.methods.pd_observer import inequalities
 from obsynth.methods.pd_observer.realisation import with_faults_as_states
 from obsynth.numerics.central_filter import least_level, search_least_gain
 
@@ -136,11 +136,11 @@ def test_a_point_below_the_least_gain_is_in_neither():
     assert found.constraints["(45)"].violation() > 1e-2
 
 
-def pd_task(plant, theorem: int, delta: float, decay: float) -> inequalities.PdTask:
+def pd_task(plant, theorem: int, delta: float, decay: float) -> pd_inequalities.PdTask:
     augmented = with_faults_as_states(plant)
     n, ny = augmented.nx, augmented.ny
     nothing = np.zeros((n, 0))
-    return inequalities.PdTask(
+    return pd_inequalities.PdTask(
         ((augmented.A, augmented.C),), theorem, delta, decay, None, None, 1.0, None, None, np.eye(n)[:, plant.nx :],
         np.eye(n)[plant.nx :], nothing, np.zeros((ny, 0)), np.zeros((ny, 0)),
     )  # fmt: skip
@@ -151,7 +151,7 @@ def pd_task(plant, theorem: int, delta: float, decay: float) -> inequalities.PdT
 def test_the_engine_of_the_pd_observer_solves_the_printed_problem(theorem, decay):
     """The same minimum of the same problem, and each optimum is a point of the other's inequality."""
     plant = filter_plant("filasova")
-    solved = inequalities.solve(pd_task(plant, theorem, 0.1, decay), solver="CLARABEL")
+    solved = pd_inequalities.solve(pd_task(plant, theorem, 0.1, decay), solver="CLARABEL")
     printed = (conditions.filasova_theorem1, conditions.filasova_theorem2)[theorem - 1]
     found = printed(plant, delta=0.1, decay=decay)
     found.problem.solve(solver="CLARABEL")

@@ -10,10 +10,10 @@ import pytest
 import scipy.linalg
 
 import obsynth
+from obsynth.conditions.pd_inequalities import PdTask
 from obsynth.methods.pd_observer import synthesis
 from obsynth.methods.pd_observer.certificate_proofs import prove_gains
 from obsynth.methods.pd_observer.closed_form import closed_form
-from obsynth.methods.pd_observer.inequalities import PdTask
 from obsynth.methods.pd_observer.limits import fastest_mode
 from obsynth.methods.pd_observer.method import MOST_STATES_FOR_LMI, PdObserver
 from obsynth.methods.pd_observer.realisation import with_faults_as_states

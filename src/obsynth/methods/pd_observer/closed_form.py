@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.conditions.pd_inequalities import PdSolution, PdTask
 from obsynth.errors import SolverError
 from obsynth.methods.pd_observer.certificate import coupled_certificate, symmetric_certificate
-from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.doubling import EQUATION_TOLERANCE, continuous_riccati_solution, symmetric
 from obsynth.numerics.matrix_equations import continuous_solution

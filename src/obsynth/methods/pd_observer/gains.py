@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.conditions.pd_inequalities import PdSolution
 from obsynth.methods.pd_observer.certificate import explicit_certificate, gain_certificate
 from obsynth.methods.pd_observer.certificate_proofs import (
     GAIN_CLAIMS,
@@ -15,7 +16,6 @@ from obsynth.methods.pd_observer.certificate_proofs import (
     prove_gains,
     prove_shipped_stability,
 )
-from obsynth.methods.pd_observer.inequalities import PdSolution
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray

@@ -18,12 +18,12 @@ from obsynth.analysis.existence.filasova import explicit_form, pd_observer_condi
 from obsynth.analysis.structure import analyse_structure
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.options import own_terms
+from obsynth.conditions.pd_inequalities import PdSolution, PdTask, solve
 from obsynth.errors import InfeasibleError, ObsynthError, SolverError
 from obsynth.methods.engines.sensor_noise import fault_deviation
 from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
 from obsynth.methods.pd_observer.closed_form import closed_form
 from obsynth.methods.pd_observer.gains import PdGains, certified
-from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve
 from obsynth.methods.pd_observer.limits import default_delta, fastest_mode, require_possible
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states, with_sensor_noise

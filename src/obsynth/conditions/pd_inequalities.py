@@ -1,4 +1,4 @@
-r"""The matrix inequalities of the PD observer, in coordinates of our choice.
+r"""The matrix inequalities of PD observers of several plants, with bounds on gains, in coordinates of our choice.
 
 .. math::
     \begin{bmatrix} M + M^T & \cdot \\ \delta M - T^T & -\delta (T + T^T) \end{bmatrix}
