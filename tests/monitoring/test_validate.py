@@ -320,7 +320,7 @@ def test_outliers_that_a_gate_leaves_out_blame_no_variance(tank_design):
 
 
 def test_no_run_is_made_twice(tank_design, monkeypatch):
-    from obsynth.monitoring.calibration import told_variances, validating
+    from obsynth.monitoring.calibration import validating, walk_shares
 
     runs, run = [], validating.recorded_innovations
 
@@ -330,7 +330,7 @@ def test_no_run_is_made_twice(tank_design, monkeypatch):
 
     monkeypatch.setattr(validating, "recorded_innovations", counted)
     validate(walking_design(tank_design, 0.02), walking_tank(0.0))
-    assert len(runs) == len(set(runs)) == len(told_variances.VARIANCE_SHARES)
+    assert len(runs) == len(set(runs)) == len(walk_shares.VARIANCE_SHARES)
 
 
 @pytest.mark.parametrize("wrong", ["Q", "R"])

@@ -27,14 +27,14 @@ from obsynth.monitoring.calibration.plants import NonlinearPlant
 from obsynth.monitoring.calibration.problem import CalibrationProblem
 from obsynth.monitoring.calibration.simulation_error import Fit
 from obsynth.monitoring.calibration.step_graphs import sample_graphs
-from obsynth.monitoring.calibration.told_variances import (
+from obsynth.monitoring.calibration.variance_names import variance_names, with_letter
+from obsynth.monitoring.calibration.walk_shares import (
     likeliest_shares,
+    sentences_on_shares,
     shared_walk,
     stated_walk,
-    told_shares,
     with_walk,
 )
-from obsynth.monitoring.calibration.variance_names import variance_names, with_letter
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.estimates import Estimates
@@ -421,7 +421,7 @@ def _as_far_as_it_walks(
 
     note("how far parameters walk in this log")
     shares = likeliest_shares(walk, loss)
-    return *runs[shared_walk(walk, shares).tobytes()], told_shares(design.observer.fault_names, walk, shares)
+    return *runs[shared_walk(walk, shares).tobytes()], sentences_on_shares(design.observer.fault_names, walk, shares)
 
 
 def states_innovations(design: ObserverDesign) -> bool:

@@ -81,7 +81,7 @@ class Screening:
         entering, known = bound.rounding.copy(), np.zeros((bound.width, bound.rounding.shape[1]))
         known[:, order] = _known(bound, n, nu)
         largest_start = np.maximum(bound.start.max(axis=0, initial=0.0), bound.start_later[1])
-        entering[:m, order] += bound.solved @ structure.seen(first[:rows])
+        entering[:m, order] += bound.solved @ structure.channel_sizes(first[:rows])
         entering += bound.same.T @ known
         entering[:, -1] += bound.nominal + largest_start
         gathered = bound.kernels.reshape(bound.length, bound.width, -1).sum(axis=0).T

@@ -128,7 +128,7 @@ class Start:
         found = np.abs(self.center) + self.radius
         return np.asarray(found if self.norm is None else found + self.norm)
 
-    def seen(self, left: FloatArray) -> FloatArray:
+    def largest(self, left: FloatArray) -> FloatArray:
         """Return the largest size of each row of ``left eps``."""
         found = np.abs(left @ self.center) + np.abs(left) @ self.radius
         return np.asarray(found if self.norm is None else found + self.norm * np.linalg.norm(left, axis=-1))
@@ -149,7 +149,7 @@ def adaptive_bound(
     kernels = np.concatenate([responses.kernels, _driven(structure, responses, rest[inner][:, driven])], axis=1)
     kernels[:, :, :m] = kernels[:, :, :m] @ solved.T * OUTWARD
     kernels = np.ascontiguousarray(kernels[::-1].reshape(-1, kernels.shape[2]))
-    through = structure.seen(np.abs(rows) @ rest[state][:, driven])
+    through = structure.channel_sizes(np.abs(rows) @ rest[state][:, driven])
     same = (
         np.hstack(
             [
@@ -195,7 +195,7 @@ def _driven(structure: ErrorStructure, responses: Responses, columns: FloatArray
     def sizes(left: FloatArray) -> FloatArray:
         return np.asarray((np.abs(left @ powers) + power_rounding(left, powers)) @ columns)
 
-    channels = structure.seen(np.moveaxis(sizes(structure.channel_rows @ structure.Cx), 1, 0))
+    channels = structure.channel_sizes(np.moveaxis(sizes(structure.channel_rows @ structure.Cx), 1, 0))
     parts = [np.moveaxis(channels, 0, 1), sizes(structure.Co), sizes(np.eye(len(structure.Az)))]
     return np.asarray(np.concatenate(parts, axis=1).transpose(0, 2, 1) * OUTWARD)
 
@@ -206,8 +206,8 @@ def _start_table(
     """Return what the start adds to channels and outputs, sample by sample, and what goes on decaying after that."""
     both, power, found = (structure.channel_rows @ structure.Cx, structure.Co), np.eye(len(structure.Az)), []
     for _ in range(START_RINGS * responses.length):
-        channels, outputs = (start.seen(left @ power) for left in both)
-        found.append(np.concatenate([structure.seen(channels), outputs]) * OUTWARD)
+        channels, outputs = (start.largest(left @ power) for left in both)
+        found.append(np.concatenate([structure.channel_sizes(channels), outputs]) * OUTWARD)
         power = structure.Az @ power
     # ``|Az^L| w <= theta w`` is proved.
     theta, weights = positive_vector(responses.tail_eps)
@@ -218,7 +218,7 @@ def _start_table(
         (np.abs(left @ responses.powers[:-1]) + power_rounding(left, responses.powers)).max(axis=0) @ weights
         for left in both
     )
-    return np.array(found), (theta, np.concatenate([structure.seen(channels), outputs]) * factor)
+    return np.array(found), (theta, np.concatenate([structure.channel_sizes(channels), outputs]) * factor)
 
 
 def _nominal(structure: ErrorStructure, responses: Responses, *, center: bool = True) -> FloatArray:
@@ -236,7 +236,7 @@ def _nominal(structure: ErrorStructure, responses: Responses, *, center: bool = 
 
     rows = structure.channel_rows
     channels = total(rows @ structure.Cx, given[state, :].after(rows))
-    return np.concatenate([structure.seen(channels), total(structure.Co, given[outputs, :])])
+    return np.concatenate([structure.channel_sizes(channels), total(structure.Co, given[outputs, :])])
 
 
 def _rounding(
@@ -273,4 +273,4 @@ def _rounding(
             (structure.Co, absolute(both[outputs]), found),
         ):
             total[:, order] += spread(left, direct + absolute(left) @ largest_psi, into)
-    return np.vstack([structure.seen(channels), found]) * OUTWARD
+    return np.vstack([structure.channel_sizes(channels), found]) * OUTWARD

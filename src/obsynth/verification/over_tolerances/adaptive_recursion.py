@@ -166,7 +166,7 @@ def _varying(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _Firs
 
 def _channels(bound: AdaptiveBound, rows: FloatArray) -> FloatArray:
     """Return the size of each channel ``(..., m)`` from its rows ``(..., rows)``."""
-    return np.moveaxis(bound.structure.seen(np.moveaxis(rows, -1, 0)), 0, -1)
+    return np.moveaxis(bound.structure.channel_sizes(np.moveaxis(rows, -1, 0)), 0, -1)
 
 
 def _followed(ring: FloatArray, row: FloatArray) -> FloatArray:

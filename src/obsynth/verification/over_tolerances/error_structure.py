@@ -69,7 +69,7 @@ class ErrorStructure:
         """Number of channels."""
         return int(self.effects.shape[1])
 
-    def seen(self, values: FloatArray) -> FloatArray:
+    def channel_sizes(self, values: FloatArray) -> FloatArray:
         """Return the size of each channel from ``channel_rows`` times something, rows in the first axis."""
         sizes = np.abs(values)
         if self.single == len(sizes):

@@ -121,9 +121,9 @@ def responses_of(structure: ErrorStructure) -> Responses:
     signed = structure.channel_rows @ structure.effects[state]
     absolute = np.abs(structure.channel_rows) @ np.abs(structure.effects[state])
     own = len(structure.owner)
-    same = structure.seen(np.hstack([signed[:, :own], absolute[:, own:]]))
+    same = structure.channel_sizes(np.hstack([signed[:, :own], absolute[:, own:]]))
     eye = np.eye(nz)
-    tail = structure.seen(np.abs(rows @ powers[-1]) + power_rounding(rows, powers))
+    tail = structure.channel_sizes(np.abs(rows @ powers[-1]) + power_rounding(rows, powers))
     out = np.abs(structure.Co @ powers[-1]) + power_rounding(structure.Co, powers)
     inside = (np.abs(powers[-1]) + power_rounding(eye, powers)) * OUTWARD
     repeated = inverse_bound(inside)
@@ -219,7 +219,7 @@ def blamed_rows(responses: Responses, tracking: FloatArray, parts: tuple[FloatAr
     """Return the share of each row of the plant ``(nx,)`` in the loop; ``parts (p, nx, n)`` of E and A."""
     structure = responses.structure
     left, right = _perron(responses.loop)
-    into = structure.seen(responses.gain(structure.channel_rows @ structure.Cx, tracking))
+    into = structure.channel_sizes(responses.gain(structure.channel_rows @ structure.Cx, tracking))
     shares = np.zeros(tracking.shape[1])
     for i in sorted(set(structure.owner)):
         chosen = np.flatnonzero(np.equal(structure.owner, i))

@@ -57,7 +57,7 @@ def likeliest_shares(walk: FloatArray, loss: Callable[[FloatArray], float]) -> F
     return shares
 
 
-def told_shares(names: Sequence[str], walk: FloatArray, shares: FloatArray) -> list[str]:
+def sentences_on_shares(names: Sequence[str], walk: FloatArray, shares: FloatArray) -> list[str]:
     """Return a sentence for each parameter whose walk is not all used."""
     found = []
     for name, share, variance in zip(names, shares.tolist(), np.diag(walk).tolist(), strict=False):
