@@ -144,16 +144,16 @@ def wang2015(
     shown_d = (np.eye(m) - C @ N) @ work.Dd  # of d in the innovation: zero in the paper, as D1 and Zd
     TD, D1 = T @ D - TA @ (N @ work.Dd) - L0 @ shown_d, rest @ shown_d
     convex = GainProblem(
-        A1,
-        V.T @ C,
-        W0 @ C,
-        TD,
-        V.T @ shown_d,
-        W0 @ shown_d,
-        np.zeros((n, m - q)),
-        -np.eye(m - q),
-        np.zeros((q, m - q)),
-        free,
+        A=A1,
+        C=V.T @ C,
+        Z=W0 @ C,
+        B=TD,
+        D=V.T @ shown_d,
+        Zd=W0 @ shown_d,
+        Bn=np.zeros((n, m - q)),
+        Dn=-np.eye(m - q),
+        Zn=np.zeros((q, m - q)),
+        free_weight=free,
     )
     X, R0, unit = as_matrix(np.eye(n), "X"), np.zeros((n, m)), 1.0
     if chosen(coordinates, "coordinates", ("plant", "balanced")) == "balanced":

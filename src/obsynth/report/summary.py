@@ -141,16 +141,16 @@ def summary(design: ObserverDesign, *, file: Path | None = None, everything: boo
     more = _counted([(count, what) for count, what in hidden if count > 0])
     verdict = f"{design.name}: {verdict_line(design.report.checks).plain}"
     return Summary(
-        verdict,
-        design.report.passed,
-        tuple(_facts(design, steps)),
-        headings,
-        tuple(rows[:shown]),
-        f"{more} with -v" if more else "",
-        warnings,
-        notes,
-        "" if file is None else str(file),
-        tuple(estimate_figures(design, gains)),
+        verdict=verdict,
+        passed=design.report.passed,
+        facts=tuple(_facts(design, steps)),
+        headings=headings,
+        rows=tuple(rows[:shown]),
+        more=f"{more} with -v" if more else "",
+        warnings=warnings,
+        notes=notes,
+        file="" if file is None else str(file),
+        figures=tuple(estimate_figures(design, gains)),
     )
 
 

@@ -110,7 +110,18 @@ def information(
     name: str, claim: str, value: float, *, source: str, detail: str = "", status: Status = "recomputed"
 ) -> Check:
     """Return a row that informs and cannot fail."""
-    return Check(name, claim, float(value), math.nan, math.nan, True, source, "information", detail, status)
+    return Check(
+        name=name,
+        claim=claim,
+        value=float(value),
+        bound=math.nan,
+        margin=math.nan,
+        passed=True,
+        source=source,
+        kind="information",
+        detail=detail,
+        status=status,
+    )
 
 
 def all_hold(checks: Sequence[Check]) -> bool:

@@ -313,17 +313,17 @@ def side_by_side(
     usual = min(among, key=lambda entry: entry.rank(sampled.nd > 0, settling), default=None)
     reference = None if log is None else log.reference
     return Comparison(
-        tuple(compared),
-        "" if best is None else best.method,
-        _reason(best, compared, sampled, "" if usual is None else usual.method),
-        dt,
-        read_only(shown.times),
-        read_only(truth),
-        plant.fault_names,
-        setting,
-        asked if log is None or reference is not None else {},
-        reference,
-        () if logged is None else logged.notes,
+        methods=tuple(compared),
+        recommended="" if best is None else best.method,
+        reason=_reason(best, compared, sampled, "" if usual is None else usual.method),
+        sample_time=dt,
+        times=read_only(shown.times),
+        truth=read_only(truth),
+        fault_names=plant.fault_names,
+        setting=setting,
+        asked=asked if log is None or reference is not None else {},
+        log=reference,
+        notes=() if logged is None else logged.notes,
     )
 
 

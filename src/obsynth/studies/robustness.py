@@ -102,7 +102,21 @@ def robustness(
     uncertain = plant.uncertainty
     if uncertain is None or not uncertain.box.names:
         empty = ConstantsBox({}) if uncertain is None else uncertain.box
-        return Robustness(empty, True, "open", {}, None, None, {}, {}, {}, {}, "open", 0, EXACT_MODEL)
+        return Robustness(
+            box=empty,
+            assumes_exact_model=True,
+            regular="open",
+            breaking={},
+            loop_radius=None,
+            largest_factor=None,
+            blame={},
+            rows={},
+            error_per_unit={},
+            vertex_gains={},
+            stable="open",
+            boxes=0,
+            reason=EXACT_MODEL,
+        )
     report_stage("regularity over the box")
     regular = index_one_on_box(plant)
     reason = ""
@@ -140,23 +154,23 @@ def robustness(
         except PreconditionError as error:
             reason = str(error)
     return Robustness(
-        uncertain.box,
-        False,
-        regular.verdict,
-        breaking,
-        radius,
-        factor,
-        shares,
-        rows,
-        errors,
-        gains,
-        stable.verdict,
-        stable.boxes,
-        reason,
-        acting_like_faults(plant),
-        untouched,
-        uncertain.not_covered,
-        design,
+        box=uncertain.box,
+        assumes_exact_model=False,
+        regular=regular.verdict,
+        breaking=breaking,
+        loop_radius=radius,
+        largest_factor=factor,
+        blame=shares,
+        rows=rows,
+        error_per_unit=errors,
+        vertex_gains=gains,
+        stable=stable.verdict,
+        boxes=stable.boxes,
+        reason=reason,
+        sharing=acting_like_faults(plant),
+        untouched=untouched,
+        not_covered=uncertain.not_covered,
+        design=design,
     )
 
 

@@ -152,4 +152,6 @@ def prepare(plant: DescriptorSystem, s: FloatArray | None = None, *, exactly: bo
     found = fault_detectability(ta, c, tf, plant=work, scaling=scaling, exact=exact_indexes(plant) if exactly else None)
     bd, dd = error_input(work.Bd, work.Dd)
     bw, dw = error_input(work.Bw, work.Dw)
-    return PreparedPlant(work, scaling, t, n, ta, c, bd, dd, bw, dw, found)
+    return PreparedPlant(
+        plant=work, scaling=scaling, T=t, N=n, TA=ta, C=c, Bd=bd, Dd=dd, Bw=bw, Dw=dw, detectability=found
+    )

@@ -188,18 +188,18 @@ def question_of(asked: TestOptions, plant: DescriptorSystem | TimeVaryingDescrip
     if isinstance(plant, DescriptorSystem) and not decide_rank(plant.E).full:
         index = ExactPencil.written(plant.E, plant.A).index
     return TestProblem(
-        fault,
-        asked.course,
-        before + 1,
-        asked.lag or 0,
-        before,
-        free_faults(names, asked.free, fault),
-        asked.free_course,
-        asked.disturbance,
-        rates,
-        float(asked.fault_rate or 0.0),
-        asked.norm == "ellipsoid",
-        max((index or 0) - 1, 0),
+        fault=fault,
+        course=asked.course,
+        samples=before + 1,
+        lag=asked.lag or 0,
+        before=before,
+        free=free_faults(names, asked.free, fault),
+        free_course=asked.free_course,
+        disturbance=asked.disturbance,
+        disturbance_rate=rates,
+        fault_rate=float(asked.fault_rate or 0.0),
+        ellipsoid=asked.norm == "ellipsoid",
+        closing=max((index or 0) - 1, 0),
     )
 
 

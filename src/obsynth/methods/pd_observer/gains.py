@@ -63,7 +63,18 @@ def certified(
         return None
     ends = asked.range_numbers
     p1, p3 = symmetric(found.P1[0]), symmetric(found.P3) if asked.theorem == 2 else found.P3
-    gains = PdGains(found.J, found.L, p1, p3, asked.theorem, delta, delta, decay, observer, found.record)
+    gains = PdGains(
+        J=found.J,
+        L=found.L,
+        P1=p1,
+        P3=p3,
+        theorem=asked.theorem,
+        asked_delta=delta,
+        delta=delta,
+        decay=decay,
+        observer=observer,
+        record=found.record,
+    )
     if ends is not None:
         return _certified_range(plant, replace(gains, ends=found.P1), ends)
     certificates = _gain_certificates(plant, asked, gains)

@@ -100,7 +100,19 @@ def placement_problem(
         n = len(f)
         fixed_modes = finite_zeros(np.vstack([np.eye(n), np.zeros((len(c), n))]), np.vstack([f, c])).values
     split = observable_split(f, c, fixed_modes, dt=scaled.dt)
-    return PlacementProblem(scaled, model, units, decoupled, u, d, f, c, free, split, _own_rate(scaled, split.F))
+    return PlacementProblem(
+        plant=scaled,
+        model=model,
+        units=units,
+        decoupled=decoupled,
+        U=u,
+        D=d,
+        F=f,
+        C=c,
+        free=free,
+        split=split,
+        rate=_own_rate(scaled, split.F),
+    )
 
 
 def _free_part(decoupled: Decoupled, plant: DescriptorSystem, model: Exosystem) -> tuple[FloatArray, FloatArray]:

@@ -144,18 +144,18 @@ class AlarmLog:
             named = fault
             self._named_by[by] = evidence if distinguished else -math.inf
         self._open[by] = AlarmEvent(
-            by,
-            named,
-            time if before is None else before.start,
-            time,
-            row if before is None else before.first_row,
-            row,
-            1 if before is None else before.rows + 1,
-            size,
-            low,
-            high,
-            evidence if largest or before is None else before.evidence,
-            distinguished or (before is not None and before.distinguished),
+            by=by,
+            fault=named,
+            start=time if before is None else before.start,
+            end=time,
+            first_row=row if before is None else before.first_row,
+            last_row=row,
+            rows=1 if before is None else before.rows + 1,
+            size=size,
+            low=low,
+            high=high,
+            evidence=evidence if largest or before is None else before.evidence,
+            distinguished=distinguished or (before is not None and before.distinguished),
         )
 
     def _size(self, fault: str, cells: Sequence[float]) -> tuple[float, float, float]:

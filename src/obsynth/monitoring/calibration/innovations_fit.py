@@ -167,19 +167,19 @@ def innovations_fit(
     bounds = at_bounds(maximum.z, objective.low, objective.high)[: objective.nt]
     has_offsets = isinstance(problem.plant, PlantWithNoise) and bool(problem.plant.states.offsets)
     return InnovationsFit(
-        objective.constants(maximum.z),
-        objective.likelihood(objective.full(maximum.z))[0],
-        found,
-        sides,
-        Q,
-        R,
-        limited[: len(Q)],
-        limited[len(Q) :],
-        bounds,
-        whitened,
-        e,
-        spread,
-        _at_end(objective, maximum, found) if has_offsets else None,
+        t=objective.constants(maximum.z),
+        value=objective.likelihood(objective.full(maximum.z))[0],
+        information=found,
+        sides=sides,
+        Q=Q,
+        R=R,
+        limited_Q=limited[: len(Q)],
+        limited_R=limited[len(Q) :],
+        at_bounds=bounds,
+        whitened=whitened,
+        innovations=e,
+        variances=spread,
+        at_end=_at_end(objective, maximum, found) if has_offsets else None,
     ), moved
 
 

@@ -197,18 +197,18 @@ def _of_simulation(problem: CalibrationProblem, start: Fit, level: float) -> Inn
     variances = np.tile(start.deviations**2, (len(y), 1))
     nothing = np.zeros(len(problem.noisy))
     return InnovationsFit(
-        start.t,
-        start.cost,
-        information,
-        sides,
-        nothing,
-        start.deviations**2,
-        nothing.astype(bool),
-        np.zeros(len(problem.output_names), dtype=bool),
-        ends,
-        e / start.deviations,
-        e,
-        variances,
+        t=start.t,
+        value=start.cost,
+        information=information,
+        sides=sides,
+        Q=nothing,
+        R=start.deviations**2,
+        limited_Q=nothing.astype(bool),
+        limited_R=np.zeros(len(problem.output_names), dtype=bool),
+        at_bounds=ends,
+        whitened=e / start.deviations,
+        innovations=e,
+        variances=variances,
     )
 
 

@@ -107,7 +107,17 @@ def sample_graphs(
     if in_c:
         solve, sensitivities, fast = compiled([solve, sensitivities, local])
     return SampleGraphs(
-        solve, sensitivities, local, outputs, fast, nx, nu, outputs.size1_out(0), nt, packed.shape[0], in_c
+        solve=solve,
+        sensitivities=sensitivities,
+        local=local,
+        outputs=outputs,
+        fast=fast,
+        nx=nx,
+        nu=nu,
+        ny=outputs.size1_out(0),
+        nt=nt,
+        numbers=packed.shape[0],
+        in_c=in_c,
     )
 
 

@@ -128,16 +128,16 @@ def _sampled_plan(
     def plan(begin: Start) -> AdaptivePlan:
         bound = adaptive_bound(structure, problem.observer, begin, varying=False)
         return AdaptivePlan(
-            replace(bound, first=problem.first),
-            None,
-            False,
-            why,
-            True,
-            watches_estimates(design),
-            (*problem.affine.box.names, SAMPLING),
-            observer.fault_names,
-            observer.residual_names,
-            sample_time,
+            bound=replace(bound, first=problem.first),
+            faults=None,
+            same=False,
+            reason=why,
+            start_beyond_nominal=True,
+            estimates=watches_estimates(design),
+            names=(*problem.affine.box.names, SAMPLING),
+            fault_names=observer.fault_names,
+            residual_names=observer.residual_names,
+            sample_time=sample_time,
         )
 
     return plan(problem.start(stated, box)), plan(problem.start(stated, None))

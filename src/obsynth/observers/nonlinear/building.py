@@ -210,19 +210,19 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
         parameter_scales=np.sqrt(np.diag(observer.initial_parameter_covariance)),
     )
     return DAEFacts(
-        index_report(model, observer.dt, x=found.states[-1], u=u, theta=found.parameters[-1]).index,
-        float(found.conditions.max()),
-        int(np.argmax(found.conditions)),
-        float(found.residuals.max()),
-        float(found.contraction[-1]),
-        read_only(deviations),
-        read_only(covariance / np.outer(safe, safe)),
-        found.projection,
-        identifiable,
-        read_only(observer.steps.part(end, "K")),
-        read_only(observer.steps.part(end, "Upsilon")),
-        read_only(np.concatenate(kept)[1:]),
-        read_only(covariance),
+        index=index_report(model, observer.dt, x=found.states[-1], u=u, theta=found.parameters[-1]).index,
+        condition=float(found.conditions.max()),
+        condition_k=int(np.argmax(found.conditions)),
+        residual=float(found.residuals.max()),
+        contraction=float(found.contraction[-1]),
+        deviations=read_only(deviations),
+        correlations=read_only(covariance / np.outer(safe, safe)),
+        projection=found.projection,
+        identifiable=identifiable,
+        K=read_only(observer.steps.part(end, "K")),
+        Upsilon=read_only(observer.steps.part(end, "Upsilon")),
+        kept=read_only(np.concatenate(kept)[1:]),
+        parameter_covariance=read_only(covariance),
     )
 
 

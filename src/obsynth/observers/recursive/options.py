@@ -34,18 +34,18 @@ def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[s
             reset=options["reset"],
         )
     return RecursiveObserver(
-        plant,
-        _sequence(options["Q"], plant.ne, "Q", plant),
-        _sequence(options["R"], plant.ny, "R", plant),
-        _vector(options["initial_state"], plant.nx, "initial_state"),
-        _square(options["initial_covariance"], plant.nx, 1.0, "initial_covariance"),
-        adaptation,
-        options["early_constraints"],
-        options.get("outliers") or "none",
-        options.get("outlier_limit"),
-        options.get("outlier_sizes"),
-        options.get("sensors"),
-        options.get("state_bounds"),
+        plant=plant,
+        Q=_sequence(options["Q"], plant.ne, "Q", plant),
+        R=_sequence(options["R"], plant.ny, "R", plant),
+        initial_state=_vector(options["initial_state"], plant.nx, "initial_state"),
+        initial_covariance=_square(options["initial_covariance"], plant.nx, 1.0, "initial_covariance"),
+        adaptation=adaptation,
+        early_constraints=options["early_constraints"],
+        outliers=options.get("outliers") or "none",
+        outlier_limit=options.get("outlier_limit"),
+        outlier_sizes=options.get("outlier_sizes"),
+        sensors=options.get("sensors"),
+        state_bounds=options.get("state_bounds"),
     )
 
 

@@ -199,20 +199,20 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
 
     def _linear(self, place: int, Cz: FloatArray, Du: FloatArray, Dy: FloatArray) -> LinearObserver:
         return LinearObserver(
-            self.Az[place],
-            self.Bu[place],
-            self.By[place],
-            Cz,
-            Du,
-            Dy,
-            self.dt,
-            self.input_names[: self.inputs],
-            self.output_names,
-            self.state_names,
-            self.fault_names,
-            self.residual_names,
-            self.state_delays,
-            self.fault_delays,
+            Az=self.Az[place],
+            Bu=self.Bu[place],
+            By=self.By[place],
+            Cz=Cz,
+            Du=Du,
+            Dy=Dy,
+            dt=self.dt,
+            input_names=self.input_names[: self.inputs],
+            output_names=self.output_names,
+            state_names=self.state_names,
+            fault_names=self.fault_names,
+            residual_names=self.residual_names,
+            state_delays=self.state_delays,
+            fault_delays=self.fault_delays,
         )
 
     def as_dict(self) -> dict[str, Any]:

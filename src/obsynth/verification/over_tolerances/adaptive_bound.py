@@ -169,22 +169,22 @@ def adaptive_bound(
     )
     theta, settled = later
     return AdaptiveBound(
-        structure,
-        responses,
-        varying,
-        drive,
-        np.vstack([rows @ structure.Cx, structure.Co]),
-        kernels,
-        np.ascontiguousarray(same.T),
-        solved,
-        tail,
-        outward @ _nominal(structure, responses),
-        _nominal(structure, responses, center=False)[m:],
-        outward @ _rounding(structure, responses, observer, start.state),
-        table @ outward.T * OUTWARD,
-        (theta, outward @ settled * OUTWARD),
-        1.0 + np.abs(structure.offsets),
-        tuple(driven.tolist()),
+        structure=structure,
+        responses=responses,
+        varying=varying,
+        drive=drive,
+        shown=np.vstack([rows @ structure.Cx, structure.Co]),
+        kernels=kernels,
+        same=np.ascontiguousarray(same.T),
+        solved=solved,
+        tail=tail,
+        nominal=outward @ _nominal(structure, responses),
+        more=_nominal(structure, responses, center=False)[m:],
+        rounding=outward @ _rounding(structure, responses, observer, start.state),
+        start=table @ outward.T * OUTWARD,
+        start_later=(theta, outward @ settled * OUTWARD),
+        spans=1.0 + np.abs(structure.offsets),
+        remainder_inputs=tuple(driven.tolist()),
     )
 
 

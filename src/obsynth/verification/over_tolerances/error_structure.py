@@ -137,20 +137,20 @@ def error_structure(
     more, single, remainders = _remainder_channels(rest, sizes)
     input_parts, input_rest = _about_nominal(known, offsets)
     return ErrorStructure(
-        observer.Az,
-        c[: n + nf],
-        c[n + nf :],
-        AffineMatrix(np.zeros_like(rest), parts, rest),
-        AffineMatrix(np.zeros_like(input_rest), input_parts, input_rest),
-        disturbances,
-        np.concatenate([bounds, np.full(plant.nw, noise_bound)]),
-        np.vstack([rows, more]),
-        len(rows) + single,
-        np.hstack([effects, remainders]),
-        tuple(owner),
-        offsets,
-        picked[: n + nf],
-        picked[n + nf :],
+        Az=observer.Az,
+        Cx=c[: n + nf],
+        Co=c[n + nf :],
+        state=AffineMatrix(np.zeros_like(rest), parts, rest),
+        inputs=AffineMatrix(np.zeros_like(input_rest), input_parts, input_rest),
+        disturbances=disturbances,
+        bounds=np.concatenate([bounds, np.full(plant.nw, noise_bound)]),
+        channel_rows=np.vstack([rows, more]),
+        single=len(rows) + single,
+        effects=np.hstack([effects, remainders]),
+        owner=tuple(owner),
+        offsets=offsets,
+        reading=picked[: n + nf],
+        watching=picked[n + nf :],
     )
 
 

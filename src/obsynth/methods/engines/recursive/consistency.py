@@ -148,15 +148,15 @@ def _estimated(name: str, claim: str, mean: float, expected: float, width: float
     """Return the row that a mean is within so much of what is expected."""
     low, high = expected - width, expected + width
     return Check(
-        name,
-        claim,
-        mean,
-        high if mean >= expected else low,
-        width - abs(mean - expected),
-        bool(low <= mean <= high),
-        _SOURCE,
-        "computed",
-        f"{detail}; chance alone keeps it within {low:.4g} to {high:.4g}, but one time in two million",
-        "estimated",
-        (low, high),
+        name=name,
+        claim=claim,
+        value=mean,
+        bound=high if mean >= expected else low,
+        margin=width - abs(mean - expected),
+        passed=bool(low <= mean <= high),
+        source=_SOURCE,
+        kind="computed",
+        detail=f"{detail}; chance alone keeps it within {low:.4g} to {high:.4g}, but one time in two million",
+        status="estimated",
+        interval=(low, high),
     )
