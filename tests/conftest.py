@@ -3,7 +3,8 @@
 Tests marked ``long`` take seconds and are left to `.ci/run`, or to who names them.
 
 `.ci/run` takes the tests marked ``sampled`` once more with the cases that were left out (``--rest``), and those marked
-``numerics`` with other processors' kernels and with the oldest dependencies.
+``numerics`` with other processors' kernels and with the oldest dependencies: of each the share whose turn it is
+(``--turn``), drawn by the commit, so that its time does not grow and a few commits see them all.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ import pytest
 
 #: Without ``--whole`` or ``--rest`` one of so many cases that are drawn at random is looked at.
 PARTS = 4
+#: With ``--turn`` one of so many tests is run, drawn by its argument.
+TURNS = 4
 #: Files of tests that decide something numerically.
 NUMERIC = frozenset({
     "test_balls.py", "test_ball_arithmetic.py", "test_certain_covariance.py", "test_compiled_run.py",
@@ -42,6 +45,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--rest", action="store_true", help="the cases of the tests marked sampled that a run without it leaves out"
     )
+    parser.addoption("--turn", default="", help="run the share of the tests that this text draws, a commit for example")
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -57,7 +61,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         drawn = getattr(getattr(item, "function", None), "is_hypothesis_test", False)
         if drawn or "share" in getattr(item, "fixturenames", ()) or item.get_closest_marker("long"):
             item.add_marker(pytest.mark.sampled)
-    left_out = _left_out(config, items)
+    left_out = _left_out(config, items) | _whose_turn_it_is_not(config.option.turn, items)
     config.hook.pytest_deselected(items=list(left_out))
     items[:] = [item for item in items if item not in left_out]
 
@@ -78,6 +82,11 @@ def _left_out(config: pytest.Config, items: Sequence[pytest.Item]) -> set[pytest
         found.update(set(same) - set(looked_at(same[first:] + same[:first], parts, config)))
     # A case that is named on the command line is run.
     return {item for item in found if item.nodeid not in config.args}
+
+
+def _whose_turn_it_is_not(turn: str, items: Sequence[pytest.Item]) -> set[pytest.Item]:
+    """Return the tests that a turn leaves out; none without one."""
+    return {item for item in items if turn and zlib.crc32(f"{turn} {item.nodeid}".encode()) % TURNS}
 
 
 def looked_at(cases: Sequence[Any], parts: int, config: pytest.Config) -> Sequence[Any]:

@@ -129,6 +129,7 @@ method: {id: fault-estimation-filter}
 """
 
 
+@pytest.mark.long
 def test_constants_without_a_tolerance_are_an_exact_model_and_rounding_is_no_tolerance(tmp_path, capsys) -> None:
     # A rigid gear, differentiated: E is singular by a combination of its rows, which is known up to rounding.
     data = tmp_path / "log.csv"

@@ -79,6 +79,7 @@ def test_units_decide_nothing(seed: int) -> None:
 
 
 @pytest.mark.parametrize("time", [1.0, 2.0**-9])
+@pytest.mark.long
 def test_a_gain_is_proved_wherever_noise_drives_every_state(time: float) -> None:
     # No zero is anywhere: of 330 random plants 18 were refused for one, as the strictness of the proof was a fixed one.
     a = [

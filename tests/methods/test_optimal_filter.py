@@ -222,6 +222,7 @@ def test_the_error_of_a_simulation_is_within_the_gain_and_reaches_it() -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
+@pytest.mark.long
 def test_no_filter_of_finite_response_is_below_the_least(seed: int) -> None:
     """Another way: the least largest gain on a grid of frequencies over the taps of a filter, a convex programme."""
     import cvxpy as cp

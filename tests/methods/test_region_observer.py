@@ -118,6 +118,7 @@ def test_the_gain_is_not_exceeded() -> None:
         assert np.linalg.norm(found.faults - clean.faults) <= level * np.linalg.norm(w) * 1.05
 
 
+@pytest.mark.long
 def test_decay_alone_and_given_gains(design: ObserverDesign) -> None:
     fast = obsynth.region_observer(tanks(), region=REGION, sample_time=STEP, goal="decay")
     assert set(fast.certificate.claims) == {"region_decay"}

@@ -272,6 +272,7 @@ def test_headers_say_what_a_controller_needs(shipped: SimpleNamespace) -> None:
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no compiler of C++")
+@pytest.mark.long
 def test_every_source_is_cplusplus_too(shipped: SimpleNamespace) -> None:
     """Who builds controllers in C++ compiles sources as such: casts, tables and enumerations are checked more."""
     files = [str(file) for file in sorted(shipped.folder.glob("*.c"))]

@@ -73,6 +73,7 @@ def test_a_kink_of_the_model_at_the_maximum_spoils_no_box(measured, share) -> No
             assert abs(found.box.high[name] - stated.box.high[name]) < 0.1 * width
 
 
+@pytest.mark.long
 def test_a_leak_inside_the_rows_is_found(share):
     for end in share((80, 70, 100)):
         found_inside(f"0:{end}")
@@ -122,6 +123,7 @@ def test_known_constants_are_in_their_boxes_and_the_rest_is_said():
     assert found.R["y"] == pytest.approx(1e-4, rel=0.5)
 
 
+@pytest.mark.long
 def test_a_product_that_alone_is_seen_is_named_as_a_direction():
     model = first_order()
     unknown = {"T": (0.5, 10.0), "k": (0.2, 5.0), "g": (0.2, 5.0)}

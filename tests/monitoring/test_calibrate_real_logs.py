@@ -100,6 +100,7 @@ def test_a_sample_that_stands_out_is_named() -> None:
     assert found.outlier_sizes["vm"] == pytest.approx((usual * 0.3) ** 0.5, rel=0.05)
 
 
+@pytest.mark.long
 def test_a_sensor_of_another_sign_and_one_with_a_bias_are_named(share) -> None:
     # Offsets and delays are looked for with --whole, which takes twice as long.
     for samples, options in share(((200, {"offset": {}, "input_delay": 0}), (240, {})), 2):
@@ -178,6 +179,7 @@ def test_a_log_with_a_wrong_sample_is_compared_without_it_and_steps_that_are_too
     assert not said(exact, "backward Euler")
 
 
+@pytest.mark.long
 def test_another_unit_of_one_sensor_of_a_linear_plant_is_refused() -> None:
     plant = TimeVaryingDescriptorSystem(
         E=[[1, 0], [0, 0]], A=[["p", "0.1"], ["c", -1]], B=[["b"], [0]], C=[[1, 0], [0, 1]], Phi=[[0], [0]], dt=1.0,
@@ -227,6 +229,7 @@ def test_the_record_of_another_simulator_has_its_own_start_and_no_delay_that_it_
     assert found.box.holds(true)
 
 
+@pytest.mark.long
 def test_coloured_noise_that_process_noise_stands_for_is_found() -> None:
     """Two vessels: process noise made the innovations of both gauges white, 43 nats below a state for the noise."""
     rng, dt, rows, kept = np.random.default_rng(0), 0.5, 300, 0.9

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
@@ -24,6 +25,7 @@ def test_variances_of_a_plant_with_one_sensor_are_found(share):
     assert all(one.nominal == {} and one.nis.holds for one in found)
 
 
+@pytest.mark.long
 def test_a_variance_far_below_the_sensors_is_found_or_bounded_and_never_zero(share):
     case = CASES["R = 1000 Q"]
     found = [calibrated(case, seed) for seed in share(range(3), 2)]
@@ -35,6 +37,7 @@ def test_a_variance_far_below_the_sensors_is_found_or_bounded_and_never_zero(sha
                 assert one.Q[name] > true
 
 
+@pytest.mark.long
 def test_variances_of_an_equation_and_a_sensor_of_the_same_name_are_apart():
     rng, x, rows = np.random.default_rng(0), 0.0, []
     for k in range(1_500):

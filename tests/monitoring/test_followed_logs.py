@@ -102,6 +102,7 @@ def test_a_run_on_a_log_that_grows_says_what_a_run_on_the_whole_log_says(tmp_pat
     assert found["status"].tolist() == expected["status"].tolist()
 
 
+@pytest.mark.long
 def test_a_process_that_is_killed_goes_on_where_its_state_is(tmp_path: Path) -> None:
     """Every row is there at least once, rows after the last saved state twice, and all are those of one run."""
     path, gains, state = tmp_path / "log.csv", design().save(tmp_path / "g.json"), tmp_path / "state.json"

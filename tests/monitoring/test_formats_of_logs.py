@@ -399,6 +399,7 @@ def damaged(whole: bytes, rng: np.random.Generator, kinds: int) -> bytes:
 
 @of_asammdf
 @pytest.mark.parametrize("suffix", [".parquet", ".tdms", ".mf4", ".csv"])
+@pytest.mark.long
 def test_damaged_files_are_read_or_refused_in_a_sentence(design, frame, tmp_path, capfd, suffix):
     log, out = tmp_path / f"log{suffix}", tmp_path / "estimates.csv"
     if suffix == ".parquet":

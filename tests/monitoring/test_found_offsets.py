@@ -118,6 +118,7 @@ LINEAR = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 def test_an_offset_of_a_linear_plant_is_part_of_its_operating_point(tmp_path: Path) -> None:
     """The filter took hundreds of samples of each run to find it, from a deviation of 0.1 on."""
     of_two_states(1, 0.5).to_csv(tmp_path / "normal.csv", index=False)
@@ -136,6 +137,7 @@ def test_an_offset_of_a_linear_plant_is_part_of_its_operating_point(tmp_path: Pa
 
 
 @pytest.mark.parametrize("method", ["descriptor-kalman", "dae-adaptive-observer"])
+@pytest.mark.long
 def test_a_start_that_is_stated_has_room_for_states_that_a_calibration_adds(method: str, tmp_path: Path) -> None:
     """The written spec kept a start and covariances without the state of the offset, and no design took them."""
     if method == "descriptor-kalman":

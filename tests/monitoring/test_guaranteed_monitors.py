@@ -148,6 +148,7 @@ def test_exact_intervals_over_many_runs() -> None:
     assert found[exact].false_alarm_rate.value == 0.0
 
 
+@pytest.mark.long
 def test_two_levels_tell_pairs_and_name_the_smallest_group(tmp_path: Path) -> None:
     two = tanks().replace(C=tanks().C[:2], D=None, Df=None, Dw=None, Bw=None, noise_names=None,
                           output_names=["h1", "h2"], operating_point={}, units={})  # fmt: skip

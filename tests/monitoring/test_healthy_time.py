@@ -65,6 +65,7 @@ def in_alarm(learned: obsynth.types.LearnedThresholds, data: pd.DataFrame) -> np
         ({}, ({"start": 0.5}, {})),
     ],
 )
+@pytest.mark.long
 def test_drifts_and_starts_are_no_alarms_and_faults_are(normal: dict, tests: tuple[dict, ...]) -> None:
     learned = obsynth.learn_thresholds(design(), log(0, **normal))
     assert in_alarm(learned, log(0, **normal)).mean() < 0.01
@@ -74,6 +75,7 @@ def test_drifts_and_starts_are_no_alarms_and_faults_are(normal: dict, tests: tup
             assert in_alarm(learned, log(10 + seed, leak=0.4, **test))[ROWS // 2 + 100 :].mean() > 0.5, test
 
 
+@pytest.mark.long
 def test_several_logs_are_learned_from_and_say_how_logs_differ(tmp_path: Path) -> None:
     logs = [
         log(seed, start=start, drift=drift) for seed, start, drift in ((0, 0.7, 1.0), (1, 1.3, -1.0), (2, 1.0, 0.0))
@@ -89,6 +91,7 @@ def test_several_logs_are_learned_from_and_say_how_logs_differ(tmp_path: Path) -
     assert again.save(tmp_path / "again.json").read_bytes() == file.read_bytes()
 
 
+@pytest.mark.long
 def test_a_folder_of_logs_is_the_logs_in_it_and_the_command_says_the_share(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -76,6 +76,7 @@ def with_outliers(data: pd.DataFrame, low: float, high: float) -> pd.DataFrame:
 
 
 @pytest.mark.parametrize(("low", "high", "stated"), [(8.0, 30.0, 1.6), (19.0, 21.0, None)])
+@pytest.mark.long
 def test_how_far_off_outliers_are_is_learned_where_the_log_shows_another_size(
     low: float, high: float, stated: float | None, tmp_path: Path
 ) -> None:
@@ -283,6 +284,7 @@ def drained_log(rows: int, seed: int, begin: int | None = None) -> pd.DataFrame:
     return pd.DataFrame(found, columns=["time", "u", "y"])
 
 
+@pytest.mark.long
 def test_a_fault_that_moves_a_state_first_is_an_alarm_as_soon_as_its_estimate_says() -> None:
     """Samples that share what is not known of a state do not add up: their ratios came some twenty rows later."""
     design, normal = drained(), drained_log(3_000, 0)
@@ -300,6 +302,7 @@ def test_a_fault_that_moves_a_state_first_is_an_alarm_as_soon_as_its_estimate_sa
     assert len(quiet.events) <= 8
 
 
+@pytest.mark.long
 def test_blank_rows_say_nothing_of_faults_and_change_nothing_after_them() -> None:
     found, data = learned(), log(400, 3, begin=200, size=0.8)
     whole = run_with(found, data).table
@@ -382,6 +385,7 @@ def rate(learned_rows: int, every: float, seed: int, memory: float, *, conformal
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.5])
+@pytest.mark.long
 def test_the_stated_rate_is_kept_out_of_sample(memory: float, share: Callable[..., Any]) -> None:
     rates = [rate(2_000, 1_000.0, seed, memory, conformal=False) for seed in share(range(8), 4)]
     assert 0.15 <= np.mean(rates) <= 1.0
@@ -401,6 +405,7 @@ def test_it_is_told_where_rows_say_too_little_of_faults_for_a_rate() -> None:
     assert "the estimates are too strongly correlated for any rate from these rows" in few.statement
 
 
+@pytest.mark.long
 def test_many_rows_show_their_rate_themselves() -> None:
     rates = [rate(6_000, 100.0, seed, 0.5, conformal=True) for seed in range(4)]
     # Of 29 alarms that the second half may have: a deviation of .19 each, .1 of their mean.
@@ -422,6 +427,7 @@ def doubly_seen(sensors: str = "") -> obsynth.ObserverDesign:
 
 
 @pytest.mark.parametrize("sensors", ["", "stated"])
+@pytest.mark.long
 def test_sensors_slower_than_the_rows_leave_the_others_to_be_watched(sensors: str, tmp_path: Path) -> None:
     """No row with such a sample follows another one, so that no autoregression could be fitted: it ended in an error
     of LAPACK. What its samples say of the faults counts all the same."""

@@ -283,6 +283,7 @@ def learned() -> obsynth.types.LearnedThresholds:
     return obsynth.learn_thresholds(heated(), log(3_000, 0), false_alarms="1 per 500 rows")
 
 
+@pytest.mark.long
 def test_normal_rows_are_quiet_and_a_fault_is_named() -> None:
     monitor = obsynth.online_monitor(heated(), "learned", normal=learned())
     assert learned().holds
@@ -401,6 +402,7 @@ def learned_from(kind: str) -> obsynth.types.LearnedThresholds:
 @pytest.mark.one_in(2)
 @pytest.mark.usefixtures("taken_as_verified")
 @pytest.mark.parametrize("kind", ["pair", "pair and a blank"])
+@pytest.mark.long
 def test_two_wrong_samples_in_a_row_do_not_raise_the_levels(kind: str) -> None:
     found, wanted = learned_from(kind), learned_from("gone")
     assert (found.pairs.number, wanted.pairs.number) == (1, 0)
@@ -416,6 +418,7 @@ def test_two_wrong_samples_in_a_row_do_not_raise_the_levels(kind: str) -> None:
 @pytest.mark.one_in(2)
 @pytest.mark.usefixtures("taken_as_verified")
 @pytest.mark.parametrize("kind", ["stays", "many pairs"])
+@pytest.mark.long
 def test_what_no_chance_explains_is_how_the_plant_is(kind: str) -> None:
     assert learned_from(kind).pairs.number == 0
     assert learned_from(kind).levels[0] > 2.0 * learned_from("gone").levels[0]

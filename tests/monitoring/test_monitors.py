@@ -334,6 +334,7 @@ def test_what_has_no_bound_or_no_covariance_is_refused(wang, noisy) -> None:
 # Many runs
 
 
+@pytest.mark.long
 def test_runs_do_not_depend_on_where_they_are_made(wang) -> None:
     design, scenario = wang
     watched = obsynth.monitor(design, scenario, **BOUNDS)

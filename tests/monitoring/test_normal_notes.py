@@ -42,6 +42,7 @@ def learned(data: pd.DataFrame) -> obsynth.types.LearnedThresholds:
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.long
 def test_an_event_that_raises_the_levels_is_told_with_its_rows(seed: int) -> None:
     data = log(seed)
     usual = learned(data)
@@ -73,6 +74,7 @@ def test_nothing_is_told_of_usual_rows(seed: int, memory: float, step: float) ->
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.long
 def test_wild_rows_of_noise_with_heavy_tails_are_no_event(seed: int) -> None:
     assert learned(log(seed, freedom=4.0)).notes == ()
 
@@ -91,6 +93,7 @@ def noise_that_follows_itself(seed: int) -> pd.DataFrame:
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.long
 def test_noise_whose_variance_follows_itself_is_told(seed: int) -> None:
     found, usual = learned(noise_that_follows_itself(seed)), learned(log(seed))
     assert found.lasting > 0.05
@@ -99,6 +102,7 @@ def test_noise_whose_variance_follows_itself_is_told(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.long
 def test_errors_of_the_model_where_inputs_move_are_told(seed: int) -> None:
     """What sensors read as well while a held input moves, once in 25 rows; a held input without it is none."""
     for wrong, told in ((0.0, 0), (0.1, 1)):
@@ -114,6 +118,7 @@ def test_errors_of_the_model_where_inputs_move_are_told(seed: int) -> None:
 
 
 @pytest.mark.parametrize("offset", [True, False])
+@pytest.mark.long
 def test_an_offset_that_each_start_divides_anew_is_told(offset: bool) -> None:
     """The bias of a sensor beside its unknown offset: the estimate stays where the start has left it."""
     model, q = obsynth.DAEModel(

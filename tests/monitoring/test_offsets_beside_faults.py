@@ -2,6 +2,7 @@
 
 import numpy as np
 import pandas as pd
+import pytest
 
 import obsynth
 
@@ -23,12 +24,14 @@ def found(model: obsynth.DAEModel, offset: float) -> obsynth.types.Calibration:
     return obsynth.calibrate(model, log, {"a": (0.05, 0.2)}, input_delay=0, starts=1, integration="backward-euler")
 
 
+@pytest.mark.long
 def test_an_offset_that_hides_a_fault_needs_as_many_nats_as_any_other_state() -> None:
     """By 2.43 nats a level sensor had an offset, and the design that was to estimate a leak beside it was refused."""
     assert list(found(tank(""), 0.04).offset) == ["LT"]
     assert not found(tank(), 0.04).offset
 
 
+@pytest.mark.long
 def test_an_offset_that_hides_a_fault_is_told_with_the_fault_and_the_remedy() -> None:
     told = found(tank(), 0.1)
     assert list(told.offset) == ["LT"]

@@ -112,6 +112,7 @@ def test_statistics_of_a_record_row_by_row(kind, noisy):
 
 
 @pytest.mark.parametrize("kind", ["chi-square", "cusum"])
+@pytest.mark.long
 def test_false_alarms_of_long_runs_stay_below_what_was_asked(kind, noisy, share):
     scenario = obsynth.Scenario(horizon=600, noise=1, disturbances={"d1": obsynth.Gaussian(deviation=0.2)})
     alarms, seeds = 0, share(range(25), 3)

@@ -118,6 +118,7 @@ def test_rows_that_are_missing_decide_as_rows_without_signals(name: str, kind: s
 
 
 @pytest.mark.parametrize("kind", ["ui-pi-observer", "recursive", "nonlinear"])
+@pytest.mark.long
 def test_thresholds_learned_from_rows_that_are_missing_are_those_of_rows_without_signals(kind: str) -> None:
     data = blanked(kind, 500)
     found = [

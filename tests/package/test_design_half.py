@@ -88,6 +88,7 @@ def test_every_shipped_spec_is_designed_by_python(
         assert found["varies"] or found["files"], spec
 
 
+@pytest.mark.long
 def test_every_shipped_spec_is_designed_by_the_command_line(
     design_half: Path, tmp_path: Path, share: Callable[..., Sequence[Any]]
 ) -> None:

@@ -79,6 +79,7 @@ def test_it_is_not_slow(design: obsynth.ObserverDesign) -> None:
     assert EXPECTED["without_weights"]["decay"] > 10.0 * EXPECTED["plain_kalman"]["decay"]
 
 
+@pytest.mark.long
 def test_faster_costs_noise() -> None:
     for asked, slowest, deviations in EXPECTED["trade_off"]:
         found = obsynth.ui_pi_observer(PLANT, decay=asked)

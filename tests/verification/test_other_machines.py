@@ -135,6 +135,7 @@ def test_exponents_are_found_where_weights_are_large(weight: float) -> None:
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="OpenBLAS's kernels of x86-64")
+@pytest.mark.long
 def test_a_gain_set_that_one_processor_made_another_verifies(capfd: pytest.CaptureFixture[str]) -> None:
     """Of the network floating point has eliminated the algebraic states, before it was sampled."""
     assert kernels.compare_designs(("Haswell", "Nehalem"), ["sharepasand/spec", "ieee14/spec"]) == 0
