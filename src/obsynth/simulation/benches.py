@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 
@@ -26,8 +27,9 @@ from obsynth.plants.signal_names import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae
 from obsynth.simulation.linear import PlantRuns, scenario_runs, scenario_stepper, varying_runs
+from obsynth.simulation.over_region import courses_of, scenario_runs_over_region
 from obsynth.simulation.scenario import Scenario, observer_start
-from obsynth.simulation.signals import ScenarioSignals, resolve_parameters
+from obsynth.simulation.signals import ScenarioSignals, resolve, resolve_parameters
 from obsynth.verification.over_tolerances.plants_of_the_box import drawn_points, plant_at
 
 #: Warm-up ends when the effect of an error at the start has shrunk to this share of its largest, for good.
@@ -39,10 +41,19 @@ INPUTS_BETWEEN_SAMPLES = (
     "first-order hold."
 )
 
+INPUTS_OVER_REGION = (
+    "Between samples the plant follows its parameters, with signals that are constant or linear there; its observer "
+    "takes steps of implicit Euler."
+)
+
 STABILISED = (
     "A stabilising state feedback (linear-quadratic, unit weights) was added for this simulation; the inputs include "
     "it."
 )
+
+
+#: Observers that a bench runs.
+BenchObserver: TypeAlias = LinearObserver | RecursiveObserver | DAEObserver | ScheduledObserver | RegionObserver
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +66,7 @@ class Runs:
     faults: FloatArray  # the parameters of a plant that has some
     disturbances: FloatArray
     rows: FloatArray  # the observer's states, faults, residuals
-    observer: LinearObserver | RecursiveObserver | DAEObserver
+    observer: BenchObserver
     kept: tuple[Estimates, ...] = ()  # estimates that say more than rows
 
     @property
@@ -71,7 +82,7 @@ class Bench:
     """A design and a scenario, ready to run; it can be sent to another process, with a model that is data."""
 
     signals: ScenarioSignals
-    observer: LinearObserver | RecursiveObserver | DAEObserver  # in discrete time
+    observer: BenchObserver  # in discrete time, but for a scheduled one
     initial_state: FloatArray
     fault_signals: slice
     estimated: tuple[int, ...]  # which of the true faults are estimated
@@ -95,6 +106,10 @@ class Bench:
     def warm_ups(self) -> tuple[int | None, int | None]:
         """Return from when the start no longer shows in the estimates of states, and of faults; 0 with deviations."""
         observer, steps = self.observer, self.signals.steps
+        if isinstance(observer, (ScheduledObserver, RegionObserver)):
+            forgotten = observer.rows_without_claim(self.signals.dt)
+            end_of_start = forgotten if forgotten < steps else None
+            return end_of_start, end_of_start
         if not isinstance(observer, LinearObserver):
             return 0, 0
 
@@ -165,17 +180,9 @@ def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
             path="observer",
         )
     if isinstance(design.observer, ScheduledObserver):
-        raise SpecError(
-            f"Design {design.name!r} is for a region: scenarios have no courses of scheduling parameters yet. Run the "
-            "observer on outputs, inputs and parameters (design.observer.run), or on a log (obsynth.run_on_data).",
-            path="observer",
-        )
+        return _scheduled_bench(design, scenario)
     if isinstance(design.observer, RegionObserver):
-        raise SpecError(
-            f"Design {design.name!r} is for a region of a nonlinear plant: scenarios do not run it yet. Simulate the "
-            "plant (obsynth.simulate_dae) and run the observer on the outputs (design.observer.run).",
-            path="observer",
-        )
+        return _region_bench(design, scenario)
     observer: RecursiveObserver | DAEObserver
     simulated: Callable[..., PlantRuns]
     if isinstance(design.observer, DAEObserver):
@@ -207,6 +214,106 @@ def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
         partial(simulated, drive, begin, *true),
         partial(_rows_of, observer),
     )
+
+
+def _scheduled_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
+    """Return a design over a region and a scenario with courses of its parameters."""
+    plant, observer = design.scheduled
+    for group, why in {
+        "observer_state": "A scheduled observer starts at zero: leave observer_state out.",
+        "stabilise": "No feedback is designed over a region: give inputs that keep the plant near its operating point.",
+    }.items():
+        if getattr(scenario, group):
+            raise SpecError(why, path=group)
+    drive = resolve(plant, scenario)
+    courses = courses_of(plant, scenario, drive.steps, drive.dt)
+    start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])
+    return Bench(
+        drive,
+        observer,
+        start,
+        slice(plant.nu, plant.nu + plant.nf),
+        tuple(index_of(name, plant.fault_names, what="The plant") for name in observer.fault_names),
+        () if plant.is_discrete else (INPUTS_OVER_REGION,),
+        partial(scenario_runs_over_region, plant, drive, courses, start),
+        partial(_scheduled_rows, observer, None if observer.dt else drive.dt),
+    )
+
+
+def _scheduled_rows(
+    observer: ScheduledObserver, sample_time: float | None, outputs: FloatArray, inputs: FloatArray
+) -> tuple[FloatArray, tuple[Estimates, ...]]:
+    """Return rows and estimates of a scheduled observer."""
+    found = [
+        observer.record(outputs[:, run], inputs[:, run], sample_time=sample_time)[0] for run in range(outputs.shape[1])
+    ]
+    return np.stack(found, axis=1), tuple(map(observer.split, found))
+
+
+def rows_without_claim(bench: Bench, runs: Runs) -> int:
+    """Return in how many samples of the first run an observer over a region claims nothing; 0 of other observers."""
+    observer, outputs, inputs = bench.observer, runs.outputs[:, 0], runs.inputs[:, 0]
+    if isinstance(observer, ScheduledObserver):
+        sample_time = None if observer.dt else bench.signals.dt
+        return int(np.sum(~observer.record(outputs, inputs, sample_time=sample_time)[1]))
+    return int(np.sum(~observer.record(outputs, inputs)[1])) if isinstance(observer, RegionObserver) else 0
+
+
+def _region_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
+    """Return a design over a region of a nonlinear plant and a scenario."""
+    _, observer = design.over_region
+    model = observer.model
+    drive = resolve_parameters(model, scenario, dt=observer.dt)
+    begin = np.array([scenario.initial_state.get(name, value) for name, value in model.states.items()])
+    nu = len(model.input_names)
+    inputs, parameters = model.nominal_input + drive.left[:, :nu], model.nominal_parameters + drive.left[:, nu:]
+    noise = dict(design.options.get("noise") or {}) if drive.noise else {}
+    return Bench(
+        drive,
+        observer,
+        begin,
+        slice(nu, None),
+        tuple(index_of(name, model.parameter_names, what="The plant") for name in observer.fault_names),
+        ("The plant was integrated by Radau IIA, with inputs constant during each step.",),
+        partial(_region_plant, observer, noise, drive, begin, inputs, parameters),
+        partial(_region_rows, observer),
+    )
+
+
+def _region_plant(
+    observer: RegionObserver,
+    noise: Mapping[str, float],
+    drive: ScenarioSignals,
+    begin: FloatArray,
+    inputs: FloatArray,
+    parameters: FloatArray,
+    seeds: Sequence[int],
+) -> PlantRuns:
+    """Run the nonlinear plant once for each seed, with the noise of its sensors and the drift of its faults."""
+    model, dt = observer.model, observer.dt
+    sensors = np.array([noise.get(name, 0.0) for name in model.output_names])
+    drifts = np.array([noise.get(name, noise.get(f"der({name})", 0.0)) for name in model.parameter_names])
+    R = np.diag((drive.noise * sensors) ** 2 + drive.deviations**2)
+    states, clean, moved = [], [], []
+    for seed in seeds:
+        steps = np.random.default_rng([seed, 1]).standard_normal(parameters.shape) * drive.noise * drifts * np.sqrt(dt)
+        theta = parameters + np.cumsum(steps, axis=0) - steps[:1]
+        run = simulate_dae(model, inputs, dt=dt, parameters=theta, initial_state=begin, R=R, seed=seed)
+        states.append(run.states)
+        clean.append(run.outputs)
+        moved.append(theta)
+    outputs = drive.measured(np.stack(clean, axis=1))
+    shared = np.broadcast_to(inputs[:, None], (len(inputs), len(seeds), inputs.shape[1]))
+    none = np.zeros((len(inputs), len(seeds), 0))
+    return np.stack(states, axis=1), outputs, shared, np.stack(moved, axis=1), none
+
+
+def _region_rows(
+    observer: RegionObserver, outputs: FloatArray, inputs: FloatArray
+) -> tuple[FloatArray, tuple[Estimates, ...]]:
+    """Return rows and estimates of an observer over a region."""
+    found = [observer.record(outputs[:, run], inputs[:, run])[0] for run in range(outputs.shape[1])]
+    return np.stack(found, axis=1), tuple(map(observer.split, found))
 
 
 def _varying_plant(

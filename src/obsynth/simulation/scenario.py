@@ -14,6 +14,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_array, real_number, require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray, require_no_overflow
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.signal_names import index_of
 from obsynth.simulation.profiles import (
     Additive,
@@ -57,6 +58,7 @@ _ALLOWED: dict[str, tuple[type[Profile], ...]] = {
     "faults": (*_ADDITIVE, *FAILURES),
     "disturbances": (*_ADDITIVE, *_RANDOM),
     "sensors": (*_ADDITIVE, *FAILURES),
+    "scheduling": _ADDITIVE,
 }
 
 #: The names of a plant's signals that each group speaks of; the faults of a plant with parameters are these.
@@ -88,6 +90,9 @@ class Scenario:
     sensors : mapping, optional
         What is wrong with a sensor, by name of the output: a bias (`Step`), a `Ramp`, ..., `Stuck`,
         `LostEffectiveness`.  The plant's model does not know of it.
+    scheduling : mapping, optional
+        How the scheduling parameters of a plant over a region move: profiles by their names, added to the middle of
+        their ranges, which they may not leave.
     noise : float, optional
         The plant's own noise (``Bw, Dw``), as a multiple of what it states; 0 for none.
     sensor_noise : mapping, optional
@@ -119,6 +124,7 @@ class Scenario:
     initial_state: Mapping[str, float] = field(default_factory=dict)
     observer_state: Sequence[float] | None = None
     stabilise: bool = False
+    scheduling: Profiles = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("horizon", "sample_time"):
@@ -169,12 +175,12 @@ class Scenario:
             }
         return {name: dict(value) if isinstance(value, Mapping) else value for name, value in found.items()}
 
-    def step_of(self, plant: DescriptorSystem) -> float:
+    def step_of(self, plant: DescriptorSystem | PolytopicSystem) -> float:
         """Return the seconds between samples.
 
         Parameters
         ----------
-        plant : DescriptorSystem
+        plant : DescriptorSystem or PolytopicSystem
             Whose ``dt`` counts, where it has one.
 
         Raises
@@ -183,7 +189,7 @@ class Scenario:
             The plant is of another kind, it is continuous and the scenario has no sample time, or both have different
             ones.
         """
-        require_kind(plant, DescriptorSystem, "plant", "a DescriptorSystem")
+        require_kind(plant, (DescriptorSystem, PolytopicSystem), "plant", "a DescriptorSystem or a PolytopicSystem")
         if plant.is_discrete:
             if self.sample_time is not None and self.sample_time != plant.dt:
                 raise SpecError(
@@ -200,7 +206,7 @@ class Scenario:
 
         Parameters
         ----------
-        plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
+        plant : DescriptorSystem, PolytopicSystem, TimeVaryingDescriptorSystem or DAEModel
             The plant that is to be simulated.
 
         Raises
@@ -209,7 +215,7 @@ class Scenario:
             An unknown name, with the closest ones; ``path`` says where.
         """
         for group, names in _GROUP_NAMES.items():
-            if group == "faults" and not isinstance(plant, DescriptorSystem):
+            if group == "faults" and not isinstance(plant, (DescriptorSystem, PolytopicSystem)):
                 names = "parameter_names"
             known: Sequence[str] = getattr(plant, names, ())
             for name in getattr(self, group) if hasattr(plant, names) else ():
@@ -217,6 +223,16 @@ class Scenario:
                     index_of(name, known, what="The plant")
                 except SpecError as error:
                     raise SpecError(str(error), path=f"{group}.{name}") from None
+        scheduled = plant.scheduling.names if isinstance(plant, PolytopicSystem) else ()
+        if self.scheduling and not scheduled:
+            raise SpecError(
+                "The plant has no scheduling parameters: scheduling is for plants over a region.", path="scheduling"
+            )
+        for name in self.scheduling:
+            try:
+                index_of(name, scheduled, what="scheduling")
+            except SpecError as error:
+                raise SpecError(str(error), path=f"scheduling.{name}") from None
 
 
 def scenario_from(data: Mapping[str, Any]) -> Scenario:
@@ -228,7 +244,7 @@ def scenario_from(data: Mapping[str, Any]) -> Scenario:
                 PROFILE_KINDS[item["kind"]](**{key: value for key, value in item.items() if key != "kind"})
                 for item in profiles
             ]
-            for name, profiles in given[group].items()
+            for name, profiles in given.get(group, {}).items()
         }
     return Scenario(**given)
 

@@ -12,6 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_given, as_matrix, freeze
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.signal_names import index_of
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.profiles import SAMPLE_SLACK, Additive, LostEffectiveness, Profile, Random, Stuck
@@ -75,7 +76,7 @@ class ScenarioSignals:
         return int(np.argmax(wrong)) if wrong.any() else None
 
 
-def resolve(plant: DescriptorSystem, scenario: Scenario) -> ScenarioSignals:
+def resolve(plant: DescriptorSystem | PolytopicSystem, scenario: Scenario) -> ScenarioSignals:
     """Return the signals of ``scenario`` for ``plant``."""
     scenario.check_names(plant)
     return _resolved(plant, scenario, scenario.step_of(plant), plant.fault_names, plant.disturbance_names)
@@ -121,7 +122,7 @@ def check_parameters(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Sc
 
 
 def _resolved(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel,
+    plant: DescriptorSystem | PolytopicSystem | TimeVaryingDescriptorSystem | DAEModel,
     scenario: Scenario,
     dt: float,
     faults: tuple[str, ...],
@@ -145,7 +146,7 @@ def _resolved(
             elif isinstance(profile, Additive):
                 for ends, values in zip((left, right), profile.sampled(steps, dt), strict=True):
                     ends[:, column] += values
-            elif isinstance(plant, DescriptorSystem):
+            elif isinstance(plant, (DescriptorSystem, PolytopicSystem)):
                 actuator, acts = _actuator(plant, name, scenario), profile.active(steps, dt)
                 for ends in (left, right):
                     added = _missing(profile, ends[:, actuator], acts, left[:, actuator])
@@ -172,7 +173,7 @@ def _missing(profile: Profile, commanded: FloatArray, acts: np.ndarray, before: 
     return np.asarray((before[int(np.argmax(acts))] if value is None else value) - commanded)
 
 
-def _actuator(plant: DescriptorSystem, fault: str, scenario: Scenario) -> int:
+def _actuator(plant: DescriptorSystem | PolytopicSystem, fault: str, scenario: Scenario) -> int:
     """Return the input whose columns of B and D are those of the fault."""
     where = f"faults.{fault}"
     if scenario.stabilise:
@@ -182,8 +183,9 @@ def _actuator(plant: DescriptorSystem, fault: str, scenario: Scenario) -> int:
             path=where,
         )
     column = plant.fault_names.index(fault)
-    of_fault = np.concatenate([plant.Bf[:, column], plant.Df[:, column]])
-    of_inputs = np.vstack([plant.B, plant.D])
+    everywhere = plant.vertices if isinstance(plant, PolytopicSystem) else (plant,)
+    of_fault = np.concatenate([part for at in everywhere for part in (at.Bf[:, column], at.Df[:, column])])
+    of_inputs = np.vstack([part for at in everywhere for part in (at.B, at.D)])
     found = [i for i in range(plant.nu) if np.array_equal(of_inputs[:, i], of_fault)]
     if len(found) != 1:
         raise SpecError(

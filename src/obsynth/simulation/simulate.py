@@ -20,12 +20,14 @@ from obsynth.observers.estimates import BAND_WIDTH, Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.design import ObserverDesign
-from obsynth.simulation.benches import bench_of
+from obsynth.simulation.benches import bench_of, rows_without_claim
 from obsynth.simulation.dae import simulate_dae
 from obsynth.simulation.linear import simulate_plant, simulate_time_varying
+from obsynth.simulation.over_region import simulate_polytopic
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.signals import Trajectory
 
@@ -46,6 +48,7 @@ _PLANT_SIMULATIONS: dict[type, Callable[..., Trajectory]] = {
     DescriptorSystem: simulate_plant,
     TimeVaryingDescriptorSystem: simulate_time_varying,
     DAEModel: simulate_dae,
+    PolytopicSystem: simulate_polytopic,
 }
 
 
@@ -191,13 +194,19 @@ def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation: ...
 
 @overload
 def simulate(
-    design: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel | Transformation, **signals: Any
+    design: DescriptorSystem | PolytopicSystem | TimeVaryingDescriptorSystem | DAEModel | Transformation,
+    **signals: Any,
 ) -> Trajectory: ...
 
 
 @arguments_checked
 def simulate(
-    design: ObserverDesign | DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel | Transformation,
+    design: ObserverDesign
+    | DescriptorSystem
+    | PolytopicSystem
+    | TimeVaryingDescriptorSystem
+    | DAEModel
+    | Transformation,
     scenario: Scenario | None = None,
     **signals: Any,
 ) -> Simulation | Trajectory:
@@ -205,7 +214,7 @@ def simulate(
 
     Parameters
     ----------
-    design : ObserverDesign, DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel or Transformation
+    design : ObserverDesign, DescriptorSystem, PolytopicSystem, TimeVaryingDescriptorSystem, DAEModel or Transformation
         A design of any method, the plant of a linear one of index 0 or 1; or a plant.
     scenario : Scenario, optional
         What happens; for a design.  For a time-varying plant or a DAE, ``inputs`` and ``faults`` are added to the
@@ -214,7 +223,8 @@ def simulate(
     **signals
         For a plant alone.  A discrete linear one: ``steps`` samples, with ``u (steps, nu)``, ``f (steps, nf)``,
         ``d (steps, nd)``, ``w (steps, nw)`` and ``initial_state (nx,)``, zero by default.  A time-varying one: as
-        `simulate_time_varying`.  A DAE: as `simulate_dae`.
+        `simulate_time_varying`.  A DAE: as `simulate_dae`.  A plant over a region: its course ``scheduling
+        (samples, p)``, the same signals, and ``sample_time`` in continuous time.
 
     Returns
     -------
@@ -269,6 +279,7 @@ def _simulated(design: ObserverDesign, scenario: Scenario) -> Simulation:
     bench = bench_of(design, scenario)
     runs = bench.run([scenario.seed])
     plant, dt = design.plant, bench.signals.dt
+    silent = rows_without_claim(bench, runs)
     state_warm_up, fault_warm_up = bench.warm_ups()
     change, notes = float(np.linalg.norm(runs.states[0, 0] - bench.initial_state)), list(bench.notes)
     if isinstance(design.observer, LinearObserver) and not scenario.initial_state:
@@ -279,6 +290,11 @@ def _simulated(design: ObserverDesign, scenario: Scenario) -> Simulation:
             "The initial state did not satisfy the algebraic equations: it was projected, a change of "
             f"{change:.3g} (norm)."
         )
+    if silent:
+        notes.append(
+            f"In {silent} of {bench.signals.steps} samples nothing is claimed: the plant, or its estimate, was outside "
+            "the region, or faster than a stated rate, or had been so until recently."
+        )
     return Simulation(
         time=dt * np.arange(bench.signals.steps, dtype=np.float64),
         states=runs.states[:, 0],
@@ -288,7 +304,7 @@ def _simulated(design: ObserverDesign, scenario: Scenario) -> Simulation:
         disturbances=runs.disturbances[:, 0],
         estimates=runs.estimates[0],
         output_names=plant.output_names,
-        input_names=plant.input_names,
+        input_names=getattr(design.observer, "input_names", plant.input_names),
         disturbance_names=getattr(plant, "disturbance_names", ()),
         fault_columns=bench.estimated,
         inconsistency=change,

@@ -19,7 +19,7 @@ from obsynth.specs.documents import DocumentProblems
 if TYPE_CHECKING:
     from obsynth.specs.schema import ScenarioSection
 
-_SCENARIO_GROUPS = ("inputs", "faults", "disturbances", "sensors")
+_SCENARIO_GROUPS = ("inputs", "faults", "disturbances", "sensors", "scheduling")
 
 
 def built_scenario(
@@ -30,11 +30,6 @@ def built_scenario(
     """Return the scenario of a spec; `None` if it has none."""
     if section is None:
         return None
-    if isinstance(plant, PolytopicSystem):
-        raise SpecError(
-            f"{source}: a plant over a region has no scenario: these have no courses of parameters yet.",
-            path="scenario",
-        )
     problems = DocumentProblems(source, what="spec")
     given: dict[str, Any] = {name: getattr(section, name) for name in section.model_fields_set}
     for group in _SCENARIO_GROUPS:
@@ -48,7 +43,7 @@ def built_scenario(
     problems.raise_if_any()
     try:
         scenario = Scenario(**given)
-        if isinstance(plant, DescriptorSystem):
+        if isinstance(plant, (DescriptorSystem, PolytopicSystem)):
             scenario.check_names(plant)
             scenario.step_of(plant)
         else:

@@ -79,6 +79,7 @@ class ScenarioSection(Section):
     initial_state: dict[Text, float] = Field(default_factory=dict)
     observer_state: Annotated[list[float], Field(min_length=1)] | None = None
     stabilise: bool = False
+    scheduling: dict[Text, Profiles] = Field(default_factory=dict)
 
 
 class SpecDocument(Section):

@@ -267,6 +267,10 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
         seen = all(ranges[place, 0] <= y[output] - constant <= ranges[place, 1] for place, output, constant in measured)
         return seen and bool(np.all((values >= ranges[:, 0]) & (values <= ranges[:, 1])))
 
+    def rows_without_claim(self, _: float) -> int:
+        """Return the rows until a hundredth of an error is left."""
+        return self.forgetting
+
     def init(self) -> RegionState:
         """Return the state before the first sample."""
         signals = len(self.input_names) + len(self.output_names)

@@ -289,6 +289,18 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         left = max(state.unclaimed - self._forgotten(seconds), 0.0) if inside else self.forgetting
         return ScheduledState(z, weights, parameters, left), row
 
+    def rows_without_claim(self, seconds: float) -> int:
+        """Return the rows, each so long after the one before, until a hundredth of an error is left.
+
+        Parameters
+        ----------
+        seconds : float
+            Between rows; for continuous time.
+        """
+        if self.dt > 0.0 or not self.forgetting:
+            return int(self.forgetting)
+        return int(np.ceil(self.forgetting / self._forgotten(seconds)))
+
     def _forgotten(self, seconds: float) -> float:
         """Return the seconds of the exact observer in which an error shrinks as it does in one step of these."""
         if self.forgetting == 0.0:

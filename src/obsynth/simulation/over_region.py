@@ -1,0 +1,287 @@
+"""Simulation of polytopic plants along courses of their scheduling parameters: many runs at once.
+
+Dynamic and algebraic equations are separated once, as E is the same everywhere.  Discrete plants step by their own
+equations.  Continuous ones step by the matrix exponential at the middle of short parts of each interval, which is exact
+where the parameters rest, for signals that are constant or linear between samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics.arguments import arguments_checked, is_finite_number, real_array, real_vector, shown
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.continuous import first_order_hold
+from obsynth.numerics.ranks import decide_rank
+from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.simulation.linear import PlantRuns
+from obsynth.simulation.scenario import Scenario, profiles_of
+from obsynth.simulation.signals import ScenarioSignals, Trajectory, signal_of
+
+#: Parts of an interval in which parameters move: the error of each falls with the cube of its length.
+PARTS = 8
+#: Rounding of a course that ends at the edge of its range.
+EDGE_SLACK = 1e-12
+
+
+@arguments_checked
+def simulate_polytopic(
+    plant: PolytopicSystem,
+    *,
+    scheduling: ArrayLike,
+    u: ArrayLike | None = None,
+    f: ArrayLike | None = None,
+    d: ArrayLike | None = None,
+    w: ArrayLike | None = None,
+    initial_state: ArrayLike | None = None,
+    sample_time: float | None = None,
+) -> Trajectory:
+    """Simulate a polytopic plant along a course of its scheduling parameters.
+
+    Parameters
+    ----------
+    plant : PolytopicSystem
+        Of index 0 or 1 along the course.
+    scheduling : array_like
+        ``(samples, p)``, inside the region.
+    u, f, d, w : array_like, optional
+        Known inputs, faults, disturbances and noise, ``(samples, size)`` each; zero by default.
+    initial_state : array_like, optional
+        ``(nx,)``; zero by default.
+    sample_time : float, optional, seconds
+        Between samples of a continuous plant, whose signals and parameters are constant in between.
+
+    Returns
+    -------
+    Trajectory
+        States and outputs, and what drove them.
+
+    Raises
+    ------
+    SpecError
+        Shapes do not fit, a parameter is outside its range, or the sample time is missing or not wanted.
+    PreconditionError
+        The equations do not determine the state at some sample.
+
+    Examples
+    --------
+    >>> import obsynth
+    >>> plant = obsynth.PolytopicSystem(plant={"A": [["v"]], "C": [[1]], "dt": 1.0}, scheduling={"v": [0.0, 1.0]})
+    >>> obsynth.simulate(plant, scheduling=[[0.5], [0.5], [0.0]], initial_state=[1.0]).outputs.ravel().tolist()
+    [1.0, 0.5, 0.25]
+    """
+    course = real_array(scheduling, "scheduling")
+    course = course.reshape(-1, 1) if course.ndim == 1 and len(plant.scheduling.names) == 1 else course
+    if course.ndim != 2 or course.shape[1] != len(plant.scheduling.names):
+        raise SpecError(
+            f"scheduling is {course.shape}: give (samples, {len(plant.scheduling.names)}), the columns those of "
+            f"{', '.join(plant.scheduling.names)}.",
+            path="scheduling",
+        )
+    dt = _sample_time(plant, sample_time)
+    require_inside(plant, course, dt)
+    steps = len(course)
+    sizes = {"u": plant.nu, "f": plant.nf, "d": plant.nd, "w": plant.nw}
+    given = {"u": u, "f": f, "d": d, "w": w}
+    signals = {name: signal_of(given[name], name, (steps, size)) for name, size in sizes.items()}
+    start = np.zeros(plant.nx) if initial_state is None else real_vector(initial_state, plant.nx, "initial_state")
+    held = np.hstack([signals["u"], signals["f"], signals["d"]])[:, None]
+    states, outputs = region_runs(plant, (course, course), held, held, signals["w"][:, None], start, dt)
+    return Trajectory(
+        states[:, 0],
+        outputs[:, 0],
+        signals["u"],
+        signals["f"],
+        signals["d"],
+        signals["w"],
+        time=dt * np.arange(steps, dtype=np.float64),
+        inconsistency=float(np.linalg.norm(states[0, 0] - start)) if steps and initial_state is not None else 0.0,
+    )
+
+
+def _sample_time(plant: PolytopicSystem, sample_time: float | None) -> float:
+    if plant.is_discrete:
+        if sample_time is not None and sample_time != plant.dt:
+            raise SpecError(f"The plant has dt {plant.dt:g} s: leave sample_time out.", path="sample_time")
+        return float(plant.dt)
+    if sample_time is None or not (is_finite_number(sample_time) and sample_time > 0.0):
+        raise SpecError(
+            f"sample_time is {shown(sample_time)}: the plant is continuous, give the seconds between samples.",
+            path="sample_time",
+        )
+    return float(sample_time)
+
+
+def courses_of(plant: PolytopicSystem, scenario: Scenario, steps: int, dt: float) -> tuple[FloatArray, FloatArray]:
+    """Return the parameters ``(steps, p)`` where each interval begins and where it ends: the middle and profiles."""
+    names, held = plant.scheduling.names, plant.scheduling
+    middle = np.full(len(names), 1.0 / len(names)) if held.gives_weights else 0.5 * (held.low + held.high)
+    left, right = np.tile(middle, (steps, 1)), np.tile(middle, (steps, 1))
+    for name, profile in profiles_of(scenario, "scheduling"):
+        place = names.index(name)
+        for ends, values in zip((left, right), profile.sampled(steps, dt), strict=True):
+            ends[:, place] += values
+    if plant.is_discrete:
+        right = left
+    for ends in (left, right):
+        require_inside(plant, ends, dt)
+        if not held.gives_weights:
+            np.clip(ends, held.low, held.high, out=ends)
+    return left, right
+
+
+def require_inside(plant: PolytopicSystem, course: FloatArray, dt: float) -> None:
+    """Raise `SpecError` where parameters ``(steps, p)`` leave the region, outside which the plant is not known."""
+    held = plant.scheduling
+    room = EDGE_SLACK * np.maximum(np.abs(held.low), np.abs(held.high))
+    outside = ~((course >= held.low - room) & (course <= held.high + room))
+    if outside.any():
+        k, place = (int(found[0]) for found in np.nonzero(outside))
+        name = held.names[place]
+        raise SpecError(
+            f"{name} is {course[k, place]:.6g} at {k * dt:.6g} s: the plant is known for {held.sentence()}. Profiles of "
+            f"a parameter are added to the middle of its range.",
+            path=f"scheduling.{name}",
+        )
+    if held.gives_weights and len(course) and not all(map(held.is_inside, course)):
+        raise SpecError("The weights of the vertices must sum to one at every sample.", path="scheduling")
+
+
+def scenario_runs_over_region(
+    plant: PolytopicSystem,
+    drive: ScenarioSignals,
+    courses: tuple[FloatArray, FloatArray],
+    start: FloatArray,
+    seeds: Sequence[int],
+) -> PlantRuns:
+    """Run a polytopic plant over a scenario; the inputs are known ones, then scheduling parameters."""
+    if drive.noise and not plant.is_discrete and plant.nw:
+        raise SpecError(
+            "Process noise of a continuous plant over a region is not simulated: give sensor_noise, or random "
+            "disturbances.",
+            path="noise",
+        )
+    drawn, noise, sensor_noise = drive.drawn(seeds, plant.nw)
+    left, right = drive.left[:, None] + drawn, drive.right[:, None] + drawn
+    states, clean = region_runs(plant, courses, left, right, noise, start, drive.dt)
+    u, faults, disturbances = np.split(left, (plant.nu, plant.nu + plant.nf), axis=2)
+    parameters = np.broadcast_to(courses[0][:, None], (*left.shape[:2], courses[0].shape[1]))
+    return states, drive.measured(clean + sensor_noise), np.concatenate([u, parameters], axis=2), faults, disturbances
+
+
+def region_runs(
+    plant: PolytopicSystem,
+    courses: tuple[FloatArray, FloatArray],
+    left: FloatArray,
+    right: FloatArray,
+    noise: FloatArray,
+    start: FloatArray,
+    dt: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Return states and outputs ``(steps, runs, *)`` for signals ``[u, f, d]`` where intervals begin and end."""
+    moving = _Moving.of(plant)
+    steps, runs = left.shape[:2]
+    states, outputs = np.empty((steps, runs, plant.nx)), np.empty((steps, runs, plant.ny))
+    v = np.repeat((moving.E1 @ start)[:, None], runs, axis=1)
+    before, at = None, moving.at(courses[0][0]) if steps else None
+    for k in range(steps):
+        if before is None or not np.array_equal(before, courses[0][k]):
+            before, at = courses[0][k], moving.at(courses[0][k])
+        assert at is not None
+        s, w = left[k].T, noise[k].T
+        x = at.state(v, s, w)
+        states[k] = x.T
+        outputs[k] = (at.C @ x + at.D @ s + at.Dw @ w).T
+        if plant.is_discrete:
+            v = moving.U1.T @ (at.A @ x + at.S @ s + at.Bw @ w)
+        else:
+            v = moving.moved(v, courses[0][k], courses[1][k], left[k].T, right[k].T, dt)
+    finite = np.isfinite(states).reshape(steps, -1).all(axis=1)
+    if not finite.all():
+        raise SpecError(
+            f"The states outgrow double precision at sample {int(np.argmin(finite))}: shorten the record, or give "
+            "inputs that keep the plant near its operating point.",
+            path="horizon",
+        )
+    return states, outputs
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """The matrices at one point; S, D: of ``[u, f, d]``."""
+
+    A: FloatArray
+    S: FloatArray
+    Bw: FloatArray
+    C: FloatArray
+    D: FloatArray
+    Dw: FloatArray
+    solve: FloatArray  # the inverse of [U1'E; U2'A]
+    algebraic: FloatArray  # U2
+
+    def state(self, v: FloatArray, s: FloatArray, w: FloatArray) -> FloatArray:
+        """Return the states of dynamic coordinates ``v = U1' E x`` and signals."""
+        return np.asarray(self.solve @ np.vstack([v, -self.algebraic.T @ (self.S @ s + self.Bw @ w)]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Moving:
+    """A polytopic plant with its dynamic equations ``U1'`` and its algebraic ones ``U2'`` apart."""
+
+    plant: PolytopicSystem
+    U1: FloatArray
+    U2: FloatArray
+    E1: FloatArray
+    vertices: dict[str, FloatArray]
+
+    @classmethod
+    def of(cls, plant: PolytopicSystem) -> _Moving:
+        left, rank = np.linalg.svd(plant.E)[0], decide_rank(plant.E).rank
+        U1, U2 = left[:, :rank], left[:, rank:]
+
+        def stacked(*names: str) -> FloatArray:
+            return np.array([np.hstack([getattr(vertex, name) for name in names]) for vertex in plant.vertices])
+
+        vertices = {
+            "A": stacked("A"), "S": stacked("B", "Bf", "Bd"), "Bw": stacked("Bw"),
+            "C": stacked("C"), "D": stacked("D", "Df", "Dd"), "Dw": stacked("Dw"),
+        }  # fmt: skip
+        return cls(plant, U1, U2, U1.T @ plant.E, vertices)
+
+    def at(self, parameters: FloatArray) -> _Point:
+        """Return the matrices at parameters."""
+        weights = self.plant.scheduling.weights(parameters)
+        found = {name: np.tensordot(weights, matrix, 1) for name, matrix in self.vertices.items()}
+        whole = np.vstack([self.E1, self.U2.T @ found["A"]])
+        decision = decide_rank(whole)
+        if not decision.full:
+            point = ", ".join(
+                f"{name} = {value:.6g}" for name, value in zip(self.plant.scheduling.names, parameters, strict=True)
+            )
+            raise PreconditionError(
+                f"At {point} the equations do not determine the state ({decision.describe()}): the index is 2 or more "
+                "there.",
+                condition="index one",
+            )
+        return _Point(**found, solve=np.linalg.inv(whole), algebraic=self.U2)
+
+    def moved(
+        self, v: FloatArray, begin: FloatArray, end: FloatArray, left: FloatArray, right: FloatArray, dt: float
+    ) -> FloatArray:
+        """Return the dynamic coordinates at the end of an interval, in continuous time."""
+        parts = 1 if np.array_equal(begin, end) else PARTS
+        for part in range(parts):
+            share = (part + 0.5) / parts
+            at = self.at((1.0 - share) * begin + share * end)
+            r = len(self.E1)
+            a = self.U1.T @ at.A @ at.solve[:, :r]
+            b = self.U1.T @ (at.S - at.A @ at.solve[:, r:] @ self.U2.T @ at.S)
+            one, other = (left + (part + edge) / parts * (right - left) for edge in (0, 1))
+            transition, held, ramped = first_order_hold(a, b, dt / parts)
+            v = transition @ v + held @ one + ramped @ (other - one)
+        return v
