@@ -301,6 +301,11 @@ KEYS: Keys = {
             "Add a state feedback that stabilises the plant, in the simulation only (linear-quadratic, unit weights).",
             "true",
         ),
+        "scheduling": (
+            "profiles by parameter",
+            "How the scheduling parameters of a plant over a region move: added to the middle of their ranges.",
+            "{speed: {kind: sine, amplitude: 1, frequency: 0.1}}",
+        ),
     },
     "ProfileSection": {
         "kind": ("", "How the signal goes with time.", "step"),

@@ -98,3 +98,31 @@ def test_what_is_no_region_is_refused_with_its_place(tmp_path: Path, old: str, n
     with pytest.raises(SpecError) as refused:
         obsynth.load_spec(_written(tmp_path, (old, new)))
     assert told in f"{refused.value.path}: {refused.value} {refused.value.problems}"
+
+
+def test_a_range_alone_and_a_scenario_in_a_spec(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenario = (
+        "scenario:\n  horizon: 100\n  faults: {f2: {kind: step, size: 1, start: 60}}\n"
+        "  scheduling: {a: {kind: sine, amplitude: 1, frequency: 0.3}}\nmethod:"
+    )
+    spec = _written(tmp_path, ("{range: [-1, 1], unit: m}", "[-1, 1]"), ("method:", scenario))
+    out, gains = tmp_path / "signals.csv", tmp_path / "region.gains.json"
+    assert main(["design", "--system", str(spec), "--output", str(gains), "--quiet"]) == 0
+    assert main(["simulate", "--system", str(spec), "--gains", str(gains), "--out", str(out)]) == 0
+    table = pd.read_csv(out)
+    assert {"a", "speed"} <= set(table.columns)
+    assert table["fhat[f2]"][61:].to_numpy() == pytest.approx(np.ones(40), abs=1e-6)
+    # What was written is a log.
+    assert main(["run", "--gains", str(gains), "--data", str(out), "--out", str(tmp_path / "run.csv")]) == 0
+    assert (pd.read_csv(tmp_path / "run.csv").status[40:] == "ok").all()
+    capsys.readouterr()
+    bad = _written(tmp_path, ("method:", scenario.replace("scheduling: {a", "scheduling: {speed")))
+    assert main(["simulate", "--system", str(bad)]) == 2
+    assert "scenario.scheduling.speed" in capsys.readouterr().err
+
+
+def test_commands_for_other_plants_say_why_they_refuse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spec = str(_written(tmp_path))
+    for command in (["compare"], ["sensors"]):
+        assert main([*command, "--system", spec]) == 2
+        assert "give that at one point, plant.at({...})" in " ".join(capsys.readouterr().err.split())

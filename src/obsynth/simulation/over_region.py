@@ -144,8 +144,8 @@ def require_inside(plant: PolytopicSystem, course: FloatArray, dt: float) -> Non
         k, place = (int(found[0]) for found in np.nonzero(outside))
         name = held.names[place]
         raise SpecError(
-            f"{name} is {course[k, place]:.6g} at {k * dt:.6g} s: the plant is known for {held.sentence()}. Profiles of "
-            f"a parameter are added to the middle of its range.",
+            f"{name} is {course[k, place]:.6g} at {k * dt:.6g} s: the plant is known for {held.sentence()}. Profiles "
+            "of a parameter are added to the middle of its range.",
             path=f"scheduling.{name}",
         )
     if held.gives_weights and len(course) and not all(map(held.is_inside, course)):

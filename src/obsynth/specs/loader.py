@@ -138,7 +138,7 @@ def load_plant(
         plant = plant if spec.model is None else spec.model
     if isinstance(plant, PolytopicSystem):
         raise SpecError(
-            f"{source} holds a plant over a region (scheduling), which is not calibrated: give one with constants.",
+            f"{source} holds a plant over a region (scheduling): this is for one that does not change, with constants.",
             path="plant.scheduling",
         )
     return plant, spec

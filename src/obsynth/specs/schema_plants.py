@@ -80,6 +80,12 @@ class SchedulingSection(Section):
     unit: Text | None = None
     measured: bool = True
 
+    @model_validator(mode="before")
+    @classmethod
+    def _range_alone(cls, data: Any) -> Any:
+        """Return a list as the range that it is."""
+        return {"range": data} if isinstance(data, list) else data
+
 
 class BoxSection(Section):
     """Where the tolerances come from: a source, or a file that ``obsynth calibrate --out`` has written."""

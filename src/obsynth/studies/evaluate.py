@@ -19,8 +19,10 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.progress import RunsProgress, as_they_come, progress_of_runs
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.benches import Bench, Runs, bench_of, drawn_designs, make_bench
 from obsynth.simulation.scenario import Scenario
@@ -256,6 +258,12 @@ def _require_fit(
         return
     if plants is not None:
         raise SpecError("plants are drawn for linear designs of a plant with tolerances.", path="plants")
+    if monitor is not None and isinstance(bench.observer, (ScheduledObserver, RegionObserver)):
+        raise SpecError(
+            "Of a design over a region errors are counted, not alarms: leave monitor out, and run it on simulated logs "
+            "(obsynth.run_on_data) with learned thresholds.",
+            path="monitor",
+        )
     if isinstance(monitor, Monitor):
         raise SpecError(
             "This design is recursive or nonlinear: give monitor=obsynth.ParameterMonitor(...).", path="monitor"

@@ -35,7 +35,8 @@ NO_ALARM = "No alarm"
 #: Why a row cannot alarm, by its status.
 REASONS = {
     WARM_UP: "the observer was still settling (shorten with --warm-up)",
-    OUT: "a scheduling parameter was outside its region, or had been so until recently",
+    OUT: "a scheduling parameter, an input, a measurement or the estimate was outside the region, or had been so until "
+    "recently",
     RECOVERING: "the observer was still settling after a gap (shorten with --warm-up)",
     GAP: "samples are missing, or left out as outliers",
     REPEATED_STAMP: "the time stamp repeats the one before",

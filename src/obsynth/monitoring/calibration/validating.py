@@ -38,13 +38,11 @@ from obsynth.monitoring.calibration.walk_shares import (
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.estimates import GatheredRows
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.estimates import recursive_estimates
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import changed
-from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.transformations.noise_states import with_noise
 from obsynth.results.design import ObserverDesign
 
@@ -426,7 +424,7 @@ def _as_far_as_it_walks(
 
 def states_innovations(design: ObserverDesign) -> bool:
     """Whether a design predicts its outputs with a covariance, which a log could contradict."""
-    return not isinstance(design.observer, (LinearObserver, WindowObserver))
+    return isinstance(design.observer, (DAEObserver, RecursiveObserver))
 
 
 def _sensors(record: RecordedInnovations, names: Sequence[str]) -> dict[str, SensorValidation]:

@@ -407,7 +407,9 @@ def _said_of(design: ObserverDesign, run: LogRun, log: FloatArray, first: int) -
     silent = Scores(np.zeros(faults), np.zeros((faults, faults)), nothing_of_faults, nothing_of_faults)
     settling = settling_rows(design)
     gate = run.observer if isinstance(run.observer, SteppingLogObserver) and run.observer.gates else None
-    initial = np.asarray(getattr(design.observer, "initial_state", ()), dtype=np.float64)
+    # Others than those with a covariance at the start cannot be told how far off a start may be.
+    stated = getattr(design.observer, "initial_state", ()) if hasattr(design.observer, "initial_covariance") else ()
+    initial = np.asarray(stated, dtype=np.float64)
     starts = np.zeros(len(initial))
     for count, last in enumerate(_rows(run, log, CHUNK_ROWS if gate is None else 1)):
         if gate is not None:

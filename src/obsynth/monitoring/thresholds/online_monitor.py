@@ -19,7 +19,7 @@ from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, Monitor, Rule, 
 from obsynth.monitoring.thresholds.options import DISTURBANCES, LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options
 from obsynth.monitoring.thresholds.parameter_rule import parameter_monitor
 from obsynth.monitoring.thresholds.residual_model import ResidualModel, residual_model, watches_estimates
-from obsynth.monitoring.thresholds.residual_monitor import RESIDUAL_ROUNDING_SHARE, bounds_of
+from obsynth.monitoring.thresholds.residual_monitor import RESIDUAL_ROUNDING_SHARE, bounds_of, require_no_region
 from obsynth.monitoring.thresholds.rules import ANY_LENGTH, NormRule, WhitenedRule
 from obsynth.monitoring.thresholds.stated_noise import samples_of, scaled_inputs, unlimited_bound, unlimited_paper
 from obsynth.monitoring.thresholds.whitening import steady_mean, whitened
@@ -168,6 +168,7 @@ def online_monitor(
         return _learned(design, normal)
     if isinstance(design.observer, (RecursiveObserver, DAEObserver)):
         return parameter_monitor(design.observer, kind, nominal or {}, change, false_alarms)
+    require_no_region(design, kind)
     _require_linear_kind(kind, nominal)
     if is_guaranteed(design):
         return data_monitor(design, kind, given)

@@ -8,6 +8,7 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
+from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.monitoring.thresholds.adaptive_monitor import NO_TOLERANCE, noisy_design, over_box, tolerances_of
 from obsynth.monitoring.thresholds.guaranteed import record_monitor
@@ -26,7 +27,9 @@ from obsynth.monitoring.thresholds.whitening import settled, steady_mean, whiten
 from obsynth.numerics.arguments import arguments_checked, chosen, real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.outliers import chi_square_limit
+from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.signal_names import index_of
 from obsynth.results.design import ObserverDesign, require_verified
@@ -139,6 +142,7 @@ def monitor(
     ('f1', 11.0)
     """
     require_verified(design, unverified=unverified)
+    require_no_region(design, kind)
     chosen(kind, "kind", MONITOR_KINDS)
     given = {
         "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound, "initial_error": initial_error,
@@ -191,6 +195,16 @@ def monitor(
         isolation_delay=isolation_delay,
         watches_estimates=estimates,
     )
+
+
+def require_no_region(design: ObserverDesign, kind: str) -> None:
+    """Raise `SpecError` for designs over a region, whose residuals have no other bound than one that is learned."""
+    if isinstance(design.observer, (RegionObserver, ScheduledObserver)):
+        raise SpecError(
+            f"Design {design.name!r} is over a region, where the monitor {kind!r} has no bound of the residual: learn "
+            "thresholds from rows without faults (kind 'learned' with normal=...).",
+            path="kind",
+        )
 
 
 def _whitened_rule(

@@ -34,6 +34,8 @@ Each row of estimates has a status:
   warm-up     the initial-condition response has not settled yet
   gap         a sample is missing: fault estimates are held, the plant model stands in, no alarms
   partial     recursive and nonlinear designs: some outputs are missing, the others are used
+  out         designs over a region: a scheduling parameter, an input, a measurement or the estimate is outside the \
+region, or was so until recently: nothing is claimed, no alarms
   recovering  after a gap: an alarm needs a value that passes its threshold by more than the gap can have caused
   repeated stamp, out of order: the time stamp is not later than the last one: the row is left out (more than 10\
  in a row are an error)
@@ -51,7 +53,8 @@ for each threshold, the guaranteed interval of each fault, and the share of each
   chi-square  linear: a window of the residual against its covariance; recursive: the parameters against theirs
   cusum       small changes of the residual, or of a parameter
   nis         recursive and nonlinear designs: innovations too large for the model
-  learned     every design: thresholds from rows without faults (--normal), whatever noise the model assumes
+  learned     every design, and the only one for those over a region: thresholds from rows without faults\
+ (--normal), whatever noise the model assumes
 The scenario of --system, or the options, state which disturbances and noise to expect.
 
 If --gains is a folder, every gain set in it is run on --data, which is a log or a folder of logs, on --jobs \

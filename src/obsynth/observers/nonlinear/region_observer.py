@@ -267,8 +267,15 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
         seen = all(ranges[place, 0] <= y[output] - constant <= ranges[place, 1] for place, output, constant in measured)
         return seen and bool(np.all((values >= ranges[:, 0]) & (values <= ranges[:, 1])))
 
-    def rows_without_claim(self, _: float) -> int:
-        """Return the rows until a hundredth of an error is left."""
+    def rows_without_claim(self, seconds: float) -> int:
+        """Return the rows until a hundredth of an error is left.
+
+        Parameters
+        ----------
+        seconds : float
+            Between rows: those of the design.
+        """
+        del seconds
         return self.forgetting
 
     def init(self) -> RegionState:

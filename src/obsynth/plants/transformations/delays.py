@@ -17,6 +17,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.dead_times import delays_in_words
 from obsynth.plants.descriptor import DescriptorSystem, note_source
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.delayed_signals import counted_at_reading, whole_samples_late
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states
 from obsynth.plants.transformations.recovery import (
@@ -173,6 +174,12 @@ def linear_plant(given: Any) -> DescriptorSystem:
         raise SpecError(
             "This is for linear plants; of a plant of equations give the linear one that its spec makes with "
             "transform: {linearise: {at: equilibrium, faults: [...]}}, or obsynth.linearise.",
+            path="plant",
+        )
+    if isinstance(plant, PolytopicSystem):
+        raise SpecError(
+            "This is for linear plants that do not change; of a plant over a region (scheduling) give that at one "
+            "point, plant.at({...}), or compare designs by obsynth.simulate.",
             path="plant",
         )
     require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
