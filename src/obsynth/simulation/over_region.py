@@ -20,6 +20,7 @@ from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.simulation.linear import PlantRuns
+from obsynth.simulation.profiles import Additive
 from obsynth.simulation.scenario import Scenario, profiles_of
 from obsynth.simulation.signals import ScenarioSignals, Trajectory, signal_of
 
@@ -124,6 +125,7 @@ def courses_of(plant: PolytopicSystem, scenario: Scenario, steps: int, dt: float
     left, right = np.tile(middle, (steps, 1)), np.tile(middle, (steps, 1))
     for name, profile in profiles_of(scenario, "scheduling"):
         place = names.index(name)
+        assert isinstance(profile, Additive)  # the scenario takes no others
         for ends, values in zip((left, right), profile.sampled(steps, dt), strict=True):
             ends[:, place] += values
     if plant.is_discrete:
