@@ -17,7 +17,7 @@ from benchmarks.campaigns.frame import Outcome
 
 import obsynth
 
-CASES = 300
+CASES = 1000
 LIMIT = 60.0
 SAME = 1e-6
 POINTS = (0.7, 1.0 + 2.0j, -0.3 + 5.0j)

@@ -170,3 +170,23 @@ def test_methods_take_a_mechanism_at_position_level_as_its_minimal_form(method):
     for claim, value in minimal.certificate.claims.items():
         assert np.isclose(own.certificate.claims[claim], value, rtol=1e-6)
     assert obsynth.check(bar("position"))[method].passed
+
+
+def test_an_output_of_constrained_states_alone_shows_nothing_of_computed_coordinates():
+    # x1' = -x1 + f and x2 = x3 = 0 (index 2) in rotated coordinates; the second output shows x2 and x3 alone.
+    rng = np.random.default_rng(7)
+    left, right = (np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(2))
+    e = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, 0, 0]])
+    a = np.array([[-1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
+    for unit in (1.0, 1e9):
+        plant = obsynth.DescriptorSystem(
+            left @ e @ right,
+            left @ a @ right,
+            Bf=left @ np.array([[1.0], [0.0], [0.0]]),
+            C=np.diag([1.0, unit]) @ np.array([[1.0, 0, 0], [0, 2.0, 3.0]]) @ right,
+        )
+        reduced = obsynth.eliminate_algebraic_states(plant).plant
+        assert reduced.nx == 1
+        assert reduced.C[0, 0] != 0.0
+        assert reduced.C[1, 0] == 0.0
+        assert obsynth.functional_filter(plant, decay=0.5).report.passed

@@ -95,3 +95,22 @@ def test_a_matrix_that_is_given_for_independent_outputs_is_named():
         obsynth.fault_estimation_filter(plant, S=np.zeros((2, 4)))
     assert caught.value.condition == "rank C"
     assert obsynth.fault_estimation_filter(plant).report.passed
+
+
+def test_a_copy_in_another_unit_changes_no_choice_of_outputs():
+    # 10 times 1.076 in doubles is not ten times the number as written: the rows depend within rounding alone.
+    c = np.array([[1.076, -0.806, 0.767]])
+    for factor in (0.1, 10.0, 1000.0):
+        both = obsynth.DescriptorSystem(
+            A=-np.diag([1.0, 2.0, 3.0]), C=np.vstack([c, factor * c]), Dw=np.diag([0.1, 0.1 * factor])
+        )
+        assert np.allclose(merged_outputs(both).plant.C, c, rtol=1e-12)
+
+
+def test_nearly_equal_sensors_are_merged_where_the_stated_decay_is_reached():
+    a, bf = [[-1.866, -0.394], [-0.162, -1.27]], [[-1.225], [-0.032]]
+    rows = [[-0.15, -0.706], [-0.149026, -0.704717]]
+    one = obsynth.DescriptorSystem(A=a, C=rows[:1], Bf=bf, Dw=[[0.1]])
+    both = obsynth.DescriptorSystem(A=a, C=rows, Bf=bf, Dw=np.diag([0.1, 0.1]))
+    alone, more = (obsynth.pd_observer(plant, decay=0.3) for plant in (one, both))
+    assert noise_of(more) <= 0.75 * noise_of(alone)

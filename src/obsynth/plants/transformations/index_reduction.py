@@ -152,7 +152,9 @@ def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | No
     e, a = in_own_units(plant)
     signals = [getattr(plant, name) for _, name, _, _ in _SIGNALS]
     direct = np.hstack([getattr(plant, name) for _, _, name, _ in _SIGNALS])
-    entering, c = units.rate * units.equations[:, None] * np.hstack(signals), plant.C * units.states
+    entering = units.rate * units.equations[:, None] * np.hstack(signals)
+    shown = units.outputs[:, None]
+    c = shown * plant.C * units.states
     shift = max(_SHIFTS, key=lambda point: float(np.linalg.svd(point * e - a, compute_uv=False)[-1]))
     pencil = shift * e - a
     moved = np.linalg.solve(pencil, e)
@@ -179,12 +181,12 @@ def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | No
     return _Split(
         own * factor[:, None] / factor / units.rate,
         b * factor[:, None] / units.rate,
-        c @ dynamic / factor,
-        _but_small(c @ states, np.abs(c) @ np.abs(states)) + direct,
+        _but_small(c @ dynamic, np.abs(c) @ np.abs(dynamic)) / shown / factor,
+        _but_small(c @ states, np.abs(c) @ np.abs(states)) / shown + direct,
         v * _but_small(dynamic, np.ones_like(dynamic)) / factor,
         v * states,
         v * differentiated,
-        _but_small(c @ differentiated, np.abs(c) @ np.abs(differentiated)),
+        _but_small(c @ differentiated, np.abs(c) @ np.abs(differentiated)) / shown,
         tuple(rows),
         None,
     )

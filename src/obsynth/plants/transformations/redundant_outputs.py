@@ -100,9 +100,7 @@ def _independent(shown: FloatArray) -> tuple[list[int], FloatArray, bool]:
     picked = pivot_columns(written_matrix(shown).transpose()) if count else []
     exact = len(picked) == count
     if not exact:
-        from scipy.linalg import qr
-
-        picked = sorted(int(moving[place]) for place in qr(units.T, mode="r", pivoting=True)[1][:count])
+        picked = [int(moving[place]) for place in _first_independent(units, count)]
     q = np.zeros((len(shown), count))
     if count:
         unit_rows = shown[picked] / lengths[picked, None]
@@ -110,6 +108,20 @@ def _independent(shown: FloatArray) -> tuple[list[int], FloatArray, bool]:
         q[moving] = but_rounding(found, np.ones_like(found)) * lengths[moving, None] / lengths[picked]
         q[picked] = np.eye(count)
     return picked, q, exact
+
+
+def _first_independent(units: FloatArray, count: int) -> list[int]:
+    """Return the first rows that are independent within rounding: a sensor that is added changes no choice; where
+    rounding leaves fewer than ``count``, those of a pivoted factorisation."""
+    picked: list[int] = []
+    for place in range(len(units)):
+        if len(picked) < count and rounding_rank(units[[*picked, place]]) > len(picked):
+            picked.append(place)
+    if len(picked) == count:
+        return picked
+    from scipy.linalg import qr
+
+    return sorted(int(place) for place in qr(units.T, mode="r", pivoting=True)[1][:count])
 
 
 def _weights(q: FloatArray, noise: FloatArray) -> FloatArray:
