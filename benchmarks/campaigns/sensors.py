@@ -15,7 +15,7 @@ from benchmarks.campaigns.frame import Outcome
 
 import obsynth
 
-CASES = 1000
+CASES = 250
 LIMIT = 120.0
 WORSE = 1.001
 NOISE = 0.1

@@ -123,6 +123,12 @@ KEYS: Keys = {
         **{name: text for name, text in _NAMES.items() if name != "parameter_names"},
         **_SIGNALS,
         "delays": _DELAYS,
+        "functionals": (
+            "",
+            "Combinations of states with names of their own: further states, which every command shows, and which "
+            "`states` of `functional-filter` estimates alone, by an observer of low order. Their units go into `units`.",
+            "{twist: {motor: 1, load: -1}}",
+        ),
         **_NOISE,
         **_TOLERANCES,
         "scheduling": (

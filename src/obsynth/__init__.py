@@ -82,6 +82,7 @@ _PUBLIC_NAMES = {
     "plants.time_varying": "TimeVaryingDescriptorSystem",
     "plants.transformations.delays": "absorb_delays",
     "plants.transformations.elimination": "eliminate_algebraic_states",
+    "plants.transformations.functionals": "with_functionals",
     "plants.transformations.linearisation": "linearise",
     "plants.transformations.noise_states": "with_noise",
     "plants.transformations.sampling": "discretise",

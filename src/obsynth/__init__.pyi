@@ -69,6 +69,7 @@ from obsynth.plants.polytopic import PolytopicSystem as PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem as TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.delays import absorb_delays as absorb_delays
 from obsynth.plants.transformations.elimination import eliminate_algebraic_states as eliminate_algebraic_states
+from obsynth.plants.transformations.functionals import with_functionals as with_functionals
 from obsynth.plants.transformations.linearisation import linearise as linearise
 from obsynth.plants.transformations.noise_states import with_noise as with_noise
 from obsynth.plants.transformations.sampling import discretise as discretise

@@ -393,3 +393,18 @@ def test_a_fault_that_equations_without_noise_tell_has_a_walk() -> None:
         dt=0.5,
     )
     assert obsynth.functional_filter(plant).observer.fault_names == ("f1", "f2")
+
+
+@pytest.mark.parametrize("decay", [0.01, 0.05, 0.1, 0.3])
+def test_any_decay_of_a_sampled_plant_without_other_noise_has_a_gain(decay: float) -> None:
+    # Nothing drives the fault's own mode, which the decay makes unstable: the solution that doubling begins at is none.
+    plant = obsynth.DescriptorSystem(
+        A=[[0.9, 0.1, 0.0], [0.0, 0.8, 0.1], [0.0, 0.0, 0.7]],
+        C=[[1, 0, 0], [0, 1, 0]],
+        Bf=[[1], [0], [0]],
+        dt=1.0,
+        sensor_noise={"y1": 0.1, "y2": 0.1},
+    )
+    found = obsynth.functional_filter(plant, decay=decay)
+    assert found.report.passed
+    assert found.certificate.claims["decay"] >= decay

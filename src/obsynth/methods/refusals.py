@@ -29,6 +29,9 @@ MOST_FOR_PAIRS, MOST_FOR_ONE = 16, 48
 #: How a refusal begins where nothing of the kind exists, see `Condition.require`.
 NONE_OF_THIS_KIND = "No observer of this kind exists: "
 
+#: Methods that estimate every state beside the faults.
+_OF_THE_WHOLE_STATE = ("pd-observer", "ui-pi-observer")
+
 #: Conditions on the kind of plant, whose messages say what to do: no sensor changes it.
 OF_THE_KIND = ("continuous time", "discrete time", "plant of this kind")
 
@@ -105,13 +108,21 @@ def _named_assumption(error: PreconditionError, plant: DescriptorSystem, asked: 
     if not str(error).startswith(NONE_OF_THIS_KIND) or plant.nx > MOST_FOR_ONE or "faults" not in asked.purposes:
         return error
     others = [name for name in _methods_for_faults(asked) if _takes(name, plant)]
+    states = bool(getattr(asked, "states", None))
+    if states:
+        # Of the methods for faults these estimate the whole state, with faults that follow their models.
+        others = [name for name in others if name in _OF_THE_WHOLE_STATE]
     if not others:
         return error
     text = str(error).removeprefix(NONE_OF_THIS_KIND)
     exist = "exists" if len(others) == 1 else "exist"
     return PreconditionError(
-        f"{asked.id} assumes more than this plant has: {text} The faults can be estimated: {', '.join(others)} "
-        f"{exist}.",
+        f"{asked.id} assumes more than this plant has: {text} "
+        + (
+            f"The states can be estimated beside faults that follow their models: {', '.join(others)} {exist}."
+            if states
+            else f"The faults can be estimated: {', '.join(others)} {exist}."
+        ),
         condition=error.condition,
         mode=error.mode,
         signals=error.signals,

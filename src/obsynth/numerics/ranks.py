@@ -238,9 +238,9 @@ def rank_in_any_units(first: FloatArray, second: FloatArray, *, expected: int) -
     return max(found, other, key=lambda decision: (decision.rank, decision.smallest_kept))
 
 
-def numerical_rank(values: FloatArray, *, scale: float | None = None) -> int:
+def numerical_rank(values: FloatArray, *, scale: float | None = None, tolerance: float = RANK_TOLERANCE) -> int:
     """Return how many singular values, the largest first, are not zero beside ``scale``: by default the largest."""
-    return int(np.sum(values > RANK_TOLERANCE * (values[0] if scale is None else scale))) if values.size else 0
+    return int(np.sum(values > tolerance * (values[0] if scale is None else scale))) if values.size else 0
 
 
 def rank_from(

@@ -279,7 +279,8 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
         names = "" if chosen is None else " = ".join(chosen.group(1).split(" and "))
         yield f"{names} = identity, because no noise was given" if names else "the stated noise"
     model = design.options.get("fault_model")
-    if isinstance(model, str):
+    of_states = bool(getattr(design.observer, "state_names", ())) and not design.observer.fault_names
+    if isinstance(model, str) and not of_states:
         yield f"faults that follow the model '{model}'"
     if is_guaranteed(design) and isinstance(design.plant, DescriptorSystem) and design.options.get("noise_bound"):
         yield "noise within its stated bounds"

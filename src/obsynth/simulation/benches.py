@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -91,6 +91,7 @@ class Bench:
     simulated: Callable[[Sequence[int]], PlantRuns]
     #: Rows of the observer from outputs and inputs of several runs, and its estimates where they say more than rows.
     observed: Callable[[FloatArray, FloatArray], tuple[FloatArray, tuple[Estimates, ...]]]
+    estimated_states: tuple[int, ...] | None = None  # which states are estimated, where only some are
 
     def run(self, seeds: Sequence[int]) -> Runs:
         """Run the plant and the observer, once for each seed."""
@@ -102,6 +103,10 @@ class Bench:
     def onset(self) -> int | None:
         """First sample at which a fault acts, or a faulty sensor; `None` if there is none."""
         return self.signals.first_fault(self.fault_signals)
+
+    def true_states(self, states: FloatArray) -> FloatArray:
+        """Return of the plant's states ``(..., nx)`` those that the observer estimates, or all where it is none."""
+        return states if self.estimated_states is None else states[..., list(self.estimated_states)]
 
     def warm_ups(self) -> tuple[int | None, int | None]:
         """Return from when the start no longer shows in the estimates of states, and of faults; 0 with deviations."""
@@ -145,7 +150,16 @@ def make_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
         tuple(text for holds, text in said if holds),
         partial(scenario_runs, drive, stepper, (plant.nu, plant.nu + plant.nf)),
         partial(_linear_rows, observer, begin, ramp),
+        _some_states(observer, plant),
     )
+
+
+def _some_states(observer: LinearObserver, plant: Any) -> tuple[int, ...] | None:
+    """Return which states of the plant an observer estimates that is only for some."""
+    names = observer.state_names
+    if not names or names == plant.state_names:
+        return None
+    return tuple(index_of(name, plant.state_names, what="The plant") for name in names)
 
 
 def _linear_rows(

@@ -61,9 +61,9 @@ class Simulation:
     time : FloatArray
         ``(steps,)``, seconds.
     states, outputs, inputs, faults, disturbances : FloatArray
-        ``(steps, nx)``, ``(steps, ny)`` as measured (the model of a time-varying plant begins with y(1): its first row
-        is NaN), ``(steps, nu)`` with any feedback, ``(steps, nf)``, ``(steps, nd)``.  The faults of a plant with
-        parameters are these: `parameters` is another name.
+        ``(steps, nx)`` (of an observer of some states: those), ``(steps, ny)`` as measured (the model of a time-varying
+        plant begins with y(1): its first row is NaN), ``(steps, nu)`` with any feedback, ``(steps, nf)``,
+        ``(steps, nd)``.  The faults of a plant with parameters are these: `parameters` is another name.
     estimates : Estimates
         At sample k, of the signals at k minus their delays.
     output_names, input_names, disturbance_names : tuple of str
@@ -297,7 +297,7 @@ def _simulated(design: ObserverDesign, scenario: Scenario) -> Simulation:
         )
     return Simulation(
         time=dt * np.arange(bench.signals.steps, dtype=np.float64),
-        states=runs.states[:, 0],
+        states=bench.true_states(runs.states[:, 0]),
         outputs=runs.outputs[:, 0],
         inputs=runs.inputs[:, 0],
         faults=runs.faults[:, 0],

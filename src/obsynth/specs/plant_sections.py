@@ -16,6 +16,7 @@ from obsynth.plants.descriptor import ALL_MATRICES, SIGNAL_NAMES, DescriptorSyst
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.signal_names import index_of
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.transformations.functionals import with_functionals
 from obsynth.plants.uncertain_system import with_expressions
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
 from obsynth.results.calibration_files import read_calibration
@@ -174,7 +175,7 @@ def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel
 def _polytopic_plant(section: PlantSection, source: Path, prefix: str) -> PolytopicSystem:
     """Return the plant of a section with scheduling parameters."""
     arguments = _read(section, source, prefix, ("dt", "sensor_noise", *_LABELS), ALL_MATRICES, SIGNAL_NAMES)
-    for name in ("tolerance", "variation", "box", "transform", "delays"):
+    for name in ("tolerance", "variation", "box", "transform", "delays", "functionals"):
         if getattr(section, name) is not None:
             raise SpecError(f"{source}: {name} is for plants without scheduling: remove it.", path=joined(prefix, name))
     if noise_needs_states(noise_model_of(section)):
@@ -218,7 +219,16 @@ def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> Descri
     for matrix, names in _SIGNAL_OF_PICK.items():
         if isinstance(arguments[matrix], list) and arguments[names] is None:
             arguments[names] = arguments[matrix]
-    return _placed(lambda: with_constants(DescriptorSystem(**arguments), section, source.parent), source, prefix)
+
+    def made() -> DescriptorSystem:
+        functionals = section.functionals or {}
+        units = arguments.pop("units") or {}
+        own = {name: unit for name, unit in units.items() if name not in functionals}
+        plant = DescriptorSystem(**arguments, units=own)
+        named = {name: unit for name, unit in units.items() if name in functionals}
+        return with_constants(with_functionals(plant, functionals, units=named), section, source.parent)
+
+    return _placed(made, source, prefix)
 
 
 def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | None:

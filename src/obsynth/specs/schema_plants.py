@@ -138,6 +138,7 @@ class PlantSection(Section):
     scales: dict[Text, float] | None = None
     units: dict[Text, str] | None = None
     delays: dict[Text, NonNegative | Text] | None = None
+    functionals: dict[Text, dict[Text, float]] | None = None
     sensor_noise: SensorNoises | None = None
     offset: Sizes | None = None
     walks: Sizes | None = None

@@ -133,7 +133,7 @@ def _run(
     runs, observer = bench.run(seeds), bench.observer
     found, nx = dict[str, FloatArray](), len(observer.state_names)
     for name, rows, truth, delays, warm_up in (
-        ("states", slice(0, nx), runs.states, observer.state_delays, warm_ups[0]),
+        ("states", slice(0, nx), bench.true_states(runs.states), observer.state_delays, warm_ups[0]),
         (
             "faults",
             slice(nx, nx + len(observer.fault_names)),

@@ -59,13 +59,15 @@ class OutputRows:
 
 @dataclass(frozen=True, eq=False)
 class FilterPart:
-    """A filter for some faults: its dynamics, rows that estimate them, and residuals; ``delay`` in samples."""
+    """A filter for some faults, or for states: its dynamics, rows that estimate them, and residuals; ``delay`` in
+    samples."""
 
     dynamics: OutputRows
     estimates: OutputRows
     residuals: OutputRows
     faults: tuple[int, ...]
     delay: int
+    states: tuple[int, ...] = ()
 
 
 def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, delay: int, mean: int) -> FilterPart:
@@ -147,8 +149,11 @@ def assembled(
     nu, nx = plant.nu, plant.nx
     a = block_diag(*(part.dynamics.C for part in parts)) if parts else np.zeros((0, 0))
     b = _stacked([part.dynamics.D for part in parts], nu + plant.ny)
+    states = [state for part in parts for state in part.states]
     faults = [(fault, part.delay) for part in parts for fault in part.faults if len(part.estimates.C)]
-    rows = sorted(range(len(faults)), key=lambda i: faults[i][0])
+    # The filter of states comes first: so do its rows.
+    order = sorted(range(len(faults)), key=lambda i: faults[i][0])
+    rows = [*range(len(states)), *(len(states) + i for i in order)]
     orders = [len(part.dynamics.C) for part in parts]
     estimate = _side_by_side([part.estimates for part in parts], orders, nu + plant.ny, nx)
     residual = _side_by_side([part.residuals for part in parts], orders, nu + plant.ny, nx)
@@ -166,11 +171,11 @@ def assembled(
         dt=plant.dt,
         input_names=plant.input_names,
         output_names=plant.output_names,
-        state_names=(),
-        fault_names=tuple(plant.fault_names[faults[i][0]] for i in rows),
+        state_names=tuple(plant.state_names[state] for state in states),
+        fault_names=tuple(plant.fault_names[faults[i][0]] for i in order),
         residual_names=tuple(residual_names),
-        state_delays=(),
-        fault_delays=tuple(faults[i][1] for i in rows),
+        state_delays=(0,) * len(states),
+        fault_delays=tuple(faults[i][1] for i in order),
     )
     return observer, _stacked([part.dynamics.T0 for part in parts], nx), t0
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from obsynth.analysis.existence.augmented_pencils import shipped_model
 from obsynth.analysis.existence.functional_filter import conditions, residual_sets
+from obsynth.analysis.existence.functional_states import chosen_states, state_conditions
 from obsynth.methods.functional_filter.tracking import estimate_deviations, wanted_faults
 from obsynth.methods.ui_pi_observer.decoupling import decoupling_norms
 from obsynth.numerics.arrays import FloatArray, reachable
@@ -42,7 +43,9 @@ _SOURCE = "identities of the error z - T E x, ours"
 def decoupling_rows(design: ObserverDesign) -> Iterator[Check]:
     """Yield the measured gains: of d to everything, of other faults into each estimate or set of residuals."""
     plant, observer = design.linear
-    groups = [("unknown inputs", list(range(len(observer.Cz))), list[str]())] if plant.nd else []
+    # Unknown inputs move states: what their estimates make of them is in the identities.
+    others = list(range(len(observer.Cz)))[len(observer.state_names) :]
+    groups = [("unknown inputs", others, list[str]())] if plant.nd and others else []
     groups += [(f"free of others: {name}", rows, blind) for name, rows, blind in _blind_to(design) if blind]
     if not groups:
         return
@@ -74,7 +77,7 @@ def _blind_to(design: ObserverDesign) -> Iterator[tuple[str, list[int], list[str
         others = [name for name in plant.fault_names if name not in observer.fault_names]
         for row, name in enumerate(observer.fault_names):
             beside = [] if options.get("joint") else [other for other in observer.fault_names if other != name]
-            yield name, [row], [*others, *beside]
+            yield name, [observer.fault_rows.start + row], [*others, *beside]
         return
     sets = residual_sets(options["residuals"], plant) or []
     for seen in ([plant.fault_names[i] for i in indices] for indices in sets):
@@ -130,13 +133,17 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         return
     options = design.options
     yield from condition_rows(
-        conditions(
-            plant,
-            fault_model=shipped_model(matrices, plant.nf),
-            faults=options.get("faults"),
-            residuals=options.get("residuals"),
-        )
+        state_conditions(plant, chosen_states(options.get("states"), plant), options.get("decay"))
     )
+    if observer.fault_names or options.get("residuals") is not None:
+        yield from condition_rows(
+            conditions(
+                plant,
+                fault_model=shipped_model(matrices, plant.nf),
+                faults=options.get("faults"),
+                residuals=options.get("residuals"),
+            )
+        )
     tolerance = relative_tolerance(printed_digits, plant.nx + plant.ny + observer.order)
     for name, claim, identity in _identities(plant, observer, matrices["T"], matrices["T0"]):
         yield equality(name, claim, identity.residual(), _SOURCE, bound=tolerance)
@@ -187,13 +194,20 @@ def _fits(design: ObserverDesign) -> bool:
         and finite
         and observer.input_names == plant.input_names
         and observer.output_names == plant.output_names
-        and observer.state_names == ()
+        and observer.state_names == _states_asked_for(design)
         and set(observer.fault_names) <= set(plant.fault_names)
-        and (observer.fault_names or observer.residual_names)
+        and (observer.state_names or observer.fault_names or observer.residual_names)
         and observer.dt == plant.dt
         and list(observer.fault_names) == list(design.options.get("faults") or [])
         and all(delay == _delay(design) for delay in observer.fault_delays)
     )
+
+
+def _states_asked_for(design: ObserverDesign) -> tuple[str, ...]:
+    """Return the states asked for, in the order of the plant's."""
+    names = design.options.get("states") or ()
+    listed = (names,) if isinstance(names, str) else tuple(names)
+    return tuple(name for name in design.linear[0].state_names if name in listed)
 
 
 def _delay(design: ObserverDesign) -> int:
@@ -229,11 +243,14 @@ def _identities(
         Identity((by @ plant.Dd, -t @ plant.Bd), ((by, plant.Dd), (size_t, plant.Bd))),
     )
     yield "algebraic rows", "T0 E = 0", Identity((t0 @ plant.E,), ((size_t0, plant.E), (size_t0, plant.A)), units)
+    goal = np.zeros_like(t0)
+    places = [plant.state_names.index(name) for name in observer.state_names]
+    goal[range(len(places)), places] = 1.0
     yield (
         "state in the estimates",
-        "Cz T E + Dy C = T0 A",
+        "Cz T E + Dy C = T0 A + the states estimated" if observer.state_names else "Cz T E + Dy C = T0 A",
         Identity(
-            (cz @ (t @ plant.E), dy @ plant.C, -t0 @ plant.A),
+            (cz @ (t @ plant.E), dy @ plant.C, -t0 @ plant.A, -goal),
             ((cz, t, plant.E), (dy, plant.C), (size_t0, plant.A), (cz, t, plant.A)),
             units,
         ),

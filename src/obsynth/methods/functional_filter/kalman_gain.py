@@ -19,6 +19,7 @@ from obsynth.numerics.matrix_equations import (
     continuous_lyapunov,
     continuous_solution,
     discrete_lyapunov,
+    discrete_solution,
     riccati_solution,
 )
 from obsynth.numerics.ranks import RANK_TOLERANCE, rank_from
@@ -265,7 +266,11 @@ class _Equation:
     def solution(self) -> tuple[FloatArray, float] | None:
         """Return the covariance and what it misses the equation by; ``None`` where no stable filter came out."""
         solve = riccati_solution if self.sampled else continuous_solution
-        p = solve(self.a, self.c, self.process, self.measured, self.cross)
+        given = (self.a, self.c, self.process, self.measured, self.cross)
+        p = solve(*given)
+        if self.sampled and p is not None and not self._is_stable(p):
+            # Doubling begins at zero, which solves the equation where nothing drives an unstable mode.
+            p = discrete_solution(*given)
         if p is None or not np.all(np.isfinite(p)):
             return None
         p = 0.5 * (p + p.T)
@@ -279,6 +284,13 @@ class _Equation:
                 break
             p, missed = better, less
         return (p, missed) if np.isfinite(missed) else None
+
+    def _is_stable(self, p: FloatArray) -> bool:
+        try:
+            closed = self.a - self.gain(p) @ self.c
+        except np.linalg.LinAlgError:
+            return False
+        return bool(np.all(np.isfinite(closed)) and abscissa(closed, 1.0) < 1.0)
 
     def _stepped(self, p: FloatArray) -> FloatArray | None:
         """Return the covariance of the filter with the gain of another one: Newton's step, which needs no inverse of

@@ -54,6 +54,11 @@ class FunctionalFilter(Method):
         (one for each fault, or set of faults), a list of poles for each.
     noise : float or mapping of str to float, optional
         Standard deviation of each output that the gain is for, per sample; what the plant states by default.
+    states : sequence of str, optional
+        States to estimate, free of all unknown inputs and faults: with ``functionals`` of the plant any ``K x``.  The
+        observer has the order of Darouach's functional observer where his conditions hold, and as many states more as
+        it takes elsewhere; ``decay`` or ``poles`` choose its dynamics.  Faults are estimated beside only where
+        ``faults`` names them.
     residuals : {"detect", "isolate"} or sequence, optional
         Only residuals, blind to the unknown inputs: one set that sees every fault, one set for each fault that is
         blind to all others, or one for each list of faults to see.
@@ -63,8 +68,8 @@ class FunctionalFilter(Method):
     Returns
     -------
     ObserverDesign
-        An observer without state rows; ``gains`` and the certificate hold ``T (nz, nx)`` and ``T0 (rows, nx)``, which
-        prove that neither state, nor u, nor d reaches any estimate.
+        An observer without state rows but those of ``states``; ``gains`` and the certificate hold ``T (nz, nx)`` and
+        ``T0 (rows, nx)``, which prove that neither state, nor u, nor d reaches any estimate.
 
     Raises
     ------
@@ -83,6 +88,8 @@ class FunctionalFilter(Method):
     .. [Frisk] E. Frisk, M. Nyberg, "A minimal polynomial basis solution to residual generation for fault diagnosis in
        linear systems", Automatica 37, 2001: the null space.  Ours: one state-space reduction for any index, fault
        models and walks on it, delay, and the proof by T and T0 on the shipped numbers.
+    .. [Darouach] M. Darouach, "Existence and design of functional observers for linear systems", IEEE Transactions on
+       Automatic Control 45(5), 2000: ``states``.  Ours: any index, and unknown inputs and faults taken out first.
     .. [AndersonMoore] B. Anderson, J. Moore, Optimal Filtering, 1979, ch. 7: the fixed lag.
 
     Examples
@@ -127,6 +134,7 @@ class FunctionalFilter(Method):
     poles: Annotated[Any, WrittenAs("pole sets")] = None
     noise: Annotated[Any, WrittenAs("named numbers")] = None
     residuals: Annotated[Any, WrittenAs("fault sets")] = None
+    states: Annotated[Any, WrittenAs("texts")] = None
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""
@@ -135,8 +143,15 @@ class FunctionalFilter(Method):
             given += ["delay"] if self.delay else []
             if given:
                 yield f"{', '.join(given)} choose gains, and so do poles: give one."
+        if self.states is not None and self.faults is None:
+            given = [name for name in ("fault_rate", "noise") if getattr(self, name) is not None]
+            given += [name for name, default in (("delay", 0), ("mean", 1)) if getattr(self, name) != default]
+            if given:
+                yield f"{', '.join(given)} concern estimates of faults: name these (faults), or leave them out."
+        if self.states is not None and self.faults is not None and self.poles is not None:
+            yield "poles are of one observer: give decay, or design states and faults one at a time."
         if self.residuals is not None:
-            given = [name for name in ("faults", "fault_rate") if getattr(self, name) is not None]
+            given = [name for name in ("faults", "states", "fault_rate") if getattr(self, name) is not None]
             late = [name for name, default in (("delay", 0), ("mean", 1)) if getattr(self, name) != default]
             if given or late or self.joint:
                 listed = [*given, *late, *(["joint"] if self.joint else [])]
@@ -157,8 +172,12 @@ class FunctionalFilter(Method):
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, one or two for each fault asked for."""
         from obsynth.analysis.existence.functional_filter import conditions
+        from obsynth.analysis.existence.functional_states import chosen_states, state_conditions
 
-        return conditions(
+        of_states = state_conditions(plant, chosen_states(self.states, plant), self.decay)
+        if self.states is not None and self.faults is None:
+            return of_states
+        return of_states + conditions(
             plant,
             fault_model=self.fault_model,
             faults=self.faults,
@@ -169,6 +188,10 @@ class FunctionalFilter(Method):
     def require_stated(self, plant: DescriptorSystem) -> None:
         """Raise `PreconditionError` where a combination of the outputs that the gain reads has no noise."""
         import_module("obsynth.methods.functional_filter.synthesis").require_stated(plant, self)
+
+    def is_for_states_as_written(self, plant: DescriptorSystem) -> bool:
+        """Whether states are named, which a reduced plant may not have."""
+        return self.states is not None
 
     def for_plant(self, plant: DescriptorSystem) -> Self:
         """Return the method without the faults that a plant no longer has."""

@@ -7,13 +7,17 @@ Nyberg (2001); fixed lag: Anderson, Moore (1979, ch. 7).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from obsynth.analysis.existence.functional_filter import chosen_faults, residual_sets
+from obsynth.analysis.existence.functional_states import chosen_states, fixed_modes, state_goals, without_faults
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.functional_filter.assembly import FilterPart, assembled, filter_part
+from obsynth.methods.functional_filter.functional_observer import functional_part
 from obsynth.methods.functional_filter.kalman_gain import (
     RATE_REACHED,
     FilterModel,
@@ -54,9 +58,10 @@ def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Ca
     progress("decoupling the unknown inputs")
     models = _models(noisy, model, asked)
     progress("choosing the gains")
+    of_states = _state_parts(noisy, model, asked)
     for longer in (MOST_LONGER, 0):
         parts, rates, seen = _parts(noisy, models, asked, longer)
-        observer, t, t0 = assembled(plant, parts, _residual_names(plant, models, parts, asked))
+        observer, t, t0 = assembled(plant, [*of_states, *parts], _residual_names(plant, models, parts, asked))
         if not any(seconds > settling_time(plant) for seconds, _ in seen) or _is_above_rounding(plant, observer):
             break
     progress("building the realisation and its certificate")
@@ -87,6 +92,25 @@ def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Ca
     )
 
 
+def _state_parts(plant: DescriptorSystem, model: Exosystem, asked: FunctionalFilter) -> list[FilterPart]:
+    """Return the filter of the states asked for, if any."""
+    places = chosen_states(asked.states, plant)
+    if not places:
+        return []
+    free = filter_model(plant, model, removed=range(plant.nf), faults=())
+    fixed = fixed_modes(plant, without_faults(plant), free.T, asked.decay or 0.0)
+    free = replace(
+        free,
+        A=block_diag(free.A, fixed.A),
+        C=np.hstack([free.C, np.zeros((len(free.C), len(fixed.A)))]),
+        B=np.vstack([free.B, fixed.B]),
+        T=np.vstack([free.T, fixed.T]),
+    )
+    goals = state_goals(plant, places, free.T)
+    rate = asked.decay or 1.0 / settling_time(plant)
+    return [functional_part(free, goals, rate=rate, poles=asked.poles, places=places)]
+
+
 def _is_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> bool:
     """Whether rounding of the outputs leaves something of the estimates."""
     try:
@@ -100,7 +124,7 @@ def require_stated(plant: DescriptorSystem, asked: FunctionalFilter) -> None:
     """Raise `PreconditionError` where a Kalman gain would be infinite: a combination of the outputs has no noise."""
     _require_samples(plant, asked)
     noisy, _ = _with_noise(plant, asked)
-    if asked.poles is None:
+    if asked.poles is None and not _is_for_states_alone(asked):
         for model in _models(noisy, exosystem(asked.fault_model, plant.fault_names, plant.dt), asked):
             require_noise(model, noisy.output_names, noisy.Dw)
 
@@ -119,7 +143,7 @@ def _with_noise(plant: DescriptorSystem, asked: FunctionalFilter) -> tuple[Descr
     given = asked.sensor_noise(plant)
     if given is None and plant.nw:
         return plant, ()
-    if given is None and asked.poles is not None:
+    if given is None and (asked.poles is not None or _is_for_states_alone(asked)):
         return plant, ()
     deviations = np.ones(plant.ny) if given is None else given
     process = np.flatnonzero(plant.Bw.any(axis=0))
@@ -134,8 +158,14 @@ def _with_noise(plant: DescriptorSystem, asked: FunctionalFilter) -> tuple[Descr
     return noisy, () if given is not None else (note,)
 
 
+def _is_for_states_alone(asked: FunctionalFilter) -> bool:
+    return asked.states is not None and asked.faults is None
+
+
 def _models(plant: DescriptorSystem, model: Exosystem, asked: FunctionalFilter) -> list[FilterModel]:
     """Return a filter model for each group of faults that one filter serves."""
+    if _is_for_states_alone(asked):
+        return []
     groups = sets = residual_sets(asked.residuals, plant)
     if groups is None:
         chosen = chosen_faults(asked.faults, plant)
@@ -151,7 +181,7 @@ def _parts(
     plant: DescriptorSystem, models: Sequence[FilterModel], asked: FunctionalFilter, longer: int
 ) -> tuple[list[FilterPart], list[FloatArray], list[tuple[float, float]]]:
     """Return the filters, the walks of their fault models' states, and when steps are seen with walks by default."""
-    if asked.poles is not None:
+    if asked.poles is not None and models:
         return _placed(plant, models, asked), [np.zeros(model.drive.shape[1]) for model in models], []
     given = asked.rates(plant)
     parts, rates, seen = [], [], []
@@ -233,7 +263,11 @@ def _resolved(
 ) -> dict[str, Any]:
     """Return the options as plain data, for the gain set."""
     found = asked.as_plain()
-    found["faults"] = None if asked.residuals is not None else [plant.fault_names[i] for i in estimated]
+    found["faults"] = (
+        None
+        if asked.residuals is not None or _is_for_states_alone(asked)
+        else [plant.fault_names[i] for i in estimated]
+    )
     found["fault_model_in_words"] = dict(zip(plant.fault_names, model.descriptions, strict=True))
     chosen = np.concatenate([np.zeros(0), *rates])
     found["fault_rate_found"] = None if asked.fault_rate is not None or not chosen.any() else chosen.tolist()

@@ -54,7 +54,9 @@ def wanted_faults(
         first = delay - (mean - 1) // 2
         back = np.linalg.inv(phi) if delay or mean > 1 else np.eye(len(phi))
         powers = [np.linalg.matrix_power(back, first + j) for j in range(mean)]
-        rows[row] = cw[plant.fault_names.index(name)] @ (sum(powers[1:], start=powers[0]) / mean)
+        rows[observer.fault_rows.start + row] = cw[plant.fault_names.index(name)] @ (
+            sum(powers[1:], start=powers[0]) / mean
+        )
     return rows
 
 

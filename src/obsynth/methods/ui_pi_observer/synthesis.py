@@ -44,6 +44,9 @@ SLOWEST = 1e-300
 #: A filter is as fast as another one where its slowest error needs this many times as long.
 AS_FAST = 1.001
 
+#: Of a filter that is noisier, only one that is so many times as fast is worth it.
+FAR_SLOWER = 3.0
+
 #: A default this many times slower than the plant itself is worth a note.
 SLOW_DEFAULT = 1000.0
 
@@ -155,12 +158,13 @@ def synthesise(
 def _without_likeness(
     found: Existence, model: Exosystem, asked: UiPiObserver, merged: MergedOutputs | None, weights: Mapping[str, Any]
 ) -> MergedOutputs | None:
-    """Return which outputs to merge where some nearly depend on others.  Placed poles do not see the noise, and the
-    default is as fast as the noise of the quietest filter allows: with these merged it is no slower."""
+    """Return which outputs to merge where some nearly depend on others.  Placed poles do not see the noise: the quieter
+    one is taken.  Of two defaults that are as fast as their noise allows, the one with the outputs as they are is taken
+    where it is faster and no noisier, or far faster."""
     near = nearly_merged_outputs(found.plant)
     if near is None:
         return merged
-    costs = []
+    found_costs = []
     for choice in (merged, near):
         try:
             problem = placement_problem(
@@ -168,7 +172,7 @@ def _without_likeness(
             )
             gain = _chosen(asked, problem, None, weights, found.plant.dt)[0]
         except (ObsynthError, np.linalg.LinAlgError):
-            costs.append(np.inf)
+            found_costs.append((np.inf, np.inf))
             continue
         U, D, K = problem.gains(gain)
         means = np.eye(found.plant.ny) if choice is None else choice.weights
@@ -176,12 +180,17 @@ def _without_likeness(
             found.plant, model, (U, D @ means, K @ means), None, {}, structured=not asked.joint
         ).observer
         assert isinstance(observer, LinearObserver)
-        if asked.poles is not None:
-            costs.append(fault_deviation(found.plant, observer))
-        else:
-            poles = np.linalg.eigvals(observer.Az).astype(np.complex128)
-            costs.append(1.0 / max(float(np.min(decay_rates(poles, observer.dt))), SLOWEST))
-    return near if costs[1] <= AS_FAST * costs[0] and np.isfinite(costs[1]) else merged
+        poles = np.linalg.eigvals(observer.Az).astype(np.complex128)
+        settling = 1.0 / max(float(np.min(decay_rates(poles, observer.dt))), SLOWEST)
+        found_costs.append((fault_deviation(found.plant, observer), settling))
+    (noise, settling), (near_noise, near_settling) = found_costs
+    if not np.isfinite(near_settling):
+        return merged
+    if asked.poles is not None:
+        return near if near_noise <= AS_FAST * noise else merged
+    if near_settling <= AS_FAST * settling:
+        return near
+    return near if near_noise * AS_FAST < noise and near_settling < FAR_SLOWER * settling else merged
 
 
 def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str) -> Choice:

@@ -108,7 +108,8 @@ def estimate_gains(design: ObserverDesign, *, to: str = "faults") -> EstimateGai
             continue
         states, seen, terms = _responses(plant, b, d, points, to_estimate)
         if to == "states":
-            truth = _delayed(observer, points) * states
+            own = [plant.state_names.index(name) for name in observer.state_names]
+            truth = _delayed(observer, points) * states[:, own]
             seen, terms = seen - truth, terms + _sizes(truth)
         values = _above_rounding(np.linalg.svd(seen, compute_uv=False), terms[:, None])
         gains[name] = values[:, 0]
