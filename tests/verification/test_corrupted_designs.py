@@ -16,8 +16,10 @@ from corruption_tables import (
     claim,
     entry,
     failed,
+    last_digits,
     nudged,
     scattered,
+    slow_plant,
     with_certificate,
     with_observer,
     with_plant,
@@ -125,6 +127,8 @@ PLANTS = {"paper": paper, "chain": chain, "direct": direct, "quiet": quiet, "dri
 
 @cache
 def good(name: str) -> ObserverDesign:
+    if name == "slow":
+        return fault_estimation_filter(slow_plant(1.0), name=name)
     if name == "metered":
         return fault_estimation_filter(metered(), weight="free", name=name)
     return fault_estimation_filter(PLANTS[name](), weight="paper", name=name)
@@ -573,6 +577,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "a claimed error of another shape": ("paper", certificate_cut("state_error", slice(1, None)), (STORED_X,)),
     "a gain from a state that never decays": (
         "metered", lambda d: without_stored_errors(entry("By", 1, 0, 2e-10)(d)), (COMPOSITE,)),
+    "By in the last digits, of a slow plant": ("slow", last_digits, ("constant fault",)),
     "a matrix that nothing checks": ("paper", lambda d: with_certificate(d, more=np.eye(2)), (COVERED,)),
 }  # fmt: skip
 

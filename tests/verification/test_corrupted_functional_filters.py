@@ -105,6 +105,12 @@ def at(row: int, column: int, factor: float = 1.0, *, add: float = 0.01) -> Call
 
 
 TABLE = {
+    "a limit below what is missed": (
+        "both", lambda d: d.replace(options={**d.options, "steady_error_limit": 1e-18}), ["constant fault"],
+    ),
+    "a limit that is none": (
+        "both", lambda d: d.replace(options={**d.options, "steady_error_limit": "none"}), ["options"],
+    ),
     "states beside no estimate": ("both", lambda d: d.replace(options={**d.options, "faults": ["a"]}), [FITS]),
     "a delay that is not shipped": ("both", lambda d: d.replace(options={**d.options, "delay": 2}), [FITS]),
     "known input": ("both", observer(Bu=at(0, 0)), [U_ERROR]),

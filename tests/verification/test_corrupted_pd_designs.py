@@ -17,7 +17,9 @@ from corruption_tables import (
     claim,
     entry,
     failed,
+    last_digits,
     nudged,
+    slow_plant,
     with_certificate,
     with_observer,
     with_plant,
@@ -95,7 +97,7 @@ GOOD: dict[str, Callable[[], ObserverDesign]] = {
 
 @cache
 def good(name: str) -> ObserverDesign:
-    return GOOD[name]()
+    return pd_observer(slow_plant(0.0), decay=1.0) if name == "slow" else GOOD[name]()
 
 
 # Ways to corrupt a design.
@@ -204,6 +206,7 @@ def faults(count: int) -> Corruption:
 
 
 TABLE: dict[str, tuple[str, Corruption, tuple[str, ...]]] = {
+    "By in the last digits, of a slow plant": ("slow", last_digits, ("constant fault",)),
     # One entry of the observer, by 1e-6.
     "Az": ("paper", entry("Az", 1, 1), (DYNAMICS, GAINS)),
     "Az of a fault": ("direct", entry("Az", 4, 0), (DYNAMICS, GAINS)),

@@ -16,7 +16,9 @@ from corruption_tables import (
     claim_times,
     entry,
     failed,
+    last_digits,
     nudged,
+    slow_plant,
     with_certificate,
     with_plant,
 )
@@ -87,7 +89,7 @@ DESIGNS = {"paper": paper, "direct": direct, "fixed": fixed, "long": long}
 
 @cache
 def good(name: str) -> ObserverDesign:
-    return DESIGNS[name]()
+    return ui_pi_observer(slow_plant(0.0), decay=1.0) if name == "slow" else DESIGNS[name]()
 
 
 # Ways to corrupt a design.
@@ -206,6 +208,7 @@ def like_the_disturbance(fault: int) -> Callable[[ObserverDesign], ObserverDesig
 
 #: What is corrupted -> (good design, corruption, exactly the rows that fail).
 TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[str, ...]]] = {
+    "By in the last digits, of a slow plant": ("slow", last_digits, ("constant fault",)),
     # One entry of the observer.
     "Az": ("paper", entry("Az", 1, 1, 1e-5), (SYLVESTER, POLES, DECOUPLING)),
     "Az of a fixed mode": ("fixed", entry("Az", 2, 2, 1e-5), (SYLVESTER, DECOUPLING)),

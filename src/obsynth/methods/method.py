@@ -22,6 +22,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.recovery import Transformation
 from obsynth.results.checks import Check
 from obsynth.results.design import Certificate, ObserverDesign
+from obsynth.verification.constant_faults import held_faults
 from obsynth.verification.error_system import ErrorModel
 
 if TYPE_CHECKING:
@@ -180,6 +181,13 @@ class Method(ABC):
         Every linear design that `has_error_model` needs one, and `verify` checks it.
         """
         return None
+
+    @classmethod
+    def constant_fault_gain(cls, design: ObserverDesign, model: ErrorModel) -> FloatArray:
+        """Return what the estimates ``(nf, nf)`` of constant faults are in the end; NaN columns say nothing.
+
+        By default the faults themselves, where the fault model that the observer holds has a constant."""
+        return held_faults(model)
 
     def as_given(self) -> dict[str, Any]:
         """Return every option by name."""

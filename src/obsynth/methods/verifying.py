@@ -9,13 +9,14 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.methods.method import Method
 from obsynth.methods.registry import REGISTRY, method_class
-from obsynth.numerics.arguments import arguments_checked, field_types, is_whole, shown
+from obsynth.numerics.arguments import arguments_checked, field_types, is_number, is_whole, shown
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.checks import Check, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.results.verification_report import VerificationReport
 from obsynth.verification.claims import before_the_mean, closed_claims, mean_noise_rows
+from obsynth.verification.constant_faults import STEADY_ERROR, ConstantFaults, constant_fault_row
 from obsynth.verification.error_system import error_model_row
 from obsynth.verification.over_tolerances.rows import tolerance_rows
 from obsynth.verification.plant import condition_rows, derivation_rows, stored_twice_rows
@@ -83,12 +84,30 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
             gamma = design.certificate.claims.get("gamma") if "gamma" in method.claims else None
             if model is not None and rows[-1].passed:
                 rows = (*rows, *stored_number_rows(design, model, gamma), *derivation_rows(design, model))
+                rows = (*rows, *_constant_fault_rows(method, shipped, printed_digits))
         if all(row.passed for row in rows):
             rows = (*rows, *stored_twice_rows(shipped), *tolerance_rows(shipped))
         covered = {name: meaning.row for name, meaning in method.claims.items()}
         meanings = {name: meaning.meaning for name, meaning in method.claims.items()}
         rows = rows if shipped is design else (*rows, *mean_noise_rows(shipped))
         return VerificationReport.of((*rows, *closed_claims(design, rows, covered, meanings, method.witnesses)))
+
+
+def _constant_fault_rows(method: type[Method], shipped: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+    """Yield the row on the estimates of constant faults, of what is shipped: with its mean, if it has one."""
+    model = method.error_model(shipped)
+    if model is None or not model.fits or not model.observer.fault_names:
+        return
+    limit = shipped.options.get("steady_error_limit", STEADY_ERROR)
+    if not (is_number(limit) and 0.0 < float(limit) < 1.0):
+        yield upper_bound_check(
+            "options", "steady_error_limit is a number between 0 and 1", 1.0, 0.0, source="options", detail=shown(limit)
+        )
+        return
+    given = ConstantFaults(model, method.constant_fault_gain(shipped, model))
+    row = constant_fault_row(given, float(limit), printed_digits)
+    if row is not None:
+        yield row
 
 
 def _conditions_again(method: type[Method], design: ObserverDesign, known: tuple[Check, ...]) -> Iterator[Check]:

@@ -24,6 +24,7 @@ from obsynth.numerics.arrays import require_no_overflow
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.design import ObserverDesign
+from obsynth.verification.constant_faults import STEADY_ERROR
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.least_gain_proof import LEAST_GAIN_WITNESSES
 from obsynth.verification.over_region import DECAY_ROW, WITNESSES
@@ -95,6 +96,9 @@ class FaultEstimationFilter(Method):
     mean : int, optional, samples
         Over how many samples each fault estimate is averaged; adds ``(mean - 1) // 2`` to its delay.  The gain gamma is
         proved for the estimate before the mean, which makes no l2 norm larger.
+    steady_error_limit : float, optional
+        Largest share of a constant fault that its estimate may miss in the end, proved on plant and stored numbers: a
+        design beyond it is refused.
     name : str, optional
         Name of the design.
 
@@ -178,6 +182,7 @@ class FaultEstimationFilter(Method):
     tolerance: OpenUnitInterval = 1e-6
     prove_least: bool = False
     mean: Annotated[FewSamples, Ge(1)] = 1
+    steady_error_limit: OpenUnitInterval = STEADY_ERROR
 
     def is_for_states_as_written(self, plant: DescriptorSystem) -> bool:
         """Whether the free matrix of the paper is given."""

@@ -13,10 +13,11 @@ from annotated_types import Ge
 from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
 from obsynth.errors import SpecError
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
-from obsynth.numerics.arguments import FewSamples, NonNegative, WrittenAs, is_finite_number
+from obsynth.numerics.arguments import FewSamples, NonNegative, OpenUnitInterval, WrittenAs, is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
+from obsynth.verification.constant_faults import STEADY_ERROR
 from obsynth.verification.error_system import ErrorModel
 
 
@@ -62,6 +63,9 @@ class FunctionalFilter(Method):
     residuals : {"detect", "isolate"} or sequence, optional
         Only residuals, blind to the unknown inputs: one set that sees every fault, one set for each fault that is
         blind to all others, or one for each list of faults to see.
+    steady_error_limit : float, optional
+        Largest share of a constant fault that its estimate may miss in the end, proved on plant and stored numbers: a
+        design beyond it is refused.
     name : str, optional
         Name of the design.
 
@@ -135,6 +139,7 @@ class FunctionalFilter(Method):
     noise: Annotated[Any, WrittenAs("named numbers")] = None
     residuals: Annotated[Any, WrittenAs("fault sets")] = None
     states: Annotated[Any, WrittenAs("texts")] = None
+    steady_error_limit: OpenUnitInterval = STEADY_ERROR
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""

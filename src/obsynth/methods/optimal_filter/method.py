@@ -6,12 +6,16 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
+
 from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
-from obsynth.numerics.arguments import WrittenAs
+from obsynth.numerics.arguments import OpenUnitInterval, WrittenAs
+from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.signal_names import require_known
 from obsynth.results.design import ObserverDesign
+from obsynth.verification.constant_faults import STEADY_ERROR, held_faults
 from obsynth.verification.error_system import ErrorModel
 
 
@@ -43,6 +47,9 @@ class OptimalFilterMethod(Method):
         Whether faults pass exactly by the fault map; otherwise they drive the error beside the noise.
     decoupled : str or sequence of str, optional
         Disturbances that never reach the error, whatever their time course; none by default.
+    steady_error_limit : float, optional
+        Largest share of a constant fault that its estimate may miss in the end, proved on plant and stored numbers: a
+        design beyond it is refused.
     name : str, optional
         Name of the design.
 
@@ -107,6 +114,7 @@ class OptimalFilterMethod(Method):
     norm: Literal["hinf", "h2"] = "hinf"
     exact: bool = True
     decoupled: Annotated[Any, WrittenAs("texts")] = None
+    steady_error_limit: OpenUnitInterval = STEADY_ERROR
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""
@@ -152,3 +160,16 @@ class OptimalFilterMethod(Method):
             lag=matrices["T0"].shape[1] // plant.nx - 1,
             decoupled=set(design.options["decoupled"]) == set(plant.disturbance_names),
         )
+
+    @classmethod
+    def constant_fault_gain(cls, design: ObserverDesign, model: ErrorModel) -> FloatArray:
+        """Return that of the reference model, else one; of model matching, which leaves an error, nothing is said."""
+        names = model.observer.fault_names
+        if not design.options["exact"] or not set(names) <= set(model.plant.fault_names):
+            return np.full((len(names), len(names)), np.nan)
+        matrices = design.certificate.matrices
+        if "reference_A" not in matrices:
+            return held_faults(model)
+        a, b, c, d = (matrices[f"reference_{name}"] for name in "ABCD")
+        still = np.eye(len(a)) * (model.plant.dt > 0.0)
+        return np.asarray(d + c @ np.linalg.solve(still - a, b))

@@ -60,6 +60,7 @@ def synthesise(plant: DescriptorSystem, asked: OptimalFilterMethod, *, progress:
         "norm": asked.norm,
         "exact": fault_map.exact,
         "decoupled": [*decoupled],
+        "steady_error_limit": asked.steady_error_limit,
     }
     solver = {
         "engine": "filtering Riccati equation",

@@ -12,10 +12,11 @@ from obsynth.analysis.existence.condition import Condition
 from obsynth.conditions.options import OwnConstraints, OwnRegion, SolverName, SolverOptions, own_term_conflicts
 from obsynth.errors import SpecError
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
-from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, real_array, shown
+from obsynth.numerics.arguments import NonNegative, OpenUnitInterval, Positive, WrittenAs, real_array, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
+from obsynth.verification.constant_faults import STEADY_ERROR
 from obsynth.verification.error_system import ErrorModel
 
 #: Up to so many unknown states "auto" takes the inequality (a second or two); up to so many it tries it where the
@@ -78,6 +79,9 @@ class PdObserver(Method):
         A function of the variables that returns what is minimised instead of the size of Y, Z and P3.
     region : LMIRegion, optional
         Where all eigenvalues of the error system must lie (1/s), such as ``conditions.sector(0.7)``.
+    steady_error_limit : float, optional
+        Largest share of a constant fault that its estimate may miss in the end, proved on plant and stored numbers: a
+        design beyond it is refused.
     name : str, optional
         Name of the design.
 
@@ -164,6 +168,7 @@ class PdObserver(Method):
     constraints: OwnConstraints = None
     objective: Annotated[Any, WrittenAs("function")] = None
     region: OwnRegion = None
+    steady_error_limit: OpenUnitInterval = STEADY_ERROR
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options, or for lists of numbers, that is broken."""

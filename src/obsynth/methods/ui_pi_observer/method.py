@@ -12,13 +12,14 @@ from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
 from obsynth.conditions.options import OwnConstraints, SolverName, SolverOptions, own_term_conflicts
 from obsynth.errors import SpecError
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
-from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, problem_with, shown
+from obsynth.numerics.arguments import NonNegative, OpenUnitInterval, Positive, WrittenAs, problem_with, shown
 from obsynth.numerics.spectra import decay_rates
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import STATED_BY_SEARCH
+from obsynth.verification.constant_faults import STEADY_ERROR
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.over_region import DECAY_ROW, GAIN_WITNESSES, REGION_GAIN_ROW, WITNESSES
 
@@ -76,6 +77,9 @@ class UiPiObserver(Method):
     constraints : callable, optional
         A function of the variables of `obsynth.conditions.sharepasand` by name that returns cvxpy constraints.  The
         inequality is then solved as it stands there, as it is with a region of `obsynth.conditions`.
+    steady_error_limit : float, optional
+        Largest share of a constant fault that its estimate may miss in the end, proved on plant and stored numbers: a
+        design beyond it is refused.
     name : str, optional
         Name of the design.
 
@@ -164,6 +168,7 @@ class UiPiObserver(Method):
     solver: SolverName = "CLARABEL"
     solver_options: SolverOptions = None
     constraints: OwnConstraints = None
+    steady_error_limit: OpenUnitInterval = STEADY_ERROR
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""

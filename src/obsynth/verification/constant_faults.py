@@ -1,0 +1,247 @@
+r"""The estimate of a constant fault in the end, enclosed: what plant and stored observer make of it together.
+
+With ``lambda = 1`` (0 in continuous time), x the plant's state under a constant fault f, and z the observer's,
+
+.. math::
+    (\lambda E - A) x = B_f f, \quad (\lambda - A_z) z = B_y (C x + D_f f), \quad
+    \hat f = C_z z + D_y (C x + D_f f),
+
+to be f (whatever the delay), or what the method says.  Rounding of stored numbers has no other bound: an identity holds
+to 1e-16 of its terms, and states may be 1e20 times a fault, or an observer's decay 1e-20.
+
+A plant with a pole at ``lambda``, or too near to it for a state that ever settles, has no such x.  Of it the errors
+alone are looked at, ``(lambda - A_z) e = -k``, with k and j what a constant fault leaves of the identities of z and of
+the estimates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import flint
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.modes import poles_of
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.balls import Ball
+from obsynth.proofs.extended_balls import Enclosed, ExtendedBall
+from obsynth.proofs.linear_equations import enclosed_solution
+from obsynth.proofs.products import as_ball
+from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.verification.error_system import PRINTED_SHARE, ErrorModel, natural_scaling
+
+#: What an estimate may miss of a constant fault in the end, as a share of it, where no option says otherwise.
+STEADY_ERROR = 1e-3
+
+#: Digits, in bits, that are tried after double precision; of more states of plant or observer none are.
+STEADY_BITS, MOST_STATES_IN_BITS = (212, 848, 3392), 300
+
+#: A state that takes more than one over this samples (or times the slowest decay of the observer) to settle is none
+#: that settles: it differs from the one for faults that grow at this rate.
+SLOWEST_SETTLING, ALIKE = 1e-7, 0.5
+
+_NAME = "constant fault"
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantFaults:
+    """What the estimates of constant faults shall be in the end, by the error model of a linear observer.
+
+    Parameters
+    ----------
+    model : ErrorModel
+        Of the shipped observer.
+    gain : FloatArray
+        ``(nf, nf)``, over the estimated faults; a column that is NaN says nothing.
+    """
+
+    model: ErrorModel
+    gain: FloatArray
+
+    @property
+    def own(self) -> list[int]:
+        """Places of the estimated faults among the plant's that are looked at."""
+        names = self.model.observer.fault_names
+        looked_at = np.all(np.isfinite(self.gain), axis=0)
+        return [self.model.plant.fault_names.index(name) for name, real in zip(names, looked_at, strict=True) if real]
+
+
+def held_faults(model: ErrorModel) -> FloatArray:
+    """Return the gains that constant faults shall have: one, and zero to other estimates; NaN where the fault model
+    that the observer holds has no constant."""
+    names, plant = model.observer.fault_names, model.plant
+    gain = np.eye(len(names))
+    if model.Phi is None or model.Cw is None:
+        return gain
+    for column, name in enumerate(names):
+        if _constant(model, plant.fault_names.index(name)) is None:
+            gain[:, column] = np.nan
+    return gain
+
+
+def _constant(model: ErrorModel, fault: int) -> FloatArray | None:
+    """Return the state of the fault model, one of its coordinates, in which a fault alone is one and stays."""
+    assert model.Phi is not None
+    assert model.Cw is not None
+    still = model.Phi - np.eye(len(model.Phi)) * (model.observer.dt > 0.0)
+    for place in np.flatnonzero(~still.any(axis=0)):
+        shown = model.Cw[:, place]
+        if shown[fault] != 0.0 and np.count_nonzero(shown) == 1:
+            return np.asarray(np.eye(len(still))[place] / shown[fault])
+    return None
+
+
+def constant_fault_row(given: ConstantFaults, limit: float, printed_digits: int | None) -> Check | None:
+    """Return the row on constant faults; ``None`` where nothing is claimed of any.
+
+    ``limit``: what an estimate may miss, as a share of the fault."""
+    model = given.model
+    if not given.own:
+        return None
+    if printed_digits is not None:
+        limit = max(limit, PRINTED_SHARE)
+    claim = "the estimate of a constant fault equals it in the end, up to this share"
+    source = "stored numbers and plant together, outward rounded"
+    sizes = _sizes(given)
+    missed = _decided(given, _missed_together, sizes, limit)
+    detail = "of plant and observer together"
+    if missed is None or not missed <= limit:
+        alone = _decided(given, _missed_alone, sizes, limit) if not _settles(model) else None
+        if alone is not None:
+            missed, detail = alone, "of the errors alone: the plant has no steady state with such a fault"
+    if missed is None:
+        if max(model.plant.nx, model.observer.order) > MOST_STATES_IN_BITS:
+            return information(_NAME, claim, np.nan, source=source, status="assumed", detail="not decided")
+        missed = np.nan
+    return upper_bound_check(_NAME, claim, missed, limit, source=source, kind="proved", detail=detail)
+
+
+_Missed = Callable[[ConstantFaults, type[Any]], Any]
+
+
+def _decided(given: ConstantFaults, missed: _Missed, sizes: FloatArray, limit: float) -> float | None:
+    """Return a bound on the largest share that is missed, in as many digits as tell it from the limit."""
+    value = None
+    many = max(given.model.plant.nx, given.model.observer.order) > MOST_STATES_IN_BITS
+    for bits in (0,) if many else (0, *STEADY_BITS):
+        found: Ball | None
+        if bits:
+            with flint.ctx.workprec(bits):
+                exact = missed(given, ExtendedBall)
+                found = None if exact is None else as_ball(exact.content)
+        else:
+            found = missed(given, Ball)
+        if found is None or not np.all(np.isfinite(found.magnitude)):
+            continue
+        value = float(np.max(found.magnitude * sizes, initial=0.0))
+        if value <= limit or np.max((np.abs(found.midpoint) - found.radius) * sizes, initial=0.0) > limit:
+            break
+    return value
+
+
+def _sizes(given: ConstantFaults) -> FloatArray:
+    """Return how large one fault is beside another, ``(nf, columns)``: faults are as large as what they make of the
+    outputs in their natural units."""
+    plant = given.model.plant
+    with np.errstate(all="ignore"):
+        try:
+            state = np.linalg.solve(_pencil(plant, _point(plant)), plant.Bf)
+        except np.linalg.LinAlgError:
+            state = np.zeros((plant.nx, plant.nf))
+        shown = np.abs(plant.C @ state + plant.Df) / natural_scaling(plant).outputs[:, None]
+        reach = np.max(shown, axis=0, initial=0.0)
+    usual = np.isfinite(reach) & (reach > 0.0)
+    reach = np.where(usual, reach, 1.0) if usual.all() else np.ones(plant.nf)
+    rows = [plant.fault_names.index(name) for name in given.model.observer.fault_names]
+    return np.asarray(reach[rows][:, None] / reach[given.own][None, :])
+
+
+def _point(plant: DescriptorSystem) -> float:
+    return 1.0 if plant.dt > 0.0 else 0.0
+
+
+def _pencil(plant: DescriptorSystem, point: float) -> FloatArray:
+    return np.asarray(point * plant.E - plant.A)
+
+
+def _goal(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed:
+    """Return what the estimates shall be, ``(nf, columns)``."""
+    return kind.exact(given.gain[:, np.all(np.isfinite(given.gain), axis=0)])
+
+
+def _missed_together(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed | None:
+    """Return what the estimates of plant and observer together miss ``(nf, columns)``."""
+    plant, own = given.model.plant, given.own
+    e, a, c = (kind.exact(part) for part in (plant.E, plant.A, plant.C))
+    state = enclosed_solution(e - a if plant.dt > 0.0 else -a, kind.exact(plant.Bf[:, own]))
+    if state is None:
+        return None
+    seen = c @ state + kind.exact(plant.Df[:, own])
+    observer = given.model.observer
+    driven = kind.exact(observer.By) @ seen
+    shown = _shown(observer, driven, kind)
+    direct = kind.exact(observer.Dy[observer.fault_rows]) @ seen
+    return None if shown is None else shown + direct - _goal(given, kind)
+
+
+def _missed_alone(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed | None:
+    """Return what the estimates miss where the plant's states meet the identities ``(nf, columns)``."""
+    model, own = given.model, given.own
+    plant, observer, rows = model.plant, model.observer, model.observer.fault_rows
+    bf, df, by, dy = (kind.exact(part) for part in (plant.Bf[:, own], plant.Df[:, own], observer.By, observer.Dy[rows]))
+    if model.Phi is None:
+        driven = by @ df - kind.exact(model.own) @ bf
+        direct = dy @ df - _goal(given, kind)
+        if model.T0 is not None:
+            direct = direct + kind.exact(model.T0[rows, : plant.nx]) @ bf
+    else:
+        states = (_constant(model, fault) for fault in own)
+        still = np.column_stack([state for state in states if state is not None])
+        motion = kind.exact(np.vstack([np.zeros((len(model.E) - len(still), len(own))), still]))
+        tracked = kind.exact(model.T) @ (kind.exact(model.E) @ motion)
+        ahead = kind.exact(model.T) @ (kind.exact(model.A) @ motion)
+        seen = kind.exact(model.C) @ motion
+        driven = kind.exact(observer.Az) @ tracked + by @ seen - ahead
+        direct = kind.exact(observer.Cz[rows]) @ tracked + dy @ seen - _goal(given, kind)
+        if model.T0 is not None:
+            direct = direct + kind.exact(model.T0[rows]) @ (kind.exact(model.A) @ motion)
+    shown = _shown(observer, driven, kind)
+    return None if shown is None else shown + direct
+
+
+def _shown(observer: LinearObserver, driven: Enclosed, kind: type[Enclosed]) -> Enclosed | None:
+    """Return what the fault estimates show in the end of what drives the observer's state all the time."""
+    az = kind.exact(observer.Az)
+    state = enclosed_solution(kind.exact(np.eye(observer.order)) - az if observer.dt > 0.0 else -az, driven)
+    return None if state is None else kind.exact(observer.Cz[observer.fault_rows]) @ state
+
+
+def _settles(model: ErrorModel) -> bool:
+    """Return whether the plant's state under constant faults settles in a time that matters."""
+    plant, observer = model.plant, model.observer
+    slowest = 1.0
+    if plant.dt == 0.0 and observer.order:
+        slowest = float(np.min(np.abs(poles_of(observer).real)))
+    held, growing = (_state_at(plant, _point(plant) + rate) for rate in (0.0, SLOWEST_SETTLING * slowest))
+    if held is None or growing is None:
+        return False
+    with np.errstate(all="ignore"):
+        units = natural_scaling(plant).states[:, None]
+        apart = np.max(np.abs(held - growing) / units, axis=0, initial=0.0)
+        size = np.max(np.maximum(np.abs(held), np.abs(growing)) / units, axis=0, initial=0.0)
+    return bool(np.all(apart <= ALIKE * size))
+
+
+def _state_at(plant: DescriptorSystem, point: float) -> FloatArray | None:
+    """Return the state under faults that grow as ``lambda^k`` (e^(lambda t)), one in the beginning."""
+    with flint.ctx.workprec(STEADY_BITS[1]):
+        kind: type[Any] = ExtendedBall if plant.nx <= MOST_STATES_IN_BITS else Ball
+        pencil = kind.exact(plant.E).scaled(point) - kind.exact(plant.A)
+        found = enclosed_solution(pencil, kind.exact(plant.Bf))
+        if found is None:
+            return None
+        return (found if isinstance(found, Ball) else as_ball(found.content)).midpoint
