@@ -137,3 +137,78 @@ def test_hours_minutes_and_seconds_alone_count_as_seconds_and_the_date_beside_th
         data["time"] = [f"00:{at // 60:02.0f}:{at % 60:05.2f}" for at in data["time"]]
     table = obsynth.run_on_data(designed("ui-pi-observer"), data).table
     pd.testing.assert_frame_equal(table, wanted, atol=1e-12)
+
+
+def autumn(rows: int = 80, minutes: int = 2) -> pd.DataFrame:
+    """Return a log over the end of summer time in Berlin, with local stamps that name no zone."""
+    data = log()[:rows].reset_index(drop=True)
+    moments = pd.date_range("2026-10-24T23:30:00Z", periods=rows, freq=f"{minutes}min").tz_convert("Europe/Berlin")
+    return data.assign(time=[f"{at:%Y-%m-%d %H:%M:%S}" for at in moments])
+
+
+def slow(minutes: int = 2) -> obsynth.ObserverDesign:
+    plant = designed("ui-pi-observer").plant
+    return obsynth.design(plant.replace(dt=60.0 * minutes), "ui-pi-observer")
+
+
+def test_the_hour_that_comes_twice_in_autumn_is_told_apart_in_a_stated_zone(tmp_path: Path) -> None:
+    data, design, file = autumn(), slow(), tmp_path / "log.csv"
+    data.to_csv(file, index=False)
+    utc = data.assign(time=pd.date_range("2026-10-24T23:30:00Z", periods=len(data), freq="2min"))
+    wanted = obsynth.run_on_data(design, utc).table
+    frames = (file, data, data.assign(time=pd.to_datetime(data["time"])))
+    for source in frames:
+        run = obsynth.run_on_data(design, source, time_zone="Europe/Berlin")
+        assert set(run.statuses) == {"warm-up", "ok"}
+        table = run.table
+        assert str(table["time"].iloc[20]) == "2026-10-25 02:10:00+02:00"
+        assert str(table["time"].iloc[50]) == "2026-10-25 02:10:00+01:00"
+        pd.testing.assert_frame_equal(table.drop(columns="time"), wanted.drop(columns="time"))
+    # In the middle of the second hour a run goes on where it was.
+    state, parts = tmp_path / "state.json", []
+    for part in (data[:55], data[55:]):
+        parts.append(obsynth.run_on_data(design, part, state=state, time_zone="Europe/Berlin").table)
+    pd.testing.assert_frame_equal(pd.concat(parts, ignore_index=True), run.table)
+
+
+def test_rows_as_far_apart_as_clocks_go_back_repeat_a_stamp() -> None:
+    data = autumn(rows=30, minutes=60)
+    assert data["time"].duplicated().sum() == 1
+    run = obsynth.run_on_data(slow(60), data, time_zone="Europe/Berlin")
+    assert set(run.statuses) == {"warm-up"}
+    # A stamp that repeats the one before it a minute later is no other hour.
+    data = autumn()
+    data.loc[21, "time"] = data.loc[20, "time"]
+    run = obsynth.run_on_data(slow(), data, time_zone="Europe/Berlin")
+    assert run.statuses["repeated stamp"] == 1
+    assert run.table["time"].iloc[22] == pd.Timestamp("2026-10-25T02:14:00+02:00")
+
+
+def test_what_is_lost_in_autumn_is_told_in_local_time() -> None:
+    with pytest.raises(obsynth.SpecError, match="Row 56: the time falls from 2026-10-25T02:58:00 to 2026-10-25T02:2"):
+        obsynth.run_on_data(slow(), autumn())
+    run = obsynth.run_on_data(slow(10), autumn(rows=40, minutes=10))
+    assert run.statuses["out of order"] + run.statuses["repeated stamp"] == 6
+    (note,) = [text for text in run.warnings if "clocks go back" in text]
+    assert "Row 10: the time falls from 2026-10-25 02:50:00 to 2026-10-25 02:00:00" in note
+    assert "--time-zone" in note
+
+
+def test_what_a_stated_zone_is_not_for_is_refused() -> None:
+    data, design = autumn(), slow()
+    spring = data.assign(time=[f"2026-03-29 02:{k:02}:00" for k in range(0, 60, 2)] * 2 + data["time"].tolist()[:20])
+    with pytest.raises(obsynth.SpecError, match="there is no 2026-03-29 02:00:00 in Europe/Berlin"):
+        obsynth.run_on_data(design, spring, time_zone="Europe/Berlin")
+    assert obsynth.run_on_data(design, spring[:30], time_zone="+01:00").rows == 30
+    with pytest.raises(obsynth.SpecError, match="'Europe/Bärlin' is no time zone"):
+        obsynth.run_on_data(design, data, time_zone="Europe/Bärlin")
+    zoned = data.assign(time=pd.date_range("2026-10-24T23:30:00Z", periods=len(data), freq="2min"))
+    for stamps, text in (
+        (zoned, "name their time zone"),
+        (data.assign(time=120.0 * np.arange(len(data))), "are seconds"),
+    ):
+        with pytest.raises(obsynth.SpecError, match=text):
+            obsynth.run_on_data(design, stamps, time_zone="Europe/Berlin")
+    mixed = data.assign(time=[*data["time"][:50], *(f"{text}+01:00" for text in data["time"][50:])])
+    with pytest.raises(obsynth.SpecError, match="cannot be mixed"):
+        obsynth.run_on_data(design, mixed, time_zone="Europe/Berlin")

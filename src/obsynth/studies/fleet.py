@@ -177,8 +177,8 @@ def run_fleet(
     progress : callable, optional
         Called with the number of runs done and their total.
     **options
-        As for `run_on_data`: ``columns, time_column, scales, thresholds, gap, warm_up, recovered, outliers``; and
-        ``unverified``: whether designs that fail their verification are run all the same.
+        As for `run_on_data`: ``columns, time_column, time_zone, scales, thresholds, gap, warm_up, recovered,
+        outliers``; and ``unverified``: whether designs that fail their verification are run all the same.
 
     Returns
     -------
@@ -207,7 +207,10 @@ def run_fleet(
     ...     print(len(fleet))
     1
     """
-    known = ("columns", "time_column", "scales", "thresholds", "gap", "warm_up", "recovered", "outliers", "unverified")
+    known = (
+        *("columns", "time_column", "time_zone", "scales", "thresholds", "gap", "warm_up", "recovered", "outliers"),
+        "unverified",
+    )
     wrong = sorted(set(options) - set(known))
     if wrong:
         raise SpecError(f"{', '.join(wrong)}: use some of {', '.join(known)}.", path=wrong[0])

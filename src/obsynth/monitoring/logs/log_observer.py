@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
@@ -85,6 +85,18 @@ class Row(NamedTuple):
     missed: tuple[Row, ...] = ()
 
 
+class StampError(SpecError):
+    """A stamp that comes before the one of an earlier row."""
+
+    def __init__(self, message: str, row: int, last: float, time: float) -> None:
+        super().__init__(message, path=f"row {row}")
+        self.row, self.last, self.time = row, last, time
+
+    def dated(self, shown: Callable[[float], str]) -> str:
+        """Return the message with dates as the log writes them."""
+        return f"Row {self.row}: the time falls from {shown(self.last)} to {shown(self.time)}."
+
+
 class Clock:
     """Checks one time stamp after the other; ``dt`` is 0 in continuous time, with gaps longer than ``gap`` seconds."""
 
@@ -127,7 +139,7 @@ class Clock:
         if time == last:
             raise SpecError(f"Row {row} repeats the time {time:.17g} s of the row before.", path=f"row {row}")
         if time < last:
-            raise SpecError(f"Row {row}: the time falls from {last:.17g} to {time:.17g} s.", path=f"row {row}")
+            raise StampError(f"Row {row}: the time falls from {last:.17g} to {time:.17g} s.", row, last, time)
         step = interval(last, time)
         self.is_own = self.irregular and self._is_irregular(step)
         if self.is_own:

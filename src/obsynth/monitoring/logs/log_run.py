@@ -16,7 +16,7 @@ from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.monitoring.alarms.events import NO_DECISION, AlarmEvent, AlarmLog
 from obsynth.monitoring.logs.linear_observer import log_observer
-from obsynth.monitoring.logs.log_observer import DECIDING, GAP, RECOVERING, STALE, Clock, Row
+from obsynth.monitoring.logs.log_observer import DECIDING, GAP, RECOVERING, STALE, Clock, Row, StampError
 from obsynth.monitoring.logs.recovered_states import FIRST_SECONDS, MOST_FIRST_ROWS, RecoveredStates
 from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals
 from obsynth.monitoring.logs.stamps import Stamps
@@ -301,6 +301,8 @@ class LogRun:
             for part, kept in zip(parts, before, strict=True):
                 vars(part).update(kept)
             place = f"row {number}"
+            if self.stamps is not None and self.stamps.is_dated and isinstance(error, StampError):
+                error.args = (error.dated(self.stamps.shown),)
             if isinstance(error, SpecError):
                 if error.path == place:
                     raise
@@ -447,6 +449,8 @@ class LogRun:
             self.unrepeated.memory = np.asarray(data["repeated"], dtype=np.float64)
         self.observer.resume(data["observer"])
         self.clock.resume(data["clock"])
+        if self.stamps is not None:
+            self.stamps.latest = self.clock.stamp
         if self.stamps is not None:
             self.stamps.earlier, self.stamps.numeric = data["inputs"], set(data["numeric"])
         if self.recovered is not None:

@@ -130,6 +130,7 @@ def run_on_data(
     *,
     columns: Mapping[str, str] | None = None,
     time_column: str | None = None,
+    time_zone: str | None = None,
     scales: Mapping[str, float] | None = None,
     thresholds: Mapping[str, float] | None = None,
     monitor: Monitor | None = None,
@@ -167,6 +168,9 @@ def run_on_data(
         Column of a signal (or of ``time``) where their names differ.
     time_column : str, optional
         Column of the time, the same as ``columns={"time": ...}``.
+    time_zone : str, optional
+        Zone of dates that name none, such as ``Europe/Berlin`` or ``+01:00``, in which they are written back: the hour
+        that comes twice in autumn is told apart by the order of the rows.
     scales : mapping, optional, signal's unit per column's unit
         Factor of a signal's column; by default the plant's.
     thresholds : mapping, optional
@@ -252,7 +256,7 @@ def run_on_data(
     _require_files(state=state, out=out, data=data)
     if time_column is not None:
         columns = {**(columns or {}), TIME_HEADER: time_column}
-    stamps = Stamps()
+    stamps = Stamps(time_zone)
     run = LogRun(
         design,
         columns,

@@ -551,7 +551,7 @@ def _times(column: pd.Series, done: int, stamps: Stamps, dates: pd.Series | None
     if found is not None:
         return found
     if pd.api.types.is_numeric_dtype(column):
-        stamps.is_dated = False
+        stamps.take_number()
         return stamps.seconds(_numbers(column, done))
     texts = ["" if pd.isna(cell) else str(cell) for cell in column]
     if dates is not None:

@@ -6,8 +6,9 @@ import math
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from datetime import UTC, datetime, timedelta, tzinfo
+from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from typing import TYPE_CHECKING, Any
+from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -65,6 +66,13 @@ _LARGEST_SECONDS = 1e11
 _PARTS = (1e3, 1e6, 1e9)
 
 _MICROSECOND = timedelta(microseconds=1)
+
+#: An offset from UTC.
+_OFFSET = re.compile(r"([+-])([01]\d|2[0-3]):?([0-5]\d)?")
+
+#: Where clocks go back by an hour in autumn, stamps fall by that less the interval of the rows: by so many seconds at
+#: least where these are not half an hour apart.
+LEAST_FALL, AUTUMN_FALL = 1800.0, 3600.0
 
 #: Seconds in a nanosecond, a microsecond and a day; microseconds in a second.
 _NANO, _MICRO, _DAY_SECONDS, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
@@ -136,10 +144,32 @@ def _zone(text: str) -> tuple[str, str]:
     return body, f"{sign or '+'}{hours or '0':0>2}:{minutes or '00'}"
 
 
+def zone_of(name: str) -> tzinfo:
+    """Return a time zone: a name such as ``Europe/Berlin``, or an offset such as ``+01:00``; raise `SpecError`."""
+    found = _OFFSET.fullmatch(name)
+    if found is not None:
+        sign, hours, minutes = found.groups()
+        offset = timedelta(hours=int(hours), minutes=int(minutes or 0))
+        return timezone(-offset if sign == "-" else offset)
+    try:
+        return ZoneInfo(name)
+    except (LookupError, ValueError, OSError) as error:
+        raise SpecError(
+            f"{name!r} is no time zone that is known here: give a name, such as Europe/Berlin, or an offset from UTC, "
+            "such as +01:00.",
+            path="time_zone",
+        ) from error
+
+
 class Stamps:
     """Which kind of stamps a log has, decided by its first one, and the zone in which they are written back."""
 
-    def __init__(self) -> None:
+    def __init__(self, time_zone: str | None = None) -> None:
+        #: The zone of dates that name none, where it is stated.
+        self.stated = None if time_zone is None else zone_of(time_zone)
+        #: Whether dates name no zone, the latest of them, and the interval before it, in seconds.
+        self.are_local: bool | None = None
+        self.latest, self.step = -math.inf, 0.0
         self.is_dated: bool | None = None
         self.are_missing = False  # of a log without stamps, whose rows are counted by who reads it
         self.zone: tzinfo | None = None  # of the first stamp, `None` where it names none (taken as UTC)
@@ -173,6 +203,15 @@ class Stamps:
                 for column, (count, row, text, status) in self.bad.items()
             ),
         )
+
+    def take_number(self) -> None:
+        """Take the first stamp as seconds."""
+        if self.stated is not None and self.is_dated is None:
+            raise SpecError(
+                "The stamps are seconds, which are in no time zone: leave time_zone (--time-zone) out.",
+                path="time_zone",
+            )
+        self.is_dated = False
 
     def take_bad(self, column: str, row: int, text: str, status: str, *, count: int = 1) -> None:
         """Count cells that are bad by the column of their status, the first of which is in a row and says a text."""
@@ -248,11 +287,11 @@ class Stamps:
             except ValueError:
                 seconds = None
             if seconds is not None:
-                self.is_dated = False
+                self.take_number()
                 return float(self.seconds(np.array([seconds]))[0])
             elapsed = _ELAPSED.fullmatch(cell)
             if elapsed is not None:
-                self.is_dated = False
+                self.take_number()
                 hours, minutes, rest = elapsed.groups()
                 return 3600.0 * int(hours) + 60.0 * int(minutes) + float(rest.replace(",", "."))
         if self.is_dated is not False:
@@ -336,12 +375,12 @@ class Stamps:
             return None
         missing = np.asarray(column.isna())
         if kind == "m":
-            self.is_dated = False
+            self.take_number()
             seconds = np.asarray(column.dt.total_seconds(), dtype=np.float64)
         else:
             zone = column.dt.tz
             if self.is_dated is None:
-                self.is_dated, self.zone = True, zone
+                self._dated(zone)
             moments = (column if zone is None else column.dt.tz_convert("UTC").dt.tz_localize(None)).to_numpy()
             # Apart, so that the fraction keeps its digits, and in seconds, of which no date has too many.
             whole = moments.astype("datetime64[s]")
@@ -349,6 +388,13 @@ class Stamps:
             if np.any(parts):
                 self.digits = "microseconds"
             seconds = whole.astype(np.int64) + parts * _NANO
+            if zone is None and self.stated is not None:
+                dates = [datetime.min if gone else date for date, gone in zip(whole.tolist(), missing, strict=True)]
+                local = [
+                    math.nan if gone else self._local(date, row, str(column.name)).timestamp()
+                    for row, (date, gone) in enumerate(zip(dates, missing, strict=True), 1)
+                ]
+                seconds = np.array(local) + parts * _NANO
         return np.where(missing, np.nan, seconds)
 
     def shown(self, seconds: float) -> str:
@@ -366,14 +412,57 @@ class Stamps:
         found = _EPOCH + timedelta(seconds=math.floor(seconds)) + round((seconds % 1.0) * _MICROSECONDS) * _MICROSECOND
         return found.replace(tzinfo=None) if self.zone is None else found.astimezone(self.zone)
 
+    def _dated(self, zone: tzinfo | None) -> None:
+        """Take the first stamp as a date in a zone, or in none."""
+        if self.stated is not None and zone is not None:
+            raise SpecError("The stamps name their time zone: leave time_zone (--time-zone) out.", path="time_zone")
+        self.is_dated, self.are_local = True, zone is None
+        self.zone = self.stated if zone is None else zone
+
+    def _local(self, found: datetime, row: int, column: str) -> datetime:
+        """Return a date that names no zone in the stated one. Of an hour that comes twice, as clocks go back, it is the
+        second one where the first would not come after the stamps before it."""
+        first, second = (found.replace(tzinfo=self.stated, fold=fold) for fold in (0, 1))
+        seconds = first.timestamp()
+        if (ahead := second.utcoffset()) != (before := first.utcoffset()):
+            if before is not None and ahead is not None and before < ahead:
+                raise SpecError(
+                    f"Row {row}, column {column!r}: there is no {found.isoformat(sep=' ')} in {self.stated}, where "
+                    "clocks go forward then. If the clock of the log does not, name its offset (--time-zone +01:00).",
+                    path=f"row {row}",
+                )
+            # The same stamp again is the next hour only where rows are as far apart.
+            if seconds < self.latest or (seconds == self.latest and self.step >= second.timestamp() - seconds):
+                first, seconds = second, second.timestamp()
+        if seconds > self.latest:
+            self.step = seconds - self.latest if math.isfinite(self.latest) else 0.0
+            self.latest = seconds
+        return first
+
+    def _note_of_autumn(self, found: datetime, seconds: float, row: int) -> None:
+        """Say what dates without a zone may be that fall by an hour, as clocks do in autumn."""
+        fallen = self.latest - seconds
+        if LEAST_FALL <= fallen <= AUTUMN_FALL and not any("clocks go back" in note for note in self.notes):
+            before = self.moment(self.latest).isoformat(sep=" ")
+            self.notes.append(
+                f"Row {row}: the time falls from {before} to {found.isoformat(sep=' ')}, as where clocks go back in "
+                "autumn. The stamps name no time zone: state it (time_zone, --time-zone Europe/Berlin), so that no "
+                "row of this hour is left out."
+            )
+        self.latest = max(self.latest, seconds)
+
     def _seconds(self, found: datetime, row: int, column: str) -> float:
         if self.is_dated is None:
-            self.is_dated, self.zone = True, found.tzinfo
-        if (found.tzinfo is None) != (self.zone is None):
+            self._dated(found.tzinfo)
+        if (found.tzinfo is None) != bool(self.are_local):
             raise SpecError(
                 f"Row {row}, column {column!r}: stamps with a time zone and without one cannot be mixed in one log.",
                 path=f"row {row}",
             )
+        if self.are_local and self.stated is not None:
+            found = self._local(found, row, column)
+        elif self.are_local:
+            self._note_of_autumn(found, (found.replace(tzinfo=UTC) - _EPOCH).total_seconds(), row)
         past = (found if found.tzinfo is not None else found.replace(tzinfo=UTC)) - _EPOCH
         return past.days * _DAY_SECONDS + past.seconds + past.microseconds * _MICRO
 

@@ -7,7 +7,16 @@ from typing import Any
 
 from obsynth.monitoring.thresholds.options import DISTURBANCES, FALSE_ALARMS, LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW
 from obsynth.report.terminal.arguments import OPTION_NAMES, Group, Settings, numbers_of, option, ranges_of
-from obsynth.report.terminal.common_options import _SCALE, INPUT_DELAY, MAP, TIME_COLUMN, count, positive, probability
+from obsynth.report.terminal.common_options import (
+    _SCALE,
+    INPUT_DELAY,
+    MAP,
+    TIME_COLUMN,
+    TIME_ZONE,
+    count,
+    positive,
+    probability,
+)
 
 #: What a monitor is made of.
 _WHAT_A_MONITOR_DOES = "compare the residual (or the parameters) with a threshold; obsynth run --help lists the kinds"
@@ -68,6 +77,7 @@ DATA_OPTIONS = (
     Settings(
         (
             TIME_COLUMN,
+            TIME_ZONE,
             INPUT_DELAY,
             option(
                 "--normal",

@@ -71,6 +71,7 @@ def run_of(
             log,
             out,
             columns=columns_of(options),
+            time_zone=options.time_zone,
             scales=numbers_of(options.scale),
             thresholds=numbers_of(options.threshold),
             monitor=watched,
@@ -242,6 +243,8 @@ def certificate_target(options: argparse.Namespace) -> Path | None:
 
     if options.monitor != "pointwise":
         raise SpecError("--prove is for alarms of --monitor pointwise.", path="--prove")
+    if options.time_zone is not None:
+        raise SpecError("--prove counts rows by stamps with a zone, or in UTC: leave --time-zone out.", path="--prove")
     if options.data == STREAM or options.state is not None:
         raise SpecError(
             "--prove reads the data again from their first row on: give --data a file, and no --state.", path="--prove"

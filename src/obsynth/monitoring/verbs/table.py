@@ -20,6 +20,7 @@ from obsynth.report.terminal.common_options import (
     SCALE,
     SYSTEM,
     TIME_COLUMN,
+    TIME_ZONE,
     UNVERIFIED,
 )
 from obsynth.report.terminal.verbs import Verb
@@ -229,6 +230,7 @@ VERBS = {
             *LOG_OPTIONS,
             Settings(
                 (
+                    TIME_ZONE,
                     INPUT_DELAY,
                     option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),
                     option(

@@ -36,6 +36,7 @@ def run_thresholds(options: argparse.Namespace) -> int:
         false_alarms=options.false_alarms or FALSE_ALARM_RATE,
         rows=options.rows,
         columns=columns_of(options),
+        time_zone=options.time_zone,
         scales=numbers_of(options.scale),
         gap=options.gap,
         warm_up=options.warm_up,

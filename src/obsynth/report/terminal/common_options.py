@@ -61,6 +61,13 @@ TIME_COLUMN = option(
     "column with the time, in seconds or as dates (ISO 8601, or 05.03.2026 08:30) (default: time)",
 )
 
+TIME_ZONE = option(
+    "--time-zone",
+    "ZONE",
+    "zone of dates that name none, such as Europe/Berlin or +01:00; the hour that comes twice in autumn is told apart "
+    "by the order of the rows (default: UTC)",
+)
+
 #: How a log without faults is read.
 LOG_OPTIONS = (
     MAP,

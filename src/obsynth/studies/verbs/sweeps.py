@@ -97,6 +97,7 @@ def run_many(options: argparse.Namespace) -> int:
     asked = {
         "columns": dict(options.map) or None,
         "time_column": options.time_column,
+        "time_zone": options.time_zone,
         "outliers": options.outliers,
         "scales": numbers_of(options.scale) or None,
         "thresholds": numbers_of(options.threshold) or None,
