@@ -190,3 +190,26 @@ def test_an_output_of_constrained_states_alone_shows_nothing_of_computed_coordin
         assert reduced.C[0, 0] != 0.0
         assert reduced.C[1, 0] == 0.0
         assert obsynth.functional_filter(plant, decay=0.5).report.passed
+
+
+@pytest.mark.parametrize("method", ["pd-observer", "ui-pi-observer", "functional-filter"])
+def test_a_refusal_of_a_reduced_plant_names_what_was_left_out_and_states_as_written(method):
+    # x1 + f = 0 and x2 = x1': the second output is the derivative of the fault.
+    plant = obsynth.DescriptorSystem(
+        np.diag([1.0, 0.0, 1.0]),
+        [[0, 1.0, 0], [1.0, 0, 0], [0, 1.0, -1.0]],
+        [[0.0], [0.0], [1.0]],
+        C=[[0, 0, 1.0], [0, 1.0, 0]],
+        Bf=[[0.0], [-1.0], [0.0]],
+        fault_names=["leak"],
+    )
+    with pytest.raises(obsynth.PreconditionError, match="y2 needs the derivative of leak: it is left out") as caught:
+        obsynth.design(plant, method)
+    assert "No observer of this kind exists" not in str(caught.value)
+    assert caught.value.add == (("x1",),)
+    # The remedy was tried: x1 measured, the design exists.
+    measured = plant.replace(
+        C=[[0, 0, 1.0], [0, 1.0, 0], [1.0, 0, 0]], D=np.zeros((3, 1)), Df=np.zeros((3, 1)), Dd=np.zeros((3, 0)),
+        Dw=np.zeros((3, 0)), output_names=["y1", "y2", "x1 measured"],
+    )  # fmt: skip
+    assert obsynth.design(measured, method).report.passed

@@ -190,7 +190,8 @@ def _designed(
             if not isinstance(plant, DescriptorSystem) or not advise:
                 raise
             progress("searching for sensors that would make it possible")
-            raise with_advice(error, plant, asked) from None
+            sensors, done = working.sensors(), notes if working.reduced else ()
+            raise with_advice(error, plant, asked, sensors=sensors, notes=done) from None
         if notes:
             found = replace(found, notes=(*notes, *found.notes))
         progress("verifying the shipped realisation")

@@ -7,8 +7,9 @@ u the unit roundoff, in any units; the observer's own numbers, with z its state,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +23,9 @@ from obsynth.numerics.spectra import pole_text
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
+
+if TYPE_CHECKING:
+    from obsynth.analysis.diagnosis.explanations import Sensor
 
 #: Plants with more states are not searched for pairs, and those with more still not at all.
 MOST_FOR_PAIRS, MOST_FOR_ONE = 16, 48
@@ -70,8 +74,17 @@ def require_all_conditions(conditions: Iterable[Condition]) -> None:
         ) from None
 
 
-def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method) -> PreconditionError:
-    """Return the refusal with what would help at its end; as it is where the existence conditions hold."""
+def with_advice(
+    error: PreconditionError,
+    plant: DescriptorSystem,
+    asked: Method,
+    *,
+    sensors: Sequence[Sensor] | None = None,
+    notes: Sequence[str] = (),
+) -> PreconditionError:
+    """Return the refusal with what would help at its end; as it is where the existence conditions hold.
+
+    ``sensors``: those to try, by default one for each state; ``notes``: what was done to the plant before."""
     from obsynth.analysis.diagnosis.explanations import least_additions, listed_sets, state_sensors
 
     def holds(plant: DescriptorSystem) -> bool:
@@ -83,8 +96,19 @@ def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method
 
     if holds(plant):
         return error
+    if len(notes) > 1 and str(error).startswith(NONE_OF_THIS_KIND):
+        # Outputs were left out: nothing is proved of the plant with them.
+        text = str(error).removeprefix(NONE_OF_THIS_KIND)
+        error = PreconditionError(
+            f"{asked.id} works on a proper form of this plant, which does not allow it: {text}",
+            condition=error.condition,
+            mode=error.mode,
+            signals=error.signals,
+            unclear=error.unclear,
+        )
     error = _named_assumption(error, plant, asked)
-    sets = least_additions(plant, state_sensors(plant), holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
+    candidates = state_sensors(plant) if sensors is None else sensors
+    sets = least_additions(plant, candidates, holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
     if sets:
         text = f"Measure one of: {listed_sets(sets)}."
     elif drops := _drops(plant, holds):
@@ -94,7 +118,7 @@ def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method
     else:
         text = _nothing(plant)
     return PreconditionError(
-        f"{error} {text}",
+        " ".join([str(error), *notes, text]),
         condition=error.condition,
         mode=error.mode,
         signals=error.signals,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import PreconditionError
@@ -16,6 +17,9 @@ from obsynth.plants.transformations.exact_elimination import MOST_STATES_EXACTLY
 from obsynth.plants.transformations.index_reduction import improper_outputs
 from obsynth.plants.transformations.recovery import StateRecovery, Transformation
 
+if TYPE_CHECKING:
+    from obsynth.analysis.diagnosis.explanations import Sensor
+
 
 @dataclass(frozen=True, eq=False)
 class WorkingPlant:
@@ -26,6 +30,16 @@ class WorkingPlant:
     recovery: StateRecovery | None
     notes: tuple[str, ...] = ()
     reduced: str = ""
+    dropped: tuple[str, ...] = ()
+
+    def sensors(self) -> tuple[Sensor, ...] | None:
+        """Return a sensor for each state as written that a reduced plant still has; ``None`` where it was not
+        reduced."""
+        from obsynth.analysis.diagnosis.explanations import recovered_sensors
+
+        if not self.reduced or self.recovery is None or not isinstance(self.plant, DescriptorSystem):
+            return None
+        return recovered_sensors(self.plant, self.recovery, self.dropped)
 
     def conditions(self) -> tuple[Condition, ...]:
         """Return the condition that says how the index was reduced; none where it was not."""
@@ -48,7 +62,7 @@ def working_plant(
             return WorkingPlant(plant, recovery)
         progress("reducing the index")
         notes = (f"The plant has index 2 or more: {found.description}.", *notes)
-        return WorkingPlant(found.plant, _through(recovery, found), notes, " ".join(notes))
+        return WorkingPlant(found.plant, _through(recovery, found), notes, " ".join(notes), found.dropped)
     if not plant.is_sparse:
         return WorkingPlant(plant, recovery)
     progress("eliminating the algebraic states")

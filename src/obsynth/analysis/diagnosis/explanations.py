@@ -15,6 +15,7 @@ from obsynth.analysis.diagnosis.without_unknown_inputs import PencilUnits
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.recovery import StateRecovery
 
 #: Plants with more states are not searched for pairs.
 MOST_STATES_FOR_SENSOR_PAIRS = 24
@@ -52,6 +53,17 @@ def state_sensors(plant: DescriptorSystem, names: Sequence[str] | None = None) -
     zero = (np.zeros(plant.nu), np.zeros(plant.nd), np.zeros(plant.nf))
     eye = np.eye(plant.nx)
     return tuple(Sensor(name, eye[plant.state_names.index(name)], *zero) for name in chosen)
+
+
+def recovered_sensors(plant: DescriptorSystem, way: StateRecovery, dropped: Sequence[str]) -> tuple[Sensor, ...]:
+    """Return a sensor for each state as written that is not an output of the reduced plant already; ``dropped`` ones
+    are not known."""
+    measured = {*plant.output_names, *dropped}
+    return tuple(
+        Sensor(name, way.from_state[row], way.from_input[row], way.from_disturbance[row], way.from_fault[row])
+        for row, name in enumerate(way.names)
+        if name not in measured
+    )
 
 
 def with_sensors(plant: DescriptorSystem, sensors: Sequence[Sensor]) -> DescriptorSystem:
