@@ -14,12 +14,13 @@ Diagnosis Problems*, 2017, sections 5.2 and 7.4 to 7.9 (null-space method).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from obsynth.errors import PreconditionError
@@ -33,6 +34,8 @@ GENERIC_POINT = 1.3717
 LENGTHS_ONE_BY_ONE = 8
 #: An identity of the windows holds to this.
 WINDOW_IDENTITY = 1e-7
+#: What passes from an input of a reference model by less than this share is rounding: it passes later.
+DEAD_SHARE = 1e-9
 #: Modes of a core beyond this modulus count as not asymptotically stable where what nobody sees is taken out.
 EDGE_OF_STABILITY = 0.999
 #: What is seen of such a mode, relative to the outputs.
@@ -90,7 +93,11 @@ class _Window(NamedTuple):
 
 
 def estimation_problem(
-    plant: Channels, *, delay: int | None = None, reference: Model | None = None, exact: bool = True
+    plant: Channels,
+    *,
+    delay: int | Sequence[int] | None = None,
+    reference: Model | None = None,
+    exact: bool = True,
 ) -> EstimationProblem:
     """Return the problem of estimation of a plant.
 
@@ -98,8 +105,8 @@ def estimation_problem(
     ----------
     plant : Channels
         A regular pencil of any index.
-    delay : int, optional
-        Samples L of the exact fault map ``z^-L`` (discrete time).
+    delay : int or sequence of int, optional
+        Samples L of the exact fault map ``z^-L`` (discrete time), of all faults or of each.
     reference : tuple of FloatArray, optional
         A reference model ``(a, b, c, d)`` of what the estimate shall be of the faults.
     exact : bool, optional
@@ -120,8 +127,11 @@ def estimation_problem(
     bh, dh = (np.hstack([bf, bd]), np.hstack([df, dd])) if exact else (bd, dd)
     if not exact:
         bw, dw = np.hstack([bf, bw]), np.hstack([df, dw])
-    lag = (delay or 0) + form.shift
-    window = _decoupling_window(form.A, form.C, (bh, dh), (bw, dw), nf if exact else 0, lag, plant.dt, nf)
+    lags = np.broadcast_to(np.asarray(0 if delay is None else delay, dtype=np.int64), (nf,))
+    if reference is not None and exact and plant.dt > 0.0:
+        lags, reference = _without_dead_samples(reference, longest=len(form.A) + 1)
+    lags = lags + form.shift
+    window = _decoupling_window(form.A, form.C, (bh, dh), (bw, dw), nf if exact else 0, lags, plant.dt, nf)
     core = _core(form.A, (bw, dw), window, len(form.C))
     if reference is not None:
         newest = np.hstack([np.zeros((nf, bw.shape[1] * window.length)), np.eye(nf, bw.shape[1])])
@@ -129,6 +139,23 @@ def estimation_problem(
     core = _without_unseen(core, modelled=plant.dt == 0.0 or reference is not None)
     chained = _with_chain(core, bw.shape[1], window.length)
     return EstimationProblem(*chained, window.length, form.alpha, form.shift)
+
+
+def _without_dead_samples(model: Model, *, longest: int) -> tuple[NDArray[np.int64], Model]:
+    """Return the samples that each input of a model takes to its outputs, and the model without them.
+
+    Faults that are known so many samples late drive the rest: ``C A^(L-1) B`` is then what passes at once.
+    """
+    a, b, c, d = model
+    lags, entering, direct = np.zeros(d.shape[1], dtype=np.int64), b.copy(), d.copy()
+    nothing = DEAD_SHARE * (np.linalg.norm(c) * np.linalg.norm(b, axis=0) + np.linalg.norm(d, axis=0))
+    for i in range(d.shape[1]):
+        while lags[i] < longest and np.linalg.norm(direct[:, i]) <= nothing[i]:
+            direct[:, i], entering[:, i] = c @ entering[:, i], a @ entering[:, i]
+            lags[i] += 1
+        if lags[i] == longest:  # the input does nothing at all
+            lags[i], direct[:, i], entering[:, i] = 0, 0.0, 0.0
+    return lags, (a, entering, c, direct)
 
 
 def _stacked(a: FloatArray, c: FloatArray, b: FloatArray, d: FloatArray, length: int) -> FloatArray:
@@ -150,13 +177,13 @@ def _decoupling_window(
     hidden: tuple[FloatArray, FloatArray],
     noise: tuple[FloatArray, FloatArray],
     estimated: int,
-    lag: int,
+    lags: NDArray[np.int64],
     dt: float,
     nf: int,
 ) -> _Window:
     """Return the shortest window in which faults and unknown inputs can be told; raise where there is none."""
     n, (bh, dh) = len(a), hidden
-    nh = bh.shape[1]
+    nh, lag = bh.shape[1], int(np.max(lags, initial=0))
     if nh and _normal_rank(a, bh, c, dh) < nh:
         raise PreconditionError(
             "The unknown inputs and faults cannot be reconstructed together from the outputs, with whatever delay: the "
@@ -166,7 +193,7 @@ def _decoupling_window(
         )
     shortest, longest = lag if estimated else 0, n + lag + 1
     window = _first_window(
-        lambda length: _tried_window(a, c, hidden, estimated, lag, length, nf),
+        lambda length: _tried_window(a, c, hidden, estimated, lags, length, nf),
         shortest,
         shortest if dt == 0.0 else longest,
     )
@@ -178,12 +205,16 @@ def _decoupling_window(
         )
     if not window.told:
         raise PreconditionError(
-            f"No causal filter has the exact fault map with a delay of {lag} samples: allow a longer delay.",
+            f"No causal filter has the exact fault map with a delay of {_listed(lags)} samples: allow a longer delay.",
             condition="delay",
         )
     return _Window(
         window.observed, window.Th, _stacked(a, c, *noise, window.length), window.G, window.Mf, window.length
     )
+
+
+def _listed(lags: NDArray[np.int64]) -> str:
+    return ", ".join(str(lag) for lag in (lags[:1] if len(set(lags.tolist())) == 1 else lags))
 
 
 class _TriedWindow(NamedTuple):
@@ -228,7 +259,13 @@ def _first_window(tried: Callable[[int], _TriedWindow], shortest: int, longest: 
 
 
 def _tried_window(
-    a: FloatArray, c: FloatArray, hidden: tuple[FloatArray, FloatArray], estimated: int, lag: int, length: int, nf: int
+    a: FloatArray,
+    c: FloatArray,
+    hidden: tuple[FloatArray, FloatArray],
+    estimated: int,
+    lags: NDArray[np.int64],
+    length: int,
+    nf: int,
 ) -> _TriedWindow:
     n, (bh, dh) = len(a), hidden
     nh, rows = bh.shape[1], [c]
@@ -239,7 +276,8 @@ def _tried_window(
     first = np.hstack([bh, np.zeros((n, nh * length))])
     chosen = np.zeros((nf, nh * (length + 1)))
     if estimated:
-        chosen[:, (length - lag) * nh : (length - lag) * nh + nf] = np.eye(nf)
+        faults = np.arange(nf)
+        chosen[faults, (length - lags) * nh + faults] = 1.0
     G, Mf = (first @ inverse, chosen @ inverse) if nh else (np.zeros((n, len(th))), np.zeros((nf, len(th))))
     moved = not nh or bool(np.linalg.norm(G @ th - first) <= WINDOW_IDENTITY * (1.0 + np.linalg.norm(bh)))
     told = not estimated or bool(np.linalg.norm(Mf @ th - chosen) <= WINDOW_IDENTITY)

@@ -25,6 +25,11 @@ from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.ranks import BOUNDARY_RANK_TOLERANCE, WINDOW_RANK_TOLERANCE
 from obsynth.numerics.standard_form import reachable_basis, uncayley
 
+#: Why there is no filter.
+UNSTABLE_ZERO = (
+    "The transfer from the faults to the outputs has a zero that is not strictly stable: no stable filter has this "
+    "fault map."
+)
 #: The bisection of the level ends at this share.
 LEVEL_SHARE = 1e-8
 MOST_LEVELS = 60
@@ -159,14 +164,13 @@ def least_mean_square(problem: EstimationProblem) -> ContinuousFilter:
             "of higher order, or norm hinf.",
             condition="finite mean square",
         )
-    try:
-        covariance = continuous_riccati(a.T, c.T, b @ b.T, d @ d.T, s=b @ d.T)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise PreconditionError(
-            "Some output is measured without noise, or the faults have a zero that is not strictly stable: the filter "
-            f"of least mean square has no Riccati equation ({error}). State the noise of every sensor (sensor_noise).",
-            condition="zeros",
-        ) from None
+    if not rows:
+        # Nothing is left to be weighed: there is one filter.
+        if np.any(np.linalg.eigvals(a).real >= 0.0):
+            raise PreconditionError(UNSTABLE_ZERO, condition="zeros")
+        covariance = np.zeros_like(a)
+    else:
+        covariance = _continuous_covariance(a, b, c, d)
     K = np.asarray(np.linalg.solve(d @ d.T, c @ covariance + d @ b.T).T)
     closed, entering, shown = a - K @ c, b - K @ d, wanted - Z0 @ c
     spread = continuous_lyapunov(closed, -entering @ entering.T) if len(a) else np.zeros((0, 0))
@@ -175,6 +179,17 @@ def least_mean_square(problem: EstimationProblem) -> ContinuousFilter:
     moved, through = np.sqrt(2.0 * problem.alpha) * half, np.vstack([problem.C, problem.L]) @ half
     seen, direct_estimate = problem.V + through[:rows], problem.F + through[rows:]
     return ContinuousFilter(closed, moved + K @ seen, -shown, direct_estimate - Z0 @ seen, deviation)
+
+
+def _continuous_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
+    try:
+        return continuous_riccati(a.T, c.T, b @ b.T, d @ d.T, s=b @ d.T)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise PreconditionError(
+            "Some output is measured without noise, or the faults have a zero that is not strictly stable: the filter "
+            f"of least mean square has no Riccati equation ({error}). State the noise of every sensor (sensor_noise).",
+            condition="zeros",
+        ) from None
 
 
 def _riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> FloatArray:
@@ -216,11 +231,7 @@ def _whitened(problem: EstimationProblem) -> _Whitened:
     )
     if not rows or (blind and stable):
         if not stable:
-            raise PreconditionError(
-                "The transfer from the faults to the outputs has a zero that is not strictly stable: no stable "
-                "filter has this fault map.",
-                condition="zeros",
-            )
+            raise PreconditionError(UNSTABLE_ZERO, condition="zeros")
         bare = replace(problem, C=problem.C[:0], D=problem.D[:0])
         return _Whitened(bare, bare, None, np.zeros((n, 0)), np.eye(n), 0.0)
     reason: object = ""

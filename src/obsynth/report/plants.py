@@ -14,6 +14,7 @@ from rich.text import Text
 from obsynth.analysis.structure import Structure
 from obsynth.files.outputs import yaml_text
 from obsynth.files.tables import aligned
+from obsynth.methods.optimal_filter.least_possible import least_possible_of
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
@@ -94,6 +95,9 @@ def check_report(
         rows = [(label, *(column[label] for column in columns)) for label in columns[0]]
         headings = ["", *structures] if len(columns) > 1 else []
         print_section(console, "Structure (information, no verdict)", facts_table(rows, headings=headings))
+    if isinstance(plant, DescriptorSystem) and (text := least_possible_of(plant)):
+        console.print()
+        console.print(Text(text))
     for method, report in methods.items():
         title = f"Existence conditions of {method}"
         print_section(console, title, checks_table(report.checks, width=console.width))

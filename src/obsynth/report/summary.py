@@ -18,6 +18,7 @@ from obsynth.analysis.structure import questions
 from obsynth.files.tables import html_table
 from obsynth.methods.fault_figures import FaultFigures
 from obsynth.methods.guaranteed_test.method import is_guaranteed
+from obsynth.methods.optimal_filter.least_possible import least_possible
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.modes import SETTLED_TO, transient
 from obsynth.observers.nonlinear.region_observer import RegionObserver
@@ -143,7 +144,7 @@ def summary(design: ObserverDesign, *, file: Path | None = None, everything: boo
     return Summary(
         verdict=verdict,
         passed=design.report.passed,
-        facts=tuple(_facts(design, steps)),
+        facts=(*_facts(design, steps), *(_beside_the_least(design) if everything else ())),
         headings=headings,
         rows=tuple(rows[:shown]),
         more=f"{more} with -v" if more else "",
@@ -169,6 +170,13 @@ def _facts(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterato
     yield "dynamics", _dynamics(design)
     yield from _speed(design, steps)
     yield "assumes", "; ".join(_assumptions(design))
+
+
+def _beside_the_least(design: ObserverDesign) -> Iterator[tuple[str, str]]:
+    """Yield how near a design is to the least that any causal filter with its response to the faults lets through."""
+    found = least_possible(design, later=True) if design.method in REGISTRY else None
+    if found is not None and (text := found.sentence()):
+        yield "least", text
 
 
 def _engine(design: ObserverDesign) -> Iterator[tuple[str, str]]:

@@ -17,6 +17,7 @@ from obsynth.methods.automatic import DECOUPLED, SETTLING_TIMES, Candidate, Make
 from obsynth.methods.designing import agree, design
 from obsynth.methods.fault_figures import held, on_the_clock, step_responses
 from obsynth.methods.functional_filter.rates import settling_time
+from obsynth.methods.optimal_filter.least_possible import least_possible
 from obsynth.methods.registry import method_class
 from obsynth.monitoring.logs.log_run import faults_on_rows
 from obsynth.monitoring.thresholds.residual_model import largest_disturbances
@@ -419,6 +420,7 @@ def _compared(
         rows.append(FaultComparison(figures, rms(error), rms(truth), bias, level, delay, smallest, *beside[row]))
     shown = found[0] if replayed is None else replayed
     fast = all(fault.figures.reaches and fault.figures.most <= limit for fault in rows)
+    least = None if entry.design is None else least_possible(entry.design, later=True)
     own = np.column_stack([responses[:, i, plant.fault_names.index(f.fault)] for i, f in enumerate(entry.figures)])
     return ComparedMethod(
         entry.method,
@@ -430,6 +432,7 @@ def _compared(
         fast,
         read_only(own),
         read_only(shown),
+        least,
     )
 
 

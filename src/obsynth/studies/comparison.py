@@ -14,6 +14,7 @@ from obsynth.errors import SpecError
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.files.tables import html_table, standing_page, text_table
 from obsynth.methods.fault_figures import FaultFigures
+from obsynth.methods.optimal_filter.least_possible import LeastPossible
 from obsynth.numerics.arrays import FloatArray
 from obsynth.report.plots.panels import (
     LINE_COLOURS,
@@ -66,6 +67,8 @@ _HEADER = (
     "bound",
     "bound / optimum",
     "rms",
+    "gain / least",
+    "noise / least",
     "ms",
 )
 #: A gain of at most this is zero but for rounding, and is shown as zero.
@@ -89,6 +92,14 @@ _FIGURE_MEANINGS = {
         "observer uses older samples"
     ),
     "rms": "root mean square error in the runs, or on the log where it has a column of the fault",
+    "gain / least": (
+        "gain from all unknown inputs to all estimates, in times the least of any causal filter that responds to the "
+        "faults as this one does; inf: some such filter has none"
+    ),
+    "noise / least": (
+        "root mean square for the stated noise as white noise, likewise, of filters that decouple the unknown inputs "
+        "where this one does"
+    ),
     "ms": "milliseconds to design and verify",
 }
 
@@ -157,6 +168,9 @@ class ComparedMethod:
         ``(steps, faults)``: estimates of a unit step of each fault.
     estimates : FloatArray
         ``(steps, faults)``: on the first drawn run, or on the log.
+    beside : LeastPossible or None
+        Gain from the unknown inputs, and deviation for the noise, with the least of any causal filter that responds to
+        the faults as this one does, in the design's own time; ``None`` where that is not known.
     """
 
     method: str
@@ -168,6 +182,13 @@ class ComparedMethod:
     fast_enough: bool
     responses: FloatArray
     estimates: FloatArray
+    beside: LeastPossible | None = None
+
+    @property
+    def shares(self) -> tuple[float, float]:
+        """Gain and deviation in times the least possible; NaN where that is not known."""
+        found = self.beside
+        return (np.nan, np.nan) if found is None else (found.gain_share, found.deviation_share)
 
     @property
     def relative_error(self) -> float:
@@ -255,6 +276,7 @@ class Comparison:
                         figures.fault,
                         str(entry.order) if k == 0 else "",
                         *(_number(value) for value in numbers),
+                        *(_number(share) if k == 0 else "" for share in entry.shares),
                         f"{entry.milliseconds:.0f}" if k == 0 else "",
                     )
                 )
@@ -280,6 +302,12 @@ class Comparison:
         return "; ".join(f"{name}: {_FIGURE_MEANINGS[name]}" for name in columns if name in _FIGURE_MEANINGS) + "."
 
     @property
+    def beside_the_least(self) -> tuple[str, ...]:
+        """How near each method is to the least that any causal filter lets through, in one line each."""
+        found = ((entry.method, "" if entry.beside is None else entry.beside.sentence()) for entry in self.methods)
+        return tuple(f"{method}: {text}" for method, text in found if text)
+
+    @property
     def refusals(self) -> tuple[str, ...]:
         """Methods that do not exist, each with the reason in one line."""
         return tuple(f"{entry.method}: {entry.refused}" for entry in self.methods if entry.refused)
@@ -293,6 +321,7 @@ class Comparison:
             "sample_time": self.sample_time,
             "setting": self.setting,
             "notes": list(self.notes),
+            "beside_the_least": list(self.beside_the_least),
             "refusals": list(self.refusals),
             "rows": [dict(zip(header, row, strict=True)) for row in rows],
             "methods": [{"method": name, **entry} for name, entry in self.claims()["methods"].items()],
@@ -407,7 +436,9 @@ class Comparison:
 
     def __repr__(self) -> str:
         table = text_table(self.rows(), left=2)
-        return "\n".join([self.setting, *self.notes, *table, self.meanings(), *self.refusals, self.advice])
+        return "\n".join(
+            [self.setting, *self.notes, *table, self.meanings(), *self.beside_the_least, *self.refusals, self.advice]
+        )
 
     @property
     def advice(self) -> str:
@@ -416,7 +447,8 @@ class Comparison:
 
     def _repr_html_(self) -> str:
         return f"<p>{escape(self.setting)}</p>{html_table(self.rows())}" + "".join(
-            f"<p>{escape(text)}</p>" for text in (*self.notes, self.meanings(), *self.refusals, self.advice)
+            f"<p>{escape(text)}</p>"
+            for text in (*self.notes, self.meanings(), *self.beside_the_least, *self.refusals, self.advice)
         )
 
     def page(self) -> str:

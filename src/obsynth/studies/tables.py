@@ -31,9 +31,20 @@ _DECISIONS = {
 
 
 #: Columns left out where the console is narrower than so many characters.
-NARROW = 130
+NARROW = 160
 
-_LESS = ("order", "s to 50 %", "at horizon", "peak", "bias", "s to alarm", "smallest", "ms")
+_LESS = (
+    "order",
+    "s to 50 %",
+    "at horizon",
+    "peak",
+    "bias",
+    "s to alarm",
+    "smallest",
+    "gain / least",
+    "noise / least",
+    "ms",
+)
 
 #: Columns of names, how wide they are there (eighty columns less six of numbers), and how wide headings of numbers.
 _NAME_COLUMNS = ("method", "fault")
@@ -121,6 +132,8 @@ def comparison_report(found: Comparison, *, console: Console, file: Path | None 
     if rows:
         print_section(console, "", table)
         console.print(Text(found.meanings([header[i] for i in kept]), style="dim"))
+    for text in found.beside_the_least:
+        console.print(Text(text))
     for refusal in found.refusals:
         console.print(Text(refusal, style="yellow"))
     console.print(Text(found.advice, style="bold"))

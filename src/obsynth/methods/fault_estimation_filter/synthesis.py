@@ -43,9 +43,9 @@ from obsynth.methods.fault_estimation_filter.over_region import synthesise_over_
 from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
 from obsynth.methods.fault_estimation_filter.search import NOMINAL_GAIN, FoundGains, found_within
 from obsynth.methods.fault_estimation_filter.small_gains import PrintedInequality
+from obsynth.methods.fault_estimation_filter.weights import least_gains_by_weight
 from obsynth.methods.method import Synthesis
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.central_filter import search_least_gain
 from obsynth.observers.linear.means import averaged
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -58,9 +58,6 @@ _OF_OUTPUTS = ("N", "L", "W", "R")
 
 #: A free weight is taken by default where it lowers the least gain by this share: it may add noise.
 WORTH_A_FREE_WEIGHT = 0.05
-
-#: A least gain below this share of what disturbances can do is printed as zero.
-AS_NOTHING = 1e-9
 
 #: Coordinates in which a certificate is looked for before the gain is judged again.
 FIRST_TRIES = 4
@@ -208,17 +205,12 @@ def weight_by_gain(
         return asked.asks_for_free_weight, ()
     if plant.nw or not plant.nd:
         return plant.nw > 0, ()
-    free, _ = gain_problem(prepared, free_weight=True)
-    fixed, parts = gain_problem(prepared, free_weight=False)
-    fixed, _ = centred(fixed, prepared, parts)
-    if not free.measured:
+    if not gain_problem(prepared, free_weight=True)[0].measured:
         return False, ()
-    lower, upper = (search_least_gain(problem).gain for problem in (free, fixed))
+    upper, lower = least_gains_by_weight(prepared)
     taken = bool(lower <= (1.0 - WORTH_A_FREE_WEIGHT) * upper)
-    nothing = AS_NOTHING * max(free.disturbance_size, upper)
-    figures = [f"{gain:.5g}" if gain > nothing else "0" for gain in (lower, upper)]
     taken_for = "the free W is taken" if taken else "the paper's W is taken"
-    told = f"Least gamma with these T and N: {figures[0]} with a free W, {figures[1]} with the paper's W; {taken_for}."
+    told = f"Least gamma with these T and N: {lower:.5g} with a free W, {upper:.5g} with the paper's W; {taken_for}."
     return taken, (told,)
 
 

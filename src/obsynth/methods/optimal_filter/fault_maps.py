@@ -53,11 +53,12 @@ class Options(Protocol):
 
 
 class FaultMap(NamedTuple):
-    """What the estimate is of the faults: a delay, or a reference model; exact or not."""
+    """What the estimate is of the faults: a delay, of all or ``each`` of them, or a reference model; exact or not."""
 
     delay: int | None
     reference: Model | None
     exact: bool
+    each: tuple[int, ...] | None = None
 
 
 class Units(NamedTuple):
@@ -175,7 +176,7 @@ def problem_of(plant: DescriptorSystem, fault_map: FaultMap) -> EstimationProble
     )
     reference = fault_map.reference
     if reference is None:
-        found = estimation_problem(channels, delay=fault_map.delay, exact=fault_map.exact)
+        found = estimation_problem(channels, delay=fault_map.each or fault_map.delay, exact=fault_map.exact)
         weights = (own.faults / units.error)[:, None]
         return replace(found, L=weights * found.L, D1=weights * found.D1, F=weights * found.F)
     a, b, c, d = reference
