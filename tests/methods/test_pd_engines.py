@@ -15,7 +15,7 @@ from obsynth.methods.pd_observer import synthesis
 from obsynth.methods.pd_observer.certificate_proofs import prove_gains
 from obsynth.methods.pd_observer.closed_form import closed_form
 from obsynth.methods.pd_observer.limits import fastest_mode
-from obsynth.methods.pd_observer.method import MOST_STATES_FOR_LMI, PdObserver
+from obsynth.methods.pd_observer.method import LMI_UP_TO, PdObserver
 from obsynth.methods.pd_observer.realisation import with_faults_as_states
 from obsynth.specs.loader import load_spec
 
@@ -101,14 +101,14 @@ class TestChoice:
     @pytest.mark.long
     def test_where_the_closed_form_does_not_serve_the_inequality_does(self) -> None:
         """Theorem 2 for a delta of many time constants: "auto" goes on, and says so."""
-        plant = large_plant(MOST_STATES_FOR_LMI)
+        plant = large_plant(LMI_UP_TO)
         design = obsynth.pd_observer(plant, theorem=2, delta=20.0, decay=0.0)
         assert design.report.passed
         assert design.solver["engine"] == "lmi"
         assert any("'riccati' failed" in note for note in design.notes)
 
     def test_what_is_asked_besides_takes_the_whole_inequality(self) -> None:
-        assert PdObserver(gain_bound=3.0).engines_for(10 * MOST_STATES_FOR_LMI) == ("lmi",)
+        assert PdObserver(gain_bound=3.0).engines_for(10 * LMI_UP_TO) == ("lmi",)
         assert obsynth.pd_observer(PLANT, fault_rate_gain=0.7).solver["engine"] == "lmi"
         with pytest.raises(obsynth.SpecError, match="stability and a decay rate alone") as caught:
             obsynth.pd_observer(PLANT, engine="riccati", gain_bound=30.0)

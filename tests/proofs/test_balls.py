@@ -197,7 +197,7 @@ class TestExponentialsOfManyStates:
 
     @pytest.mark.parametrize("time", [0.05, 3.0])
     def test_balls_hold_what_more_digits_and_identities_say(self, time, monkeypatch):
-        n, rng = products.MOST_STATES_FOR_BALLS + 1, np.random.default_rng(7)
+        n, rng = products.EXACT_PRODUCTS_UP_TO + 1, np.random.default_rng(7)
         units = 10.0 ** rng.uniform(-3, 3, n)
         a = units[:, None] * (rng.normal(size=(n, n)) / np.sqrt(n) - 1.5 * np.eye(n)) / units
         b = Ball.exact(units[:, None] * rng.normal(size=(n, 2)))
@@ -212,7 +212,7 @@ class TestExponentialsOfManyStates:
         assert np.max(sharp.radius) < np.max(found.radius) <= 1e-7 * np.max(np.abs(found.midpoint))
 
     def test_what_double_precision_does_not_tell_is_left_to_more_digits(self, monkeypatch):
-        a = np.random.default_rng(8).normal(size=(products.MOST_STATES_FOR_BALLS + 1,) * 2) / 8.0
+        a = np.random.default_rng(8).normal(size=(products.EXACT_PRODUCTS_UP_TO + 1,) * 2) / 8.0
         fast = products.exponential(a, 1.0)
         monkeypatch.setattr(products, "LARGEST_RADIUS_SHARE", 1e-15)
         assert np.max(products.exponential(a, 1.0).radius) < 0.01 * np.max(fast.radius)

@@ -85,7 +85,7 @@ def test_bounds_hold_by_any_contraction_where_rounding_decides_which_is_proved(
     time: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a triple pole beside one 2,800 times faster one machine proved the first rate, and another the third alone."""
-    for name, value in (("MOST_ROOM", 0.0), ("MOST_STATES_CLOSELY", 0)):
+    for name, value in (("MOST_ROOM", 0.0), ("OWN_SUMS_UP_TO", 0)):
         monkeypatch.setattr(stored_numbers, name, value)
     design = METHODS[time](PLANTS[time])
     monkeypatch.setattr(contraction, "TRIED_RATES", (0.8,))

@@ -26,7 +26,7 @@ from obsynth.plants.transformations.recovery import Transformation
 _FAR_EIGENVALUE = 3.0
 
 #: Larger plants are not asked: their eigenvalues would take too long for a question.
-_MOST_STATES_FOR_QUESTIONS = 200
+_QUESTIONS_UP_TO = 200
 
 #: Signals that a question lists.
 _MOST_QUESTIONED = 5
@@ -137,7 +137,7 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
 
 def questions(plant: DescriptorSystem) -> tuple[str, ...]:
     """Return what to ask about a linear plant: half an operating point, or matrices of another time than ``dt``."""
-    return (*_half_a_point(plant), *(_other_time(plant) if plant.nx <= _MOST_STATES_FOR_QUESTIONS else ()))
+    return (*_half_a_point(plant), *(_other_time(plant) if plant.nx <= _QUESTIONS_UP_TO else ()))
 
 
 def _half_a_point(plant: DescriptorSystem) -> tuple[str, ...]:
@@ -156,7 +156,7 @@ def _half_a_point(plant: DescriptorSystem) -> tuple[str, ...]:
 def _rest(plant: DescriptorSystem, missing: Sequence[str]) -> str:
     """Return in words where the missing outputs are at rest, if the equations hold for absolute values."""
     names = [name for name in missing if name in plant.output_names]
-    if not names or plant.nx > _MOST_STATES_FOR_QUESTIONS:
+    if not names or plant.nx > _QUESTIONS_UP_TO:
         return ""
     plain, point = plant.dense(), plant.operating_point
     known = np.array([point.get(name, 0.0) for name in plant.input_names])

@@ -13,7 +13,7 @@ from obsynth.methods.registry import Plant
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import structure_of
 from obsynth.plants.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
-from obsynth.plants.transformations.exact_elimination import MOST_STATES_EXACTLY
+from obsynth.plants.transformations.exact_elimination import EXACT_ELIMINATION_UP_TO
 from obsynth.plants.transformations.index_reduction import improper_outputs
 from obsynth.plants.transformations.recovery import StateRecovery, Transformation
 
@@ -77,7 +77,7 @@ def _through(recovery: StateRecovery | None, found: Transformation) -> StateReco
 def _of_low_index(plant: DescriptorSystem, asked: Method | None) -> tuple[Transformation | None, tuple[str, ...]]:
     """Return the minimal proper form of a plant of index 2 or more, and what was left out for it; ``None`` for any
     other plant, or where the method takes it as written."""
-    if plant.nx > MOST_STATES_EXACTLY or (structure_of(plant).index or 0) < 2:
+    if plant.nx > EXACT_ELIMINATION_UP_TO or (structure_of(plant).index or 0) < 2:
         return None, ()
     if asked is not None and asked.is_for_states_as_written(plant):
         return None, ()

@@ -50,7 +50,7 @@ LEVEL_FACTORS = (1.0, 1.5)
 
 #: Above so many states the higher level, which makes gains up to a quarter smaller, would cost up to half of the time;
 #: and one weight in so many is enough.
-MOST_STATES_FOR_LEVELS = 200
+HIGHER_LEVEL_UP_TO = 200
 
 COARSE_WEIGHTS = 4
 
@@ -228,7 +228,7 @@ def noise_weighted_filters(
     sizes = [float(np.linalg.norm(np.vstack(pair))) for pair in ((work.B, work.D), (work.Bn, work.Dn))]
     if work.order == 0 or work.measured == 0 or not min(sizes) > 0.0:
         return
-    coarse = 1 if work.order <= MOST_STATES_FOR_LEVELS else COARSE_WEIGHTS
+    coarse = 1 if work.order <= HIGHER_LEVEL_UP_TO else COARSE_WEIGHTS
     weights, begin, last = (NOISE_WEIGHTS * sizes[0] / sizes[1])[::coarse], USUAL_WEIGHT // coarse, 0
 
     def tried(place: int, factor: float) -> Injection | None:
@@ -327,7 +327,7 @@ def search_least_gain(problem: GainProblem) -> LeastGain:
         if level * normalised.gain < gain:
             best, gain = normalised.restore(found), level * normalised.gain
             # Found once, in one of the two coordinates, among many states.
-            modes = normalised.restored_modes(work.modes(found)) if problem.order > MOST_STATES_FOR_LEVELS else None
+            modes = normalised.restored_modes(work.modes(found)) if problem.order > HIGHER_LEVEL_UP_TO else None
         if gain >= GOOD_COORDINATES * before or gain <= NEGLIGIBLE_GAIN * starting:
             break
     exact = replace(problem, judged_exactly=True)

@@ -50,7 +50,7 @@ MODE_BITS = 10
 MOST_DEPENDENT = 1e6
 
 #: Bits in which motions of a plant without tolerances are followed, and the most states for it.
-BITS_OF_MOTIONS, MOST_STATES_IN_BALLS = 256, 40
+BITS_OF_MOTIONS, PRECISE_MOTIONS_UP_TO = 256, 40
 
 #: Covers the rounding of the largest eigenvalue of a symmetric matrix of two rows, as a share of its entries.
 GROWTH_ROUNDING = 1e-14
@@ -197,7 +197,7 @@ def _motions(
     a: AffineMatrix, b: AffineMatrix, widths: list[float]
 ) -> Iterator[tuple[AffineMatrix, AffineMatrix, AffineMatrix]]:
     """Yield ``e^{A s} b`` at both ends of each piece, with its second and fourth derivatives."""
-    certain = a.is_certain and b.is_certain and len(a.center) <= MOST_STATES_IN_BALLS
+    certain = a.is_certain and b.is_certain and len(a.center) <= PRECISE_MOTIONS_UP_TO
     # Of fast modes that have decayed nothing is left but rounding, which derivatives would magnify: many bits.
     if not certain:
         moves = {width: _transition(a, width) for width in set(widths)}

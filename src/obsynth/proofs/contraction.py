@@ -39,7 +39,7 @@ ROOM_DIGITS = 8
 OPERATIONS = 1e3
 
 #: Up to so many states Lyapunov equations are solved by sums first; doublings of these, and when they have settled.
-MOST_STATES_FOR_SUMS, MOST_SUM_DOUBLINGS, SUMS_SETTLED = 100, 80, 1e-17
+LYAPUNOV_SUMS_UP_TO, MOST_SUM_DOUBLINGS, SUMS_SETTLED = 100, 80, 1e-17
 
 #: From so many states on Lyapunov equations in discrete time are solved by products alone, and their root by Cholesky.
 STATES_FOR_DOUBLED_SUMS = 200
@@ -48,7 +48,7 @@ STATES_FOR_DOUBLED_SUMS = 200
 LARGEST_SUM = 1e9
 
 #: Where both lose it the sum is formed in so many digits, in bits, up to so many states.
-PRECISE_BITS, MOST_STATES_PRECISELY = 1024, 20
+PRECISE_BITS, PRECISE_SUMS_UP_TO = 1024, 20
 
 #: The same where the rate itself is what is asked for.
 TIGHT_RATES = (0.01, 0.1)
@@ -163,7 +163,7 @@ def proved_contractions(
     for share in TRIED_RATES:
         tried = 1.0 - (1.0 - share) * room if discrete else (1.0 - share) * room
         # Sums of squares lose no digits to the slowest mode; with many states they take too long.
-        found = _tried(ball, tried, discrete=discrete, sums_first=len(a) <= MOST_STATES_FOR_SUMS)
+        found = _tried(ball, tried, discrete=discrete, sums_first=len(a) <= LYAPUNOV_SUMS_UP_TO)
         if found is not None:
             yield found
 
@@ -249,7 +249,7 @@ def _precise_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray
     """Return the second sum of `_summed_factor` in many digits, where double precision has lost it to eigenvectors that
     nearly coincide: whether it does is a matter of one processor's rounding."""
     n = len(a)
-    if n > MOST_STATES_PRECISELY or not np.all(np.isfinite(a)) or not rate > 0.0:
+    if n > PRECISE_SUMS_UP_TO or not np.all(np.isfinite(a)) or not rate > 0.0:
         return None
     balanced, scale = balanced_matrix(a)
     with flint.ctx.workprec(PRECISE_BITS):

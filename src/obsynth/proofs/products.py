@@ -29,7 +29,7 @@ EXPONENTIAL_BITS = 160
 
 #: With more states double precision comes first, where its radius is below this share of the largest entry;
 #: with few, where python-flint takes no second, it must be as good as nothing.
-MOST_STATES_FOR_BALLS, LARGEST_RADIUS_SHARE = 60, 1e-7
+EXACT_PRODUCTS_UP_TO, LARGEST_RADIUS_SHARE = 60, 1e-7
 
 FEW_STATES_FOR_BALLS, LARGEST_SHARE_OF_FEW = 8, 1e-12
 
@@ -73,7 +73,7 @@ def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
 
 
 def _is_sharp(ball: Ball) -> bool:
-    share = LARGEST_RADIUS_SHARE if len(ball.midpoint) > MOST_STATES_FOR_BALLS else LARGEST_SHARE_OF_FEW
+    share = LARGEST_RADIUS_SHARE if len(ball.midpoint) > EXACT_PRODUCTS_UP_TO else LARGEST_SHARE_OF_FEW
     return bool(np.max(ball.radius) <= share * np.max(np.abs(ball.midpoint)))
 
 

@@ -49,7 +49,7 @@ _NAMES_OF_SIGNALS = {
 
 
 #: Curves of at most so many faults; plants with more states have none, and no steps are followed there.
-MOST_CURVES, MOST_STATES_OF_CURVES = 3, 80
+MOST_CURVES, CURVES_UP_TO = 3, 80
 
 
 #: What the meaning of a claim says of its proof, which is left out where checks fail.
@@ -137,11 +137,7 @@ def delay_curves(design: ObserverDesign) -> list[DelayCurve]:
     """Return the deviation against the delay on the plant of a design, for each fault that it estimates, where noise is
     stated."""
     plant, observer = design.plant, design.observer
-    if (
-        not isinstance(plant, DescriptorSystem)
-        or not isinstance(observer, LinearObserver)
-        or plant.nx > MOST_STATES_OF_CURVES
-    ):
+    if not isinstance(plant, DescriptorSystem) or not isinstance(observer, LinearObserver) or plant.nx > CURVES_UP_TO:
         return []
     names = [name for name in observer.fault_names if name in plant.fault_names][:MOST_CURVES]
     rates = design.options.get("fault_rate")
@@ -258,11 +254,7 @@ def estimate_figures(design: ObserverDesign, gains: FaultGains | None) -> Iterat
 def _estimating(design: ObserverDesign) -> tuple[DescriptorSystem, LinearObserver] | None:
     """Return plant and observer of a linear design that estimates faults of a plant that is not too large."""
     plant, observer = design.plant, design.observer
-    if (
-        not isinstance(plant, DescriptorSystem)
-        or not isinstance(observer, LinearObserver)
-        or plant.nx > MOST_STATES_OF_CURVES
-    ):
+    if not isinstance(plant, DescriptorSystem) or not isinstance(observer, LinearObserver) or plant.nx > CURVES_UP_TO:
         return None
     return (plant, observer) if observer.fault_names and set(observer.fault_names) <= set(plant.fault_names) else None
 

@@ -11,7 +11,7 @@ from obsynth.methods.automatic import SETTLING_TIMES
 from obsynth.methods.fault_figures import held, on_the_clock, step_responses
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
-from obsynth.methods.guaranteed_test.problem import MOST_STATES, problem_of
+from obsynth.methods.guaranteed_test.problem import MOST_WINDOW_STATES, problem_of
 from obsynth.methods.guaranteed_test.programs import largest_hidden_fault
 from obsynth.monitoring.thresholds.residual_model import largest_disturbances
 from obsynth.numerics.arrays import FloatArray
@@ -59,7 +59,7 @@ def _least(
 ) -> float:
     """Return the least threshold: of a fault of any time course told after a lag, else of a constant one."""
     course = {"course": "constant"} if lag is None else {"course": "any", "lag": lag}
-    samples = max(min(LONGEST_WINDOW, MOST_STATES // max(plant.nx, 1)), (lag or 0) + 2)
+    samples = max(min(LONGEST_WINDOW, MOST_WINDOW_STATES // max(plant.nx, 1)), (lag or 0) + 2)
     try:
         asked = GuaranteedTestMethod.of(
             {

@@ -30,7 +30,7 @@ from obsynth.verification.error_system import BOTH_BALLS, ByNumbers, ErrorModel,
 MOST_ROOM = 1.0
 
 #: Up to so many states each bound is found by a sum of its own where another machine's is to be found again.
-MOST_STATES_CLOSELY = 40
+OWN_SUMS_UP_TO = 40
 
 #: A gain is claimed for disturbances that last up to one over this, rad per sample: slower ones are reported.
 SLOWEST_CLAIMED, CLAIM_POINTS = 1e-7, 120
@@ -107,7 +107,7 @@ class StoredErrors:
     def least(self, observer: LinearObserver) -> StoredErrors:
         """Return the least bounds by all contractions that are found, by the first with a sum of each: any of them is a
         proof."""
-        return self._by_all(observer, np.fmin, closely=observer.order <= MOST_STATES_CLOSELY)
+        return self._by_all(observer, np.fmin, closely=observer.order <= OWN_SUMS_UP_TO)
 
     def _by_all(self, observer: LinearObserver, chosen: np.ufunc, *, closely: bool = False) -> StoredErrors:
         bounds = self.bounds

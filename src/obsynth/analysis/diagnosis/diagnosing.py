@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from obsynth.analysis.diagnosis.exact_fault_columns import DecoupledFaults, decided_exactly
 from obsynth.analysis.diagnosis.explanations import (
-    MOST_STATES_FOR_SENSOR_PAIRS,
-    MOST_STATES_FOR_SENSORS,
+    SENSOR_PAIRS_UP_TO,
+    SENSOR_SEARCH_UP_TO,
     Sensor,
     hidden_motion,
     least_additions,
@@ -252,9 +252,9 @@ class _Candidates:
     @property
     def searched(self) -> str:
         """Which additions are searched, in words; empty where none are: each is asked anew for each fault."""
-        if self.plant.nx > MOST_STATES_FOR_SENSORS or len(self.sensors) * self.plant.nf > MOST_ADDITIONS:
+        if self.plant.nx > SENSOR_SEARCH_UP_TO or len(self.sensors) * self.plant.nf > MOST_ADDITIONS:
             return ""
-        return "state" if self.plant.nx > MOST_STATES_FOR_SENSOR_PAIRS else "state or pair of states"
+        return "state" if self.plant.nx > SENSOR_PAIRS_UP_TO else "state or pair of states"
 
     @cached_property
     def responses(self) -> SensorResponses | None:

@@ -18,10 +18,10 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.recovery import StateRecovery
 
 #: Plants with more states are not searched for pairs.
-MOST_STATES_FOR_SENSOR_PAIRS = 24
+SENSOR_PAIRS_UP_TO = 24
 
 #: Plants with more states are not searched for suggestions at all.
-MOST_STATES_FOR_SENSORS = 120
+SENSOR_SEARCH_UP_TO = 120
 
 #: Sets of sensors that are listed; the others are counted.
 MOST_LISTED_CHOICES = 6
@@ -97,7 +97,7 @@ def least_additions(
     sensors: Sequence[Sensor],
     reached: Callable[[DescriptorSystem], bool],
     *,
-    most: tuple[int, int] = (MOST_STATES_FOR_SENSORS, MOST_STATES_FOR_SENSOR_PAIRS),
+    most: tuple[int, int] = (SENSOR_SEARCH_UP_TO, SENSOR_PAIRS_UP_TO),
     promising: Callable[[NDArray[np.int64]], NDArray[np.bool_]] | None = None,
 ) -> tuple[tuple[str, ...], ...]:
     """Return all single sensors that do it, or else all pairs; none for plants of more states than ``most``.

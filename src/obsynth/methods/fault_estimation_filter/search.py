@@ -13,7 +13,7 @@ from obsynth.conditions.gamma_lower_bound import BOUND_MARGIN, proved_lower_boun
 from obsynth.errors import InfeasibleError, SolverError
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.fault_estimation_filter.small_gains import (
-    MOST_STATES_TO_POLISH,
+    POLISHING_UP_TO,
     PrintedInequality,
     small_gain_design,
 )
@@ -142,7 +142,7 @@ def _polished(problem: GainProblem, least: LeastGain, printed: PrintedInequality
 def _leaves_little(gamma: float | None, least: float, problem: GainProblem) -> bool:
     """Whether a gamma leaves less room above the least gain found than the inequality may still find."""
     near = gamma is not None and BELOW_LEAST * least <= gamma <= ABOVE_LEAST * least
-    return near and problem.disturbances > 0 and problem.order <= MOST_STATES_TO_POLISH
+    return near and problem.disturbances > 0 and problem.order <= POLISHING_UP_TO
 
 
 def _gain_to_ship(asked: FaultEstimationFilter, problem: GainProblem, least: LeastGain, *, noisy: bool) -> float:

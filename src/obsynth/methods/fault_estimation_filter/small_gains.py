@@ -20,7 +20,7 @@ from obsynth.methods.fault_estimation_filter.convex_problem import GainParts
 from obsynth.numerics.arrays import largest_singular_value
 from obsynth.numerics.central_filter import (
     FEW_STATES,
-    MOST_STATES_FOR_LEVELS,
+    HIGHER_LEVEL_UP_TO,
     LeastGain,
     least_noise_filter,
     noise_weighted_filters,
@@ -35,7 +35,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 SLOWEST_DECAY = 0.999
 
 #: Up to so many states the whole inequality competes although nothing needs it.
-MOST_STATES_FOR_WHOLE = 12
+WHOLE_INEQUALITY_UP_TO = 12
 
 #: Noise on the states, relative to that of the plant, for filters that shall decay faster; and how much more variance
 #: than the least of such filters that may cost.
@@ -50,7 +50,7 @@ COARSE_LINE_STEPS = 3
 
 COARSEST_LINE_STEPS = 2
 
-MOST_STATES_TO_POLISH = 20
+POLISHING_UP_TO = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,11 +214,11 @@ def small_gain_design(
         central = [item for item in central if goal.is_fast(item)] or central
         candidates += [_towards(goal, min(central, key=goal.cost), target)] if central else []
     records.append({"what": "small gains", "solver": "central filter", "status": f"{len(central)} filters"})
-    small = problem.order <= MOST_STATES_FOR_WHOLE
+    small = problem.order <= WHOLE_INEQUALITY_UP_TO
     wanted = {
         "auto": small and not candidates,
         "riccati": False,
-        "lmi": problem.order <= MOST_STATES_TO_POLISH or problem.weight_limit is not None or not candidates,
+        "lmi": problem.order <= POLISHING_UP_TO or problem.weight_limit is not None or not candidates,
     }
     if wanted[engine]:
         candidates += gains_by_inequality(goal, printed, records)
@@ -232,7 +232,7 @@ def small_gain_design(
     if quick is not None and goal.cost(quick) <= PRICE_OF_SPEED * goal.cost(found):
         found = quick
     # Among many states what was moved towards the target once is not moved again: each judgement is an equation.
-    moved = problem.order > MOST_STATES_FOR_LEVELS and len(candidates) == 1
+    moved = problem.order > HIGHER_LEVEL_UP_TO and len(candidates) == 1
     return (_towards(goal, found, target) if goal.noisy and quick is None and not moved else found), records
 
 
@@ -261,7 +261,7 @@ def _towards(goal: Goal, injection: Injection, target: Injection | None, *, slow
     few = goal.problem.order <= FEW_STATES
     if not goal.noisy:
         step = 0.5  # without noise the target is no filter of this gain
-    many = COARSE_LINE_STEPS if goal.problem.order <= MOST_STATES_FOR_LEVELS else COARSEST_LINE_STEPS
+    many = COARSE_LINE_STEPS if goal.problem.order <= HIGHER_LEVEL_UP_TO else COARSEST_LINE_STEPS
     for _ in range(LINE_STEPS - (not goal.noisy) if few else many):
         tried = share + step
         mixed = Injection(*((1.0 - tried) * a + tried * b for a, b in zip(injection.parts, target.parts, strict=True)))

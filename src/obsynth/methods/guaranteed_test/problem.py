@@ -48,7 +48,7 @@ COURSES: Mapping[str, str] = {
 CANDIDATE_LENGTHS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 
 #: The ladder ends where a window has more states than this.
-MOST_STATES = 2500
+MOST_WINDOW_STATES = 2500
 
 #: The least number of samples whose threshold is within this share of the last one's is taken.
 WITHIN = 0.05
@@ -104,7 +104,7 @@ class WindowProblem:
 
     def ladder(self) -> tuple[int, ...]:
         """Return the numbers of samples to try; of a large plant fewer."""
-        most = max(MOST_STATES // max(self.plant.nx, 1), self.shortest)
+        most = max(MOST_WINDOW_STATES // max(self.plant.nx, 1), self.shortest)
         most = most if self.horizon is None else min(most, self.horizon)
         asked = [self.question.before + rung for rung in CANDIDATE_LENGTHS]
         return tuple(rung for rung in asked if self.shortest <= rung <= most) or (self.shortest,)

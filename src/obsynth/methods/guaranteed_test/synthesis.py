@@ -15,7 +15,7 @@ from obsynth.methods.guaranteed_test.existence import conditions, detectability
 from obsynth.methods.guaranteed_test.options import TestOptions
 from obsynth.methods.guaranteed_test.problem import (
     COURSES,
-    MOST_STATES,
+    MOST_WINDOW_STATES,
     WITHIN,
     WindowProblem,
     WindowProgrammes,
@@ -386,7 +386,7 @@ def _notes(
     if len(table) > 1:
         listed = ", ".join(f"{int(row[0])}: {row[-1]:.4g}" for row in table)
         words.append(f"Samples and thresholds (by linear programmes; that of {question.samples} is proved): {listed}.")
-        if problem.plant.nx * table[-1, 0] * 2 > MOST_STATES:
+        if problem.plant.nx * table[-1, 0] * 2 > MOST_WINDOW_STATES:
             words.append(
                 f"The table ends at {int(table[-1, 0])} samples, as its programmes grow with samples times states: "
                 f"twice as many take {in_time(problem.plant.nx, 2 * int(table[-1, 0]))}. Give samples for more."

@@ -21,9 +21,9 @@ from obsynth.verification.error_system import ErrorModel
 
 #: Up to so many unknown states "auto" takes the inequality (a second or two); up to so many it tries it where the
 #: closed form does not serve (a minute or two).
-MOST_STATES_FOR_LMI = 20
+LMI_UP_TO = 20
 
-MOST_STATES_FOR_SPARE_LMI = 50
+SPARE_LMI_UP_TO = 50
 
 
 @dataclass(frozen=True)
@@ -203,10 +203,10 @@ class PdObserver(Method):
 
     def engines_for(self, states: int) -> tuple[str, ...]:
         """Return the engine for this many unknown states (of plant and faults), and those to take if it fails."""
-        if self.further or self.engine == "lmi" or (self.engine == "auto" and states <= MOST_STATES_FOR_LMI):
+        if self.further or self.engine == "lmi" or (self.engine == "auto" and states <= LMI_UP_TO):
             return ("lmi",) if self.further else ("lmi", "riccati")
         if self.engine == "auto":
-            return ("riccati", "lmi") if states <= MOST_STATES_FOR_SPARE_LMI else ("riccati",)
+            return ("riccati", "lmi") if states <= SPARE_LMI_UP_TO else ("riccati",)
         return ("riccati",)
 
     @property

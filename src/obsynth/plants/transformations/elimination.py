@@ -18,7 +18,7 @@ from obsynth.numerics.sparse import is_sparse
 from obsynth.plants.descriptor import DescriptorSystem, note_source
 from obsynth.plants.pencil import in_own_units, structure_of
 from obsynth.plants.plant_units import PlantUnits
-from obsynth.plants.transformations.exact_elimination import MOST_STATES_EXACTLY, exact_elimination, rounded_once
+from obsynth.plants.transformations.exact_elimination import EXACT_ELIMINATION_UP_TO, exact_elimination, rounded_once
 from obsynth.plants.transformations.idle_variables import (
     active_part,
     active_variables,
@@ -87,7 +87,7 @@ def eliminate_algebraic_states(plant: DescriptorSystem | Transformation) -> Tran
         same = plant.dense()
         return Transformation(plant, same, "", unchanged_states(plant, same, from_state=np.eye(plant.nx)))
     with one_thread_if_small(plant.nx):
-        if plant.nx > MOST_STATES_EXACTLY and (plant.is_sparse or _has_few_entries(plant)):
+        if plant.nx > EXACT_ELIMINATION_UP_TO and (plant.is_sparse or _has_few_entries(plant)):
             return eliminated_by_sparsity(plant)
         arrays = plant.dense()
         found = eliminated_exactly(arrays) or _eliminated_in_floating_point(arrays)

@@ -35,7 +35,7 @@ from obsynth.proofs.exact_arithmetic import (
 )
 
 #: Plants of more states are eliminated in floating point.
-MOST_STATES_EXACTLY = 64
+EXACT_ELIMINATION_UP_TO = 64
 
 #: Digits (binary) in which coordinates that are not rational are changed.
 COORDINATE_BITS = 600
@@ -75,7 +75,7 @@ class ExactElimination:
 
 def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
     """Return the elimination; ``None`` for too many states, or where no state can be eliminated so."""
-    if plant.nx > MOST_STATES_EXACTLY or plant.exact is not None:
+    if plant.nx > EXACT_ELIMINATION_UP_TO or plant.exact is not None:
         return None
     computed = any(holds_computed(getattr(plant, name)) for name in ("E", "A", "C", *_EXACT_INPUTS, *_EXACT_DIRECT))
     found = _eliminated(plant, clean=computed)

@@ -30,7 +30,7 @@ from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DECISIVE, DescriptorSystem, ExactNumbers
 from obsynth.plants.pencil import in_own_units, structure_of
 from obsynth.plants.plant_units import PlantUnits
-from obsynth.plants.transformations.exact_elimination import MOST_STATES_EXACTLY
+from obsynth.plants.transformations.exact_elimination import EXACT_ELIMINATION_UP_TO
 from obsynth.plants.transformations.recovery import StateRecovery, Transformation, state_point, with_states
 from obsynth.proofs.exact_arithmetic import (
     blocks,
@@ -100,7 +100,7 @@ class _Split:
 
 
 def _split(plant: DescriptorSystem) -> _Split | None:
-    if plant.nx > MOST_STATES_EXACTLY:
+    if plant.nx > EXACT_ELIMINATION_UP_TO:
         return None
     count = plant.nx - sum(structure_of(plant).infinite_block_sizes)
     found = _split_exactly(plant, count) if plant.exact is None else None

@@ -19,7 +19,7 @@ from obsynth.numerics.sparse import dense
 from obsynth.plants.descriptor import DescriptorSystem, note_source
 from obsynth.plants.transformations.delayed_signals import sampled_with_delays
 from obsynth.plants.transformations.elimination import columns_of, eliminate_algebraic_states
-from obsynth.plants.transformations.exact_elimination import MOST_STATES_EXACTLY, sampled_exact_numbers
+from obsynth.plants.transformations.exact_elimination import EXACT_ELIMINATION_UP_TO, sampled_exact_numbers
 from obsynth.plants.transformations.recovery import Transformation, unchanged_states
 from obsynth.plants.uncertainty import SAMPLED
 from obsynth.proofs.extended_balls import arb_matrix
@@ -116,7 +116,7 @@ def _sampled(plant: DescriptorSystem, sample_time: float, *, before: Transformat
     Bw = np.hstack([factor, np.zeros((smooth.nx, len(kept)))])
     Dw = np.hstack([np.zeros((smooth.ny, factor.shape[1])), smooth.Dw[:, direct]])
     changes = {"A": transition, "B": B, "Bf": Bf, "Bd": Bd, "Bw": Bw, "Dw": Dw}
-    exact = sampled_exact_numbers(smooth, sample_time) if smooth.nx <= MOST_STATES_EXACTLY else None
+    exact = sampled_exact_numbers(smooth, sample_time) if smooth.nx <= EXACT_ELIMINATION_UP_TO else None
     sampled = smooth.replace(**changes, dt=float(sample_time), noise_names=noise_names, exact=exact)
     noise_kept = np.hstack([np.zeros((smooth.nw, factor.shape[1])), np.eye(smooth.nw)[:, direct]])
     recovery = unchanged_states(smooth, sampled, from_state=np.eye(smooth.nx), noise_kept=noise_kept)
