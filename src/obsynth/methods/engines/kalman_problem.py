@@ -18,7 +18,7 @@ from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_c
 #: Times the Riccati equation is solved, each time in the coordinates of the last solution, which improve it.
 KALMAN_ROUNDS = 2
 
-#: From so many states on the Riccati equation is solved by doubling first: at 40 states 1 to 2 ms for the 12 to 15 ms of
+#: From so many states on the Riccati equation is solved by doubling first: at 40 states 1 to 2 ms for 12 to 15 ms of
 #: the QZ algorithm.
 DOUBLING_FROM = 40
 

@@ -13,7 +13,8 @@ from obsynth.methods.guaranteed_test.condensed import Condensed
 from obsynth.methods.guaranteed_test.options import TestOptions
 from obsynth.methods.guaranteed_test.problem import WindowProblem, missing_bounds, problem_of, samples_given
 from obsynth.methods.guaranteed_test.proofs import proved_ray, repaired_multipliers
-from obsynth.methods.guaranteed_test.windows import Window, fault_names
+from obsynth.methods.guaranteed_test.window_models import fault_names
+from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem

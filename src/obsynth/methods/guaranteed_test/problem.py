@@ -14,14 +14,8 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.options import TestOptions
 from obsynth.methods.guaranteed_test.tolerant import side_by_side
-from obsynth.methods.guaranteed_test.windows import (
-    Bounds,
-    TestProblem,
-    Window,
-    disturbance_names,
-    fault_names,
-    window_of,
-)
+from obsynth.methods.guaranteed_test.window_models import Bounds, TestProblem, disturbance_names, fault_names
+from obsynth.methods.guaranteed_test.windows import Window, window_of
 from obsynth.numerics.arrays import LARGEST, FloatArray, require_no_overflow
 from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.linear.observer import LinearObserver

@@ -42,7 +42,8 @@ from obsynth.methods.guaranteed_test.tolerant import (
     thresholds_over_record,
     with_tolerances,
 )
-from obsynth.methods.guaranteed_test.windows import TestProblem, Window, disturbance_names
+from obsynth.methods.guaranteed_test.window_models import TestProblem, disturbance_names
+from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.methods.method import Synthesis
 from obsynth.methods.tracking import tracking_of
 from obsynth.numerics.arrays import FloatArray

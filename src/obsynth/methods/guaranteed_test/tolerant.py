@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from obsynth.methods.guaranteed_test.windows import Builder, Window
+from obsynth.methods.guaranteed_test.window_columns import Builder
+from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.window.observer import WindowObserver

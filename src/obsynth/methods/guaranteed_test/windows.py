@@ -9,8 +9,7 @@ size of the fault.  Every entry is kept as a double times a whole number, so tha
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -18,11 +17,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.methods.guaranteed_test.window_columns import (
+    Builder,
+    columns_between_samples,
+    disturbance_columns,
+    fault_columns,
+    moving_disturbances,
+)
+from obsynth.methods.guaranteed_test.window_models import (
+    Bounds,
+    Model,
+    TestProblem,
+    constant_model,
+    disturbance_names,
+    fault_names,
+    varying_model,
+)
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.plants.transformations.moving_disturbances import MovingColumns
 from obsynth.proofs.balls import UNIT_ROUNDOFF
 
 if TYPE_CHECKING:
@@ -37,136 +50,6 @@ SCALING_ROUNDS = 4
 
 #: Room for the sums that bound what rounding does to a running test.
 SUM_ROOM = 1.01
-
-
-@dataclass(frozen=True, eq=False)
-class Bounds:
-    """What keeps its bounds: disturbances, columns of noise, states.
-
-    All of them half widths.  ``disturbance (nd,)``; ``noise_state (nx, n)``, ``noise_output (ny, n)`` and
-    ``noise (n,)``: noise columns and their bounds; ``state`` and ``first`` ``(nx,)``: of the states at every and at the
-    first sample, infinite without any.
-    ``disturbance_middle (nd,)``, ``noise_middle (n,)``: the middles of their bounds, zero where not given.
-    """
-
-    disturbance: FloatArray
-    noise_state: FloatArray
-    noise_output: FloatArray
-    noise: FloatArray
-    state: FloatArray
-    first: FloatArray
-    disturbance_middle: FloatArray | None = None
-    noise_middle: FloatArray | None = None
-    #: What disturbances put into the states of a sampled plant where they move between samples, and their bounds there
-    #: ``(nd,)``; ``every``: whether every course counts, and not only those that rest in each piece of a sample.
-    moving: MovingColumns | None = None
-    moving_bounds: FloatArray | None = None
-    every: bool = False
-    #: How many times what the columns leave counts.
-    times_rest: float = 1.0
-
-    @property
-    def middles(self) -> Iterator[tuple[str, int, float]]:
-        """Kind, number and middle of what does not move about zero."""
-        for kind, given in (("d", self.disturbance_middle), ("w", self.noise_middle)):
-            for i, value in enumerate(() if given is None else given.tolist()):
-                if value:
-                    yield kind, i, value
-
-
-@dataclass(frozen=True, eq=False)
-class TestProblem:
-    """What is asked of a window: the fault, its course, the samples, and what else may happen."""
-
-    fault: int
-    course: str
-    samples: int
-    lag: int = 0
-    before: int = 0
-    free: tuple[int, ...] = ()
-    free_course: str = "any"
-    disturbance: str = "any"
-    disturbance_rate: FloatArray = field(default_factory=lambda: np.zeros(0))
-    fault_rate: float = 0.0
-    ellipsoid: bool = False
-    #: Equations after the last sample, without outputs: sound where the record goes on.
-    closing: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Model:
-    """The matrices of a plant over a window, by its samples, 0 first.
-
-    Of each equation what multiplies the states after and before it, and known inputs; of each sample what multiplies
-    the state in its outputs, and of faults, disturbances and noise (``f``, ``d``, ``w``) the number of the equation
-    that they enter, what they do there and what they do to the outputs.
-    """
-
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem
-    equations: tuple[tuple[FloatArray, FloatArray, FloatArray], ...]
-    seen: tuple[FloatArray, ...]
-    columns: Mapping[str, Sequence[tuple[int, FloatArray, FloatArray]]]
-    #: Whether E leads from each state to the next.
-    regular: bool
-
-    @property
-    def sizes(self) -> tuple[int, int, int, int]:
-        """Numbers of states, equations of a sample, known inputs and outputs."""
-        plant = self.plant
-        return plant.nx, plant.nx if isinstance(plant, DescriptorSystem) else plant.ne, plant.nu, plant.ny
-
-    @property
-    def D(self) -> FloatArray:
-        """What known inputs do to the outputs of their own sample."""
-        plant = self.plant
-        return plant.D if isinstance(plant, DescriptorSystem) else np.zeros((plant.ny, plant.nu))
-
-
-def fault_names(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> tuple[str, ...]:
-    """Return the names of the faults of a plant: of one that changes with k its parameters."""
-    return plant.fault_names if isinstance(plant, DescriptorSystem) else plant.parameter_names
-
-
-def disturbance_names(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> tuple[str, ...]:
-    """Return the names of the disturbances; of a plant that changes with k one in each equation: ``mu1``, ..."""
-    return (
-        plant.disturbance_names if isinstance(plant, DescriptorSystem) else tuple(f"mu{i + 1}" for i in range(plant.ne))
-    )
-
-
-def _constant_model(plant: DescriptorSystem, bounds: Bounds, question: TestProblem) -> Model:
-    """Return the same matrices at each sample."""
-    regular = decide_rank(plant.E).full
-    count = question.samples - 1 if regular else question.samples + question.closing
-    kinds = {
-        "f": (plant.Bf, plant.Df),
-        "d": (plant.Bd, plant.Dd),
-        # Of disturbances that move between samples the values at the samples enter outputs alone.
-        "d at samples": (plant.Bd * (1.0 if bounds.moving is None else ~bounds.moving.moved), plant.Dd),
-        "w": (bounds.noise_state, bounds.noise_output),
-    }
-    span = range(max(count, question.samples))
-    columns = {kind: [(k, *both) for k in span] for kind, both in kinds.items()}
-    return Model(plant, ((plant.E, plant.A, plant.B),) * count, (plant.C,) * question.samples, columns, regular)
-
-
-def _varying_model(plant: TimeVaryingDescriptorSystem, samples: int, start: int) -> Model:
-    """Return the matrices of the samples from k = ``start`` on, 1 or more.
-
-    A fault of k acts on the way to sample k + 1, and shows in its outputs; of a window it is that of this sample.
-    """
-    last, ne, ny = start + samples, plant.ne, plant.ny
-    # An equation whose state is determined by nothing else says something where E loses rows only.
-    more = (plant.horizon is None or last <= plant.horizon) and not has_full_rows(plant.E.at(last))
-    ks = range(start, last - 1 + int(more))
-    columns = {
-        "f": [(k, plant.Phi.at(start + k), plant.Psi.at(start + k)) for k in range(-1, max(len(ks), samples - 1))],
-        "d": [(k, np.eye(ne), np.zeros((ny, ne))) for k in range(max(len(ks), samples))],
-        "w": [(-1, np.zeros((ne, ny)), np.eye(ny))] * max(len(ks), samples),
-    }
-    equations = tuple((plant.E.at(k + 1), plant.A.at(k), plant.B.at(k)) for k in ks)
-    regular = all(has_full_rows(after) for after, _, _ in equations)
-    return Model(plant, equations, tuple(plant.C.at(start + k) for k in range(samples)), columns, regular)
 
 
 def disturbances_in_words(window: Window) -> str:
@@ -185,35 +68,6 @@ def disturbances_in_words(window: Window) -> str:
         "held": "disturbances that are held over the window",
         "rate": "disturbances that are held between samples and change by their stated rates at most",
     }[kind]
-
-
-def has_full_rows(matrix: FloatArray) -> bool:
-    """Whether rows are independent: a state then satisfies them whatever stands on the right."""
-    return matrix.shape[0] <= matrix.shape[1] and decide_rank(matrix).rank == len(matrix)
-
-
-class Builder:
-    """Collects columns and entries."""
-
-    def __init__(self) -> None:
-        self.labels: list[tuple[Any, ...]] = []
-        self.bar: list[float] = []
-        self.group: list[int] = []
-        self.parts: list[tuple[np.ndarray, np.ndarray, FloatArray, np.ndarray]] = []
-
-    def columns(self, labels: list[tuple[Any, ...]], bars: Any, group: int = -1) -> int:
-        """Append columns; return the number of the first."""
-        first = len(self.labels)
-        self.labels += labels
-        self.bar += [float(value) for value in bars]
-        self.group += [group] * len(labels)
-        return first
-
-    def put(self, row: int, matrix: FloatArray, column: int, times: int = 1) -> None:
-        """Enter a block of the matrix."""
-        i, j = np.nonzero(matrix)
-        if i.size and times:
-            self.parts.append((row + i, column + j, matrix[i, j], np.full(i.size, times, dtype=np.int64)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -496,9 +350,9 @@ def window_of(
 ) -> Window:
     """Return the stacked equations of a question; ``start``: k of the first sample, where matrices change with it."""
     if isinstance(plant, DescriptorSystem):
-        model = _constant_model(plant, bounds, question)
+        model = constant_model(plant, bounds, question)
     else:
-        model = _varying_model(plant, question.samples, start)
+        model = varying_model(plant, question.samples, start)
     builder, samples = Builder(), question.samples
     equations = len(model.equations)
     nx, ne, _, ny = model.sizes
@@ -528,9 +382,9 @@ def window_of(
         if moving.size:
             column = builder.columns([("w", k, int(i)) for i in moving], bounds.noise[moving], 2 * k)
             acting("w", moving, k, column)
-    rows = _disturbances(bounds, question, builder, acting, range(max(equations, samples)), rows)
-    _between_samples(bounds, builder, equations, ne)
-    _course(question, builder, acting, span)
+    rows = disturbance_columns(bounds, question, builder, acting, range(max(equations, samples)), rows)
+    moving_disturbances(bounds, builder, equations, ne)
+    fault_columns(question, builder, acting, span)
     for fault in question.free:
         column = -1
         for k in span:
@@ -548,88 +402,6 @@ def window_of(
         np.array(builder.group),
         *whole,
     )
-
-
-def _disturbances(bounds: Bounds, question: TestProblem, builder: Builder, acting: Any, span: range, rows: int) -> int:
-    """Enter the disturbances; return the number of rows."""
-    one = np.ones((1, 1))
-    kind = "d at samples" if bounds.moving is not None and question.disturbance == "any" else "d"
-    for i in np.flatnonzero(bounds.disturbance > 0.0).tolist():
-        which, bar = np.array([i]), bounds.disturbance[i]
-        column = before = -1
-        for k in span:
-            if question.disturbance != "held" or column < 0:
-                label = ("d", None if question.disturbance == "held" else k, i)
-                free = question.disturbance in ("any", "jump")
-                column = builder.columns([label], [bar], 2 * k + 1 if free else -1)
-            acting(kind, which, k, column)
-            if question.disturbance == "rate" and before >= 0:
-                change = builder.columns([("change of d", k, i)], [question.disturbance_rate[i]])
-                for place, times in ((column, 1), (before, -1), (change, -1)):
-                    builder.put(rows, one, place, times)
-                rows += 1
-            before = column
-    return rows
-
-
-def _between_samples(bounds: Bounds, builder: Builder, equations: int, ne: int) -> None:
-    """Enter what disturbances that move between samples put into the equations of each: columns of one time in one
-    ellipsoid, and, where every course counts, one for each direction of what these columns leave."""
-    columns = columns_between_samples(bounds)
-    blocks = 1 + max((block for *_, block in columns if block is not None), default=0)
-    for k in range(equations):
-        for (kind, place), entries, bar, block in columns:
-            # Groups 2 k and 2 k + 1 are those of noise and disturbances at the samples.
-            group = -1 if block is None else 2 * (equations + 2 + k * blocks + block)
-            column = builder.columns([(kind, k, place, block)], [bar], group)
-            builder.put(k * ne, -entries[:, None], column)
-
-
-def columns_between_samples(bounds: Bounds) -> list[tuple[tuple[str, int], FloatArray, float, int | None]]:
-    """Return what disturbances that move between samples put into the states of each: kind and number of the signal,
-    the column ``(nx,)``, its bound, and the number of its block, or none for what the blocks leave."""
-    moving = bounds.moving
-    if moving is None or bounds.moving_bounds is None:
-        return []
-    nd, sizes = len(bounds.moving_bounds), bounds.moving_bounds.tolist()
-    columns = moving.columns if bounds.every else moving.resting
-    found: list[tuple[tuple[str, int], FloatArray, float, int | None]] = [
-        (("moving d", i), columns[:, block * nd + i], sizes[i], block)
-        for block in range(columns.shape[1] // nd)
-        for i in range(nd)
-        if sizes[i] > 0.0 and moving.moved[i]
-    ]
-    rest = bounds.times_rest * moving.rest(bounds.moving_bounds) if bounds.every else np.zeros(0)
-    for i in np.flatnonzero(rest > 0.0).tolist():
-        found.append((("left by d", i), moving.directions[:, i], float(rest[i]), None))
-    return found
-
-
-def _course(question: TestProblem, builder: Builder, acting: Any, span: range) -> None:
-    """Enter the fault that is looked for."""
-    which = np.array([question.fault])
-    target = question.samples - 1 - question.lag
-    if question.course in ("constant", "step"):
-        for k in span:
-            if k >= question.before or question.course == "constant":
-                acting("f", which, k, 0)
-    elif question.course == "ramp":
-        slope = builder.columns([("slope", None, question.fault)], [np.inf])
-        for k in span:
-            acting("f", which, k, 0)
-            acting("f", which, k, slope, k - target)
-    elif question.course == "any":
-        for k in span:
-            column = 0 if k == target else builder.columns([("f", k, question.fault)], [np.inf])
-            acting("f", which, k, column)
-    else:
-        for k in span:
-            acting("f", which, k, 0)
-        for k in span[1:]:
-            change = builder.columns([("change of f", k, question.fault)], [question.fault_rate])
-            later = range(k, len(span)) if k > target else range(k)
-            for there in later:
-                acting("f", which, there, change, 1 if k > target else -1)
 
 
 def _middle(exponents: np.ndarray, at: np.ndarray, count: int) -> np.ndarray:

@@ -26,7 +26,7 @@ DELTA_SHARE = 0.5
 #: Times that states are changed to those in which a Riccati solution is near one.
 MOST_NORMALISATIONS = 4
 
-#: With more states the Riccati equation is solved by doubling first: at 60 states 5 ms for the 12 ms of Schur vectors.
+#: With more states the Riccati equation is solved by doubling first: at 60 states 5 ms for 12 ms of Schur vectors.
 SCHUR_METHOD_UP_TO = 60
 
 #: With more still the QZ algorithm is not tried, which is the last way: .7 s at 200 states, growing with their cube.

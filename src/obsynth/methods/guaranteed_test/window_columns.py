@@ -1,0 +1,118 @@
+"""The columns of a window: how they are collected, and those of disturbances and of the fault."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from obsynth.methods.guaranteed_test.window_models import Bounds, TestProblem
+from obsynth.numerics.arrays import FloatArray
+
+
+class Builder:
+    """Collects columns and entries."""
+
+    def __init__(self) -> None:
+        self.labels: list[tuple[Any, ...]] = []
+        self.bar: list[float] = []
+        self.group: list[int] = []
+        self.parts: list[tuple[np.ndarray, np.ndarray, FloatArray, np.ndarray]] = []
+
+    def columns(self, labels: list[tuple[Any, ...]], bars: Any, group: int = -1) -> int:
+        """Append columns; return the number of the first."""
+        first = len(self.labels)
+        self.labels += labels
+        self.bar += [float(value) for value in bars]
+        self.group += [group] * len(labels)
+        return first
+
+    def put(self, row: int, matrix: FloatArray, column: int, times: int = 1) -> None:
+        """Enter a block of the matrix."""
+        i, j = np.nonzero(matrix)
+        if i.size and times:
+            self.parts.append((row + i, column + j, matrix[i, j], np.full(i.size, times, dtype=np.int64)))
+
+
+def disturbance_columns(
+    bounds: Bounds, question: TestProblem, builder: Builder, acting: Any, span: range, rows: int
+) -> int:
+    """Enter the disturbances; return the number of rows."""
+    one = np.ones((1, 1))
+    kind = "d at samples" if bounds.moving is not None and question.disturbance == "any" else "d"
+    for i in np.flatnonzero(bounds.disturbance > 0.0).tolist():
+        which, bar = np.array([i]), bounds.disturbance[i]
+        column = before = -1
+        for k in span:
+            if question.disturbance != "held" or column < 0:
+                label = ("d", None if question.disturbance == "held" else k, i)
+                free = question.disturbance in ("any", "jump")
+                column = builder.columns([label], [bar], 2 * k + 1 if free else -1)
+            acting(kind, which, k, column)
+            if question.disturbance == "rate" and before >= 0:
+                change = builder.columns([("change of d", k, i)], [question.disturbance_rate[i]])
+                for place, times in ((column, 1), (before, -1), (change, -1)):
+                    builder.put(rows, one, place, times)
+                rows += 1
+            before = column
+    return rows
+
+
+def moving_disturbances(bounds: Bounds, builder: Builder, equations: int, ne: int) -> None:
+    """Enter what disturbances that move between samples put into the equations of each: columns of one time in one
+    ellipsoid, and, where every course counts, one for each direction of what these columns leave."""
+    columns = columns_between_samples(bounds)
+    blocks = 1 + max((block for *_, block in columns if block is not None), default=0)
+    for k in range(equations):
+        for (kind, place), entries, bar, block in columns:
+            # Groups 2 k and 2 k + 1 are those of noise and disturbances at the samples.
+            group = -1 if block is None else 2 * (equations + 2 + k * blocks + block)
+            column = builder.columns([(kind, k, place, block)], [bar], group)
+            builder.put(k * ne, -entries[:, None], column)
+
+
+def columns_between_samples(bounds: Bounds) -> list[tuple[tuple[str, int], FloatArray, float, int | None]]:
+    """Return what disturbances that move between samples put into the states of each: kind and number of the signal,
+    the column ``(nx,)``, its bound, and the number of its block, or none for what the blocks leave."""
+    moving = bounds.moving
+    if moving is None or bounds.moving_bounds is None:
+        return []
+    nd, sizes = len(bounds.moving_bounds), bounds.moving_bounds.tolist()
+    columns = moving.columns if bounds.every else moving.resting
+    found: list[tuple[tuple[str, int], FloatArray, float, int | None]] = [
+        (("moving d", i), columns[:, block * nd + i], sizes[i], block)
+        for block in range(columns.shape[1] // nd)
+        for i in range(nd)
+        if sizes[i] > 0.0 and moving.moved[i]
+    ]
+    rest = bounds.times_rest * moving.rest(bounds.moving_bounds) if bounds.every else np.zeros(0)
+    for i in np.flatnonzero(rest > 0.0).tolist():
+        found.append((("left by d", i), moving.directions[:, i], float(rest[i]), None))
+    return found
+
+
+def fault_columns(question: TestProblem, builder: Builder, acting: Any, span: range) -> None:
+    """Enter the fault that is looked for."""
+    which = np.array([question.fault])
+    target = question.samples - 1 - question.lag
+    if question.course in ("constant", "step"):
+        for k in span:
+            if k >= question.before or question.course == "constant":
+                acting("f", which, k, 0)
+    elif question.course == "ramp":
+        slope = builder.columns([("slope", None, question.fault)], [np.inf])
+        for k in span:
+            acting("f", which, k, 0)
+            acting("f", which, k, slope, k - target)
+    elif question.course == "any":
+        for k in span:
+            column = 0 if k == target else builder.columns([("f", k, question.fault)], [np.inf])
+            acting("f", which, k, column)
+    else:
+        for k in span:
+            acting("f", which, k, 0)
+        for k in span[1:]:
+            change = builder.columns([("change of f", k, question.fault)], [question.fault_rate])
+            later = range(k, len(span)) if k > target else range(k)
+            for there in later:
+                acting("f", which, there, change, 1 if k > target else -1)
