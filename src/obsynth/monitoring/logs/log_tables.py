@@ -11,17 +11,9 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
+from obsynth.monitoring.logs.binary_logs import NEEDED_PACKAGES, READERS, read_by_package
 from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals, column_of
-from obsynth.monitoring.logs.sources import (
-    CHUNK_ROWS,
-    NEEDED_PACKAGES,
-    READERS,
-    TEXT_SUFFIXES,
-    check_suffix,
-    chunks,
-    read_by_package,
-    require_readable_log,
-)
+from obsynth.monitoring.logs.sources import CHUNK_ROWS, TEXT_SUFFIXES, check_suffix, chunks, require_readable_log
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.text_logs import WINDOWS_TEXT, encoding_of, no_text, opened_text
 from obsynth.numerics.arguments import require_kind
