@@ -12,7 +12,8 @@ from obsynth.errors import SpecError
 from obsynth.plants.calibrated_box import does_not_stand
 from obsynth.plants.constants import constant_of
 from obsynth.plants.dae import DAEModel
-from obsynth.plants.descriptor import ALL_MATRICES, SIGNAL_NAMES, DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.given_matrices import ALL_MATRICES, SIGNAL_NAMES
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.signal_names import index_of
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem

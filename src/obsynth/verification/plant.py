@@ -13,7 +13,9 @@ from obsynth.errors import ObsynthError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import hinf_norm
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.plants.descriptor import DECISIVE, SIGNAL_NAMES, DescriptorSystem, ExactNumbers
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
+from obsynth.plants.given_matrices import SIGNAL_NAMES
 from obsynth.plants.pencil import structure_of
 from obsynth.plants.signal_names import listed
 from obsynth.proofs.balls import Ball

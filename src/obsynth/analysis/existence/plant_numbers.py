@@ -11,7 +11,8 @@ import flint
 from flint import arb_mat, fmpq_mat, fmpz_poly
 
 from obsynth.numerics.ranks import RankDecision
-from obsynth.plants.descriptor import DECISIVE, DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exact_numbers import DECISIVE
 from obsynth.proofs.enclosed_pencils import EnclosedPencil, bits_for, exponential, rank_to_digits
 from obsynth.proofs.exact_arithmetic import (
     blocks,

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.descriptor import DECISIVE, DescriptorSystem, ExactNumbers
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
 from obsynth.plants.faults import Exosystem
 from obsynth.proofs.exact_arithmetic import written_fraction
 

@@ -14,7 +14,8 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked, is_finite_number, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import imported
-from obsynth.plants.descriptor import ALL_MATRICES, SIGNAL_NAMES, DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.given_matrices import ALL_MATRICES, SIGNAL_NAMES
 from obsynth.plants.importing.roles import plant_of
 from obsynth.plants.importing.transfer_functions import realised
 from obsynth.plants.signal_names import suggestion

@@ -17,7 +17,8 @@ from flint import fmpq, fmpq_mat
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import zero_order_hold
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
-from obsynth.plants.descriptor import DECISIVE, DescriptorSystem, ExactNumbers
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
 from obsynth.proofs.exact_arithmetic import (
     blocks,
     fractions_of,

@@ -27,7 +27,8 @@ from flint import fmpq, fmpq_mat
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
-from obsynth.plants.descriptor import DECISIVE, DescriptorSystem, ExactNumbers
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
 from obsynth.plants.pencil import in_own_units, structure_of
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.transformations.exact_elimination import EXACT_ELIMINATION_UP_TO

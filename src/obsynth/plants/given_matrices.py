@@ -1,0 +1,265 @@
+"""From what a caller gives for a linear plant to its fields: labelled frames, names for rows, noise of sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.quantities import in_unit
+from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse
+from obsynth.plants.checking import (
+    COUNTED_BY,
+    Problems,
+    any_matrix,
+    checked_dt,
+    checked_labels,
+    matrix_or_picks,
+    picked_names,
+    signal_counts,
+)
+from obsynth.plants.dead_times import checked_delays
+from obsynth.plants.signal_names import checked_names, is_name_list, plain_names, require_picked, rows_picking
+
+#: Matrix, signal of its rows, signal of its columns.
+MATRIX_LAYOUT = (
+    ("E", "x", "x"),
+    ("A", "x", "x"),
+    ("C", "y", "x"),
+    ("B", "x", "u"),
+    ("D", "y", "u"),
+    ("Bf", "x", "f"),
+    ("Df", "y", "f"),
+    ("Bd", "x", "d"),
+    ("Dd", "y", "d"),
+    ("Bw", "x", "w"),
+    ("Dw", "y", "w"),
+)
+
+
+#: Names of the signals of each kind.
+_FIELDS = {
+    "x": "state_names",
+    "u": "input_names",
+    "y": "output_names",
+    "f": "fault_names",
+    "d": "disturbance_names",
+    "w": "noise_names",
+}
+
+
+# Where a matrix picked by names names the signal as well.
+_NAMED_BY = {"output_names": "C", "fault_names": "Bf", "disturbance_names": "Bd"}
+
+
+#: Matrices of outputs that may be given by the names of sensors, each with that of the dynamics beside it.
+SENSOR_PICKS = {"Df": "Bf", "Dd": "Bd"}
+
+
+MatrixOrNames = ArrayLike | Sequence[str] | None
+
+SIGNAL_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
+
+ALL_MATRICES = tuple(name for name, *_ in MATRIX_LAYOUT)
+
+
+def _without_frames(
+    matrices: Mapping[str, Any], names: Mapping[str, Sequence[str] | None]
+) -> tuple[dict[str, Any], dict[str, Sequence[str] | None]]:
+    """Return matrices and names ``{"state_names": ...}``, labels of frames in one order; numbers are no names."""
+    plain, labels = dict(matrices), dict(names)
+    # A names the states, C the outputs; the first frame with a label decides on an order.
+    for name, rows_of, columns_of in sorted(MATRIX_LAYOUT, key=lambda row: (row[0] != "A", row[0] != "C")):
+        frame: Any = plain.get(name)
+        if not (hasattr(frame, "columns") and hasattr(frame, "index") and hasattr(frame, "to_numpy")):
+            continue
+        rows = _order(frame.index, _FIELDS[rows_of], labels, f"the rows of {name}")
+        columns = _order(frame.columns, _FIELDS[columns_of], labels, f"the columns of {name}")
+        plain[name] = frame.to_numpy()[rows][:, columns] if len(frame) else frame.to_numpy()
+    return plain, labels
+
+
+def _order(labels: Any, kind: str, known: dict[str, Sequence[str] | None], what: str) -> list[int]:
+    """Return the positions of labels in the order of the names known so far, which they define where there are none."""
+    found = list(labels)
+    if not found or not all(isinstance(label, str) for label in found):
+        return list(range(len(found)))
+    repeated = sorted({label for label in found if found.count(label) > 1})
+    if repeated:
+        raise SpecError(f"{what[0].upper()}{what[1:]} repeat the label {repeated[0]!r}.", path=kind)
+    if known.get(kind) is None:
+        known[kind] = found
+    wanted = list(known[kind] or ())
+    missing, foreign = [name for name in wanted if name not in found], [name for name in found if name not in wanted]
+    if missing or foreign:
+        texts = [f"lack {', '.join(map(repr, missing))}"] if missing else []
+        texts += [f"have {', '.join(map(repr, foreign))}"] if foreign else []
+        raise SpecError(
+            f"{what[0].upper()}{what[1:]} {' and '.join(texts)}: the {kind} are {', '.join(wanted)}.", path=kind
+        )
+    return [found.index(name) for name in wanted]
+
+
+def plant_fields(
+    asked: Mapping[str, Any],
+    names: Mapping[str, Sequence[str] | None],
+    *,
+    dt: Any,
+    operating_point: Any,
+    scales: Any,
+    units: Any,
+    delays: Any,
+    sensor_noise: Any,
+) -> dict[str, Any]:
+    """Return every field of a `DescriptorSystem`; raise one `SpecError` with all problems."""
+    problems = Problems()
+    matrices, labels = _without_frames(asked, names)
+    a = problems.collect(lambda: any_matrix(matrices.pop("A"), "A"))
+    problems.raise_if_any()
+    nx = a.shape[0]
+    if nx == 0 or a.shape[1] != nx:
+        raise SpecError(f"A is {nx} by {a.shape[1]}, but it must be square (nx by nx, nx >= 1).", path="A")
+    states = problems.collect(lambda: checked_names(labels["state_names"], nx, prefix="x", what="state_names"))
+    problems.raise_if_any()
+    given: dict[str, FloatArray | None] = {"A": a, "E": _identity_like(a) if matrices["E"] is None else None}
+    for name, value in matrices.items():
+        if value is not None and not (name in SENSOR_PICKS and is_name_list(value)):
+            given[name] = problems.collect(partial(matrix_or_picks, value, name, states))
+    more = _appended(matrices, labels, given, sensor_noise, problems)
+    sizes = {"x": nx, **signal_counts(given)}
+    # What depends on a matrix that could not be read is not judged: its own message is enough.
+    broken = {name for name, value in matrices.items() if value is not None and given.get(name) is None}
+    unknown = {
+        signal
+        for signal, telling in COUNTED_BY.items()
+        if broken.intersection(telling) and all(given.get(name) is None for name in telling)
+    }
+    values: dict[str, Any] = {
+        name: problems.shaped(given.get(name), name, (sizes[rows], sizes[columns]))
+        for name, rows, columns in MATRIX_LAYOUT
+        if not unknown.intersection((rows, columns))
+    }
+    values |= {"dt": problems.collect(lambda: checked_dt(dt)), "state_names": states}
+    for signal, key in _FIELDS.items():
+        if signal in unknown or signal == "x":
+            continue
+        own = plain_names(labels[key])
+        no_names = own is None or (isinstance(own, (list, tuple)) and not own)
+        stated = picked_names(matrices.get(_NAMED_BY.get(key, ""))) if no_names else own
+        extra = more.get(key, ())
+        if (
+            extra
+            and is_name_list(["-"] if stated is None else stated)
+            and (stated is None or len(stated) == sizes[signal] - len(extra))
+        ):
+            first = checked_names(stated, sizes[signal] - len(extra), prefix=signal, what=key)
+            stated = (*first, *extra)
+        values[key] = problems.collect(partial(checked_names, stated, sizes[signal], prefix=signal, what=key))
+    if any(values.get(field) is None for field in _FIELDS.values()):
+        # What refers to signals by name cannot be judged.
+        problems.raise_if_any()
+    known, measured = {name for field in _FIELDS.values() for name in values[field]}, set(values["input_names"])
+    measured |= set(values["output_names"])
+    values |= checked_labels(problems, known, measured, operating_point=operating_point, scales=scales, units=units)
+    values["delays"] = problems.collect(lambda: checked_delays(delays, values["input_names"], values["output_names"]))
+    problems.raise_if_any()
+    return values
+
+
+def _identity_like(a: Any) -> Any:
+    """Return the identity of the size of A, sparse where A is."""
+    if not is_sparse(a):
+        return np.eye(a.shape[0])
+    from scipy.sparse import eye_array
+
+    return as_sparse_matrix(eye_array(a.shape[0], format="csr"), "E")
+
+
+def _appended(
+    matrices: Mapping[str, Any],
+    labels: Mapping[str, Sequence[str] | None],
+    given: dict[str, FloatArray | None],
+    sensor_noise: Any,
+    problems: Problems,
+) -> dict[str, tuple[str, ...]]:
+    """Append what is given by the names of sensors to ``given``; return the names of these signals by field."""
+    if sensor_noise is None and not any(is_name_list(matrices[name]) for name in SENSOR_PICKS):
+        return {}
+    if matrices["C"] is not None and given.get("C") is None:
+        return {}
+    names = labels["output_names"]
+    stated = picked_names(matrices["C"]) if names is None else names
+    outputs = problems.collect(
+        lambda: checked_names(stated, signal_counts(given)["y"], prefix="y", what="output_names")
+    )
+    problems.raise_if_any()
+    picked = problems.collect(lambda: _with_sensor_picks(matrices, given, outputs)) or {}
+    noises = problems.collect(lambda: _noise_of_sensors(sensor_noise, given, outputs)) or ()
+    return {"fault_names": picked.get("Df", ()), "disturbance_names": picked.get("Dd", ()), "noise_names": noises}
+
+
+def _size(given: Mapping[str, Any]) -> int:
+    return int(given["A"].shape[0])
+
+
+def _with_sensor_picks(
+    asked: Mapping[str, Any], given: dict[str, FloatArray | None], outputs: Sequence[str]
+) -> dict[str, tuple[str, ...]]:
+    """Append a column to Df, Bf (Dd, Bd) in ``given`` for each sensor that Df (Dd) names; return these."""
+    found = {}
+    for name, beside in SENSOR_PICKS.items():
+        picked = asked[name]
+        if not is_name_list(picked):
+            continue
+        columns = rows_picking(picked, outputs, what=name).T
+        own = given.get(beside)
+        dynamics = np.zeros((_size(given), 0)) if own is None else dense(own)
+        given[beside] = np.hstack([dynamics, np.zeros((len(dynamics), len(picked)))])
+        given[name] = np.hstack([np.zeros((len(outputs), dynamics.shape[1])), columns])
+        found[name] = tuple(picked)
+    return found
+
+
+def _noise_of_sensors(
+    sensor_noise: Any, given: dict[str, FloatArray | None], outputs: Sequence[str]
+) -> tuple[str, ...]:
+    """Append a column to Bw, Dw in ``given`` for each sensor with a standard deviation; return their names."""
+    if sensor_noise is None:
+        return ()
+    require_kind(sensor_noise, Mapping, "sensor_noise", "a standard deviation by output, such as {'speed': 0.01}")
+    require_picked(sensor_noise, outputs, what="sensor_noise")
+    columns = np.zeros((len(outputs), len(sensor_noise)))
+    for column, (name, value) in enumerate(sensor_noise.items()):
+        deviation = float(any_matrix(value, f"sensor_noise[{name!r}]")[0, 0])
+        if deviation <= 0.0:
+            raise SpecError(
+                f"sensor_noise[{name!r}] is {deviation:g}: give a standard deviation above 0.", path="sensor_noise"
+            )
+        columns[list(outputs).index(name), column] = deviation
+    others = [matrix for name in ("Bw", "Dw") if (matrix := given.get(name)) is not None and 0 not in matrix.shape]
+    nw, nx = others[0].shape[1] if others else 0, _size(given)
+    for name, rows, more in (("Bw", nx, np.zeros((nx, len(sensor_noise)))), ("Dw", len(outputs), columns)):
+        matrix = given.get(name)
+        matrix = np.zeros((rows, nw)) if matrix is None or 0 in matrix.shape else dense(matrix)
+        if matrix.shape != (rows, nw):
+            # Its own message is enough.
+            return ()
+        given[name] = np.hstack([matrix, more])
+    return tuple(f"noise {name}" for name in sensor_noise)
+
+
+def in_stated_units(units: Any, **given: Any) -> list[Any]:
+    """Return mappings from names of signals, with quantities in the units that are stated of these signals."""
+    stated = units if isinstance(units, Mapping) else {}
+    return [
+        {name: in_unit(value, stated.get(name), f"{kind}[{name!r}]") for name, value in mapping.items()}
+        if isinstance(mapping, Mapping)
+        else mapping
+        for kind, mapping in given.items()
+    ]
