@@ -102,6 +102,7 @@ _PUBLIC_NAMES = {
     "studies.comparison": "Comparison",
     "studies.evaluate": "evaluate",
     "studies.fleet": "run_fleet",
+    "studies.region_trade_off": "region_trade_off",
     "studies.robustness": "robustness",
     "studies.sensor_sets": "sensor_sets",
     "studies.sweep": "sweep",

@@ -99,6 +99,7 @@ from obsynth.studies.comparing import compare as compare
 from obsynth.studies.comparison import Comparison as Comparison
 from obsynth.studies.evaluate import evaluate as evaluate
 from obsynth.studies.fleet import run_fleet as run_fleet
+from obsynth.studies.region_trade_off import region_trade_off as region_trade_off
 from obsynth.studies.robustness import robustness as robustness
 from obsynth.studies.sensor_sets import sensor_sets as sensor_sets
 from obsynth.studies.sweep import sweep as sweep

@@ -34,6 +34,7 @@ _TYPE_NAMES = {
     "studies.comparison": "ComparedMethod FaultComparison",
     "studies.evaluate": "Evaluation Interval",
     "studies.fleet": "Fleet FleetRun",
+    "studies.region_trade_off": "RegionTradeOff",
     "studies.robustness_result": "Robustness",
     "studies.sensor_sets": "SensorSet SensorSets",
     "studies.sweep": "Sweep SweepResult",

@@ -290,3 +290,17 @@ def test_feedthrough_and_a_sensor_fault_are_exact_too() -> None:
         moved = observer.run(record(plant, parameters, u, f, d), inputs).faults - found.faults
         assert np.linalg.norm(moved) <= gamma * np.linalg.norm(d)
         assert np.linalg.norm(moved) >= 0.05 * gamma * np.linalg.norm(d)
+
+
+def test_disturbances_that_can_be_decoupled_leave_a_negligible_gain() -> None:
+    # Two states measured, one disturbance that reaches no fault estimate: the least gain is zero.
+    plant = PolytopicSystem(
+        plant={
+            "A": [["0.7 + 0.2 * v", 0.1], [0, 0.5]], "C": [[1, 0], [0, 1]], "Bf": [[1], [0]], "Bd": [[0], [1]],
+            "dt": 1.0,
+        },
+        scheduling={"v": [-1.0, 1.0]},
+    )  # fmt: skip
+    design = obsynth.fault_estimation_filter(plant)
+    assert design.report.passed
+    assert design.certificate.claims["gamma"] < 1e-3

@@ -36,6 +36,7 @@ from obsynth.verification.identities import equality, tracking_identities, worst
 #: Names of the rows.
 GAIN_ROW, DECAY_ROW, DECOUPLING_ROW = "LMI", "decay over the region", "fault decoupled for every scheduling"
 REGION_GAIN_ROW, DEVIATION_ROW = "gain over the region", "mean square over the region"
+SWITCHING_ROW, FROZEN_ROW = "worst switching found", "worst corner at rest"
 #: Lyapunov matrices and slacks of a certificate over a region, each ``(1 or N, n, n)``.
 WITNESSES = ("P_region", "G_region")
 #: The same of a gain, where it has its own.
@@ -166,7 +167,7 @@ def switching_row(vertices: Sequence[Vertex], level: float) -> Check:
     """Return the row on the worst course of the weights that was found, beside what is proved: it informs."""
     found = worst_switching([tuple(part.midpoint for part in vertex(Ball)) for vertex in vertices])
     return information(
-        "worst switching found",
+        SWITCHING_ROW,
         "a gain that some course of the parameters reaches: no claim below it can be true",
         found,
         source="coordinate ascent over courses between vertices",

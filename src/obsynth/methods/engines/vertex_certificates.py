@@ -30,6 +30,9 @@ DECAY_ROOM = 1e-3
 LEVEL_UNITS = (2.0**-4, 2.0**4)
 #: Solutions in units of the level found before: a level 1e-10 off is near one after the second.
 MOST_RESCALINGS = 4
+#: Shares of what errors are about that count as no gain at all: where errors can be decoupled, the least level is zero
+#: but for rounding, and the first of these that is proved is shipped.
+NEGLIGIBLE = (1e-4, 1e-3, 1e-2)
 #: Steps by which a decay that is not proved is made slower, towards none.
 DECAY_SHARES = (1e-6, 1e-3, 1e-2, 1e-1, 0.3, 0.6, 0.8, 0.9, 0.95, 0.99, 0.999)
 #: Trials of a bisection for the best decay, and where it ends.
@@ -113,9 +116,12 @@ def certified(
     runs: list[dict[str, Any]] = []
     prover = prove_gain if goal == "gain" else prove_mean_square
     more = {"ball": errors.ball} if goal == "gain" else {}
-    least, z_unit = _least(units, options, gains, solver, settings, runs)
+    least, z_unit, size = _least(units, options, gains, solver, settings, runs)
     wanted = [level] if level is not None else [(1.0 + max(room, margin)) * least for room in ROOMS]
+    if level is None and least < NEGLIGIBLE[0] * size:
+        wanted = [share * size for share in NEGLIGIBLE]
     for target in dict.fromkeys(wanted):
+        z_unit = z_unit if target == level or least >= NEGLIGIBLE[0] * size else _power_of_two(target)
         moved = units.moved(z_unit)
         found = vertex_inequalities(moved, level=target / z_unit, gains=units.gains_in(gains), **options)
         if not _solve(found, solver, settings, runs):
@@ -266,14 +272,15 @@ def _decay_of(errors: ErrorPolytope, gains: Sequence[FloatArray], witness: Witne
 
 def _least(
     units: _Units, options: Mapping[str, Any], gains: Any, solver: str, settings: Any, runs: list[dict[str, Any]]
-) -> tuple[float, float]:
-    """Return the least level, and the unit of z in which it is near one."""
+) -> tuple[float, float, float]:
+    """Return the least level, the unit of z in which it is near one, and what a level is about without any gain."""
     plain = units.moved(1.0)
     sizes = [
         np.linalg.norm(z) * np.linalg.norm(b) + np.linalg.norm(d)
         for z, b, d in zip(plain.Cz, plain.B, plain.Dz, strict=True)
     ]
-    unit = float(np.exp2(np.round(np.log2(max(sizes))))) if max(sizes) > 0.0 else 1.0
+    size = float(max(sizes))
+    unit = _power_of_two(size) if size > 0.0 else 1.0
     for _ in range(MOST_RESCALINGS):
         moved = units.moved(unit)
         found = vertex_inequalities(moved, gains=units.gains_in(gains), **options)
@@ -287,10 +294,17 @@ def _least(
         squared = found.variables["gamma_squared" if options["goal"] == "gain" else "mean_square"].value
         least = float(np.sqrt(max(float(squared), 0.0)))
         if least == 0.0 or LEVEL_UNITS[0] <= least <= LEVEL_UNITS[1]:
-            return max(least, float(np.finfo(np.float64).eps)) * unit, unit
+            return max(least, float(np.finfo(np.float64).eps)) * unit, unit, size
         level = least * unit
-        unit *= float(np.exp2(np.round(np.log2(least))))
-    return level, unit
+        if level < NEGLIGIBLE[0] * size:
+            return level, unit, size
+        unit *= _power_of_two(least)
+    return level, unit, size
+
+
+def _power_of_two(value: float) -> float:
+    """Return the power of two that is nearest by ratio."""
+    return float(np.exp2(np.round(np.log2(value))))
 
 
 def _solve(found: Any, solver: str, settings: Mapping[str, Any] | None, runs: list[dict[str, Any]]) -> bool:

@@ -23,6 +23,7 @@ from obsynth.verification.claims import claimed
 from obsynth.verification.nonlinear_drive import drive_of, in_words, wanted_of
 from obsynth.verification.nonlinear_region import corner_errors
 from obsynth.verification.over_region import (
+    FROZEN_ROW,
     GAIN_WITNESSES,
     REGION_GAIN_ROW,
     WITNESSES,
@@ -132,7 +133,7 @@ def _proved_rows(
         if len(vertices) <= _MOST_COMPARED:
             frozen = max(_frozen_deviation(vertex, terms.differential) for vertex in vertices)
             yield information(
-                "worst corner at rest",
+                FROZEN_ROW,
                 "the root mean square where slopes stay at a corner: no claim below it can be true",
                 frozen,
                 source="Lyapunov equation at every corner",

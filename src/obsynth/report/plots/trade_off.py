@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from obsynth.studies.region_trade_off import RegionTradeOff
+
 
 #: Inches: height of the picture of a sweep.
 SWEEP_HEIGHT = 4.2
@@ -165,6 +167,27 @@ def plot_delays(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
     panel.set_xticks(delays)
     panel.set_ylim(bottom=0.0)
     return finish(panel, "error per unit of noise", below="delay of the fault map (samples)")
+
+
+def draw_region_trade_off(found: RegionTradeOff, axes: Axes | None) -> Axes:
+    """Draw a claim over sizes of a region, or rates; values without a design are marked below."""
+    panel = one_panel(axes, size=(WIDTH, 1.6 * PANEL_HEIGHT))
+    methods = [one.method for one in found.designs if not isinstance(one, str)]
+    numbers = np.array(found.values)
+    finite = np.isfinite(numbers)
+    # Any course stands right of the fastest rate.
+    places = np.where(finite, numbers, 2.0 * float(np.max(numbers[finite], initial=0.5)))
+    panel.plot(places, found.claims, color="black", marker="o", markersize=4, label="proved")
+    if np.isfinite(found.reached).any():
+        panel.plot(places, found.reached, color="0.5", marker="x", linestyle=":", label="reached by some course")
+    missing = np.array([isinstance(one, str) for one in found.designs])
+    panel.set_ylim(bottom=0.0)
+    if missing.any():
+        panel.plot(places[missing], np.zeros(missing.sum()), "x", color="tab:red", clip_on=False, label="none found")
+    if not finite.all():
+        panel.set_xticks(places, [f"{n:g}" if ok else "any" for n, ok in zip(numbers, finite, strict=True)])
+    below = "share of the region" if found.by == "size" else "rate of the parameter (1/s)"
+    return finish(panel, _claim_label(found.claim, methods), below=below)
 
 
 def _claim_label(name: str, methods: Sequence[str]) -> str:
