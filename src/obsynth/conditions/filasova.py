@@ -211,7 +211,7 @@ def _theorem(
 
     return Conditions(
         f"Filasova, Krokavec, Serbak, Theorem {theorem}, {names[0]}-({43 if theorem == 1 else 64}), {reading}",
-        cp.Problem(goal, list(constraints.values())),
+        lmi.semidefinite_problem(goal, list(constraints.values())),
         variables,
         {},
         {"A_o": A_o, "C_o": C_o},

@@ -164,7 +164,7 @@ def steady_gain(
     }
     return Conditions(
         "Moussa Ali, Zhang 2013, (10)-(13): steady Kalman gain as an H2 inequality",
-        cp.Problem(cp.Minimize(cp.trace(Z)), list(constraints.values())),
+        lmi.semidefinite_problem(cp.Minimize(cp.trace(Z)), list(constraints.values())),
         {"P": P, "Y": Y, "Z": Z},
         {},
         data,

@@ -115,6 +115,13 @@ def value_of(variable: Any) -> FloatArray:
     return np.asarray(value, dtype=np.float64)
 
 
+def semidefinite_problem(goal: Any, constraints: Sequence[Any]) -> Any:
+    """Return a `cvxpy.Problem` that is solved by Clarabel where no solver is named."""
+    from obsynth.conditions.semidefinite_problem import SemidefiniteProblem
+
+    return SemidefiniteProblem(goal, list(constraints))
+
+
 def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: str = "CLARABEL") -> dict[str, Any]:
     """Minimise a linear or convex objective under the constraints and return the record of the run."""
     problem = cp.Problem(cp.Minimize(0 if objective is None else objective), list(constraints))

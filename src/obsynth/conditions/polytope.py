@@ -141,7 +141,7 @@ def vertex_inequalities(
 
     return Conditions(
         "vertex inequalities (V1) to (V4)",
-        cp.Problem(objective, list(constraints.values())),
+        lmi.semidefinite_problem(objective, list(constraints.values())),
         variables,
         {},
         {f"A[{i + 1}]": A for i, A in enumerate(errors.A)},

@@ -213,7 +213,7 @@ def augmented_problem(
     }
     return Conditions(
         "Share Pasand, Aliyari, Taghirad, (13), (19), procedure 1",
-        cp.Problem(cp.Minimize(goal), list(constraints.values())),
+        lmi.semidefinite_problem(cp.Minimize(goal), list(constraints.values())),
         variables,
         {},
         data,

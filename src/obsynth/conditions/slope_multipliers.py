@@ -160,7 +160,7 @@ def slope_inequality(
 
     return Conditions(
         f"one inequality with a {multiplier} multiplier",
-        cp.Problem(objective, list(constraints.values())),
+        lmi.semidefinite_problem(objective, list(constraints.values())),
         variables,
         {},
         {"A": own.A[0], "W": errors.W, "V": errors.V, "Wy": errors.Wy},

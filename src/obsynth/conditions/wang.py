@@ -196,7 +196,7 @@ def wang2015(
     data |= {"L0": L0, "D1": D1, "X": X, "R0": R0, "rest": rest}
     return Conditions(
         "Wang et al. 2015, Theorem 2, (45)",
-        cp.Problem(goal, list(constraints.values())),
+        lmi.semidefinite_problem(goal, list(constraints.values())),
         variables,
         {} if gamma is None else {"gamma_squared": gamma_squared},
         data,
