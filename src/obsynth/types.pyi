@@ -35,6 +35,7 @@ from obsynth.studies.evaluate import Evaluation as Evaluation
 from obsynth.studies.evaluate import Interval as Interval
 from obsynth.studies.fleet import Fleet as Fleet
 from obsynth.studies.fleet import FleetRun as FleetRun
+from obsynth.studies.region_trade_off import RegionTradeOff as RegionTradeOff
 from obsynth.studies.robustness_result import Robustness as Robustness
 from obsynth.studies.sensor_sets import SensorSet as SensorSet
 from obsynth.studies.sensor_sets import SensorSets as SensorSets

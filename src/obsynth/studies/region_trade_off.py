@@ -81,7 +81,14 @@ class RegionTradeOff:
         """
         from obsynth.report.plots.trade_off import draw_region_trade_off
 
-        return draw_region_trade_off(self, axes)
+        return draw_region_trade_off(
+            np.array(self.values),
+            self.designs,
+            (self.claim, self.claims),
+            self.reached,
+            below="share of the region" if self.by == "size" else "rate of the parameter (1/s)",
+            axes=axes,
+        )
 
 
 @arguments_checked

@@ -12,6 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.optimal_filter.public import OptimalFilter
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arguments import arguments_checked, is_number
+from obsynth.numerics.arrays import FloatArray
 from obsynth.report.plots.panels import (
     PANEL_HEIGHT,
     WIDE_AXIS,
@@ -28,8 +29,6 @@ from obsynth.results.design import ObserverDesign
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from obsynth.studies.region_trade_off import RegionTradeOff
 
 
 #: Inches: height of the picture of a sweep.
@@ -169,25 +168,32 @@ def plot_delays(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
     return finish(panel, "error per unit of noise", below="delay of the fault map (samples)")
 
 
-def draw_region_trade_off(found: RegionTradeOff, axes: Axes | None) -> Axes:
-    """Draw a claim over sizes of a region, or rates; values without a design are marked below."""
+def draw_region_trade_off(
+    numbers: FloatArray,
+    designs: Sequence[ObserverDesign | str],
+    claim: tuple[str, FloatArray],
+    reached: FloatArray,
+    *,
+    below: str,
+    axes: Axes | None,
+) -> Axes:
+    """Draw a claim and its values over sizes of a region, or rates; places without a design are marked below."""
     panel = one_panel(axes, size=(WIDTH, 1.6 * PANEL_HEIGHT))
-    methods = [one.method for one in found.designs if not isinstance(one, str)]
-    numbers = np.array(found.values)
+    methods = [one.method for one in designs if not isinstance(one, str)]
+    name, proved = claim
     finite = np.isfinite(numbers)
     # Any course stands right of the fastest rate.
     places = np.where(finite, numbers, 2.0 * float(np.max(numbers[finite], initial=0.5)))
-    panel.plot(places, found.claims, color="black", marker="o", markersize=4, label="proved")
-    if np.isfinite(found.reached).any():
-        panel.plot(places, found.reached, color="0.5", marker="x", linestyle=":", label="reached by some course")
-    missing = np.array([isinstance(one, str) for one in found.designs])
+    panel.plot(places, proved, color="black", marker="o", markersize=4, label="proved")
+    if np.isfinite(reached).any():
+        panel.plot(places, reached, color="0.5", marker="x", linestyle=":", label="reached by some course")
+    missing = np.array([isinstance(one, str) for one in designs])
     panel.set_ylim(bottom=0.0)
     if missing.any():
         panel.plot(places[missing], np.zeros(missing.sum()), "x", color="tab:red", clip_on=False, label="none found")
     if not finite.all():
         panel.set_xticks(places, [f"{n:g}" if ok else "any" for n, ok in zip(numbers, finite, strict=True)])
-    below = "share of the region" if found.by == "size" else "rate of the parameter (1/s)"
-    return finish(panel, _claim_label(found.claim, methods), below=below)
+    return finish(panel, _claim_label(name, methods), below=below)
 
 
 def _claim_label(name: str, methods: Sequence[str]) -> str:
