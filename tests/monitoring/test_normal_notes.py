@@ -201,6 +201,24 @@ def test_a_sensor_that_is_stuck_in_a_run_counts_as_not_measured_there_too(tmp_pa
     assert obsynth.load_thresholds(file).repeats.tolist() == [2.0, 2.0]
 
 
+def test_a_sensor_that_stays_stuck_is_an_alarm_of_its_own() -> None:
+    """Without its samples no other alarm may ever come."""
+    design, data = heated(), log(2)
+    monitor = obsynth.online_monitor(design, "learned", normal=learned(log(1)))
+    data.loc[703:, "ya"] = data.loc[703, "ya"]
+    run = obsynth.run_on_data(design, data, monitor=monitor)
+    (event,) = run.events
+    # Rows count from 1: the second equal sample is in row 705, and 100 rows later it has lasted.
+    assert (event.by, event.fault, event.first_row, event.last_row) == ("stuck sensor ya", "", 806, ROWS)
+    assert run.table["alarm"].iloc[804] == ""
+    assert run.table["alarm"].iloc[805] == "stuck sensor ya"
+    assert run.alarms == {"stuck sensor ya": pytest.approx(805 * DT)}
+    assert run.isolated == ""
+    # In pieces, as a stream has them, and not without a monitor that has learned how many samples may be equal.
+    pd.testing.assert_frame_equal(obsynth.run_on_data(design, data, monitor=monitor, chunk_rows=7).table, run.table)
+    assert not obsynth.run_on_data(design, data).alarms
+
+
 def test_repeats_are_left_out_in_pieces_as_in_one() -> None:
     rng = np.random.default_rng(3)
     for _ in range(50):

@@ -81,6 +81,8 @@ class Row(NamedTuple):
     time: float = math.nan  # in seconds
     deviations: FloatArray | None = None  # ``(nu + ny,)`` as read
     at: float = math.nan  # the time of its sample since the first one; of continuous designs that of its stamp
+    # How many samples in a row of each output have been equal ``(ny,)``, where a monitor has learned how many may be.
+    repeated: FloatArray | None = None
     # Rows of a sampled design that were missing before this one: as the observer went through them, without signals.
     missed: tuple[Row, ...] = ()
 

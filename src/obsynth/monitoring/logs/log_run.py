@@ -20,7 +20,7 @@ from obsynth.monitoring.logs.log_observer import DECIDING, GAP, RECOVERING, STAL
 from obsynth.monitoring.logs.recovered_states import FIRST_SECONDS, MOST_FIRST_ROWS, RecoveredStates
 from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals
 from obsynth.monitoring.logs.stamps import Stamps
-from obsynth.monitoring.logs.stuck_sensors import RepeatedValues, Unrepeated, rising
+from obsynth.monitoring.logs.stuck_sensors import STUCK_ALARM_ROWS, RepeatedValues, Unrepeated, rising
 from obsynth.monitoring.thresholds.learned import LearnedRule, as_learned
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.monitor import LinearSample, Monitor, Sample
@@ -33,6 +33,9 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.certificate_files import sealed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import digest_of, plain, restored
+
+#: What an alarm by a sensor that is stuck is called, before the name of its output.
+STUCK_SENSOR = "stuck sensor"
 
 #: Its column says of which time the recovered states are.
 LATE = "recovered states"
@@ -264,9 +267,10 @@ class LogRun:
             self.first.status = found[0].status
         self.rows += len(found)
         self.first.take(times, values)
+        counts = [None] * len(found) if memory is None else list(memory[:, 1])
         return [
-            row._replace(time=time, deviations=v, at=own)
-            for row, time, v, own in zip(found, times, read, at, strict=True)
+            row._replace(time=time, deviations=v, at=own, repeated=equal)
+            for row, time, v, own, equal in zip(found, times, read, at, counts, strict=True)
         ]
 
     def _unrepeated_rows(self, times: Sequence[float], values: FloatArray) -> tuple[FloatArray, FloatArray | None]:
@@ -390,12 +394,25 @@ class LogRun:
                 self.isolated = self.isolated or seen.fault
                 self.alarm_rows.setdefault(self.monitor.kind, number)
                 names.append(f"{self.monitor.kind}: {seen.fault}" if seen.fault else self.monitor.kind)
+        for name, evidence in self._stuck(row):
+            self.events.take(name, "", evidence, time, number, [*before, *cells])
+            self.alarms.setdefault(name, time)
+            self.alarm_rows.setdefault(name, number)
+            names.append(name)
         for name, evidence in passed:
             fault = name[5:-1] if name.startswith("fhat[") else ""
             self.events.take(name, fault, evidence, time, number, [*before, *cells])
         if undecided:
             self.events.silent[row.status if row.status not in DECIDING else NO_DECISION] += 1
         return [*cells, "; ".join(names)]
+
+    def _stuck(self, row: Row) -> list[tuple[str, float]]:
+        """Return the alarms of sensors that have been stuck for long, with the share of their threshold."""
+        if self.unrepeated is None or row.repeated is None:
+            return []
+        shares = row.repeated / (self.unrepeated.longest + STUCK_ALARM_ROWS)
+        found = zip(self.observer.output_names, shares.tolist(), strict=True)
+        return [(f"{STUCK_SENSOR} {name}", share) for name, share in found if share > 1.0]
 
     def _sample(self, monitor: Monitor, row: Row) -> Sample:
         """Return what a monitor takes of a row."""

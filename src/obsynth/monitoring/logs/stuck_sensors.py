@@ -38,6 +38,10 @@ RESTING_CHANGE, SAME_STEP, LAST_CHANGES = 0.1, 0.01, 3
 #: they are single steps, only what goes to one side, and takes longer from step to step, comes to rest.
 TURNED_SHARE = 0.5
 
+#: An alarm says that a sensor is stuck where it has repeated its value for so many rows more than it may: what it does
+#: not say would be missed, and no other alarm may come without it.
+STUCK_ALARM_ROWS = 100
+
 #: Stretches in which an output is stuck that a note names.
 MOST_RUNS_TOLD = 3
 
