@@ -45,8 +45,11 @@ SHOWN_SAMPLES = 0.98
 #: Room below and above a fault in its panel, as a share of its range.
 ROOM_AROUND_FAULT = 0.1
 
-#: An estimate that reaches so many times as far as the fault and the best estimate is faint, with this opacity.
-NOISIER, FAINT = 3.0, 0.35
+#: An estimate that reaches so many times as far as the fault and the best estimate has a panel of its own.
+NOISIER = 3.0
+
+#: Order in which truth is drawn among noise that would hide it.
+ON_TOP = 20.0
 
 #: What the page of a comparison begins with.
 COMPARISON_PAGE = FileKind("a comparison of obsynth", rb'name="generator" content="obsynth compare"', suffix=".html")
@@ -377,7 +380,7 @@ class Comparison:
     def plot(self) -> Figure:
         """Return a figure: for each fault, each method's estimate of a unit step, and its estimate on the scenario.
 
-        An estimate that is much noisier than the best one lies faintly behind the others.
+        Estimates that are much noisier than the best one are drawn in a panel of their own, each in its full range.
         """
         import matplotlib.pyplot as plt
 
@@ -386,15 +389,23 @@ class Comparison:
     def _drawn(self, new_figure: Callable[..., Figure]) -> Figure:
         shown = [entry for entry in self.methods if entry.faults]
         count = len(self.fault_names)
-        figure = new_figure(figsize=(11.0, 2.8 * count), layout="constrained")
-        axes = figure.subplots(count, 2, squeeze=False)
+        far = [self._far_noisier(shown, row) for row in range(count)]
+        columns = 3 if any(far) else 2
+        figure = new_figure(figsize=(3.5 + 3.75 * (columns - 1), 2.8 * count), layout="constrained")
+        axes = figure.subplots(count, columns, squeeze=False)
         for row, name in enumerate(self.fault_names):
-            left, right = axes[row]
-            if np.isfinite(self.truth[:, row]).any():
-                right.plot(self.times, self.truth[:, row], label="fault", **TRUE_STYLE)
+            left, *panels = axes[row]
+            sets = ([entry for entry in shown if entry not in far[row]], far[row])
+            for panel, entries in zip(panels, sets, strict=False):
+                if not entries:
+                    panel.set_visible(False)
+                    continue
+                over = {"zorder": ON_TOP} if entries is far[row] else {}
+                if np.isfinite(self.truth[:, row]).any():
+                    panel.plot(self.times, self.truth[:, row], label="fault", **over, **TRUE_STYLE)
+                panel.set_ylim(*self._range(entries, row))
+                panel.set_ylabel(with_unit(name, self._units))
             left.axhline(1.0, color="0.8", linewidth=0.8)
-            low, high = self._range(shown, row)
-            best = next((_reach(e.estimates[:, 0]) for e in shown if name in [f.figures.fault for f in e.faults]), 0.0)
             for rank, entry in enumerate(shown):
                 names = [fault.figures.fault for fault in entry.faults]
                 if name not in names:
@@ -404,22 +415,33 @@ class Comparison:
                 style: dict[str, Any] = {"color": colour, "zorder": 3.0 + len(shown) - rank}
                 response, estimate = np.clip(entry.responses[:, column], -1.0, 3.0), entry.estimates[:, column]
                 left.plot(np.arange(len(response)) * self.sample_time, response, label=entry.method, **style)
-                noisy = rank > 0 and _reach(estimate) > NOISIER * max(_reach(self.truth[:, row]), best)
-                faint = {"alpha": FAINT, "linewidth": 0.4, "zorder": 1.0} if noisy else {"linewidth": 0.8}
-                right.plot(self.times, estimate, **{**style, **faint})
+                noisy = entry in far[row]
+                label = {"label": f"{entry.method}, far noisier"} if noisy else {}
+                panels[int(noisy)].plot(self.times, estimate, **style, **label, linewidth=0.4 if noisy else 0.8)
             times = [f.figures.most for entry in shown for f in entry.faults if np.isfinite(f.figures.most)]
             length = max((len(entry.responses) for entry in shown), default=2) * self.sample_time
             left.set_xlim(0.0, min(max([3.0 * max(times, default=length), 10.0 * self.sample_time]), length))
             left.set_ylabel(f"estimate of a unit step\nof {name}")
-            right.set_ylabel(with_unit(name, self._units))
-            right.set_ylim(low, high)
-            for panel in (left, right):
+            for panel in (left, *panels):
                 label_time(panel)
                 tidy(panel)
+            for panel in panels if row == 0 else panels[1:]:
+                if panel.get_visible() and panel.get_legend_handles_labels()[0]:
+                    legend_above(panel)
         legend_above(axes[0, 0])
-        if axes[0, 1].get_legend_handles_labels()[0]:
-            legend_above(axes[0, 1])
         return figure
+
+    def _far_noisier(self, shown: Sequence[ComparedMethod], row: int) -> list[ComparedMethod]:
+        """Return the methods whose estimate of a fault would hide the others in one panel; the first is none."""
+        name, reaches = self.fault_names[row], list[tuple[ComparedMethod, float]]()
+        for entry in shown:
+            names = [fault.figures.fault for fault in entry.faults]
+            if name in names:
+                reaches.append((entry, _reach(entry.estimates[:, names.index(name)])))
+        if not reaches:
+            return []
+        most = NOISIER * max(_reach(self.truth[:, row]), reaches[0][1])
+        return [entry for entry, reach in reaches[1:] if reach > most]
 
     def _range(self, shown: Sequence[ComparedMethod], row: int) -> tuple[float, float]:
         """Return the ends of the panel of a fault: all of the truth, and of every estimate."""
