@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.io import loadmat
 from tests.support.polytopic_plants import WANG_A, WANG_BD, WANG_BF, WANG_C, WANG_E, record, wang
 
 import obsynth
@@ -98,10 +99,46 @@ def test_c_equals_the_run_on_a_log(name: str, tmp_path: Path) -> None:
     assert np.nanmax(np.abs(numbers - found[:, 1:]) / np.maximum(np.abs(numbers), 1.0)) < 1e-12
 
 
+@pytest.mark.parametrize("name", ["linear", "effectiveness", "functions", "vertices"])
+@pytest.mark.parametrize("suffix", [".mat", ".npz"])
+def test_arrays_hold_the_observer_at_every_vertex(name: str, suffix: str, tmp_path: Path) -> None:
+    plant = _plants()[name]
+    design = obsynth.fault_estimation_filter(plant)
+    (file,) = obsynth.export(design, tmp_path / f"region{suffix}")
+    found = dict(np.load(file)) if suffix == ".npz" else loadmat(file)
+    observer, held, rng = design.scheduled[1], plant.scheduling, np.random.default_rng(2)
+    samples, count = 40, len(held.names)
+    parameters = rng.dirichlet(np.ones(count), samples) if name == "vertices" else rng.uniform(-1, 1, (samples, count))
+    y, u = rng.standard_normal((samples, plant.ny)), rng.standard_normal((samples, plant.nu))
+    rows, _ = observer.record(y, np.hstack([u, parameters]))
+    # The same by the arrays alone.
+    names = [str(text.item() if hasattr(text, "item") else text) for text in found["parameters"].ravel()]
+    functions = [str(text.item() if hasattr(text, "item") else text) for text in found["functions"].ravel()]
+    z, before = np.zeros((observer.order, 1)), None
+    nx, nf = len(observer.state_names), len(observer.fault_names)
+    for k in range(samples):
+        values = dict(zip(names, parameters[k], strict=True))
+        if functions:
+            a = np.array([eval(text, vars(np) | {"abs": abs, "min": min} | values) for text in functions])
+            share = (a - found["bounds"][:, 0]) / (found["bounds"][:, 1] - found["bounds"][:, 0])
+            at_high = found["corners"] == found["bounds"][:, 1]
+            weights = np.prod(np.where(at_high, share, 1 - share), axis=1)
+        else:
+            weights = parameters[k]
+        driving = np.r_[u[k], y[k]][:, None]
+        row = (found["C"] @ z + found["D"] @ driving)[:, 0]
+        if before is not None:
+            row[nx : nx + nf] = np.linalg.solve(found["effectiveness"] @ before, row[nx : nx + nf])
+            assert row == pytest.approx(rows[k], rel=1e-10, abs=1e-10)
+        z, before = (found["A"] @ weights) @ z + (found["B"] @ weights) @ driving, weights
+    assert found["forgetting"].item() == observer.forgetting
+
+
 def test_other_files_are_refused(tmp_path: Path) -> None:
     design = obsynth.fault_estimation_filter(wang())
-    for suffix in (".fmu", ".mat", ".npz"):
-        with pytest.raises(SpecError, match="exported as C"):
-            obsynth.export(design, tmp_path / f"region{suffix}")
+    with pytest.raises(SpecError, match="FMUs hold observers that do not change"):
+        obsynth.export(design, tmp_path / "region.fmu")
+    with pytest.raises(SpecError, match="leave sample_time out"):
+        obsynth.export(design, tmp_path / "region.mat", sample_time=1.0)
     with pytest.raises(SpecError, match="the observer alone"):
         obsynth.export(design, tmp_path / "region.c", thresholds={"fhat[f1]": 1.0})

@@ -7,6 +7,7 @@ import pickle
 import numpy as np
 import pytest
 
+import obsynth
 from obsynth import DescriptorSystem, PolytopicSystem, PreconditionError, SpecError
 from obsynth.plants.scheduling import MOST_FUNCTIONS
 
@@ -116,3 +117,10 @@ def test_an_entry_is_what_its_text_says_at_every_point(text: str) -> None:
         point = {name: float(rng.uniform(*ends)) for name, ends in used.items()}
         value = eval(text, {"sin": np.sin, "cos": np.cos, "exp": np.exp, "sqrt": np.sqrt}, point)
         assert plant.at(point).A[0, 0] == pytest.approx(value, rel=1e-12)
+
+
+def test_a_point_inside_at_which_nothing_shows_a_growing_mode_is_named() -> None:
+    hidden = {"A": [[0.9, "a"], [0.0, 1.5]], "C": [[1, 0]], "Bf": [[1], [0]], "dt": 1.0}
+    plant = PolytopicSystem(plant=hidden, scheduling={"a": [-1.0, 1.0]})
+    with pytest.raises(PreconditionError, match=r"at the middle of the region \(a = 0\)"):
+        obsynth.ui_pi_observer(plant)

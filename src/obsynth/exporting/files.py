@@ -6,7 +6,7 @@ import io
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from obsynth.exporting.float_error import float_error
 from obsynth.exporting.independent import copy_checker
 from obsynth.exporting.proof_file import write_proof
 from obsynth.exporting.realisation import Realisation
+from obsynth.exporting.scheduled_arrays import scheduled_arrays
 from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.observers.nonlinear.observer import DAEObserver
@@ -83,7 +84,10 @@ def export(
         ``x0 (nz, 1)`` and ``Ts`` (seconds, 0 for continuous time) of the system from ``[u; y]`` to
         ``[xhat; fhat; r]``, as a State-Space block takes them, with ``input_names``, ``output_names``, ``delays``
         (samples, of states and faults), ``input_point``, ``output_point``, ``name``, ``method`` and ``sha256``; a
-        ``.mat`` has the structures ``gains``, by the letters of the method's paper, and ``certificate`` besides.
+        ``.mat`` has the structures ``gains``, by the letters of the method's paper, and ``certificate`` besides.  Of a
+        design over a region A, B and ``effectiveness`` have a page for each vertex, ``(nz, nz, N)``; ``functions`` of
+        the ``parameters`` have the ends ``bounds (q, 2)`` and the values ``corners (N, q)`` at the vertices, and the
+        weights are products of ``(a - low) / (high - low)`` and one minus it.
         ``.c``: a source file and the header beside it, with functions ``<stem>_reset`` and ``<stem>_step`` (of a
         guaranteed test a dot product over its window, with its threshold and its alarm); the only
         one besides ``.fmu`` for an observer of a nonlinear DAE, which holds the implicit step with its homotopy.
@@ -198,7 +202,7 @@ def export(
         return write_dae_c(design, target, sample_time, alarms, numbers, outliers)
     found = Realisation.of(design, sample_time, numbers)
     if suffix != ".c":
-        return (write_atomically(target, _as_arrays(found, design, suffix)),)
+        return (write_atomically(target, _array_file(found.as_arrays(), design, suffix)),)
     if is_window(design):
         _require_own_threshold(monitor, thresholds, warm_up, numbers)
         return _write_window(found, target, numbers)
@@ -246,11 +250,19 @@ def _write_scheduled(
     sample_time: float | None,
     numbers: str,
 ) -> tuple[Path, ...]:
-    """Write a scheduled observer as C."""
-    if suffix != ".c":
+    """Write a scheduled observer as C, or its matrices at the vertices."""
+    if suffix == ".fmu":
         raise SpecError(
-            f"A design over a region is exported as C (.c): {suffix} files hold constant matrices.", path="path"
+            "A design over a region is exported as C (.c) or as its matrices at the vertices (.mat, .npz); FMUs "
+            "hold observers that do not change.",
+            path="path",
         )
+    if suffix != ".c" and sample_time is not None:
+        raise SpecError(
+            "The matrices at the vertices are those of the design: leave sample_time out.", path="sample_time"
+        )
+    if suffix != ".c":
+        return (write_atomically(target, _array_file(scheduled_arrays(design), design, suffix)),)
     if design.scheduled[1].dt == 0.0:
         raise SpecError(
             "The observer over a region is continuous in time, and solves linear equations at each row: it runs on "
@@ -324,9 +336,9 @@ def _require_fitting_options(
         )
 
 
-def _as_arrays(found: Realisation, design: ObserverDesign, suffix: str) -> bytes:
+def _array_file(arrays: Mapping[str, Any], design: ObserverDesign, suffix: str) -> bytes:
     """Return the contents of a file of arrays for numpy or MATLAB."""
-    buffer, arrays = io.BytesIO(), found.as_arrays()
+    buffer = io.BytesIO()
     if suffix == ".npz":
         np.savez(buffer, **arrays)
         return buffer.getvalue()

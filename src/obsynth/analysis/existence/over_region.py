@@ -75,15 +75,25 @@ def constant_outputs(plant: PolytopicSystem, product: str, source: str) -> Condi
     )
 
 
+def frozen_points(plant: PolytopicSystem) -> Iterator[tuple[str, DescriptorSystem]]:
+    """Yield name and plant at every vertex, then in the middle of the region: a parameter may rest anywhere."""
+    for place, vertex in enumerate(plant.vertices):
+        yield plant.scheduling.vertex_name(place), vertex
+    held = plant.scheduling
+    if plant.count > 1:
+        middle = np.full(plant.count, 1.0 / plant.count) if held.gives_weights else 0.5 * (held.low + held.high)
+        words = ", ".join(f"{name} = {value:.6g}" for name, value in zip(held.names, middle, strict=True))
+        yield f"the middle of the region ({words})", plant.at(middle)
+
+
 def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion]) -> Iterator[Condition]:
     constant = constant_outputs(plant, "L(mu) C(mu)", _SOURCE)
     yield constant
     if not constant.holds:
         return
-    for place, vertex in enumerate(plant.vertices):
-        for condition in fault_filter_conditions(vertex, exactly=exactly):
+    for where, point in frozen_points(plant):
+        for condition in fault_filter_conditions(point, exactly=exactly):
             if not condition.holds:
-                where = plant.scheduling.vertex_name(place)
                 yield replace(condition, name=f"{condition.name} at {where}")
                 return
     yield Condition(

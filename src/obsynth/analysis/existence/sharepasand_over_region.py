@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.existence.condition import Condition
-from obsynth.analysis.existence.over_region import constant_outputs
+from obsynth.analysis.existence.over_region import constant_outputs, frozen_points
 from obsynth.analysis.existence.sharepasand import existence
 from obsynth.analysis.existence.sharepasand_decoupling import decoupling_condition
 from obsynth.analysis.existence.statements import Evaluator
@@ -37,9 +37,8 @@ def _in_order(plant: PolytopicSystem, model: Exosystem, exactly: bool) -> Iterat
     yield constant
     if not constant.holds:
         return
-    for place, vertex in enumerate(plant.vertices):
-        found = existence(vertex, model, exactly=exactly)
-        where = plant.scheduling.vertex_name(place)
+    for where, point in frozen_points(plant):
+        found = existence(point, model, exactly=exactly)
         for condition in found.conditions:
             if not condition.holds:
                 yield replace(condition, name=f"{condition.name} at {where}")
