@@ -83,7 +83,7 @@ def frozen_points(plant: PolytopicSystem) -> Iterator[tuple[str, DescriptorSyste
     if plant.count > 1:
         middle = np.full(plant.count, 1.0 / plant.count) if held.gives_weights else 0.5 * (held.low + held.high)
         words = ", ".join(f"{name} = {value:.6g}" for name, value in zip(held.names, middle, strict=True))
-        yield f"the middle of the region ({words})", plant.at(middle)
+        yield f"the middle of the region ({words})", plant.at(middle.tolist())
 
 
 def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion]) -> Iterator[Condition]:
