@@ -353,8 +353,17 @@ def test_python_functions_are_refused() -> None:
         obsynth.region_observer(model, region={"x": [0, 1]}, sample_time=0.1, noise={"y": 0.1})
 
 
-def test_what_such_designs_do_not_have_yet_is_refused_by_name(design: ObserverDesign, tmp_path: Path) -> None:
+def test_what_such_designs_do_not_have_is_refused_by_name(design: ObserverDesign, tmp_path: Path) -> None:
     with pytest.raises(SpecError, match="not written as files yet"):
         obsynth.export(design, tmp_path / "tanks.c")
-    with pytest.raises(SpecError, match="scenarios do not run it yet"):
-        obsynth.simulate(design, obsynth.Scenario(horizon=10.0))
+    with pytest.raises(SpecError, match="no scheduling parameters"):
+        obsynth.simulate(design, obsynth.Scenario(horizon=10.0, scheduling={"h1": obsynth.Step(size=0.1)}))
+
+
+def test_a_growing_mode_that_no_output_shows_is_named() -> None:
+    model = DAEModel(
+        {"seen": "der(x) = -x + u + fault", "hidden": "der(z) = z + 0.1 * sin(z)"}, {"y": "x"},
+        states={"x": 1.0, "z": 0.0}, inputs={"u": 0.0}, parameters={"fault": 0.0},
+    )  # fmt: skip
+    with pytest.raises(PreconditionError, match="of z is shown by no output and does not decay"):
+        obsynth.region_observer(model, region={"z": [-0.5, 1.0]}, sample_time=0.1, noise={"y": 0.1, "fault": 0.1})

@@ -5,11 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from obsynth.analysis.existence.condition import Condition, up_to_failure
+from obsynth.analysis.existence.recursive import described_mode
+from obsynth.analysis.existence.statements import Evaluator
 from obsynth.errors import PreconditionError
 from obsynth.plants.dae import DAEModel
-from obsynth.plants.operating_region import OperatingRegion
-from obsynth.plants.transformations.nonlinear_terms import nonlinear_terms
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.operating_region import OperatingRegion, Slope
+from obsynth.plants.signal_names import leading_names
+from obsynth.plants.transformations.nonlinear_terms import NonlinearTerms, nonlinear_terms
 
 #: Slopes over whose corners a proof is made one by one: 2 ** 12 = 4096.
 MOST_SLOPES = 12
@@ -63,3 +69,39 @@ def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequenc
         f"{len(slopes)} slopes have 2 ** {len(slopes)} corners: write products of one argument as one function of it, "
         "or linearise what hardly bends",
     )  # fmt: skip
+    if len(slopes) <= MOST_SLOPES:
+        yield _detectable_in_the_middle(terms, slopes)
+
+
+def _detectable_in_the_middle(terms: NonlinearTerms, slopes: Sequence[Slope]) -> Condition:
+    """Return whether every mode that does not decay is seen where slopes are in the middle of their bounds.
+
+    Where one is not, no gain makes the errors decay there, so that there is no certificate over the region.
+    """
+    A, C = np.array(terms.A), np.array(terms.C)
+    for each in slopes:
+        turned = 0.5 * (each.low + each.high) * terms.state_parts[each.argument]
+        A += np.outer(terms.W[:, each.nonlinearity], turned)
+        C += np.outer(terms.Wy[:, each.nonlinearity], turned)
+    E = np.diag([float(place < terms.differential) for place in range(len(A))])
+    plant = DescriptorSystem(E, A, C=C, dt=0.0, state_names=terms.names, output_names=terms.output_names)
+    lost = Evaluator(plant).hidden_modes().outside
+    names: tuple[str, ...] = ()
+    if lost:
+        mode = complex(lost[0])
+        null = np.linalg.svd(np.vstack([A - mode * E, C.astype(complex)]))[2][-1]
+        names = leading_names(np.abs(null), terms.names)
+    return Condition(
+        "detectable in the middle",
+        "with slopes in the middle of their bounds, modes that no output shows decay",
+        not lost,
+        float(len(lost)),
+        0.0,
+        _SOURCE,
+        f"the mode s = {described_mode(complex(lost[0]))} of {', '.join(names)} is shown by no output and does not "
+        "decay: measure something that it moves, or estimate fewer faults"
+        if lost
+        else "",
+        mode=complex(lost[0]) if lost else None,
+        signals=names,
+    )
