@@ -1,11 +1,11 @@
 """Claims for nonlinear plants over a region, against what simulated plants do inside it, and after they have left it.
 
 Random chains of two or three states, with sines, roots and squares between them, a fault that drifts, one or two
-outputs, and at times an algebraic equation.  On the record of a plant, integrated with fifth order, the distance of two
-estimates that start anywhere shrinks in every step as is proved, in the norm of the certificate; where slopes rest
-within their bounds, neither the mean square nor the gain exceeds the claim.  Then an input drives the plant out: every such row that an input, a measurement or the estimate shows is
-out, and so are the rows after it that the certificate asks for.  The mean is that of the share of the claim that is
-reached.
+outputs, and at times an algebraic equation. On the record of a plant, integrated with fifth order, the distance of
+two estimates that start anywhere shrinks in every step as is proved, in the norm of the certificate; where slopes
+rest within their bounds, neither the mean square nor the gain exceeds the claim. Then an input drives the plant out:
+every such row that an input, a measurement or the estimate shows is out, and so are the rows after it that the
+certificate asks for. The mean is that of the share of the claim that is reached.
 """
 
 from __future__ import annotations
