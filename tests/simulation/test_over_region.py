@@ -23,6 +23,25 @@ def test_a_discrete_plant_follows_its_own_equations() -> None:
         assert plant.E @ run.states[k + 1] == pytest.approx(after, abs=1e-10)
 
 
+def test_noise_in_an_algebraic_equation_counts() -> None:
+    plant = PolytopicSystem(
+        plant={
+            "E": np.diag([1.0, 0.0]), "A": [["0.5 * v", 1], [1, -2]], "C": [[0, 1]], "Bw": [[0.5], [1]], "Dw": [[0.3]],
+            "dt": 1.0,
+        },
+        scheduling={"v": [-1.0, 1.0]},
+    )  # fmt: skip
+    rng = np.random.default_rng(8)
+    course, w = rng.uniform(-1, 1, (30, 1)), rng.standard_normal((30, 1))
+    run = obsynth.simulate(plant, scheduling=course, w=w, initial_state=[1.0, 0.5])
+    assert run.states[0] == pytest.approx([1.0, 0.5 * (1.0 + w[0, 0])])
+    for k in range(29):
+        now = plant.at(course[k])
+        after = now.A @ run.states[k] + now.Bw @ w[k]
+        assert after == pytest.approx([run.states[k + 1, 0], 0.0], abs=1e-12)
+        assert run.outputs[k] == pytest.approx(now.C @ run.states[k] + now.Dw @ w[k])
+
+
 def test_a_continuous_plant_agrees_with_an_integrator() -> None:
     plant = PolytopicSystem(
         plant={
