@@ -9,7 +9,7 @@ import pytest
 
 from obsynth.conditions import ErrorPolytope
 from obsynth.methods.engines.vertex_certificates import certified
-from obsynth.proofs.vertex_inequalities import Witness, prove_gain, prove_nonsingular
+from obsynth.proofs.vertex_inequalities import Witness, prove_gain, prove_mean_square, prove_nonsingular
 
 _ERRORS = ErrorPolytope(
     [[[0.5, 0.2], [0, 0.7]], [[0.6, -0.2], [0.1, 0.8]]], [[1.0, 0]], B=[[1.0, 0], [0.5, 0]], D=[[0, 0.3]]
@@ -60,3 +60,11 @@ def test_hulls_with_a_singular_point_are_told() -> None:
     assert prove_nonsingular([np.diag([1.0, 2.0]), np.diag([0.5, 3.0])], np.eye(2), 0.49).proved
     assert not prove_nonsingular([np.diag([1.0, 2.0]), np.diag([0.5, 3.0])], np.eye(2), 0.51).proved
     assert not prove_nonsingular([np.eye(2), -np.eye(2)], np.eye(2), 1e-9).proved
+
+
+def test_direct_noise_counts_in_the_mean_square() -> None:
+    # z = 0.1 e + w, and nothing drives e: the mean square of z is that of w.
+    errors = ErrorPolytope([[[0.5]]], np.zeros((0, 1)), B=[[0.0]], D=np.zeros((0, 1)), Cz=[[0.1]], Dz=[[1.0]])
+    closed, witness = errors.closed([np.zeros((1, 0))]), Witness([np.eye(1)])
+    assert prove_mean_square(closed, witness, 1.01, discrete=True).proved
+    assert not prove_mean_square(closed, witness, 0.99, discrete=True).proved
