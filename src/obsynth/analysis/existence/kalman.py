@@ -23,7 +23,7 @@ from obsynth.analysis.time_varying import as_time_varying
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_shape
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.ranks import numerical_rank
+from obsynth.numerics.ranks import numerical_rank, product_but_rounding
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -94,7 +94,10 @@ def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
         shown, names = np.eye(plant.nd), plant.disturbance_names
     else:
         names = tuple(f"unknown input {i + 1}" for i in range(rank))
-    left, sizes_of_entry, _ = np.linalg.svd(rows * bd @ hidden)
+    # Equations that no hidden input enters stay as they are: what is exact in them (delays) stays exact.
+    entering = rows * bd @ hidden
+    reached = np.flatnonzero(np.any(entering != 0.0, axis=1))
+    left, sizes_of_entry, _ = np.linalg.svd(entering[reached])
     moved = numerical_rank(sizes_of_entry, scale=1.0)
     if moved == plant.nx:
         raise SpecError(
@@ -102,19 +105,23 @@ def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
             "state with. State one of them as noise (Bw), or leave it out.",
             path="Bd",
         )
-    equations = left[:, moved:].T * own.equations if moved else np.eye(plant.nx)
+    equations = np.eye(plant.nx)
+    if moved:
+        turned = np.zeros((len(reached) - moved, plant.nx))
+        turned[:, reached] = left[:, moved:].T * own.equations[reached]
+        equations = np.vstack([turned, np.delete(equations, reached, axis=0)])
     if rank == plant.nd:
         # In their own units again, with their own names.
         bd, dd = plant.Bd, plant.Dd
-    through, direct = equations @ bd @ shown, dd @ shown
+    through, direct = product_but_rounding(equations, bd) @ shown, dd @ shown
     scale = 1.0 / np.linalg.norm(np.vstack([bd, dd]) @ shown, axis=0)
     count = known.nx
     taken = TimeVaryingDescriptorSystem(
-        np.hstack([equations @ plant.E, np.zeros((len(equations), rank))]),
-        np.hstack([equations @ plant.A, through]),
-        equations @ plant.B,
+        np.hstack([product_but_rounding(equations, plant.E), np.zeros((len(equations), rank))]),
+        np.hstack([product_but_rounding(equations, plant.A), through]),
+        product_but_rounding(equations, plant.B),
         np.hstack([plant.C, direct]),
-        Phi=equations @ plant.Bf,
+        Phi=product_but_rounding(equations, plant.Bf),
         Psi=plant.Df,
         D=plant.D,
         dt=plant.dt,
