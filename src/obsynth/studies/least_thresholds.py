@@ -17,6 +17,7 @@ from obsynth.monitoring.thresholds.residual_model import largest_disturbances
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.transformations.moving_disturbances import moving_columns
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.studies.comparison import LONGEST_WINDOW
@@ -32,30 +33,75 @@ MOST_RESPONSE_STEPS = 6000
 
 
 def thresholds_beside_least(
-    plant: DescriptorSystem, impulses: FloatArray, faults: Sequence[str], bounds: FloatArray
+    plant: DescriptorSystem,
+    impulses: FloatArray,
+    faults: Sequence[str],
+    bounds: FloatArray,
+    moving: FloatArray | None = None,
 ) -> list[tuple[float, float]]:
     """Return for each estimate what it never passes without a fault, and the least that any test with its delay has.
 
-    ``plant`` sampled, disturbances held between its samples; ``impulses (steps, estimates, nf + nd + nw)`` as of
-    `step_responses`; ``bounds (nd,)`` of the disturbances, noise within `DEVIATIONS`.  The first is a sum of absolute
-    values; NaN where none is known.
+    ``plant`` sampled; ``impulses (steps, estimates, nf + nd + nw)`` as of `step_responses`; ``bounds (nd,)`` of the
+    disturbances, noise within `DEVIATIONS`.  Disturbances are held between samples, or move with the gains ``moving
+    (estimates, nd)`` of `moving_gains`.  The first is a sum of absolute values; NaN where none is known.
     """
     noisy = bool(plant.Dw.any() or plant.Bw.any())
     noise = np.full(impulses.shape[2] - plant.nf - plant.nd, DEVIATIONS if noisy else 0.0)
     found = []
     for row, name in enumerate(faults):
         gains = np.abs(impulses[:, row]).sum(axis=0)
+        if moving is not None:
+            gains[plant.nf : plant.nf + plant.nd] = moving[row]
         bound = float(gains[plant.nf :] @ np.concatenate([bounds, noise]))
         seen = impulses[:, row, plant.fault_names.index(name)]
         lag = int(np.argmax(np.abs(seen) > SAME_RESPONSE))
         alone = abs(seen[lag] - 1.0) <= SAME_RESPONSE and float(np.abs(seen).sum() - abs(seen[lag])) <= SAME_RESPONSE
         blind = [other for k, other in enumerate(plant.fault_names) if other != name and gains[k] <= SAME_RESPONSE]
-        found.append((bound, _least(plant, name, bounds, noisy=noisy, lag=lag if alone else None, blind=blind)))
+        found.append(
+            (
+                bound,
+                _least(
+                    plant, name, bounds, noisy=noisy, lag=lag if alone else None, blind=blind, moves=moving is not None
+                ),
+            )
+        )
     return found
 
 
+def moving_gains(
+    plant: DescriptorSystem, observer: LinearObserver, steps: int, feedback: FloatArray
+) -> FloatArray | None:
+    """Return what a disturbance of any course within one does to each estimate at most ``(estimates, nd)``; ``None``
+    where nothing is known of a sampled plant between its samples."""
+    found = moving_columns(plant)
+    if found is None:
+        return None
+    nx, nd = plant.nx, plant.nd
+    # Sums over a sample by columns, and the value at the sample, which outputs show at once.
+    columns, values = np.hstack([found.columns, found.directions]), np.where(found.moved, 0.0, plant.Bd)
+    count = columns.shape[1]
+    driven = plant.replace(
+        Bd=np.hstack([columns, values]),
+        Dd=np.hstack([np.zeros((plant.ny, count)), plant.Dd]),
+        disturbance_names=None,
+        units={},
+        operating_point={},
+    )
+    impulses, _ = step_responses(driven, observer, steps, feedback)
+    gains = np.abs(impulses[:, :, plant.nf : plant.nf + count + nd]).sum(axis=0)
+    moved, turned, direct = np.split(gains, [count - nx, count], axis=1)
+    return np.asarray(moved.reshape(len(moved), -1, nd).sum(axis=1) + turned @ found.sizes + direct)
+
+
 def _least(
-    plant: DescriptorSystem, fault: str, bounds: FloatArray, *, noisy: bool, lag: int | None, blind: list[str]
+    plant: DescriptorSystem,
+    fault: str,
+    bounds: FloatArray,
+    *,
+    noisy: bool,
+    lag: int | None,
+    blind: list[str],
+    moves: bool,
 ) -> float:
     """Return the least threshold: of a fault of any time course told after a lag, else of a constant one."""
     course = {"course": "constant"} if lag is None else {"course": "any", "lag": lag}
@@ -68,7 +114,7 @@ def _least(
                 "free": blind,
                 "noise_bound": DEVIATIONS if noisy else None,
                 "disturbance_bounds": dict(zip(plant.disturbance_names, bounds.tolist(), strict=True)),
-                "disturbance": "jump",
+                "disturbance": "any" if moves else "jump",
                 **course,
             }
         )
@@ -78,11 +124,12 @@ def _least(
     return size if np.isfinite(size) else float("nan")
 
 
-def in_words(fault: str, bound: float, least: float, unit: str = "") -> str:
-    """Return a sentence on one fault."""
+def in_words(fault: str, bound: float, least: float, unit: str = "", *, moving: bool = False) -> str:
+    """Return a sentence on one fault; ``moving``: whether disturbances move between samples."""
     size = f"{bound:.3g}{f' {unit}' if unit else ''}"
+    course = "move within their bounds" if moving else "are held"
     own = (
-        f"Fault-free, if the model is exact and disturbances are held between samples, |estimate of {fault}| <= {size}"
+        f"Fault-free, if the model is exact and disturbances {course} between samples, |estimate of {fault}| <= {size}"
     )
     if not np.isfinite(least):
         return f"{own}. The smallest possible threshold is not known."
@@ -95,7 +142,9 @@ def in_words(fault: str, bound: float, least: float, unit: str = "") -> str:
 
 
 def design_beside_least(design: ObserverDesign, scenario: Scenario) -> dict[str, tuple[float, float]]:
-    """Return the same by fault for a linear design that estimates faults, on a scenario; empty for others."""
+    """Return the same by fault for a linear design that estimates faults, on a scenario; empty for others.
+
+    Disturbances move between samples where the plant in continuous time is known."""
     if not isinstance(design.observer, LinearObserver) or not isinstance(design.plant, DescriptorSystem):
         return {}
     plant, observer = design.linear
@@ -107,7 +156,13 @@ def design_beside_least(design: ObserverDesign, scenario: Scenario) -> dict[str,
         steps, feedback = held(sampled, steps)
         impulses, _ = step_responses(sampled, observer, steps, feedback)
         bounds = largest_disturbances(scenario, sampled.disturbance_names, steps, plant.dt)
+        moving = moving_gains(sampled, observer, steps, feedback)
+        pairs = thresholds_beside_least(sampled, impulses, observer.fault_names, bounds, moving)
     except ObsynthError:
         return {}
-    pairs = thresholds_beside_least(sampled, impulses, observer.fault_names, bounds)
     return dict(zip(observer.fault_names, pairs, strict=True))
+
+
+def is_moving(design: ObserverDesign) -> bool:
+    """Whether the bounds of `design_beside_least` count disturbances that move between samples."""
+    return isinstance(design.plant, DescriptorSystem) and moving_columns(design.plant) is not None

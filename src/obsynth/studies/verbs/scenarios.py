@@ -119,11 +119,12 @@ def run_evaluate(options: argparse.Namespace) -> int:
                 plants=options.plants,
                 **({} if options.confidence is None else {"confidence": options.confidence}),
             )
-    from obsynth.studies.least_thresholds import design_beside_least, in_words
+    from obsynth.studies.least_thresholds import design_beside_least, in_words, is_moving
     from obsynth.studies.tables import described, evaluation_report, final_threshold
 
     least = design_beside_least(design, scenario)
-    sentences = [in_words(name, *pair, design.plant.units.get(name, "")) for name, pair in least.items()]
+    units, moving = design.plant.units, bool(least) and is_moving(design)
+    sentences = [in_words(name, *pair, units.get(name, ""), moving=moving) for name, pair in least.items()]
     told: dict[str, Any] | None = None
     if watched is not None:
         kind, statement = described(watched)
@@ -133,7 +134,9 @@ def run_evaluate(options: argparse.Namespace) -> int:
         {
             "spec": spec.path,
             "monitor": told,
-            "least_thresholds": {name: {"bound": pair[0], "least": pair[1]} for name, pair in least.items()},
+            "least_thresholds": {
+                name: {"bound": pair[0], "least": pair[1], "moving": moving} for name, pair in least.items()
+            },
             **found.as_dict(),
         },
         lambda: evaluation_report(
