@@ -23,7 +23,8 @@ from typing import Any
 import flint
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.analysis.time_varying import IntArray
+from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -114,10 +115,15 @@ def constant_fault_row(given: ConstantFaults, limit: float, printed_digits: int 
         if alone is not None:
             missed, detail = alone, "of the errors alone: the plant has no steady state with such a fault"
     if missed is None:
-        if max(model.plant.nx, model.observer.order) > MOST_STATES_IN_BITS:
+        if _order(model) > MOST_STATES_IN_BITS:
             return information(_NAME, claim, np.nan, source=source, status="assumed", detail="not decided")
         missed = np.nan
     return upper_bound_check(_NAME, claim, missed, limit, source=source, kind="proved", detail=detail)
+
+
+def _order(model: ErrorModel) -> int:
+    """Return of how many unknowns the larger system of equations is."""
+    return max(model.plant.nx, len(_seen_by_faults(model.observer)))
 
 
 _Missed = Callable[[ConstantFaults, type[Any]], Any]
@@ -126,7 +132,7 @@ _Missed = Callable[[ConstantFaults, type[Any]], Any]
 def _decided(given: ConstantFaults, missed: _Missed, sizes: FloatArray, limit: float) -> float | None:
     """Return a bound on the largest share that is missed, in as many digits as tell it from the limit."""
     value = None
-    many = max(given.model.plant.nx, given.model.observer.order) > MOST_STATES_IN_BITS
+    many = _order(given.model) > MOST_STATES_IN_BITS
     for bits in (0,) if many else (0, *STEADY_BITS):
         found: Ball | None
         if bits:
@@ -215,9 +221,21 @@ def _missed_alone(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed | Non
 
 def _shown(observer: LinearObserver, driven: Enclosed, kind: type[Enclosed]) -> Enclosed | None:
     """Return what the fault estimates show in the end of what drives the observer's state all the time."""
-    az = kind.exact(observer.Az)
-    state = enclosed_solution(kind.exact(np.eye(observer.order)) - az if observer.dt > 0.0 else -az, driven)
-    return None if state is None else kind.exact(observer.Cz[observer.fault_rows]) @ state
+    kept = _seen_by_faults(observer)
+    taking = kind.exact(np.eye(observer.order)[kept])
+    az = kind.exact(observer.Az[np.ix_(kept, kept)])
+    pencil = kind.exact(np.eye(len(kept))) - az if observer.dt > 0.0 else -az
+    state = enclosed_solution(pencil, taking @ driven)
+    return None if state is None else kind.exact(observer.Cz[observer.fault_rows][:, kept]) @ state
+
+
+@remembered
+def _seen_by_faults(observer: LinearObserver) -> IntArray:
+    """Return the observer's states that reach a fault estimate, at once or later: not the registers of past states."""
+    kept = np.any(observer.Cz[observer.fault_rows] != 0.0, axis=0)
+    while np.any(more := np.any(observer.Az[kept] != 0.0, axis=0) & ~kept):
+        kept |= more
+    return np.flatnonzero(kept)
 
 
 def _settles(model: ErrorModel) -> bool:
