@@ -30,13 +30,15 @@ LISTED = 20
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a case: the row and the column of the table it counts in; ``wrong`` says what must not be, and
-    ``value`` is what the table says the mean of."""
+    """What became of a case: the row and the column of the table it counts in; ``wrong`` says what must not be,
+    ``value`` is what the table says the mean of, and ``details`` (JSON) what a campaign's own table (`more_of_table`)
+    is made of."""
 
     group: str
     result: str
     wrong: str = ""
     value: float | None = None
+    details: str = ""
 
 
 class TooLongError(BaseException):
@@ -126,6 +128,8 @@ def written_table(campaign: ModuleType, outcomes: Mapping[int, Outcome]) -> str:
         lines.append("| " + " | ".join(row) + " |")
         if number == 0:
             lines.append("|" + " --- |" * len(row))
+    if hasattr(campaign, "more_of_table"):
+        lines += ["", *campaign.more_of_table(outcomes)]
     lines += ["", f"Wrong: {len(wrong)} of {len(outcomes)}."]
     lines += [f"- seed {seed}: {outcome.group}: {outcome.wrong}" for seed, outcome in list(wrong.items())[:LISTED]]
     return "\n".join(lines) + "\n"

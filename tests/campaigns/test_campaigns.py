@@ -13,8 +13,13 @@ from benchmarks.campaigns import frame  # noqa: E402
 PARTS = 4
 
 
+#: A case of these takes minutes.
+LONG = {"logs_as_they_are"}
+NAMES = [pytest.param(name, marks=[pytest.mark.long] * (name in LONG)) for name in frame.campaign_names()]
+
+
 @pytest.mark.parametrize("part", range(PARTS))
-@pytest.mark.parametrize("name", frame.campaign_names())
+@pytest.mark.parametrize("name", NAMES)
 def test_a_share_of_the_campaign(name, part, share):
     campaign = frame.load_campaign(name)
     outcomes = frame.run_campaign(campaign, share(list(frame.share_of(campaign))[part::PARTS], 32))
