@@ -13,12 +13,8 @@ from obsynth.methods.guaranteed_test.options import TestOptions
 from obsynth.methods.guaranteed_test.problem import (
     WindowProblem,
     WindowProgrammes,
-    delay_in_samples,
-    observer_of,
-    observer_of_rows,
     problem_as_designed,
     require_linear_options,
-    rounding_of,
 )
 from obsynth.methods.guaranteed_test.proofs import (
     Repaired,
@@ -29,6 +25,12 @@ from obsynth.methods.guaranteed_test.proofs import (
 )
 from obsynth.methods.guaranteed_test.regions import remainder_check, while_inside
 from obsynth.methods.guaranteed_test.tolerant import MEAN_ROOM, mean_over_record, part_beside
+from obsynth.methods.guaranteed_test.window_observers import (
+    delay_in_samples,
+    observer_of,
+    observer_of_rows,
+    rounding_of,
+)
 from obsynth.methods.guaranteed_test.windows import Window, disturbances_in_words
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver

@@ -14,10 +14,11 @@ from typing import Any, Self
 import numpy as np
 
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
-from obsynth.methods.guaranteed_test.problem import rounding_of, window_as_designed
+from obsynth.methods.guaranteed_test.problem import window_as_designed
 from obsynth.methods.guaranteed_test.programs import TOLERANCE
 from obsynth.methods.guaranteed_test.proofs import Repaired, Square, proved_threshold, repaired_multipliers
 from obsynth.methods.guaranteed_test.tolerant import rows_before
+from obsynth.methods.guaranteed_test.window_observers import rounding_of
 from obsynth.methods.guaranteed_test.windows import Window, window_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import UNIT_ROUNDOFF, gamma, rounded_up

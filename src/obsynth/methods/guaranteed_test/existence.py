@@ -11,8 +11,9 @@ from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.condensed import Condensed
 from obsynth.methods.guaranteed_test.options import TestOptions
-from obsynth.methods.guaranteed_test.problem import WindowProblem, missing_bounds, problem_of, samples_given
+from obsynth.methods.guaranteed_test.problem import WindowProblem, problem_of, samples_given
 from obsynth.methods.guaranteed_test.proofs import proved_ray, repaired_multipliers
+from obsynth.methods.guaranteed_test.window_bounds import missing_bounds
 from obsynth.methods.guaranteed_test.window_models import fault_names
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray

@@ -12,8 +12,8 @@ from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.guaranteed_test.bank_synthesis import REMAINDER_ROUNDINGS, SHARE_ROOM
 from obsynth.methods.guaranteed_test.existence import SOURCE, conditions
-from obsynth.methods.guaranteed_test.problem import between, fault_of
 from obsynth.methods.guaranteed_test.synthesis import synthesise
+from obsynth.methods.guaranteed_test.window_bounds import between, fault_of
 from obsynth.methods.method import Synthesis
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem

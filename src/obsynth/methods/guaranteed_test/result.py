@@ -10,13 +10,9 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.methods.functions import design_function
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
-from obsynth.methods.guaranteed_test.problem import (
-    WindowProgrammes,
-    free_faults,
-    problem_as_designed,
-    window_as_designed,
-)
+from obsynth.methods.guaranteed_test.problem import WindowProgrammes, problem_as_designed, window_as_designed
 from obsynth.methods.guaranteed_test.tolerant import rows_before
+from obsynth.methods.guaranteed_test.window_bounds import free_faults
 from obsynth.methods.guaranteed_test.windows import courses_of
 from obsynth.numerics.arguments import arguments_checked, real_array, whole_number
 from obsynth.numerics.arrays import FloatArray

@@ -19,11 +19,7 @@ from obsynth.methods.guaranteed_test.problem import (
     WITHIN,
     WindowProblem,
     WindowProgrammes,
-    delay_in_samples,
-    observer_of,
-    observer_of_rows,
     problem_of,
-    rounding_of,
     samples_given,
 )
 from obsynth.methods.guaranteed_test.programs import Optimum, largest_hidden_fault
@@ -43,6 +39,12 @@ from obsynth.methods.guaranteed_test.tolerant import (
     with_tolerances,
 )
 from obsynth.methods.guaranteed_test.window_models import TestProblem, disturbance_names
+from obsynth.methods.guaranteed_test.window_observers import (
+    delay_in_samples,
+    observer_of,
+    observer_of_rows,
+    rounding_of,
+)
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.methods.method import Synthesis
 from obsynth.methods.tracking import tracking_of
