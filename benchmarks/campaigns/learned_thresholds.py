@@ -14,13 +14,13 @@ from benchmarks.campaigns.frame import Outcome
 from scipy.signal import lfilter
 
 from obsynth.monitoring.thresholds.learned_levels import (
-    Statistics,
     conformal_levels,
     count_alarms,
     is_conformal,
     learned_levels,
     rows_needed,
 )
+from obsynth.monitoring.thresholds.learned_statistics import Statistics
 from obsynth.numerics.autoregression import fitted_autoregression
 
 LIMIT = 120.0  # s

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from obsynth.exporting.float_error import UNIT, float_bounds
-from obsynth.methods.guaranteed_test.problem import rounded_outward
 from obsynth.methods.guaranteed_test.proofs import down, exact_right_sides
+from obsynth.proofs.exact_arithmetic import rounded_outward
 
 
 def one_state(pole: float, *, into: float, rise: float = 0.0) -> SimpleNamespace:

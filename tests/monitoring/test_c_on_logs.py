@@ -16,9 +16,10 @@ import pytest
 
 import obsynth
 from obsynth.exporting.c_source import c_identifier
-from obsynth.monitoring.thresholds.learned import LearnedThresholds, watched_names
-from obsynth.monitoring.thresholds.learned_levels import AGES, Statistics
+from obsynth.monitoring.thresholds.learned import LearnedThresholds
+from obsynth.monitoring.thresholds.learned_statistics import AGES, Statistics
 from obsynth.monitoring.thresholds.parameter_scores import parameter_walk
+from obsynth.monitoring.thresholds.watched_columns import watched_names
 from obsynth.numerics.autoregression import Autoregression
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.results.gain_set_writing import gain_set_digest

@@ -13,7 +13,7 @@ import pytest
 import obsynth
 from obsynth.cli.main import main
 from obsynth.monitoring.thresholds.cross_validation import HeldOut, healthy_time, levels_of_other_parts
-from obsynth.monitoring.thresholds.learned_levels import AGES, Statistics
+from obsynth.monitoring.thresholds.learned_statistics import AGES, Statistics
 from obsynth.monitoring.thresholds.slow_offsets import offset_bound
 from obsynth.numerics.autoregression import Autoregression
 

@@ -17,15 +17,14 @@ from scipy.signal import lfilter
 import obsynth
 from obsynth.monitoring.alarms.events import NOT_DISTINGUISHED_YET, alarm_rows
 from obsynth.monitoring.thresholds.learned_levels import (
-    AGES,
     SETTLING,
-    Statistics,
     conformal_levels,
     count_alarms,
     is_conformal,
     learned_levels,
     rows_needed,
 )
+from obsynth.monitoring.thresholds.learned_statistics import AGES, Statistics
 from obsynth.monitoring.thresholds.learning import learned_sizes
 from obsynth.monitoring.thresholds.monitor import NOT_DISTINGUISHED
 from obsynth.monitoring.thresholds.parameter_scores import (

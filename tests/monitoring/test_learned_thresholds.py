@@ -16,20 +16,12 @@ from scipy.signal import lfilter
 
 import obsynth
 from obsynth.cli.main import main
+from obsynth.monitoring.thresholds.alarm_rates import rows_per_alarm
 from obsynth.monitoring.thresholds.cross_validation import held_out, levels_of_other_parts
-from obsynth.monitoring.thresholds.learned import (
-    LearnedRule,
-    independent,
-    rows_per_alarm,
-    signatures,
-    varying,
-    watched_names,
-)
+from obsynth.monitoring.thresholds.learned_from_rows import independent, signatures, varying
 from obsynth.monitoring.thresholds.learned_levels import (
-    AGES,
     HOLD,
     SETTLING,
-    Statistics,
     Tail,
     conformal_levels,
     count_alarms,
@@ -39,7 +31,10 @@ from obsynth.monitoring.thresholds.learned_levels import (
     level_of,
     rows_needed,
 )
+from obsynth.monitoring.thresholds.learned_rule import LearnedRule
+from obsynth.monitoring.thresholds.learned_statistics import AGES, Statistics
 from obsynth.monitoring.thresholds.monitor import LinearSample, Sample
+from obsynth.monitoring.thresholds.watched_columns import watched_names
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 from obsynth.numerics.square_root_estimation import ParameterState
 from obsynth.observers.recursive.sample import RawEstimate

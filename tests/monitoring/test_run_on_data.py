@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import obsynth
 from obsynth import SpecError, run_on_data
-from obsynth.monitoring.logs.log_observer import interval
+from obsynth.monitoring.logs.clock import interval
 from obsynth.simulation.linear import simulate_plant
 from obsynth.specs.loader import load_spec
 

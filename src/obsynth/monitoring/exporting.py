@@ -10,10 +10,13 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.exporting.alarms import STATISTIC, MonitorVariable
 from obsynth.exporting.c_source import filled_table, filled_template, integer_table, table_lines
-from obsynth.monitoring.thresholds.learned import LearnedRule, LearnedThresholds, as_learned, watched_names
-from obsynth.monitoring.thresholds.learned_levels import AGES, FORGETTING, HOLD
+from obsynth.monitoring.thresholds.learned import LearnedThresholds
+from obsynth.monitoring.thresholds.learned_levels import HOLD
+from obsynth.monitoring.thresholds.learned_rule import LearnedRule
+from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Monitor
 from obsynth.monitoring.thresholds.parameter_scores import DISTINGUISHED, LEAST_ADDED, MODEL_SHARE, parameter_walk
+from obsynth.monitoring.thresholds.watched_columns import as_learned, watched_names
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver

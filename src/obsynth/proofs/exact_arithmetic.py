@@ -336,3 +336,9 @@ def _value(root: flint.acb, side: str, discrete: bool) -> complex:
     if side == "boundary":
         value = value / abs(value) if discrete else complex(0.0, imaginary)
     return value
+
+
+def rounded_outward(value: Fraction) -> float:
+    """Return a double that is not below a rational number."""
+    found = float(value)
+    return found if Fraction(found) >= value else float(np.nextafter(found, np.inf))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from functools import cached_property
 from typing import Any
 
@@ -264,9 +263,3 @@ def problem_as_designed(plant: DescriptorSystem | TimeVaryingDescriptorSystem, a
 def window_as_designed(plant: DescriptorSystem, asked: TestOptions) -> Window:
     """Return the stacked equations of options as a design ships them: with the number of samples and the lag."""
     return problem_as_designed(plant, asked).window(int(asked.samples))
-
-
-def rounded_outward(value: Fraction) -> float:
-    """Return a double that is not below a rational number."""
-    found = float(value)
-    return found if Fraction(found) >= value else float(np.nextafter(found, np.inf))

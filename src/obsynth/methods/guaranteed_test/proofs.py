@@ -15,10 +15,10 @@ import numpy as np
 from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from obsynth.methods.guaranteed_test.condensed import LEAST_WEIGHT, Condensed
-from obsynth.methods.guaranteed_test.problem import rounded_outward
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, rounded_up
+from obsynth.proofs.exact_arithmetic import rounded_outward
 
 #: Diagonal of the pivoted triangle, as a share of its first entry, below which rows are taken as dependent.
 DEPENDENT_ROW = 1e-13

@@ -11,13 +11,13 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.options import TestOptions
-from obsynth.methods.guaranteed_test.problem import rounded_outward
 from obsynth.methods.guaranteed_test.window_models import Bounds, disturbance_names
 from obsynth.numerics.arrays import LARGEST, FloatArray, require_no_overflow
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.transformations.moving_disturbances import moving_columns
 from obsynth.plants.transformations.remainders import continuous_model
+from obsynth.proofs.exact_arithmetic import rounded_outward
 
 
 def fault_of(names: tuple[str, ...], name: str | None) -> int:

@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from obsynth.monitoring.logs.log_observer import GAP, OUT, OUT_OF_ORDER, PARTIAL, RECOVERING, REPEATED_STAMP, WARM_UP
+from obsynth.monitoring.logs.clock import OUT_OF_ORDER, REPEATED_STAMP
+from obsynth.monitoring.logs.log_observer import GAP, OUT, PARTIAL, RECOVERING, WARM_UP
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.observers.estimates import BAND_WIDTH
 

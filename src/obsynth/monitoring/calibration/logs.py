@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.monitoring.logs.log_observer import MOST_STALE
+from obsynth.monitoring.logs.clock import MOST_STALE
 from obsynth.monitoring.logs.log_tables import log_table, parsed_rows
 from obsynth.monitoring.logs.stuck_sensors import stuck_rows, stuck_texts, without_repeats
 from obsynth.numerics.arrays import FloatArray, read_only

@@ -1,4 +1,4 @@
-"""A linear observer on a log, row by row: gaps, bad rows, warm-up; and which observer a design has on a log."""
+"""A linear observer on a log, row by row: gaps, bad rows, warm-up."""
 
 from __future__ import annotations
 
@@ -11,11 +11,8 @@ import numpy as np
 
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.methods.state_solver import state_solver
-from obsynth.monitoring.logs.log_observer import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, LogObserver, Row
-from obsynth.monitoring.logs.region_observer import RegionLogObserver
-from obsynth.monitoring.logs.scheduled_observer import ScheduledLogObserver
-from obsynth.monitoring.logs.step_observer import SteppingLogObserver
-from obsynth.monitoring.logs.window_observer import WindowLogObserver
+from obsynth.monitoring.logs.clock import LONGEST_BRIDGE
+from obsynth.monitoring.logs.log_observer import GAP, OK, RECOVERING, WARM_UP, LogObserver, Row
 from obsynth.monitoring.thresholds.monitor import LinearSample
 from obsynth.numerics.arguments import real_number
 from obsynth.numerics.arrays import FloatArray
@@ -27,11 +24,7 @@ from obsynth.observers.linear.missing_samples import (
     MissingSamples,
 )
 from obsynth.observers.linear.modes import transient
-from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.nonlinear.region_observer import RegionObserver
-from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.taken_inputs import no_inputs, over_samples, taken_inputs
-from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 
@@ -413,32 +406,3 @@ class LinearLogObserver(LogObserver):
         row = np.full(len(self.observer.Cz), np.nan)
         row[self.observer.fault_rows] = self.fault[self.told_faults]
         return row
-
-
-def log_observer(
-    design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None, outliers: str | None = None
-) -> LogObserver:
-    """Return the observer of a design on a log, at its start; ``outliers`` replace what the design says."""
-    if isinstance(design.observer, LinearObserver):
-        if outliers not in (None, "none"):
-            raise SpecError(
-                "outliers is for recursive and nonlinear designs, which know how far a sample may be from "
-                "its prediction.",
-                path="outliers",
-            )
-        return LinearLogObserver(design, gap=gap, warm_up=warm_up)
-    if gap is not None:
-        raise SpecError(SAMPLED_GAP, path="gap")
-    if isinstance(design.observer, WindowObserver):
-        if outliers not in (None, "none"):
-            raise SpecError("outliers is for recursive and nonlinear designs: leave it out.", path="outliers")
-        return WindowLogObserver(design, design.observer, warm_up=warm_up)
-    if isinstance(design.observer, ScheduledObserver):
-        if outliers not in (None, "none"):
-            raise SpecError("outliers is for recursive and nonlinear designs: leave it out.", path="outliers")
-        return ScheduledLogObserver(design, warm_up=warm_up)
-    if isinstance(design.observer, RegionObserver):
-        if outliers not in (None, "none"):
-            raise SpecError("outliers is for designs that state deviations: leave it out.", path="outliers")
-        return RegionLogObserver(design, warm_up=warm_up)
-    return SteppingLogObserver(design, warm_up=warm_up, outliers=outliers)

@@ -1,14 +1,15 @@
-"""An observer on rows of a log: what it says of each, and what every kind of observer has there; and the clock."""
+"""An observer on rows of a log: what it says of each, and what every kind of observer has there."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 from obsynth.errors import SpecError
+from obsynth.monitoring.logs.clock import LONGEST_BRIDGE
 from obsynth.monitoring.thresholds.monitor import Evidence, LinearSample
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.modes import SETTLING_SLACK, checked_warm_up
@@ -21,47 +22,11 @@ OK, WARM_UP, PARTIAL, GAP, RECOVERING = "ok", "warm-up", "partial", "gap", "reco
 #: A row in which a scheduling parameter is outside its region, or was so recently that nothing is claimed yet.
 OUT = "out"
 
-#: Rows whose stamps do not rise: they are left out, and say nothing.
-REPEATED_STAMP, OUT_OF_ORDER = "repeated stamp", "out of order"
-
-STALE = (REPEATED_STAMP, OUT_OF_ORDER)
-
 #: Rows in which a decision may be taken.
 DECIDING = (OK, PARTIAL)
 
-#: Gaps longer than this many samples are not bridged: the observer starts again.
-LONGEST_BRIDGE = 10_000
-
-#: A sampled design takes a stamp as the sample that it is nearest to: it is off by up to this share of dt.
-STAMP_SHARE = 0.45
-
-#: Continuous designs: a gap of so little more than a number of intervals has no further row in it.
-COUNTING_SHARE = 0.01
-
-#: What remains of a deviation from the samples in the next one: a clock that is a little fast is followed.
-FOLLOWING_SHARE = 0.9
-
-#: Stamps that are this far from the samples on average are of another sampling time; the average takes this share of
-#: each new row, and begins with nothing.
-OTHER_SHARE, AVERAGED_SHARE = 0.25, 0.05
-
-#: So many rows in a row whose stamps do not rise are no slip of a clock.
-MOST_STALE = 10
-
-#: One that differs by this share of dt is one of dt for certain.
-SURE_SHARE = 0.009
-
-#: Of uneven stamps one that differs by more than this is another interval.
-SAME_INTERVAL = 1e-9
-
-#: Without another word, an interval is a gap when it is longer than this many times the longest one before.
-GAP_FACTOR = 10.0
-
 #: Waiting without dt ends with a row that so many roundings call earlier.
 SETTLING_ULPS = 4.0
-
-#: A gap of more samples than this cannot be counted in double precision.
-MOST_COUNTED_SAMPLES = 2.0**53
 
 
 class Row(NamedTuple):
@@ -85,180 +50,6 @@ class Row(NamedTuple):
     repeated: FloatArray | None = None
     # Rows of a sampled design that were missing before this one: as the observer went through them, without signals.
     missed: tuple[Row, ...] = ()
-
-
-class StampError(SpecError):
-    """A stamp that comes before the one of an earlier row."""
-
-    def __init__(self, message: str, row: int, last: float, time: float) -> None:
-        super().__init__(message, path=f"row {row}")
-        self.row, self.last, self.time = row, last, time
-
-    def dated(self, shown: Callable[[float], str]) -> str:
-        """Return the message with dates as the log writes them."""
-        return f"Row {self.row}: the time falls from {shown(self.last)} to {shown(self.time)}."
-
-
-class Clock:
-    """Checks one time stamp after the other; ``dt`` is 0 in continuous time, with gaps longer than ``gap`` seconds."""
-
-    def __init__(self, dt: float, gap: float | None, *, irregular: bool = False) -> None:
-        self.dt, self.gap, self.irregular = dt, gap, irregular
-        # Sampled designs that take any interval: whether the last one was taken as it is, and by how many seconds
-        # such intervals have been longer than dt.
-        self.is_own, self.longer, self.is_uneven = False, 0.0, False
-        # Sampled designs: the time of the last sample, near which its stamp lies.
-        self.last: float | None = None
-        self.longest = 0.0
-        self.stamp, self.away, self.left_out = -math.inf, 0.0, 0
-        # Of sampled designs: the number of the last sample, from that of the first row.
-        self.count = 0
-        self.is_resumed = False  # and no row has been taken since
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what goes from row to row, as data."""
-        found = {name: getattr(self, name) for name in ("last", "longest", "stamp", "away", "left_out", "count")}
-        return found | ({"longer": self.longer, "is_uneven": self.is_uneven} if self.irregular else {})
-
-    def resume(self, data: Mapping[str, Any]) -> None:
-        """Go on from what `as_dict` returned."""
-        vars(self).update(data)
-        self.is_resumed = True
-
-    def at(self, time: float, before: int = 0) -> float:
-        """Return the time of the last sample, with this stamp, or of one so many before it: sampled designs count
-        samples, whatever their stamps are off by."""
-        return (self.count - before) * self.dt + self.longer if self.dt > 0.0 else time
-
-    def advance(self, time: float, row: int) -> tuple[float, int]:
-        """Take the stamp of the next row."""
-        if not math.isfinite(time):
-            raise SpecError(f"Row {row} has no time: each row needs a finite number of seconds.", path=f"row {row}")
-        last = self.last
-        if last is None:
-            self.last = self.stamp = time
-            return 0.0, 0
-        if time == last:
-            raise SpecError(f"Row {row} repeats the time {time:.17g} s of the row before.", path=f"row {row}")
-        if time < last:
-            raise StampError(f"Row {row}: the time falls from {last:.17g} to {time:.17g} s.", row, last, time)
-        step = interval(last, time)
-        self.is_own = self.irregular and self._is_irregular(step)
-        if self.is_own:
-            missing, self.longer = 0, self.longer + step - self.dt
-        else:
-            missing = self._sampled(step, row) if self.dt > 0.0 else self._continuous(step, row)
-        self.last = time
-        self.count += missing + 1
-        if self.dt > 0.0 and not self.is_own:
-            away = step - (missing + 1) * self.dt
-            # Regular stamps are taken as they are, and not as they are summed up.
-            self.last = time if abs(away) <= SURE_SHARE * self.dt else time - FOLLOWING_SHARE * away
-        self.stamp, self.left_out, self.is_resumed = time, 0, False
-        if not missing:
-            self.longest = max(self.longest, step)
-        return step, missing
-
-    def stale(self, time: float) -> str:
-        """Return the status of a row whose stamp does not rise, which is left out; empty for others. A run that goes on
-        from a saved state may begin with the rows that the state has, however many they are."""
-        last = self.last
-        if last is None or not math.isfinite(time) or (self.left_out >= MOST_STALE and not self.is_resumed):
-            return ""
-        # Of a sampled design the last sample may be told a little later than its stamp.
-        before = max(self.stamp, last - STAMP_SHARE * self.dt) if self.dt > 0.0 else last
-        if time > before and time != last:
-            return ""
-        self.left_out += 1
-        return REPEATED_STAMP if time in (self.stamp, last) else OUT_OF_ORDER
-
-    def regular(self, times: Sequence[float]) -> list[float]:
-        """Return the intervals to the first of these stamps that certainly follow each other without a gap; nothing is
-        taken."""
-        found: list[float] = []
-        if self.last is None or not self.longest > 0.0:
-            return found
-        before, longest = self.last, GAP_FACTOR * self.longest if self.gap is None else self.gap
-        lowest, highest = 0.0, longest
-        if self.dt > 0.0:
-            # Narrower than what fits, so that no rounding of an interval counts.
-            lowest, highest = (1.0 - SURE_SHARE) * self.dt, (1.0 + SURE_SHARE) * self.dt
-        for time in times:
-            step = interval(before, time) if time > before and time < math.inf else 0.0
-            if not lowest <= step <= highest or step <= 0.0:
-                break
-            found.append(step)
-            before = time
-        return found
-
-    def take(self, times: Sequence[float], steps: Sequence[float]) -> None:
-        """Take stamps that `regular` found to follow each other, with their intervals."""
-        self.last, self.longest = times[-1], max(self.longest, *steps)
-        self.stamp, self.left_out, self.away = times[-1], 0, 0.0
-        self.count += len(times)
-
-    def _is_irregular(self, step: float) -> bool:
-        """Whether an interval is taken as it is: it is near dt, but not dt; or the stamps are uneven: this one, or one
-        before, is no number of samples with rows missing between them. A gap is none of these."""
-        samples = step / self.dt
-        if samples > LONGEST_BRIDGE:
-            return False
-        count = max(round(samples), 1)
-        away = abs(samples - count)
-        if count == 1:
-            self.is_uneven = self.is_uneven or away > STAMP_SHARE
-            return away > (SAME_INTERVAL if self.is_uneven else SURE_SHARE)
-        # Rows are missing only where some have come one after the other.
-        fits = away <= (OTHER_SHARE if self.longest else SURE_SHARE) and (self.longest > 0.0 or not self.count)
-        self.is_uneven = self.is_uneven or not fits
-        return self.is_uneven
-
-    def _sampled(self, step: float, row: int) -> int:
-        count = _counted(step / self.dt, step, row)
-        away = abs(step - count * self.dt) / self.dt
-        average = (1.0 - AVERAGED_SHARE) * self.away + AVERAGED_SHARE * away
-        if count < 1 or away > STAMP_SHARE or average > OTHER_SHARE:
-            raise SpecError(
-                f"Row {row} comes {step:.10g} s after the row before, but the design has dt = {self.dt:.10g} s: "
-                "a time stamp may be off by 45 % of dt, and all of them by 25 % on average; irregular time stamps "
-                "need a continuous-time design, or a recursive one of a continuous plant that was sampled.",
-                path=f"row {row}",
-            )
-        # One gap may be the first interval of a log.
-        if count > 1 and self.longest == 0.0 and self.count > 0:
-            raise SpecError(
-                f"Row {row}: the log is sampled every {step:.6g} s, but the design needs {self.dt:.6g} s: resample the "
-                f"log, or design with sample_time: {step:.6g}.",
-                path=f"row {row}",
-            )
-        self.away = average
-        return count - 1
-
-    def _continuous(self, step: float, row: int) -> int:
-        typical = self.longest or step
-        if step <= (GAP_FACTOR * typical if self.gap is None else self.gap):
-            return 0
-        unit = typical if self.longest else min(step, self.gap or step)
-        _counted(step / unit, step, row)
-        return max(math.ceil(step / unit * (1.0 - COUNTING_SHARE)) - 1, 1)
-
-
-def _counted(samples: float, step: float, row: int) -> int:
-    """Return a whole number of samples; more than can be counted are no gap but a mistake."""
-    if not samples < MOST_COUNTED_SAMPLES:
-        raise SpecError(
-            f"Row {row} comes {step:.10g} s after the row before, {samples:.3g} samples: are the times in seconds?",
-            path=f"row {row}",
-        )
-    return round(samples)
-
-
-def interval(before: float, after: float) -> float:
-    """Return ``after - before``, rounded to what the two stamps can resolve, so that equal intervals are equal."""
-    resolution = 2.0 * max(math.ulp(before), math.ulp(after))
-    digits = -math.ceil(math.log10(resolution))
-    rounded = round(after - before, digits)
-    return rounded if rounded > 0.0 else after - before
 
 
 class LogObserver(ABC):

@@ -15,15 +15,17 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.monitoring.alarms.events import NO_DECISION, AlarmEvent, AlarmLog
-from obsynth.monitoring.logs.linear_observer import log_observer
-from obsynth.monitoring.logs.log_observer import DECIDING, GAP, RECOVERING, STALE, Clock, Row, StampError
+from obsynth.monitoring.logs.clock import STALE, Clock, StampError
+from obsynth.monitoring.logs.log_observer import DECIDING, GAP, RECOVERING, Row
+from obsynth.monitoring.logs.observer_of_design import log_observer
 from obsynth.monitoring.logs.recovered_states import FIRST_SECONDS, MOST_FIRST_ROWS, RecoveredStates
 from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.stuck_sensors import STUCK_ALARM_ROWS, RepeatedValues, Unrepeated, rising
-from obsynth.monitoring.thresholds.learned import LearnedRule, as_learned
 from obsynth.monitoring.thresholds.learned_levels import HOLD
+from obsynth.monitoring.thresholds.learned_rule import LearnedRule
 from obsynth.monitoring.thresholds.monitor import LinearSample, Monitor, Sample
+from obsynth.monitoring.thresholds.watched_columns import as_learned
 from obsynth.numerics.arguments import is_finite_number, is_number, real_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.modes import SETTLED_TO, transient

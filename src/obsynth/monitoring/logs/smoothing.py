@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.monitoring.logs.log_observer import STALE, LogObserver, Row
+from obsynth.monitoring.logs.clock import STALE
+from obsynth.monitoring.logs.log_observer import LogObserver, Row
 from obsynth.monitoring.logs.log_run import LogRun
 from obsynth.monitoring.logs.signals import TIME_HEADER
 from obsynth.monitoring.logs.sources import samples

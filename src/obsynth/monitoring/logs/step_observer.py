@@ -8,8 +8,8 @@ import numpy as np
 
 from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError
 from obsynth.monitoring.logs.log_observer import GAP, OK, PARTIAL, RECOVERING, WARM_UP, LogObserver, Row
-from obsynth.monitoring.thresholds.learned import innovation_names
 from obsynth.monitoring.thresholds.monitor import Evidence
+from obsynth.monitoring.thresholds.watched_columns import innovation_names
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.irregular_steps import IrregularSteps

@@ -16,13 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.monitoring.thresholds.learned_levels import (
-    HOLD,
-    SETTLING,
-    Statistics,
-    exchangeable_level,
-    normal_statistics,
-)
+from obsynth.monitoring.thresholds.learned_levels import HOLD, SETTLING, exchangeable_level, normal_statistics
+from obsynth.monitoring.thresholds.learned_statistics import Statistics
 from obsynth.monitoring.thresholds.parameter_scores import Scores
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.autoregression import fitted_autoregression

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.monitoring.thresholds.learned_levels import AGES, HOLD, Statistics, normal_statistics
+from obsynth.monitoring.thresholds.learned_levels import HOLD, normal_statistics
+from obsynth.monitoring.thresholds.learned_statistics import AGES, Statistics
 from obsynth.monitoring.thresholds.parameter_scores import Scores
 from obsynth.numerics.arrays import FloatArray
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
-from obsynth.monitoring.logs.log_observer import DECIDING, STALE, Row
+from obsynth.monitoring.logs.clock import STALE
+from obsynth.monitoring.logs.log_observer import DECIDING, Row
 from obsynth.monitoring.logs.log_run import LogRun
 from obsynth.monitoring.logs.log_tables import parsed_rows
 from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals
@@ -19,25 +20,25 @@ from obsynth.monitoring.logs.sources import CHUNK_ROWS, Data, Logs, chunks
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.step_observer import SteppingLogObserver
 from obsynth.monitoring.logs.stuck_sensors import Unrepeated, longest_repeats, rising, stuck_rows
-from obsynth.monitoring.thresholds.learned import (
+from obsynth.monitoring.thresholds.alarm_rates import rows_per_alarm
+from obsynth.monitoring.thresholds.learned import NO_PAIRS, LearnedThresholds, WrongPairs
+from obsynth.monitoring.thresholds.learned_from_rows import (
     LEAST_NORMAL,
-    NO_PAIRS,
-    LearnedThresholds,
-    WrongPairs,
     divided_at_starts,
-    has_innovations_by_sensor,
     raised_levels,
-    rows_per_alarm,
-    settling_rows,
     thresholds_from_rows,
-    watched_names,
     watched_rows,
-    watched_values,
 )
-from obsynth.monitoring.thresholds.learned_levels import AGES
+from obsynth.monitoring.thresholds.learned_statistics import AGES
 from obsynth.monitoring.thresholds.monitor import Evidence
 from obsynth.monitoring.thresholds.normal_notes import notes_of_normal_rows, notes_of_sizes, notes_of_starts
 from obsynth.monitoring.thresholds.parameter_scores import Scores, before_any, parameter_walk, sample_score
+from obsynth.monitoring.thresholds.watched_columns import (
+    has_innovations_by_sensor,
+    settling_rows,
+    watched_names,
+    watched_values,
+)
 from obsynth.monitoring.thresholds.wrong_pairs import LEAST_WRONG, NEARER, Pair, believed_pairs, taken_back, without
 from obsynth.numerics.arguments import Seed, arguments_checked
 from obsynth.numerics.arrays import FloatArray

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.stuck_sensors import stuck_texts
-from obsynth.monitoring.thresholds.learned import Raised
+from obsynth.monitoring.thresholds.learned_from_rows import Raised
 from obsynth.monitoring.thresholds.learned_levels import CHANCE_DEVIATIONS, normal_scores
 from obsynth.numerics.arrays import FloatArray
 

@@ -13,7 +13,8 @@ from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.monitoring.thresholds.adaptive_monitor import NO_TOLERANCE, noisy_design, over_box, tolerances_of
 from obsynth.monitoring.thresholds.gap_growth import GapGrowth, gap_growth
 from obsynth.monitoring.thresholds.guaranteed import data_monitor
-from obsynth.monitoring.thresholds.learned import LearnedThresholds, learned_monitor, load_thresholds
+from obsynth.monitoring.thresholds.learned import LearnedThresholds, load_thresholds
+from obsynth.monitoring.thresholds.learned_rule import learned_monitor
 from obsynth.monitoring.thresholds.learning import learn_thresholds
 from obsynth.monitoring.thresholds.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
 from obsynth.monitoring.thresholds.options import DISTURBANCES, LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options

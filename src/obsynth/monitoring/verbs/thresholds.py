@@ -15,7 +15,8 @@ from obsynth.report.terminal.output import emit, gains_to_hand_on, output_file
 
 def run_thresholds(options: argparse.Namespace) -> int:
     """Run ``thresholds``: 0 whether the rows suffice for the rate or not, which is told; every failure is an error."""
-    from obsynth.monitoring.thresholds.learned import LEARNED, expects_fault_courses
+    from obsynth.monitoring.thresholds.learned import LEARNED
+    from obsynth.monitoring.thresholds.learned_from_rows import expects_fault_courses
     from obsynth.monitoring.thresholds.learning import FALSE_ALARM_RATE, learn_thresholds
 
     logs = options.data

@@ -1,0 +1,303 @@
+"""From rows without faults to learned thresholds: which columns are watched, their model, and the levels of alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.errors import SpecError
+from obsynth.methods.registry import error_model
+from obsynth.monitoring.thresholds.cross_validation import (
+    healthy_time,
+    held_out,
+    levels_of_other_parts,
+    not_held_out,
+    room_for_other_logs,
+)
+from obsynth.monitoring.thresholds.learned import NO_PAIRS, LearnedThresholds, WrongPairs
+from obsynth.monitoring.thresholds.learned_events import Event, events_of, factors
+from obsynth.monitoring.thresholds.learned_levels import (
+    RARER_WHERE_SIZES_LAST,
+    conformal_levels,
+    is_conformal,
+    lasting_sizes,
+    learned_levels,
+    rows_needed,
+)
+from obsynth.monitoring.thresholds.learned_statistics import Statistics
+from obsynth.monitoring.thresholds.parameter_scores import (
+    Scores,
+)
+from obsynth.monitoring.thresholds.watched_columns import settling_rows, watched_names
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.autoregression import fitted_autoregression
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.plants.noise import offset_state
+from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_set_writing import gain_set_digest
+
+#: Changes have to be so many times as large to be noticed: without events it was 1.3 at most in 600 logs with normal
+#: innovations, white or coloured, and this much in one of seven logs whose innovations follow Student's t with 4.
+TOLD_LEVEL_FACTOR = 2.0
+
+#: Least share of the variance of a column that the others leave unexplained, where estimates and residuals are watched
+#: together: residuals that follow from the estimates say nothing more.
+LEAST_NEW = 1e-6
+
+#: A direction whose largest part is this share of its length is that of one column.
+OWN_DIRECTION = 0.99
+
+#: Rows without faults below which nothing is learned.
+LEAST_NORMAL = 100
+
+#: Estimates that vary by less than this share of their deviation in a log have most of it from its start.
+ONE_START_SHARE = 0.5
+
+
+def thresholds_from_rows(
+    design: ObserverDesign,
+    rows: FloatArray,
+    *,
+    every: float,
+    dt: float,
+    seed: int = 0,
+    pairs: WrongPairs = NO_PAIRS,
+    innovation: float = 1.0,
+    scores: Scores | None = None,
+    outlier_sizes: FloatArray | None = None,
+    like: LearnedThresholds | None = None,
+    logs: Sequence[slice] = (),
+    initial_covariance: FloatArray | None = None,
+    repeats: FloatArray | None = None,
+    validated: bool = True,
+) -> LearnedThresholds:
+    """Return thresholds from ``rows (n, m)`` of all that may be watched, NaN where nothing is known; ``pairs``: what
+    does not stand in them, but alarms; ``innovation``: how large innovations are in the observer's own deviations;
+    ``scores``: what these rows say of faults, where that is known; ``outlier_sizes``: what the design is to say
+    instead; ``like``: thresholds of which columns and directions are taken; ``logs``: which rows are of one log each;
+    ``initial_covariance``: that of the states at a start anywhere; ``repeats``: from which equal sample on outputs
+    count as not measured; ``validated``: whether the levels are those that
+    rows keep which are not learned from.
+
+    Where the fault estimates remember more than the rows can tell, or nearly follow from the residuals (the gains of a
+    filter move them, and what is left is how these change with the inputs), the residuals alone are watched.  A fault
+    that the estimates follow leaves nothing in these: where it is known what each sample says of the faults, changes of
+    these are looked for beside them, and the estimates in units of their deviations, which follow from the same.
+    """
+    names, faults = watched_names(design), len(design.observer.fault_names)
+    seldom = seldom_known(rows, faults) if like is None else [names.index(name) for name in like.seldom]
+    usual = [i for i in range(len(names)) if i not in seldom]
+    known = np.asarray(np.isfinite(rows[:, usual]).all(axis=1))
+    others = pairs.others(every)
+    count = int(known.sum())
+    if count < LEAST_NORMAL:
+        raise SpecError(
+            f"Only {count} rows of the log can be used, as warm-up, gaps and what a stuck sensor repeats do not count: "
+            f"give {LEAST_NORMAL} and more.",
+            path="normal",
+        )
+    conformal = is_conformal(count, others)
+    scores = None if scores is None else _usual_scores(scores, known)
+    if like is None:
+        both = [usual[i] for i in independent(rows[known][:, usual])]
+        residuals = [usual[i] for i in varying(rows[known][:, usual], faults)]
+        choices = [part for part in ((both, residuals) if scores is None else (residuals or both,)) if part]
+    else:
+        choices = [[names.index(name) for name in like.columns]]
+    if not choices:
+        raise SpecError("No monitored signal changes in these rows: there is no noise to learn from.", path="normal")
+    fits = [(kept, fitted_autoregression(np.where(known[:, None], rows[:, kept], np.nan))) for kept in choices]
+    enough = [fit for fit in fits if rows_needed(fit[1], 1.0) <= count and (fit is fits[-1] or fit[1].is_regular)]
+    kept, model = enough[0] if enough else min(fits, key=lambda fit: rows_needed(fit[1], 1.0))
+    x = np.where(known[:, None], rows[:, kept], np.nan)
+    told = tuple(names[i] for i in kept)
+    centres, scales = rows[known, :faults].mean(axis=0), rows[known, :faults].std(axis=0)
+    if scores is not None:
+        centres = scores.chosen(slice(len(rows) // 2 if conformal else None)).centre()
+    found = (
+        signatures(design, kept, np.sqrt(np.nanvar(x, axis=0)))
+        if like is None
+        else (like.statistics.signatures, like.statistics.told)
+    )
+    statistics = Statistics(model, *found, estimates=() if scores is None else names[:faults])
+    lasting, extrapolated = 0.0, False
+    if conformal:
+        statistics, levels = conformal_levels(x, others, statistics, scores, logs)
+    else:
+        lasting = lasting_sizes(model.whitened(x)) if like is None else like.lasting
+        rarer = RARER_WHERE_SIZES_LAST if lasting else 1.0
+        statistics, levels, extrapolated = learned_levels(x, others * rarer, statistics, seed, scores, logs)
+    left, room = held_out(x, statistics, scores, logs), room_for_other_logs(statistics, logs)
+    time = healthy_time(levels, left, others, room)
+    judged = left if validated else not_held_out(x, statistics, scores)
+    levels = room * levels_of_other_parts(levels, judged, others)
+    return LearnedThresholds(
+        told,
+        statistics,
+        read_only(levels),
+        every,
+        count,
+        rows_needed(statistics.model, every, scores),
+        dt,
+        read_only(centres),
+        read_only(np.where(scales > 0.0, scales, 1.0)),
+        gain_set_digest(design),
+        extrapolated,
+        tuple(name for i, name in enumerate(names) if i not in kept and name not in statistics.estimates),
+        settling_rows(design),
+        pairs,
+        innovation,
+        outlier_sizes,
+        lasting,
+        seldom=tuple(names[i] for i in seldom),
+        initial_covariance=None if initial_covariance is None else read_only(initial_covariance),
+        logs=max(len(logs), 1),
+        healthy_time=time,
+        repeats=None if repeats is None else read_only(repeats),
+    )
+
+
+def seldom_known(rows: FloatArray, faults: int) -> list[int]:
+    """Return the residuals of rows ``(n, m)``, after so many estimates of ``faults``, without which at least half of
+    the rows are whole: those of sensors that are slower than the rows.  One residual is left."""
+    there = np.isfinite(rows)
+    there = there[there.any(axis=1)]
+    left = list(range(rows.shape[1]))
+    while len(left) > faults + 1 and 2 * there[:, left].all(axis=1).sum() < len(there):
+        left.remove(min(left[faults:], key=lambda i: int(there[:, i].sum())))
+    return [i for i in range(rows.shape[1]) if i not in left]
+
+
+def divided_at_starts(observer: Any, scores: Scores | None) -> dict[str, float]:
+    """Return the faults between which and the offset of a sensor each start divides what it sees, and how much of the
+    deviation that the observer states their estimates vary by in one log: little, as they stay what a start made."""
+    if scores is None or not isinstance(observer, DAEObserver):
+        return {}
+    if not any(offset_state(name) in observer.plant.state_names for name in observer.plant.output_names):
+        return {}
+    shares = np.nanstd(scores.theta / scores.deviations, axis=0)
+    found = zip(observer.fault_names, shares.tolist(), strict=True)
+    return {name: share for name, share in found if share < ONE_START_SHARE}
+
+
+class Raised(NamedTuple):
+    """Events that raise levels, and how many times as large a change must be to pass that of a statistic: the one for
+    which this is most."""
+
+    events: tuple[Event, ...] = ()
+    statistic: str = ""
+    factor: float = 1.0
+
+
+def raised_levels(
+    design: ObserverDesign, found: LearnedThresholds, rows: FloatArray, scores: Scores | None, **given: Any
+) -> Raised:
+    """Return what in ``rows (n, m)`` raises the levels that were ``found`` with what was ``given`` to
+    `thresholds_from_rows`: no events where none do by much."""
+    known = whole_rows(design, found, rows)
+    said = _usual_scores(scores, known) if found.statistics.estimates and scores is not None else None
+    x = watched_rows(design, found, rows)
+    events = events_of(x, found.columns, found.statistics, found.levels, said, found.centres)
+    left = rows.copy()
+    for event in events:
+        left[event.begun : event.ended + 1] = np.nan
+    count = int(whole_rows(design, found, left).sum())
+    others = found.pairs.others(found.every)
+    if not events or count < LEAST_NORMAL or is_conformal(count, others) != is_conformal(found.rows, others):
+        return Raised()
+
+    def compared(before: LearnedThresholds, *, validated: bool) -> tuple[float, str]:
+        other = thresholds_from_rows(design, left, scores=scores, like=found, validated=validated, **given)
+        if other.statistics.names != before.statistics.names:
+            return 1.0, ""
+        each = factors(before.statistics, before.levels, other.statistics, other.levels)
+        most = max(each, key=lambda name: each[name])
+        return each[most], most
+
+    # The largest of few parts say little of rare rows: these alone tell whether events stand out.
+    inside = thresholds_from_rows(design, rows, scores=scores, like=found, validated=False, **given)
+    if compared(inside, validated=False)[0] < TOLD_LEVEL_FACTOR:
+        return Raised()
+    factor, most = compared(found, validated=True)
+    return Raised(events, most, factor) if factor >= TOLD_LEVEL_FACTOR else Raised()
+
+
+def watched_rows(design: ObserverDesign, found: LearnedThresholds, rows: FloatArray) -> FloatArray:
+    """Return the columns that are watched of ``rows (n, m)``, NaN in rows of which a part is not known."""
+    places = [watched_names(design).index(name) for name in found.columns]
+    return np.where(whole_rows(design, found, rows)[:, None], rows[:, places], np.nan)
+
+
+def whole_rows(design: ObserverDesign, found: LearnedThresholds, rows: FloatArray) -> NDArray[np.bool_]:
+    """Return in which of ``rows (n, m)`` nothing is missing but what most of them lack ``(n,)``."""
+    usual = [name not in found.seldom for name in watched_names(design)]
+    return np.asarray(np.isfinite(rows[:, usual]).all(axis=1))
+
+
+def _usual_scores(scores: Scores, known: NDArray[np.bool_]) -> Scores | None:
+    """Return what rows say of faults, and nothing of those that are not known; `None` where they do not determine
+    them."""
+    found = replace(
+        scores,
+        score=np.where(known[:, None], scores.score, 0.0),
+        information=np.where(known[:, None, None], scores.information, 0.0),
+        theta=np.where(known[:, None], scores.theta, np.nan),
+    )
+    return found if found.chosen(slice(len(known) // 2)).determine and found.determine else None
+
+
+def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return directions ``(s, m)`` of a step in the columns that are watched, of deviations ``sizes (m,)``, and what
+    each shows: a column alone, and what a constant fault of a linear design does to all of them where this is another
+    direction."""
+    names = [watched_names(design)[i] for i in kept]
+    found = list(np.diag(sizes))
+    if not isinstance(design.observer, LinearObserver) or expects_fault_courses(design):
+        return np.array(found), tuple(names)
+    errors = error_model(design)
+    observer, plant = errors.observer, errors.plant
+    c, direct, *_ = errors.output(slice(len(observer.state_names), None))
+    held = (np.eye(observer.order) if observer.dt > 0.0 else np.zeros_like(observer.Az)) - observer.Az
+    try:
+        gains = (direct - c @ np.linalg.solve(held, errors.fault))[kept]
+    except np.linalg.LinAlgError:
+        return np.array(found), tuple(names)
+    for name, gain in zip(plant.fault_names, gains.T, strict=True):
+        scaled = gain / sizes
+        size = float(np.linalg.norm(scaled))
+        if np.isfinite(size) and size > 0.0 and float(np.abs(scaled).max()) < OWN_DIRECTION * size:
+            found.append(gain / size)
+            names.append(f"fault {name}")
+    return np.array(found), tuple(names)
+
+
+def expects_fault_courses(design: ObserverDesign) -> bool:
+    """Whether a linear observer expects faults of a course, such as a step, which leave nothing in its residuals once
+    it has followed them."""
+    return isinstance(design.observer, LinearObserver) and error_model(design).Phi is not None
+
+
+def varying(rows: FloatArray, first: int) -> list[int]:
+    """Return the columns of ``(n, m)`` from the ``first`` on in which anything changes."""
+    return [i for i in range(first, rows.shape[1]) if float(np.ptp(rows[:, i])) > 0.0]
+
+
+def independent(rows: FloatArray) -> list[int]:
+    """Return the columns of ``(n, m)`` that those before them do not explain."""
+    kept: list[int] = []
+    basis = np.zeros((len(rows), 0))
+    for i, column in enumerate(rows.T):
+        left = column - column.mean()
+        power = float(left @ left)
+        # Twice, as once leaves rounding of large parts.
+        for _ in range(2):
+            left = left - basis @ (basis.T @ left)
+        if power > 0.0 and float(left @ left) > LEAST_NEW * power:
+            kept.append(i)
+            basis = np.column_stack([basis, left / np.linalg.norm(left)])
+    return kept

@@ -1,0 +1,242 @@
+"""Learned thresholds as a rule of a monitor: row by row, with its state as plain arrays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.monitoring.thresholds.learned import LearnedThresholds
+from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
+from obsynth.monitoring.thresholds.monitor import Evidence, Monitor, Rule, RuleOutput, Sample
+from obsynth.monitoring.thresholds.parameter_scores import (
+    before_any,
+    beyond,
+    most_likely_change,
+    parameter_walk,
+    sample_score,
+)
+from obsynth.monitoring.thresholds.watched_columns import (
+    has_innovations_by_sensor,
+    innovation_names,
+    watched_names,
+    watched_values,
+)
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_set_writing import digest_of, gain_set_digest, plain
+
+NOTHING = read_only(np.zeros(0))
+
+
+class LearnedState(NamedTuple):
+    """The state of `LearnedRule`."""
+
+    past: FloatArray  # ``(order, m)``: rows, latest first
+    white: FloatArray  # ``(ages, m)``: whitened rows, latest last
+    means: FloatArray  # exponentially weighted, one row for each weight
+    last: float | None = None
+    taken: int = 0
+    waiting: int = 0  # rows until the effect of the last one in which something was missing has settled
+    before: FloatArray = NOTHING  # ``(1 + nf, nf)``: estimates and covariance of the faults after the last sample
+    scores: FloatArray = NOTHING  # ``(ages, 2 nf)``: what samples said of faults, scores and information, latest last
+
+
+class LearnedRule(Rule):
+    """The largest of all statistics in units of its level, row by row.  A row that is missing, or in which nothing may
+    be decided, is as the autoregression predicts it: it adds no evidence, and takes none away.
+
+    Where the gain follows what is measured (all but linear observers, which recover from a gap first), a missing sample
+    moves the estimates otherwise than was learned.  Rows that are predicted from it count by no more than the
+    observer's own covariance, which has grown, makes of their innovation, by as much as it was wrong in the rows that
+    were learned from.  In that row itself the innovations of
+    ``by_sensor`` residuals are what they always are: those that are there decide, and the rest is as they make it most
+    likely."""
+
+    def __init__(
+        self,
+        learned: LearnedThresholds,
+        names: Sequence[str],
+        faults: Sequence[str] = (),
+        *,
+        by_sensor: bool = False,
+        walk: FloatArray | None = None,
+    ) -> None:
+        self.learned, self.by_sensor = learned, by_sensor
+        self._walk = walk if learned.statistics.estimates else None
+        self._residual = np.array([not name.startswith("fhat[") for name in learned.columns])
+        self._faults = {f"fault {name}": i for i, name in enumerate(faults)}
+        self._places = np.array([names.index(name) for name in learned.columns])
+        self._usual = np.array([name not in learned.seldom for name in names])
+        templates = learned.statistics.templates()
+        self._templates = templates.reshape(len(templates) * len(AGES), -1)
+        self._model = learned.statistics.model
+        effects = learned.statistics.offset_effects() / np.sqrt(learned.statistics.levels_by_age)
+        self._effects = effects.ravel()
+        bands = learned.statistics.fault_bands
+        self._bands = np.zeros(len(learned.centres)) if bands is None else bands
+
+    def init(self) -> LearnedState:
+        """Return the state before the first sample."""
+        model = self._model
+        white, means = np.zeros((max(AGES), model.channels)), np.zeros((len(FORGETTING), model.channels))
+        found = LearnedState(np.tile(model.mean, (model.order, 1)), white, means)
+        if self._walk is None:
+            return found
+        return found._replace(before=before_any(len(self._walk)), scores=np.zeros((max(AGES), 2 * len(self._walk))))
+
+    def step(self, state: LearnedState, sample: Sample) -> tuple[LearnedState, RuleOutput]:
+        """Return the largest statistic in units of its level, one as threshold, and the fault whose step it is."""
+        missing = 0 if state.last is None else round((sample.time - state.last) / self.learned.dt) - 1
+        for _ in range(min(max(missing, 0), max(AGES))):
+            state = self._added(state, None)
+        state = state._replace(last=sample.time, taken=state.taken + 1)
+        state = self._scored(state, sample.said, max(missing, 0))
+        found = watched_values(sample.residuals, sample.said)
+        whole = found is not None and sample.deciding and bool(np.isfinite(found[self._usual]).all())
+        shown = None if found is None or not sample.deciding else self._completed(state, found, whole=whole)
+        counts = shown is not None and state.taken > self.learned.settling
+        most, varying = math.inf if counts else 0.0, isinstance(sample.said, Evidence)
+        if counts and state.waiting and isinstance(sample.said, Evidence):
+            most = float(np.linalg.norm(sample.said.whitened)) / self.learned.innovation
+        if not whole and varying:
+            state = state._replace(waiting=self._model.order + 1)
+        state = state._replace(waiting=max(state.waiting - 1, 0))
+        if found is None or not (whole or (varying and (counts or np.isfinite(found[self._places]).all()))):
+            return self._added(state, None), RuleOutput(math.nan, math.nan)
+        seen = found[self._places]
+        kept = seen if shown is None else np.where(np.isfinite(seen), seen, shown)
+        state = self._added(state, kept, most, shown)
+        if not counts:
+            return state, RuleOutput(math.nan, math.nan)
+        # Products of numbers that overflow have passed any level.
+        with np.errstate(all="ignore"):
+            fits = np.maximum(np.abs(self._templates @ state.white.ravel()) - self._effects, 0.0)
+            ratios = (fits**2).reshape(-1, len(AGES)).max(axis=1)
+            weights = np.array([(2.0 - share) / share for share in FORGETTING])
+            smooth = weights * np.sum(state.means**2, axis=1)
+            first = [np.sum(state.white[-1] ** 2)]
+            changes = self._changes(state)
+            squares = self._squares(sample.said)
+            values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares]) / self.learned.levels
+        values = np.where(np.isnan(values), np.inf, values)
+        which = self._fault(found, ratios) if self._walk is None else most_likely_change(changes)
+        return state, RuleOutput(float(values.max()), 1.0, which)
+
+    def _scored(self, state: LearnedState, said: Any, missing: int) -> LearnedState:
+        """Return the state with what a sample says of the faults."""
+        if self._walk is None or not isinstance(said, Evidence):
+            return state
+        before, found = sample_score(state.before, said, self._walk, missing + 1)
+        row = np.concatenate([found.away(self.learned.centres), np.diag(found.information)])
+        gone = min(missing, max(AGES))
+        kept = np.vstack([state.scores, np.zeros((gone, len(row))), row])[-max(AGES) :]
+        return state._replace(before=before, scores=kept)
+
+    def _changes(self, state: LearnedState) -> FloatArray:
+        """Return twice the log likelihood ratios of changes of each age and fault, ``(ages, nf)``."""
+        if self._walk is None:
+            return np.zeros((1, 0))
+        sums = np.cumsum(state.scores[::-1], axis=0)[np.array(AGES) - 1]
+        away, power = np.hsplit(sums, 2)
+        return np.asarray(np.where(power > 0.0, beyond(away, self._bands * power) ** 2 / power, 0.0))
+
+    def _squares(self, said: Any) -> FloatArray:
+        """Return the squares of the estimates, from where they were, in units of their deviations, ``(nf,)``."""
+        if self._walk is None or not isinstance(said, Evidence):
+            return np.zeros(0 if self._walk is None else len(self._walk))
+        away = beyond(said.theta - self.learned.centres, self._bands)
+        return np.asarray(away**2 / np.diag(said.parameter_covariance))
+
+    def _fault(self, found: FloatArray, ratios: FloatArray) -> int | None:
+        """Return the fault whose step or ramp explains most, or whose estimate is furthest from where it was."""
+        names, count = self.learned.columns, len(self.learned.scales)
+        told = self.learned.statistics.told[int(np.argmax(ratios)) % len(self.learned.statistics.told)]
+        if told.startswith("fhat["):
+            return int(self._places[names.index(told)])
+        if told in self._faults:
+            return self._faults[told]
+        return None if not count else int(np.argmax(np.abs(found[:count] - self.learned.centres) / self.learned.scales))
+
+    def _predicted(self, state: LearnedState) -> FloatArray:
+        """Return what the autoregression says of the next row."""
+        model = self._model
+        rows = zip(model.A, state.past, strict=True)
+        return np.asarray(model.offset + sum((a @ row for a, row in rows), np.zeros(model.channels)))
+
+    def _completed(self, state: LearnedState, found: FloatArray, *, whole: bool) -> FloatArray | None:
+        """Return the watched values of a row; where some are missing, as those of sensors that are there make them most
+        likely, and `None` without any."""
+        x = found[self._places]
+        seen = self._residual & np.isfinite(x)
+        if whole or not (self.by_sensor and seen.any()):
+            return x if whole else None
+        predicted, precision = self._predicted(state), self._model.whitener.T @ self._model.whitener
+        away = (x - predicted)[seen]
+        rest = np.linalg.solve(precision[np.ix_(~seen, ~seen)], -precision[np.ix_(~seen, seen)] @ away)
+        completed = np.where(seen, x, predicted)
+        completed[~seen] += rest
+        return completed
+
+    def _added(
+        self, state: LearnedState, x: FloatArray | None, most: float = 0.0, shown: FloatArray | None = None
+    ) -> LearnedState:
+        """Return the state after a row, or after one that is as predicted (`None`): of a norm of ``most`` at most, with
+        what is ``shown`` of it for evidence (``(m,)``, as it is by default)."""
+        model, predicted = self._model, self._predicted(state)
+        shown = x if shown is None else shown
+        with np.errstate(over="ignore", invalid="ignore"):
+            e = np.zeros(model.channels) if shown is None or not most else model.whitener @ (shown - predicted)
+            size = float(np.linalg.norm(e))
+            e = e * (most / size) if size > most else e
+        shares = np.array(FORGETTING)[:, None]
+        past = np.vstack([predicted if x is None else x, state.past[:-1]]) if model.order else state.past
+        means = (1.0 - shares) * state.means + shares * e
+        return state._replace(past=past, white=np.vstack([state.white[1:], e]), means=means)
+
+    def restart(self, state: LearnedState, skipped: int = 0) -> LearnedState:
+        """Keep everything: rows that are missing are predicted over."""
+        return state
+
+    def options(self) -> Any:
+        """Return the digest of what was learned."""
+        return digest_of(plain(self.learned.as_dict()))
+
+
+def learned_monitor(design: ObserverDesign, learned: LearnedThresholds) -> Monitor:
+    """Return the monitor of thresholds that were learned with a design; raise `SpecError` for another design."""
+    if learned.gains != gain_set_digest(design):
+        raise SpecError("The thresholds were learned with another gain set: learn them again.", path="normal")
+    observer, names = design.observer, watched_names(design)
+    missing = [name for name in learned.columns if name not in names]
+    if missing:
+        raise SpecError(
+            f"The thresholds are for {missing[0]!r}, which the design does not have: learn them again for this design.",
+            path="normal",
+        )
+    if learned.outlier_sizes is not None and not has_innovations_by_sensor(observer):
+        raise SpecError(
+            "The thresholds hold sizes of outliers, and this design judges none of one sensor: learn them again.",
+            path="normal",
+        )
+    residuals = (
+        len(observer.residual_names) if isinstance(observer, LinearObserver) else len(innovation_names(observer))
+    )
+    return Monitor(
+        "learned",
+        learned.statement,
+        LearnedRule(
+            learned,
+            names,
+            observer.fault_names,
+            by_sensor=has_innovations_by_sensor(observer),
+            walk=parameter_walk(observer),
+        ),
+        residuals=residuals,
+        fault_names=observer.fault_names,
+        fault_scales=learned.scales,
+    )

@@ -1,0 +1,72 @@
+"""The columns of an observer's rows that learned thresholds watch, and what is not watched."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.monitoring.thresholds.learned import LearnedThresholds
+from obsynth.monitoring.thresholds.learned_levels import (
+    SETTLING,
+)
+from obsynth.monitoring.thresholds.monitor import Evidence, LinearSample
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.nonlinear.region_observer import RegionObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.running import changed
+from obsynth.observers.scheduled.observer import ScheduledObserver
+from obsynth.observers.window.observer import WindowObserver
+from obsynth.results.design import ObserverDesign
+
+
+def as_learned(observer: Any, learned: LearnedThresholds) -> Any:
+    """Return an observer as the one from which thresholds were learned judged outliers."""
+    given = {"outlier_sizes": learned.outlier_sizes, "initial_covariance": learned.initial_covariance}
+    known = {name: value for name, value in given.items() if value is not None}
+    return changed(observer, **known) if known else observer
+
+
+def watched_names(design: ObserverDesign) -> tuple[str, ...]:
+    """Return what may be watched of a design: fault estimates, then residuals (or innovations)."""
+    observer = design.observer
+    if isinstance(observer, WindowObserver):
+        raise SpecError(
+            f"Design {design.name!r} is a test whose weights change with k: the threshold of each row is proved, so "
+            "none is learned (use the monitor pointwise).",
+            path="design",
+        )
+    if isinstance(observer, (LinearObserver, RegionObserver, ScheduledObserver)):
+        names = observer.row_names
+        return (*names[observer.fault_rows], *names[observer.residual_rows])
+    return (*(f"fhat[{name}]" for name in observer.fault_names), *(f"r[{name}]" for name in innovation_names(observer)))
+
+
+def settling_rows(design: ObserverDesign) -> int:
+    """Return how many rows at a start are not like those that follow: linear designs have a warm-up for these."""
+    return 0 if isinstance(design.observer, (LinearObserver, RegionObserver, ScheduledObserver)) else SETTLING
+
+
+def has_innovations_by_sensor(observer: Any) -> bool:
+    """Whether each residual is the innovation of one sensor, which says the same where another one is missing."""
+    return not isinstance(
+        observer, (LinearObserver, RecursiveObserver, RegionObserver, ScheduledObserver, WindowObserver)
+    )
+
+
+def innovation_names(observer: Any) -> tuple[str, ...]:
+    """Return the names of the innovations of a recursive or nonlinear observer, as columns of runs have them."""
+    if isinstance(observer, RecursiveObserver):
+        # H_k has as many directions beside the state as there are parity innovations.
+        return tuple(f"innovation {i + 1}" for i in range(observer.innovation_count))
+    names: tuple[str, ...] = observer.plant.output_names
+    return names
+
+
+def watched_values(residuals: FloatArray, evidence: Any) -> FloatArray | None:
+    """Return fault estimates and residuals of a row, in the order of `watched_names`; `None` where there are none."""
+    if isinstance(evidence, Evidence):
+        return np.concatenate([evidence.theta, residuals])
+    return evidence.faults_and_residuals if isinstance(evidence, LinearSample) else None
