@@ -68,3 +68,16 @@ def test_direct_noise_counts_in_the_mean_square() -> None:
     closed, witness = errors.closed([np.zeros((1, 0))]), Witness([np.eye(1)])
     assert prove_mean_square(closed, witness, 1.01, discrete=True).proved
     assert not prove_mean_square(closed, witness, 0.99, discrete=True).proved
+
+
+@pytest.mark.parametrize(("discrete", "pole", "least"), [(True, 0.5, 4.0 / 3.0), (False, -1.0, 0.5)])
+def test_a_mean_square_needs_a_matrix_that_bounds_the_outputs(discrete: bool, pole: float, least: float) -> None:
+    # e+ = e / 2 + w, or e' = -e + w; z = e: the mean square is 4 / 3, or 1 / 2.
+    errors = ErrorPolytope(
+        [[[pole]]], np.zeros((0, 1)), B=[[1.0]], D=np.zeros((0, 1)), Cz=[[1.0]], dt=1.0 if discrete else 0.0
+    )
+    closed = errors.closed([np.zeros((1, 0))])
+    enough, small = (Witness([share * least * np.eye(1)]) for share in (1.01, 0.01))
+    assert prove_mean_square(closed, enough, np.sqrt(1.02 * least), discrete=discrete).proved
+    assert not prove_mean_square(closed, small, np.sqrt(1.02 * least), discrete=discrete).proved
+    assert not prove_mean_square(closed, enough, np.sqrt(1.0 * least), discrete=discrete).proved
