@@ -127,6 +127,12 @@ def _design_of_conditions(source: str, *given: Any) -> Any:
     return design_of(source, *given)
 
 
+def _problem_of_options(*given: Any) -> Any:
+    from obsynth.methods.engines.designs_of_conditions import problem_of_options
+
+    return problem_of_options(*given)
+
+
 def _summary_of_design(design: Any) -> Any:
     from obsynth.report.summary import summary
 
@@ -187,6 +193,7 @@ register(
     design_of_conditions=_design_of_conditions,
     plot_delays=_plot_delays,
     plot_least_thresholds=_plot_least_thresholds,
+    problem_of_options=_problem_of_options,
     summary_of_design=_summary_of_design,
 )
 # Rooms on data and on many designs may be left out: the design half is whole without them.

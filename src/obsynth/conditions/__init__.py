@@ -1,6 +1,7 @@
 """The papers' conditions as problems of cvxpy, to read, to change and to solve; and the inequalities they are made of.
 
-``wang2015``, ``filasova_theorem1``, ``filasova_theorem2``, ``sharepasand`` and ``kalman`` return `Conditions`;
+``wang2015``, ``filasova_theorem1``, ``filasova_theorem2``, ``sharepasand``, ``kalman``, ``hinf_filter`` and
+``h2_filter`` return `Conditions`;
 ``vertex_inequalities`` returns those of an `ErrorPolytope`, whose matrices lie in the hull of vertices,
 ``slope_inequality`` those of `SlopedErrors` with a multiplier; ``nonlinear_region``, or ``region`` of a model, those of
 a nonlinear plant over a region;
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from obsynth.conditions.bisection import Bisection
     from obsynth.conditions.filasova import filasova_theorem1, filasova_theorem2
     from obsynth.conditions.kalman_gain import kalman
+    from obsynth.conditions.least_filter import h2_filter, hinf_filter
     from obsynth.conditions.nonlinear_plants import nonlinear_region
     from obsynth.conditions.polytope import vertex_inequalities
     from obsynth.conditions.problem import Conditions
@@ -37,7 +39,9 @@ __all__ = [
     "filasova_theorem1",
     "filasova_theorem2",
     "h2",
+    "h2_filter",
     "half_plane",
+    "hinf_filter",
     "kalman",
     "nonlinear_region",
     "region",
@@ -56,6 +60,7 @@ _HOMES = {
         "conditions.bisection": "Bisection",
         "conditions.filasova": "filasova_theorem1 filasova_theorem2",
         "conditions.kalman_gain": "kalman",
+        "conditions.least_filter": "h2_filter hinf_filter",
         "conditions.nonlinear_plants": "nonlinear_region",
         "conditions.polytope": "vertex_inequalities",
         "conditions.slope_multipliers": "SlopedErrors slope_inequality",

@@ -88,7 +88,9 @@ class LeastEstimation:
     decays: tuple[NDArray[np.complex128], ...]
 
 
-class _Whitened(NamedTuple):
+class Whitened(NamedTuple):
+    """A problem whose r is the innovation, without errors that w cannot reach, and the way back to the given one."""
+
     problem: EstimationProblem
     plain: EstimationProblem  # without added noise
     factor: FloatArray | None  # of the innovation
@@ -108,7 +110,7 @@ def least_estimation(problem: EstimationProblem, *, norm: str = "hinf") -> Least
 
     Raise `PreconditionError` where no filter is stable.
     """
-    white = _whitened(problem)
+    white = whitened(problem)
     core = white.problem
     P0 = gramian(core.A, core.B @ core.B.T) if len(core.C) else 0.0 * core.A
     K, Z0 = _central(core, P0)
@@ -128,9 +130,15 @@ def least_estimation(problem: EstimationProblem, *, norm: str = "hinf") -> Least
     return LeastEstimation(*white.restored(problem, K, Z0), gain, limit, angle, white.noise, decays)
 
 
+def achieved(white: Whitened, K: FloatArray, Z0: FloatArray, norm: str) -> float:
+    """Return the norm (``"hinf"``, ``"h2"``) from w to the error with gains on the innovation."""
+    closed = _closed(white.plain, K, Z0)
+    return _norm(closed) if norm == "hinf" else _deviation(closed)
+
+
 def require_stable_filter(problem: EstimationProblem) -> None:
     """Raise `PreconditionError` where no filter is stable: cheaper than the least one."""
-    _whitened(problem)
+    whitened(problem)
 
 
 class ContinuousFilter(NamedTuple):
@@ -218,7 +226,7 @@ def _size(problem: EstimationProblem) -> float:
     return max(shown, WANTED_SHARE * wanted, SMALLEST)
 
 
-def _whitened(problem: EstimationProblem) -> _Whitened:
+def whitened(problem: EstimationProblem) -> Whitened:
     """Return the problem with an innovation for r, without errors that w cannot reach.
 
     Where an output has no noise, some is added: the filter is then one for the plant as given, and so is its gain.
@@ -233,7 +241,7 @@ def _whitened(problem: EstimationProblem) -> _Whitened:
         if not stable:
             raise PreconditionError(UNSTABLE_ZERO, condition="zeros")
         bare = replace(problem, C=problem.C[:0], D=problem.D[:0])
-        return _Whitened(bare, bare, None, np.zeros((n, 0)), np.eye(n), 0.0)
+        return Whitened(bare, bare, None, np.zeros((n, 0)), np.eye(n), 0.0)
     reason: object = ""
     for noise in ADDED_NOISES:
         B, D = problem.B, problem.D
@@ -257,7 +265,7 @@ def _whitened(problem: EstimationProblem) -> _Whitened:
         )
         count = problem.B.shape[1]
         plain = replace(reduced, B=reduced.B[:, :count], D=reduced.D[:, :count], D1=D1[:, :count])
-        return _Whitened(reduced, plain, factor, K, basis, noise)
+        return Whitened(reduced, plain, factor, K, basis, noise)
     raise PreconditionError(
         "The transfer from the faults to the outputs has a zero that is not strictly stable, or none of the "
         f"outputs shows a mode that lasts: no stable filter has this fault map ({reason}).",

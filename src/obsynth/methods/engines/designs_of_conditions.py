@@ -34,6 +34,7 @@ def design_of(source: str, plant: Any, *given: Any) -> ObserverDesign:
         "filasova": _filasova,
         "sharepasand": _sharepasand,
         "kalman": _kalman,
+        "optimal filter": _optimal_filter,
         "wang over region": _wang_over_region,
         "sharepasand over region": _sharepasand_over_region,
     }
@@ -56,6 +57,34 @@ def _wang2015(
         if found.report.passed:
             break
     return found
+
+
+def problem_of_options(plant: DescriptorSystem, options: dict[str, Any]) -> tuple[Any, Any, float]:
+    """Return the problem of estimation of `obsynth.optimal_filter` with its innovation, how to design, and its unit."""
+    from obsynth.methods.optimal_filter.fault_maps import conditions, first_problem, unit_of_gains
+    from obsynth.methods.optimal_filter.method import OptimalFilterMethod
+    from obsynth.methods.refusals import require_all_conditions
+    from obsynth.numerics.least_estimation import whitened
+    from obsynth.verification.invisible_faults import seen_plant
+
+    asked = OptimalFilterMethod.of(options)
+    held = conditions(plant, asked)
+    require_all_conditions(held)
+    seen = seen_plant(plant, asked.decoupled_names(plant))
+    fault_map, problem = first_problem(seen, asked)
+    return whitened(problem), (asked, fault_map, held), unit_of_gains(seen, fault_map)
+
+
+def _optimal_filter(
+    plant: DescriptorSystem | Transformation, asked: tuple[Any, Any, Any], gains: dict[str, FloatArray], name: str
+) -> ObserverDesign:
+    """Return the filter of gains on the innovation, with what can be proved of it and of every other one."""
+    from obsynth.methods.optimal_filter.synthesis import synthesis_of_gains
+
+    method, fault_map, _ = asked
+    own = linear_plant(plant)
+    draft = draft_of(own, method.id, synthesis_of_gains(own.dense(), method, fault_map, gains), name=name)
+    return draft.replace(report=verify(draft))
 
 
 def _wang_over_region(plant: PolytopicSystem, gains: dict[str, FloatArray], name: str) -> ObserverDesign:

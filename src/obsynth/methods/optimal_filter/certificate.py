@@ -51,7 +51,10 @@ def certified(
     if fault_map.delay is not None:
         claims["delay"] = float(fault_map.delay)
     if norm == "h2":
-        return {}, claims | {"deviation": chosen.gain, "least_deviation": chosen.gain}
+        return {}, claims | {
+            "deviation": chosen.gain,
+            "least_deviation": chosen.gain if chosen.least is None else chosen.least,
+        }
     model = ErrorModel(plant, observer, found.T, -found.T0, lag=found.lag, decoupled=True)
     channel = ErrorChannel(model, None if fault_map.exact else fault_map.reference)
     factors = [factor * chosen.nothing for factor in ZERO_LEVELS] if chosen.is_nothing else []

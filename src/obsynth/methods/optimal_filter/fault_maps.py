@@ -82,6 +82,7 @@ class Designed(NamedTuple):
     added_noise: float
     decays: tuple[ComplexArray, ...]
     nothing: float
+    least: float | None = None  # where the filter is another one than that of least norm
 
     @property
     def is_nothing(self) -> bool:
@@ -184,10 +185,22 @@ def problem_of(plant: DescriptorSystem, fault_map: FaultMap) -> EstimationProble
     return estimation_problem(channels, reference=scaled, exact=fault_map.exact)
 
 
+def unit_of_gains(plant: DescriptorSystem, fault_map: FaultMap) -> float:
+    """Return what a gain of the problem of estimation is in the units of the plant."""
+    _, units = _units_of(plant)
+    return units.error / (units.noise if fault_map.exact else units.error)
+
+
+def filter_in_plant_units(plant: DescriptorSystem, filter_: Model) -> Model:
+    """Return a filter of the problem of estimation as one from y to the faults, both in the units of the plant."""
+    own, units = _units_of(plant)
+    a, b, c, d = filter_
+    return a, b * own.outputs, units.error * c, units.error * d * own.outputs
+
+
 def designed(plant: DescriptorSystem, fault_map: FaultMap, norm: str) -> Designed:
     """Return the filter of least norm; raise `PreconditionError` where there is none."""
-    problem, (own, units) = problem_of(plant, fault_map), _units_of(plant)
-    ratio = units.error / (units.noise if fault_map.exact else units.error)
+    problem, ratio = problem_of(plant, fault_map), unit_of_gains(plant, fault_map)
     size = float(np.linalg.norm(problem.D1) + np.linalg.norm(problem.L) * np.linalg.norm(problem.B))
     try:
         if norm == "h2" and not plant.is_discrete:
@@ -203,12 +216,12 @@ def designed(plant: DescriptorSystem, fault_map: FaultMap, norm: str) -> Designe
         raise PreconditionError(
             f"The equations of the least gain have no solution: {error}.", condition="zeros"
         ) from error
-    a, b, c, d = filter_
-    least = found or LeastEstimation(a, a, gain, 0.0, 0.0, 0.0, ())
+    nothing = filter_[0]
+    least = found or LeastEstimation(nothing, nothing, gain, 0.0, 0.0, 0.0, ())
     return Designed(
         fault_map,
         problem,
-        (a, b * own.outputs, units.error * c, units.error * d * own.outputs),
+        filter_in_plant_units(plant, filter_),
         gain * ratio,
         least.limit * ratio,
         least.limit_angle,

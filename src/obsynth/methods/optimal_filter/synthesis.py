@@ -13,11 +13,21 @@ from obsynth.analysis.existence.condition import OPTIONS_PATH
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.method import Synthesis
 from obsynth.methods.optimal_filter.certificate import certified
-from obsynth.methods.optimal_filter.fault_maps import Designed, FaultMap, designed, first_problem
+from obsynth.methods.optimal_filter.fault_maps import (
+    Designed,
+    FaultMap,
+    designed,
+    filter_in_plant_units,
+    first_problem,
+    unit_of_gains,
+)
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.methods.optimal_filter.realisation import followed, minimal, observer_of
 from obsynth.methods.optimal_filter.reference import plain
 from obsynth.methods.refusals import require_all_conditions
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.least_estimation import achieved, realised, whitened
+from obsynth.numerics.standard_form import uncayley
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
 from obsynth.verification.inequalities import stability_factor
@@ -39,11 +49,29 @@ def synthesise(plant: DescriptorSystem, asked: OptimalFilterMethod, *, progress:
         )
     progress("checking the existence conditions")
     require_all_conditions(asked.existence(plant))
-    decoupled = asked.decoupled_names(plant)
-    plant = seen_plant(plant, decoupled)
+    plant = seen_plant(plant, asked.decoupled_names(plant))
     progress("searching the least gain")
     curve, chosen = _chosen(plant, asked)
     progress("building the realisation and its certificate")
+    return _made(plant, asked, curve, chosen)
+
+
+def synthesis_of_gains(
+    plant: DescriptorSystem, asked: OptimalFilterMethod, fault_map: FaultMap, gains: Mapping[str, FloatArray]
+) -> Synthesis:
+    """Return the filter of gains ``K`` and ``Z0`` on the innovation, beside the bounds on every filter."""
+    plant = seen_plant(plant, asked.decoupled_names(plant))
+    least = designed(plant, fault_map, asked.norm)
+    white = whitened(least.problem)
+    own = realised(least.problem, *white.restored(least.problem, gains["K"], gains["Z0"]), plant.ny)
+    own = own if plant.is_discrete else uncayley(*own, least.problem.alpha)
+    gain = unit_of_gains(plant, fault_map) * achieved(white, gains["K"], gains["Z0"], asked.norm)
+    chosen = least._replace(filter=filter_in_plant_units(plant, own), gain=gain, least=least.gain)
+    return _made(plant, asked, [], chosen)
+
+
+def _made(plant: DescriptorSystem, asked: OptimalFilterMethod, curve: list[_Row], chosen: Designed) -> Synthesis:
+    """Return realisation and certificate of a filter, on the plant with its disturbances that are not decoupled."""
     fault_map, problem = chosen.fault_map, chosen.problem
     found = followed(plant, minimal(chosen.filter), problem.window + problem.shift)
     rows = len(found.C)
@@ -59,7 +87,7 @@ def synthesise(plant: DescriptorSystem, asked: OptimalFilterMethod, *, progress:
         "reference": None if reference is None else plain(reference),
         "norm": asked.norm,
         "exact": fault_map.exact,
-        "decoupled": [*decoupled],
+        "decoupled": [*plant.disturbance_names],
         "steady_error_limit": asked.steady_error_limit,
     }
     solver = {
