@@ -357,6 +357,29 @@ def test_points_that_are_moved_give_no_false_bound(good) -> None:
         assert bound is None or bound <= good.gain
 
 
+@pytest.mark.parametrize("seed", [18, 30])
+def test_a_bound_that_is_not_close_to_the_gain_is_proved_again(seed: int) -> None:
+    """Few steps of inverse iteration found one bound from the gain's level, and a smaller one from its own."""
+    rng = np.random.default_rng([47, seed])
+    n, nf = int(rng.integers(2, 9)), int(rng.integers(1, 3))
+    ny, nd = nf + 2, int(rng.integers(0, 2))
+    a = rng.normal(size=(n, n))
+    size = 1.1 if rng.random() < 0.5 else 0.85
+    a = size / np.max(np.abs(np.linalg.eigvals(a))) * a
+    e = np.eye(n)
+    if rng.random() < 1.0 / 3.0:
+        e[-1, -1], a[-1, -1] = 0.0, 1.0 + rng.random()
+    noise = 10.0 ** rng.uniform(-2.0, 0.0)
+    case = plant(
+        E=e, A=a, B=rng.normal(size=(n, 1)), C=rng.normal(size=(ny, n)), Bf=rng.normal(size=(n, nf)),
+        Bd=rng.normal(size=(n, nd)), Bw=np.hstack([0.3 * rng.normal(size=(n, n)), np.zeros((n, ny))]),
+        Dw=np.hstack([np.zeros((ny, n)), noise * np.eye(ny)]),
+    )  # fmt: skip
+    design = obsynth.optimal_filter(case, delay=1)
+    assert design.report.passed
+    assert design.gain * (1.0 - 1e-4) <= design.least <= design.gain
+
+
 def test_the_gain_set_comes_back_and_is_verified(good, tmp_path) -> None:
     again = obsynth.load(good.save(tmp_path / "a.gains.json"))
     assert obsynth.verify(again).passed

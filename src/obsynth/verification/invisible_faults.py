@@ -29,8 +29,9 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 #: Digits, in bits, that are tried: close points cancel, and more digits do not.
 PRECISION_BITS = (256, 768)
-#: Steps of inverse iteration towards the worst combination: each gains the digits of the distance of the levels.
-INVERSE_STEPS = 4
+#: Steps of inverse iteration towards the worst combination: each gains the digits of the distance of the levels, which
+#: is small where the bound is not close to the level (4 steps left two results from levels 1e-6 apart 3e-4 apart).
+INVERSE_STEPS = 40
 #: Shares by which the level of that iteration lies above the bound that is repeated, and of the noise's energy that is
 #: taken off so that what is invisible without noise leaves no singular matrix.
 LEVEL_ABOVE, REGULAR_SHARE = 1e-9, 1e-40
@@ -104,7 +105,7 @@ def proved_limit(plant: DescriptorSystem, point: complex, setting: Setting) -> f
         with flint.ctx.workprec(bits):
             try:
                 trajectories = _Trajectories(plant, [point], 0, setting._replace(delay=0), conjugates=False)
-                found = trajectories.bound(1.0)
+                found = trajectories.bound(None)
             except ZeroDivisionError:
                 continue
         if found is not None:
@@ -214,8 +215,8 @@ class _Trajectories:
 
     # Combinations: coefficients of the members, then the last samples.
 
-    def bound(self, level: float) -> float | None:
-        """Return the proved ratio of the worst combination, rounded down."""
+    def bound(self, level: float | None) -> float | None:
+        """Return the proved ratio of the worst combination, rounded down; without a level of the largest one."""
         error, noise = self._energies()
         count = error.nrows()
         if not count:
@@ -227,6 +228,7 @@ class _Trajectories:
         units = [1 / flint.acb(size).sqrt() if size > 0 else flint.acb(1) for size in sizes]
         units = [unit.mid() for unit in units]
         error, noise = (_scaled(_scaled(part, units).transpose(), units).transpose() for part in (error, noise))
+        level = _largest_ratio(error, noise) if level is None else level
         square = flint.arb(level * (1.0 + LEVEL_ABOVE)) ** 2
         shifted = _middle(error - noise * square)
         for i in range(count):
@@ -279,6 +281,13 @@ class _Trajectories:
             for sample in samples:
                 padded[which] = padded[which] + _adjoint(sample) * sample
         return padded[0], padded[1]
+
+
+def _largest_ratio(error: Any, noise: Any) -> float:
+    """Return the root of the largest ratio of two energies in double precision: where to look, and no proof."""
+    above, below = (np.array([[complex(entry) for entry in row] for row in part.tolist()]) for part in (error, noise))
+    below = below + np.finfo(float).eps * np.trace(below).real * np.eye(len(below))
+    return float(np.sqrt(max(scipy.linalg.eigh(above, below, eigvals_only=True)[-1], 0.0)))
 
 
 def _from_rest(
