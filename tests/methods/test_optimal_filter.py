@@ -380,6 +380,21 @@ def test_a_bound_that_is_not_close_to_the_gain_is_proved_again(seed: int) -> Non
     assert design.gain * (1.0 - 1e-4) <= design.least <= design.gain
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_filter_of_finite_response_has_no_modes_of_rounding(seed: int) -> None:
+    """Two states, two hidden inputs: a window says all, and entries of 1e-16 were four states that followed nothing."""
+    rng = np.random.default_rng([471, seed])
+    case = plant(
+        A=0.8 * rng.normal(size=(2, 2)), C=rng.normal(size=(3, 2)), Bf=rng.normal(size=(2, 1)),
+        Bd=rng.normal(size=(2, 1)), Bw=np.hstack([0.3 * rng.normal(size=(2, 2)), np.zeros((2, 3))]),
+        Dw=np.hstack([np.zeros((3, 2)), 0.1 * np.eye(3)]),
+    )  # fmt: skip
+    design = obsynth.optimal_filter(case, delay=1, decoupled="d1")
+    assert design.report.passed
+    assert design.observer.order <= 2
+    assert design.gain * (1.0 - 1e-6) <= design.least <= design.gain
+
+
 def test_the_gain_set_comes_back_and_is_verified(good, tmp_path) -> None:
     again = obsynth.load(good.save(tmp_path / "a.gains.json"))
     assert obsynth.verify(again).passed

@@ -38,3 +38,12 @@ def test_a_design_does_not_depend_on_the_units_of_the_faults_more_than_it_must(s
     assert apart.report.passed
     # W is fixed here: its rows are in the units of the faults, exactly.
     assert apart.gains["W"] * np.array([[1.0], [2.0**30], [2.0**-30]]) == pytest.approx(alike.gains["W"], rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_unit_for_all_faults_changes_no_free_weight(seed):
+    """Units that differ between faults weigh them against each other in gamma: the best W is another one then."""
+    alike = obsynth.fault_estimation_filter(random_plant(seed, [1.0] * 3))
+    other = obsynth.fault_estimation_filter(random_plant(seed, [2.0**20] * 3))
+    assert other.options["weight"] == alike.options["weight"]
+    assert 2.0**20 * other.gains["W"] == pytest.approx(alike.gains["W"], rel=1e-8)

@@ -26,6 +26,8 @@ IDENTITY_LEFT = 1e-9
 CLEANED_SHARE = 1e-13
 #: Entries of the filter that are smaller, of the largest of their matrix, are rounding.
 ROUNDING_SHARE = 1e-14
+#: Entries of a sampled filter's A below this are rounding: its states are of the size of the outputs.
+ROUNDED_MODE = 1e-12
 #: Equations are solved so many times, each time for what is left: small rows of a filter keep their digits.
 SOLUTIONS = 3
 
@@ -46,9 +48,11 @@ class Followed(NamedTuple):
     lag: int
 
 
-def minimal(filter_: Model) -> Model:
+def minimal(filter_: Model, *, discrete: bool = False) -> Model:
     """Return a filter without states that are not reached or not read."""
     a, b, c, d = filter_
+    # Of a filter of finite response nothing but rounding may be left of the modes.
+    a = np.where(np.abs(a) > ROUNDED_MODE, a, 0.0) if discrete else a
     basis = reachable_basis(a, b)
     a, b, c = basis.T @ a @ basis, basis.T @ b, c @ basis
     basis = reachable_basis(a.T, c.T)
