@@ -101,3 +101,31 @@ def test_a_shell_completes_commands_and_options(shell: str, capsys: pytest.Captu
     script = capsys.readouterr().out
     assert "prove-alarm" in script
     assert shell == "tcsh" or "--false-alarms" in script
+
+
+def test_a_file_without_its_option_is_asked_about(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["design", "spec.yaml"])
+    assert "required: --system. Did you mean --system spec.yaml?" in capsys.readouterr().err
+
+
+def test_a_missing_file_is_asked_about_by_its_neighbours(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "spec.yaml").write_text("schema_version: 1\n")
+    assert main(["design", "--system", str(tmp_path / "spec.yml")]) == 2
+    assert f"does not exist. Did you mean {tmp_path / 'spec.yaml'}?" in capsys.readouterr().err
+    assert main(["design", "--system", str(tmp_path / "other.mat")]) == 2
+    assert "Did you mean" not in capsys.readouterr().err
+    assert main(["design", "--system", str(tmp_path / "none" / "spec.yaml")]) == 2
+    assert "Did you mean" not in capsys.readouterr().err
+
+
+def test_a_threshold_for_a_signal_and_a_misspelt_monitor_are_asked_about() -> None:
+    plant = obsynth.DescriptorSystem(
+        A=[[0.9]], C=[[1.0]], Bf=[[1.0]], dt=1.0, sensor_noise={"y1": 0.1}, fault_names=["leak"]
+    )
+    design = obsynth.functional_filter(plant)
+    log = {"time": list(range(20)), "y1": [0.0] * 20}
+    with pytest.raises(obsynth.SpecError, match=r"Did you mean 'fhat\[leak\]'\?"):
+        obsynth.run_on_data(design, log, thresholds={"leak": 1.0})
+    with pytest.raises(obsynth.SpecError, match=r"Did you mean 'chi-square'\?"):
+        obsynth.online_monitor(design, "chisquare")

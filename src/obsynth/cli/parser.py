@@ -6,6 +6,7 @@ import argparse
 import re
 from collections.abc import Sequence
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any, NoReturn
 
 #: How alike a word must be to what may be meant, as `difflib` measures it.
@@ -39,7 +40,15 @@ class Parser(argparse.ArgumentParser):
             wrong = [word.partition("=")[0] for word in self._words if word.startswith("--")]
             close = [(word, meant(word, known)) for word in wrong if word not in known]
             message += "".join(f". There is no option {word}.{told}" for word, told in close if told).rstrip(".")
+            message += self._meant_file(message)
         super().error(message)
+
+    def _meant_file(self, message: str) -> str:
+        """Return the option that a file without one may belong to: ``obsynth design spec.yaml``."""
+        needed = message.partition(": ")[2].split(",")[0].split("/")[0].strip()
+        loose = [word for word in self._words if Path(word).suffix and not word.startswith("-")]
+        plain = [word for word in loose if self._words.index(word) == 0]
+        return f". Did you mean {needed} {plain[0]}?" if needed.startswith("--") and plain else ""
 
 
 class PrintCompletion(argparse.Action):

@@ -21,6 +21,9 @@ from obsynth.errors import SpecError, a_kind
 #: Documents larger than this are refused: matrices of that size belong in matrix files.
 MOST_DOCUMENT_CHARACTERS = 32_000_000
 
+#: How alike the name of a file must be to one that may be meant, as `difflib` measures it.
+CLOSE_NAME = 0.75
+
 #: What the readers of numpy and scipy raise for a damaged file.
 READING_ERRORS = (
     OSError,
@@ -103,6 +106,18 @@ def special_kind(path: Path) -> str | None:
     return _SPECIAL.get(stat.S_IFMT(os.stat(path).st_mode))
 
 
+def _meant(path: Path) -> str:
+    """Return a question with the files of the folder whose names are close to a wrong one; empty where none is."""
+    import difflib
+
+    try:
+        names = [entry.name for entry in os.scandir(path.parent) if entry.is_file()]
+    except OSError:
+        return ""
+    close = difflib.get_close_matches(path.name, names, n=2, cutoff=CLOSE_NAME)
+    return f" Did you mean {' or '.join(str(path.parent / name) for name in close)}?" if close else ""
+
+
 def input_file(path: Path, *, where: str | None = None, is_protected: bool = True) -> Path:
     """Return ``path`` if it is a regular file, and protect it; anything else is a `SpecError` at ``where``."""
     place = where or str(path)
@@ -110,7 +125,7 @@ def input_file(path: Path, *, where: str | None = None, is_protected: bool = Tru
         if path.is_dir():
             raise SpecError(f"{path} is a folder: give the name of a file.", path=place)
         if not path.exists():
-            raise SpecError(f"{path} does not exist.", path=place)
+            raise SpecError(f"{path} does not exist.{_meant(path)}", path=place)
         kind = special_kind(path)
     except (OSError, ValueError) as error:
         raise SpecError(f"{path!s} cannot be read: {reason(error)}.", path=place) from error

@@ -32,6 +32,7 @@ from obsynth.observers.linear.modes import SETTLED_TO, transient
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.running import BY_COLUMNS
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.signal_names import suggestion
 from obsynth.results.certificate_files import sealed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import digest_of, plain, restored
@@ -178,7 +179,8 @@ class LogRun:
         for name, level in thresholds.items():
             if name not in names:
                 raise SpecError(
-                    f"There is no column {name!r} to monitor: there are {', '.join(names)}.", path="thresholds"
+                    f"There is no column {name!r} to monitor: there are {', '.join(names)}.{_meant(name, names)}",
+                    path="thresholds",
                 )
             real_number(level, f"The threshold of {name!r}", "a positive number", above=0.0, path="thresholds")
         self._levels = tuple((name, names.index(name), level) for name, level in thresholds.items())
@@ -510,6 +512,12 @@ def resume_state(path: Path, run: LogRun, digest: str) -> None:
     if not fits:
         raise damaged_state(path)
     run.resumed_from = path
+
+
+def _meant(name: str, names: Sequence[str]) -> str:
+    """Return a question with the column that a signal without brackets may mean, or one of a like name."""
+    of_signal = [column for column in names if column.endswith(f"[{name}]")]
+    return f" Did you mean {' or '.join(map(repr, of_signal))}?" if of_signal else suggestion(name, names)
 
 
 def _fits(own: Any, saved: Any) -> bool:

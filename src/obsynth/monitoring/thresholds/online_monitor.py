@@ -31,6 +31,7 @@ from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.constants import shown
 from obsynth.plants.noise import is_noise_assumed, require_noise
+from obsynth.plants.signal_names import suggestion
 from obsynth.results.design import ObserverDesign, require_verified
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.assumptions import Assumptions
@@ -239,7 +240,7 @@ def _require_linear_kind(kind: str, nominal: Mapping[str, float] | None) -> None
         hint = " glr is a decision on parameters, which a linear design has none of: cusum is nearest to it."
         raise SpecError(
             f"The monitor {kind!r} is not for this design: use one of {', '.join(MONITOR_KINDS)}, learned."
-            f"{hint if kind == 'glr' else ''}",
+            f"{hint if kind == 'glr' else suggestion(kind, (*MONITOR_KINDS, 'learned'))}",
             path="kind",
         )
     if nominal:
