@@ -126,3 +126,83 @@ def test_solutions_are_enclosed(seed: int) -> None:
     for kind in (Ball, ExtendedBall):
         with flint.ctx.workprec(212):
             assert enclosed_solution(kind.exact(singular), kind.exact(right)) is None
+
+
+def test_a_state_that_never_settles_in_practice_is_judged_by_the_errors_alone() -> None:
+    # After 1e11 samples the state would be 1e22 times the fault, and rounding of any number of the observer beside it.
+    a = np.array([[1.0 - 1e-11, 1.0], [0.0, 1.0 - 1e-11]])
+    plant = DescriptorSystem(A=a, C=[[1.0, 0.0]], Bf=[[0.0], [1.0]], dt=1.0)
+    design = obsynth.functional_filter(plant, decay=0.5)
+    wrong = last_digits(design)
+    assert missed_in_the_end(wrong) > 1.0
+    row = obsynth.verify(wrong)[ROW]
+    assert row.passed
+    assert "errors alone" in row.detail
+
+
+def test_units_of_faults_decide_nothing() -> None:
+    """A fault beside another is as large as what it makes of the outputs."""
+    found = []
+    for unit in (1.0, 1e9):
+        plant = DescriptorSystem(A=np.diag([0.5, 0.2]), C=np.eye(2), Bf=np.diag([1.0, unit]), dt=1.0)
+        design = obsynth.fault_estimation_filter(plant)
+        model = method_class(design.method).error_model(design)
+        # An estimate of f1 that would have to hold a thousandth of f2.
+        given = ConstantFaults(model, np.array([[1.0, 1e-3 * unit], [0.0, 1.0]]))
+        found.append(constant_fault_row(given, 1e-6, None).value)
+    assert found[0] == pytest.approx(found[1], rel=0.1)
+    assert 1e-4 < found[0] < 1e-2
+
+
+@pytest.mark.parametrize("method", ["functional-filter", "ui-pi-observer"])
+def test_equations_without_a_next_state_count_where_the_state_has_no_end(method: str) -> None:
+    plant = DescriptorSystem(
+        E=np.diag([1.0, 0.0]), A=np.diag([1.0, -1.0]), C=np.eye(2), Bf=[[1.0], [1.0]], dt=1.0
+    )  # fmt: skip
+    row = obsynth.design(plant, method).report[ROW]
+    assert row.passed
+    assert "errors alone" in row.detail
+
+
+def test_a_fault_is_what_its_model_shows_of_a_state_that_stays() -> None:
+    plant = DescriptorSystem(A=[[1.0]], C=[[1.0]], Bf=[[1.0]], dt=1.0)
+    model = {"Phi": [[1.0]], "Cw": [[4.0]]}
+    row = obsynth.ui_pi_observer(plant, fault_model=model).report[ROW]
+    assert row.passed
+    assert row.value < 1e-9
+
+
+def test_of_a_fault_model_without_a_constant_nothing_is_said() -> None:
+    plant = DescriptorSystem(A=[[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0)
+    design = obsynth.ui_pi_observer(plant, fault_model={"sinusoid": 0.7})
+    assert ROW not in {row.name for row in design.report.checks}
+
+
+@pytest.mark.parametrize("method", ["fault-estimation-filter", "ui-pi-observer", "functional-filter", "optimal-filter"])
+def test_faults_of_sensors_are_followed_too(method: str) -> None:
+    plant = DescriptorSystem(A=[[0.5]], C=[[1.0], [1.0]], Bf=[[0.0]], Df=[[1.0], [0.0]], dt=1.0)
+    assert obsynth.design(plant, method).report[ROW].value < 1e-9
+
+
+def test_an_optimal_filter_settles_at_its_reference() -> None:
+    plant = DescriptorSystem(A=[[0.5]], C=[[1.0], [1.0]], Bf=[[1.0]], dt=1.0, sensor_noise={"y1": 0.1, "y2": 0.1})
+    reference = {"A": [[0.5]], "B": [[0.5]], "C": [[4.0]], "D": [[0.0]]}
+    design = obsynth.optimal_filter(plant, reference=reference)
+    assert missed_in_the_end(design) > 1
+    assert design.report[ROW].value < 1e-6
+    matching = obsynth.optimal_filter(plant, reference=reference, exact=False)
+    assert ROW not in {row.name for row in matching.report.checks}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_solutions_of_all_members_are_enclosed(seed: int) -> None:
+    rng = np.random.default_rng([46, 7, seed])
+    n = int(rng.integers(2, 6))
+    matrix, right = rng.standard_normal((n, n)) + 3.0 * np.eye(n), rng.standard_normal((n, 1))
+    away, beside = 1e-3 * rng.random((n, n)), 1e-3 * rng.random((n, 1))
+    found = enclosed_solution(Ball(matrix, away), Ball(right, beside))
+    for turn in range(40):
+        of_matrix = rng.choice([-1.0, 1.0], (n, n)) * away * (turn % 3 != 1)
+        of_right = rng.choice([-1.0, 1.0], (n, 1)) * beside * (turn % 3 != 2)
+        solution = np.linalg.solve(matrix + of_matrix, right + of_right)
+        assert np.all(np.abs(solution - found.midpoint) <= found.radius * (1.0 + 1e-9))
