@@ -54,7 +54,6 @@ def test_faults_are_proved_and_certificates_hold(design, found, tmp_path) -> Non
 
 
 @pytest.mark.parametrize("make", [wang, drive])
-@pytest.mark.long
 def test_healthy_windows_are_never_proved_faulty(make) -> None:
     design = obsynth.fault_estimation_filter(make())
     name, noise_bound = design.plant.disturbance_names[0], 1.0 if design.plant.nw else None

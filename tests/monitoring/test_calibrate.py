@@ -123,7 +123,6 @@ def test_known_constants_are_in_their_boxes_and_the_rest_is_said():
     assert found.R["y"] == pytest.approx(1e-4, rel=0.5)
 
 
-@pytest.mark.long
 def test_a_product_that_alone_is_seen_is_named_as_a_direction():
     model = first_order()
     unknown = {"T": (0.5, 10.0), "k": (0.2, 5.0), "g": (0.2, 5.0)}

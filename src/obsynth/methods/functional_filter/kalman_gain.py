@@ -163,8 +163,13 @@ def require_noise(model: FilterModel, plant_outputs: tuple[str, ...], noise: Flo
     )
 
 
-def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0, decay: float = 0.0) -> KalmanGain:
-    """Return the gain for walks of the fault models, ``rates (model states,)``; errors decay at ``decay`` (1/s)."""
+def kalman_gain(
+    model: FilterModel, rates: FloatArray, *, lag: int = 0, decay: float = 0.0, insist: bool = False
+) -> KalmanGain:
+    """Return the gain for walks of the fault models, ``rates (model states,)``; errors decay at ``decay`` (1/s).
+
+    A decay may make modes unstable that nothing drives: with ``insist`` they get a gain, which may be very large.
+    """
     n, p = model.A.shape[0], model.C.shape[0]
     if n == 0:
         return KalmanGain(np.zeros((0, p)), (np.zeros((0, p)),) * (lag + 1), model.M @ model.M.T, np.zeros((0, 0)))
@@ -173,13 +178,16 @@ def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0, decay: f
     unit = max(float(np.max(np.abs(model.N[: model.order]), initial=0.0)), float(np.max(np.abs(model.M), initial=0.0)))
     states = np.diag(np.r_[np.ones(model.order), np.zeros(n - model.order)])
     exact, sampled = exact_rows(model), model.dt > 0.0
-    tried = product(SHARES_OF_NOISE, SHARES_OF_EXACT_ROWS[sampled] if len(exact) else (0.0,))
+    tried = product((False, True) if sampled and insist else (False,), SHARES_OF_NOISE,
+                    SHARES_OF_EXACT_ROWS[sampled] if len(exact) else (0.0,))  # fmt: skip
     best, least = None, MOST_MISSED
-    for share, trust in tried:
+    for stable, share, trust in tried:
+        if stable and best is not None:
+            break
         drive = process + (share * unit) ** 2 * states
         rows = measured + (trust * unit) ** 2 * (exact.T @ exact)
         if sampled:
-            found = _discrete(model, drive, rows, cross, lag, float(np.exp(decay * model.dt)))
+            found = _discrete(model, drive, rows, cross, lag, float(np.exp(decay * model.dt)), stable=stable)
         else:
             found = _continuous(model, drive, rows, cross, decay)
         if found is not None and found[1] <= least:
@@ -195,10 +203,17 @@ def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0, decay: f
 
 
 def _discrete(
-    model: FilterModel, process: FloatArray, measured: FloatArray, cross: FloatArray, lag: int, growth: float
+    model: FilterModel,
+    process: FloatArray,
+    measured: FloatArray,
+    cross: FloatArray,
+    lag: int,
+    growth: float,
+    *,
+    stable: bool,
 ) -> tuple[KalmanGain, float] | None:
     equation = _Equation(growth * model.A, model.C, process, measured, growth * cross, sampled=True)
-    found = equation.solution()
+    found = equation.solution(stable=stable)
     if found is None:
         return None
     p, missed = found
@@ -263,13 +278,16 @@ class _Equation:
         missed = float(np.linalg.norm(moved - taken + self.process)) / max(size, SMALLEST)
         return missed if np.isfinite(missed) else np.inf
 
-    def solution(self) -> tuple[FloatArray, float] | None:
-        """Return the covariance and what it misses the equation by; ``None`` where no stable filter came out."""
+    def solution(self, *, stable: bool = False) -> tuple[FloatArray, float] | None:
+        """Return the covariance and what it misses the equation by; ``None`` where no stable filter came out.
+
+        Sampled, by doubling. It begins at zero, which solves the equation where nothing drives an unstable mode: with
+        ``stable`` by the stable subspace then.
+        """
         solve = riccati_solution if self.sampled else continuous_solution
         given = (self.a, self.c, self.process, self.measured, self.cross)
         p = solve(*given)
-        if self.sampled and p is not None and not self._is_stable(p):
-            # Doubling begins at zero, which solves the equation where nothing drives an unstable mode.
+        if stable and p is not None and not self._is_stable(p):
             p = discrete_solution(*given)
         if p is None or not np.all(np.isfinite(p)):
             return None

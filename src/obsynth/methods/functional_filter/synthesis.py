@@ -198,7 +198,7 @@ def _gain(
     plant: DescriptorSystem, model: FilterModel, given: FloatArray | None, asked: FunctionalFilter, longer: int
 ) -> tuple[FloatArray, KalmanGain]:
     if not model.drive.shape[1]:
-        return np.zeros(0), kalman_gain(model, np.zeros(0), decay=asked.decay or 0.0)
+        return np.zeros(0), kalman_gain(model, np.zeros(0), decay=asked.decay or 0.0, insist=True)
     if given is not None or asked.decay is not None:
         walks = np.zeros(model.drive.shape[1])
         if given is not None:
@@ -210,7 +210,7 @@ def _gain(
                         "random-walk intensity of 0 it is a constant, and errors of its estimate would never decay.",
                         path="method.options.fault_rate",
                     )
-        return walks, kalman_gain(model, walks, lag=asked.delay, decay=asked.decay or 0.0)
+        return walks, kalman_gain(model, walks, lag=asked.delay, decay=asked.decay or 0.0, insist=True)
     return default_rates(model, settling_time(plant), lag=asked.delay, longer=longer)
 
 

@@ -93,7 +93,7 @@ def design_gains(plant: DescriptorSystem, asked: PdObserver) -> tuple[PdGains, l
         except ObsynthError:
             continue  # what the merged outputs leave unused is needed
         # A rate that is stated is reached by both: a faster one was not asked for.
-        as_fast = asked.decay is not None or AS_FAST * other.abscissa <= first.abscissa
+        as_fast = bool(asked.decay) or AS_FAST * other.abscissa <= first.abscissa
         if as_fast and fault_deviation(plant, other.observer) < fault_deviation(plant, first.observer):
             first, records = other, [*records, *more]
     return first, records
