@@ -7,7 +7,7 @@ import pytest
 
 from obsynth import DescriptorSystem, design_from_gains, ui_pi_observer
 from obsynth.analysis.existence.augmented_pencils import number
-from obsynth.errors import PreconditionError, SolverError, SpecError
+from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.methods.designing import check
 from obsynth.methods.engines.kalman_problem import KalmanProblem
 from obsynth.numerics.arrays import FloatArray
@@ -81,11 +81,17 @@ def test_the_price_in_noise_is_that_of_the_gain_that_is_shipped(dt: float, frequ
     assert 9.5 < design.certificate.claims["noise_price"] <= 10.0
 
 
-@pytest.mark.parametrize("joint", [False, True])
-def test_a_rate_far_above_the_plants_own_is_reached(joint: bool) -> None:
-    design = ui_pi_observer(PAPER, decay=3e3, joint=joint)
+@pytest.mark.parametrize(("decay", "joint"), [(3e3, False), (1e3, True)])
+def test_a_rate_far_above_the_plants_own_is_reached(decay: float, joint: bool) -> None:
+    design = ui_pi_observer(PAPER, decay=decay, joint=joint)
     assert design.report.passed
-    assert design.certificate.claims["decay"] >= 3e3
+    assert design.certificate.claims["decay"] >= decay
+
+
+def test_a_rate_at_which_stored_numbers_miss_the_fault_is_no_design() -> None:
+    """With the fault models in one observer a constant fault ends 7 % off: the last digits of the gains do it."""
+    with pytest.raises(VerificationError, match="constant fault"):
+        ui_pi_observer(PAPER, decay=3e3, joint=True)
 
 
 @pytest.mark.parametrize("decay", [1e5, 1e6])
@@ -172,7 +178,7 @@ def test_a_pseudoinverse_that_loses_an_equation_is_refused_for_it(size: float) -
 def test_coordinates_that_need_more_digits_than_are_printed_are_told() -> None:
     shear = np.array([[1.0, 1e3, 1e3], [0, 1, 1e3], [0, 0, 1]])
     back = np.linalg.inv(shear)
-    a = np.array([[0.9, 0.3, 0], [0, 0.8, 0.2], [0.1, 0, 0.7]])
+    a = np.array([[0.8, 0.3, 0], [0, 0.8, 0.2], [0.1, 0, 0.7]])
     plant = DescriptorSystem(
         np.eye(3), shear @ a @ back, C=np.eye(3)[[0, 2]] @ back, Bf=shear @ [[0.0], [1], [0]], dt=1.0
     )

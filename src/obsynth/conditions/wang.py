@@ -115,7 +115,7 @@ def wang2015(
     >>> plant = obsynth.DescriptorSystem(
     ...     A=[[0.9, 0.1], [0.0, 0.8]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0
     ... )
-    >>> paper = obsynth.conditions.wang2015(plant)
+    >>> paper = obsynth.conditions.wang2015(plant, coordinates="balanced")
     >>> _ = paper.problem.solve()
     >>> paper.problem.status, sorted(paper.variables)
     ('optimal', ['P', 'Y', 'gamma_squared'])

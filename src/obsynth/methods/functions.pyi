@@ -31,6 +31,7 @@ def fault_estimation_filter(
     tolerance: float = ...,
     prove_least: bool = ...,
     mean: int = ...,
+    steady_error_limit: float = ...,
     name: str = ...,
 ) -> ObserverDesign: ...
 def pd_observer(
@@ -51,6 +52,7 @@ def pd_observer(
     constraints: Any = ...,
     objective: Any = ...,
     region: Any = ...,
+    steady_error_limit: float = ...,
     name: str = ...,
 ) -> ObserverDesign: ...
 def ui_pi_observer(
@@ -69,6 +71,7 @@ def ui_pi_observer(
     solver: Any = ...,
     solver_options: Any = ...,
     constraints: Any = ...,
+    steady_error_limit: float = ...,
     name: str = ...,
 ) -> ObserverDesign: ...
 def functional_filter(
@@ -84,6 +87,8 @@ def functional_filter(
     poles: Any = ...,
     noise: Any = ...,
     residuals: Any = ...,
+    states: Any = ...,
+    steady_error_limit: float = ...,
     name: str = ...,
 ) -> ObserverDesign: ...
 def descriptor_kalman(

@@ -208,7 +208,7 @@ def weight_by_gain(
     if not gain_problem(prepared, free_weight=True)[0].measured:
         return False, ()
     upper, lower = least_gains_by_weight(prepared)
-    taken = bool(lower <= (1.0 - WORTH_A_FREE_WEIGHT) * upper)
+    taken = bool(lower < (1.0 - WORTH_A_FREE_WEIGHT) * upper)
     taken_for = "the free W is taken" if taken else "the paper's W is taken"
     told = f"Least gamma with these T and N: {lower:.5g} with a free W, {upper:.5g} with the paper's W; {taken_for}."
     return taken, (told,)
