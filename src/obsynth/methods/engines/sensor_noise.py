@@ -8,15 +8,19 @@ from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyap
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.plant_units import PlantUnits
 
 
 def fault_deviation(plant: DescriptorSystem, observer: LinearObserver) -> float:
     """Return the largest standard deviation of a fault estimate, in units in which the faults act alike; infinite for
-    an observer that is not stable.  Without stated noise every output has a deviation of one."""
-    noise = plant.Dw if plant.Dw.any() else np.eye(plant.ny)
+    an observer that is not stable.  Without stated noise every output has a deviation of one, in units that suit the
+    plant."""
+    own = PlantUnits.of(plant)
+    noise = plant.Dw if plant.Dw.any() else np.diag(1.0 / own.outputs)
     rows, into = observer.fault_rows, observer.By @ noise
-    sizes = np.linalg.norm(np.vstack([plant.Bf, plant.Df]), axis=0)
-    scale = np.where(sizes > 0.0, sizes, 1.0)[:, None]
+    places = [plant.fault_names.index(name) for name in observer.fault_names]
+    sizes = own.faults[places]
+    scale = np.where(sizes > 0.0, 1.0 / np.where(sizes > 0.0, sizes, 1.0), 1.0)[:, None]
     shown, direct = scale * observer.Cz[rows], scale * observer.Dy[rows] @ noise
     if not len(shown):
         return 0.0

@@ -26,6 +26,9 @@ from obsynth.proofs.exact_arithmetic import pivot_columns, written_matrix
 #: weight of nearly one then, and a mean stays unbiased to as many digits.
 LEAST_NOISE_SHARE = 1e-6
 
+#: Rows whose lengths differ by less than this share are as long as each other.
+ALIKE = 1e-6
+
 
 @dataclass(frozen=True, eq=False)
 class MergedOutputs:
@@ -77,9 +80,7 @@ def nearly_merged_outputs(plant: DescriptorSystem) -> MergedOutputs | None:
     count = int(np.sum(values > NEARLY_DEPENDENT * values[0]))
     if count == rounding_rank(units):
         return None
-    from scipy.linalg import qr
-
-    picked = sorted(int(moving[place]) for place in qr(units.T, mode="r", pivoting=True)[1][:count])
+    picked = [int(moving[place]) for place in _most_independent(units, count)]
     found = np.linalg.lstsq((shown[picked] / lengths[picked, None]).T, units.T, rcond=None)[0].T
     q = np.zeros((len(shown), count))
     q[moving] = found * lengths[moving, None] / lengths[picked]
@@ -122,6 +123,19 @@ def _first_independent(units: FloatArray, count: int) -> list[int]:
     from scipy.linalg import qr
 
     return sorted(int(place) for place in qr(units.T, mode="r", pivoting=True)[1][:count])
+
+
+def _most_independent(units: FloatArray, count: int) -> list[int]:
+    """Return ``count`` rows, each with the most that those before leave of it; of rows alike the first, whatever
+    rounding does."""
+    left, picked = units, list[int]()
+    for _ in range(count):
+        sizes = np.linalg.norm(left, axis=1)
+        place = int(np.flatnonzero(sizes >= (1.0 - ALIKE) * np.max(sizes))[0])
+        direction = left[place] / sizes[place]
+        left = left - np.outer(left @ direction, direction)
+        picked.append(place)
+    return sorted(picked)
 
 
 def _weights(q: FloatArray, noise: FloatArray) -> FloatArray:
