@@ -38,6 +38,8 @@ CASES = {
 }
 
 
+# Whether the solver's last digits do is the processor's affair: what it found is compared.
+@pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
 @pytest.mark.parametrize("norm", ["hinf", "h2"])
 @pytest.mark.parametrize("name", CASES)
 def test_inequality_and_riccati_equation_agree(name: str, norm: str) -> None:
