@@ -153,11 +153,11 @@ def test_the_gate_runs_and_has_a_bound_for_each_of_its_cases(printed):
 
     bounds = json.loads((ROOT / "benchmarks" / "gate_bounds.json").read_text())
     (rows,) = tables(printed("gate", "--small", "--commit", "0"))
-    assert len(bounds) == 12
+    assert len(bounds) == 13
     found = [re.sub(r"\d+, |of \d+$", "", line[0]) for line in rows[1:]]
     wanted = [re.sub(r"\d+, |of \d+$", "", name) for name in bounds]
     assert found == [name for name in wanted if name in found]
-    assert len(found) >= 11  # without numba one is left out
+    assert len(found) >= 12  # without numba one is left out
     for line in rows[1:]:
         assert float(line[4]) > 0.0
 

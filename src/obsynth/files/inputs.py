@@ -111,7 +111,8 @@ def _meant(path: Path) -> str:
     import difflib
 
     try:
-        names = [entry.name for entry in os.scandir(path.parent) if entry.is_file()]
+        with os.scandir(path.parent) as entries:
+            names = [entry.name for entry in entries if entry.is_file()]
     except OSError:
         return ""
     close = difflib.get_close_matches(path.name, names, n=2, cutoff=CLOSE_NAME)
