@@ -14,7 +14,7 @@ from obsynth import DescriptorSystem, PreconditionError, SpecError, TimeVaryingD
 from obsynth.cli.main import main
 from obsynth.methods.designing import check
 from obsynth.observers.recursive.gain_schedule import run_batch
-from obsynth.observers.recursive.gain_schedule_summary import gain_schedule_summary
+from obsynth.observers.recursive.gain_schedule_summary import FOLLOW_FURTHER, end_of_steps, gain_schedule_summary
 from obsynth.specs.loader import load_spec
 
 NOISE = {"Q": 0.1, "R": 0.2}
@@ -306,6 +306,18 @@ class TestManyStates:
         assert whole.contraction == pytest.approx(few.contraction, rel=1e-9)
         # Of many states the growth is a bound.
         assert whole.growth <= few.growth <= 20.0 * whole.growth
+
+
+@pytest.mark.parametrize("first", [60, 100, 364, 490, 970, 1001])
+@pytest.mark.parametrize("whole", [1000, 1001])
+def test_a_later_end_has_less_than_half_of_its_steps_behind_it(first: int, whole: int) -> None:
+    """A decay over the second half is measured from the middle: a middle that has passed would be missed."""
+    end = end_of_steps(first, whole)
+    while end < whole:
+        later = end_of_steps(FOLLOW_FURTHER * end, whole)
+        assert end < later // 2
+        end = later
+    assert end == whole
 
 
 def test_steps_are_followed_until_gains_stay(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -88,23 +88,12 @@ def hinf_filter(
     P, Y, Z0 = _variables(data)
     level = cp.Variable(name="gamma_squared")
     positive, bounded = atoms.bounded_real(
-        data["A"],
-        data["B"],
-        data["L"] - Z0 @ data["C"],
-        data["D1"] - Z0 @ data["D"],
-        P,
-        None,
-        1.0,
-        Y=Y,
-        Cy=data["C"],
-        Dy=data["D"],
-        gamma_squared=level,
-        margin=margin,
+        *_error(data, Z0), P, None, 1.0, Y=Y, Cy=data["C"], Dy=data["D"], gamma_squared=level, margin=margin
     )
     constraints = {"P > 0": positive, "bounded real": bounded}
     return Conditions(
         "Gahinet, Apkarian 1994: least gain of any causal filter",
-        cp.Problem(cp.Minimize(level), list(constraints.values())),
+        lmi.semidefinite_problem(cp.Minimize(level), list(constraints.values())),
         {"P": P, "Y": Y, "Z0": Z0, "gamma_squared": level},
         {},
         data,
@@ -169,23 +158,11 @@ def h2_filter(
     data, design, held = _problem(plant, options)
     P, Y, Z0 = _variables(data)
     Z = cp.Variable((data["B"].shape[1],) * 2, symmetric=True, name="Z")
-    stable, covariance = atoms.h2(
-        data["A"],
-        data["B"],
-        data["L"] - Z0 @ data["C"],
-        data["D1"] - Z0 @ data["D"],
-        P,
-        Z,
-        1.0,
-        Y=Y,
-        Cy=data["C"],
-        Dy=data["D"],
-        margin=margin,
-    )
+    stable, covariance = atoms.h2(*_error(data, Z0), P, Z, 1.0, Y=Y, Cy=data["C"], Dy=data["D"], margin=margin)
     constraints = {"stable": stable, "covariance": covariance}
     return Conditions(
         "de Souza, Shaked 1999: least mean square of any causal linear filter",
-        cp.Problem(cp.Minimize(cp.trace(Z)), list(constraints.values())),
+        lmi.semidefinite_problem(cp.Minimize(cp.trace(Z)), list(constraints.values())),
         {"P": P, "Y": Y, "Z0": Z0, "Z": Z},
         {},
         data,
@@ -215,6 +192,11 @@ def _variables(data: dict[str, FloatArray]) -> tuple[Any, Any, Any]:
     n, m, rows = len(data["A"]), len(data["C"]), len(data["L"])
     P = cp.Variable((n, n), symmetric=True, name="P")
     return P, cp.Variable((n, m), name="Y"), cp.Variable((rows, m), name="Z0")
+
+
+def _error(data: dict[str, FloatArray], Z0: Any) -> tuple[Any, Any, Any, Any]:
+    """Return the error of a filter with Z0, without K, which is in Y."""
+    return data["A"], data["B"], data["L"] - Z0 @ data["C"], data["D1"] - Z0 @ data["D"]
 
 
 def _gains(values: Values) -> dict[str, FloatArray]:

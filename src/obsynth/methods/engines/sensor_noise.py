@@ -22,7 +22,7 @@ def fault_deviation(plant: DescriptorSystem, observer: LinearObserver) -> float:
     rows, into = observer.fault_rows, observer.By @ noise
     places = [plant.fault_names.index(name) for name in observer.fault_names]
     sizes = own.faults[places]
-    scale = np.where(sizes > 0.0, 1.0 / np.where(sizes > 0.0, sizes, 1.0), 1.0)[:, None]
+    scale = 1.0 / np.where(sizes > 0.0, sizes, 1.0)[:, None]
     shown, direct = scale * observer.Cz[rows], scale * observer.Dy[rows] @ noise
     if not len(shown):
         return 0.0

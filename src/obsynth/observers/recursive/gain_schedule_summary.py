@@ -93,7 +93,7 @@ def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_st
                 plain.plant.nx > MANY_STATES or _stays(found.gain, middle)
             ):
                 break
-            product.go_on_to(min(whole, FOLLOW_FURTHER * product.steps))
+            product.go_on_to(end_of_steps(FOLLOW_FURTHER * product.steps, whole))
     if last is None:
         raise SpecError("The plant has no steps.", path="horizon")
     (contraction, span), ne = kept if kept is not None else product.contraction(), len(last.step.A)
@@ -131,8 +131,14 @@ def _first_end(observer: RecursiveObserver, steps: int) -> int:
     if not alike or plant.horizon or observer.adaptation is not None:
         return steps
     if plant.nx <= MANY_STATES:
-        return min(steps, FIRST_FOLLOWED)
-    return min(steps, max(FEWEST_FOLLOWED, round(steps * (MANY_STATES / plant.nx) ** 3)))
+        return end_of_steps(FIRST_FOLLOWED, steps)
+    return end_of_steps(max(FEWEST_FOLLOWED, round(steps * (MANY_STATES / plant.nx) ** 3)), steps)
+
+
+def end_of_steps(steps: int, whole: int) -> int:
+    """Return where to look next: so many steps, or all where they are not twice as many: a later end must have less
+    than half of its steps behind it, as the second half is looked at by itself."""
+    return steps if 2 * steps < whole else whole
 
 
 def _stays(gain: FloatArray, before: FloatArray | None) -> bool:

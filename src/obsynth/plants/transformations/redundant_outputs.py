@@ -113,16 +113,12 @@ def _independent(shown: FloatArray) -> tuple[list[int], FloatArray, bool]:
 
 def _first_independent(units: FloatArray, count: int) -> list[int]:
     """Return the first rows that are independent within rounding: a sensor that is added changes no choice; where
-    rounding leaves fewer than ``count``, those of a pivoted factorisation."""
+    rounding leaves fewer than ``count``, the most independent ones."""
     picked: list[int] = []
     for place in range(len(units)):
         if len(picked) < count and rounding_rank(units[[*picked, place]]) > len(picked):
             picked.append(place)
-    if len(picked) == count:
-        return picked
-    from scipy.linalg import qr
-
-    return sorted(int(place) for place in qr(units.T, mode="r", pivoting=True)[1][:count])
+    return picked if len(picked) == count else _most_independent(units, count)
 
 
 def _most_independent(units: FloatArray, count: int) -> list[int]:
