@@ -67,9 +67,8 @@ class H2Filter(Method):
         A1, C1, TD, nd = data["A1"], data["C1"], data["TD"], plant.nd
         Z, shown = cp.Variable((nd, nd), symmetric=True, name="Z"), data["W"] @ plant.C
         own = conditions.h2(A1, TD, shown, np.zeros((plant.nf, nd)), P, Z, plant.dt, Y=Y, Cy=C1)
-        own += conditions.region(
-            A1, P, conditions.disk(0.0, self.radius), Y=Y, Cy=C1, margin=1e-9
-        )  # P has its scale by (45)
+        disk = conditions.disk(0.0, self.radius)
+        own += conditions.region(A1, P, disk, Y=Y, Cy=C1, margin=1e-9)  # P has its scale by (45)
         problem = paper.changed(constraints=own, drop=["(45)"], objective=cp.trace(Z))
         problem.solve("CLARABEL", {})
         design = problem.design()

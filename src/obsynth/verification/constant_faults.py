@@ -9,7 +9,8 @@ With ``lambda = 1`` (0 in continuous time), x the plant's state under a constant
 to be f (whatever the delay), or what the method says.  Rounding of stored numbers has no other bound: an identity holds
 to 1e-16 of its terms, and states may be 1e20 times a fault, or an observer's decay 1e-20.
 
-A plant with a pole at ``lambda``, or too near to it for a state that ever settles, has no such x.  Of it the errors
+A plant with a pole at ``lambda``, or too near to it for a state that ever settles, has no such x, and an unstable one
+does not stay there.  Of these the errors
 alone are looked at, ``(lambda - A_z) e = -k``, with k and j what a constant fault leaves of the identities of z and of
 the estimates.
 """
@@ -22,9 +23,12 @@ from typing import Any
 
 import flint
 import numpy as np
+import scipy.linalg
 
 from obsynth.analysis.time_varying import IntArray
 from obsynth.numerics.arrays import FloatArray, remembered
+from obsynth.numerics.invariant_zeros import is_outside
+from obsynth.numerics.ranks import HIDDEN_MODE_TOLERANCE
 from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -113,7 +117,7 @@ def constant_fault_row(given: ConstantFaults, limit: float, printed_digits: int 
     if missed is None or not missed <= limit:
         alone = _decided(given, _missed_alone, sizes, limit) if not _settles(model) else None
         if alone is not None:
-            missed, detail = alone, "of the errors alone: the plant has no steady state with such a fault"
+            missed, detail = alone, "of the errors alone: the plant's state does not settle with such a fault"
     if missed is None:
         if _order(model) > MOST_STATES_IN_BITS:
             return information(_NAME, claim, np.nan, source=source, status="assumed", detail="not decided")
@@ -241,6 +245,8 @@ def _seen_by_faults(observer: LinearObserver) -> IntArray:
 def _settles(model: ErrorModel) -> bool:
     """Return whether the plant's state under constant faults settles in a time that matters."""
     plant, observer = model.plant, model.observer
+    if _grows(plant):
+        return False
     slowest = 1.0
     if plant.dt == 0.0 and observer.order:
         slowest = float(np.min(np.abs(poles_of(observer).real)))
@@ -252,6 +258,17 @@ def _settles(model: ErrorModel) -> bool:
         apart = np.max(np.abs(held - growing) / units, axis=0, initial=0.0)
         size = np.max(np.maximum(np.abs(held), np.abs(growing)) / units, axis=0, initial=0.0)
     return bool(np.all(apart <= ALIKE * size))
+
+
+def _grows(plant: DescriptorSystem) -> bool:
+    """Return whether faults drive an unstable mode of the plant: its state leaves the one at which it would stay."""
+    scaling = natural_scaling(plant)
+    e, a, bf = scaling.scale_dynamics(plant.E), scaling.scale_dynamics(plant.A), scaling.scale_input(plant.Bf)
+    with np.errstate(all="ignore"):
+        poles, left = scipy.linalg.eig(a, e, left=True, right=False)
+    unstable = [bool(np.isfinite(pole)) and is_outside(complex(pole), plant.dt) for pole in poles]
+    driven = np.abs(left[:, unstable].conj().T @ bf)
+    return bool(np.any(driven > HIDDEN_MODE_TOLERANCE * np.linalg.norm(bf, axis=0)))
 
 
 def _state_at(plant: DescriptorSystem, point: float) -> FloatArray | None:
