@@ -57,6 +57,7 @@ TWICE = HALF.replace(Dw=[[2.0]], dt=0.0)
 LAG = plant(A=[[-1.0]], Bf=[[0]], Bw=[[1, 0]], C=[[1], [1]], Df=[[1], [0]], Dw=[[0, 0], [0, 1]], dt=0.0)
 SLOW = plant(A=[[-1.0]], Bf=[[1]], Bw=[[0]], C=[[1]], Dw=[[1]], dt=0.0)
 INDEX_2 = plant(E=[[0, 1], [0, 0]], A=np.eye(2), Bf=[[0], [-1]], Bw=[[0], [0]], C=[[1, 1]], Dw=[[1]], dt=0.0)
+AHEAD = plant(E=[[0, 1], [0, 0]], A=np.eye(2), Bf=[[0], [-1]], Bw=[[0], [0]], C=[[1, 0]], Dw=[[1]])
 C04 = {eps: plant(A=[[0, 1], [-2, -3]], Bf=[[0], [1]], C=c, Df=[[1]], dt=0.0)
        for eps, c in ((1.0, [[-1, -5]]), (3.0, [[1, -7]]), (0.5, [[-1.5, -4.5]]))}  # fmt: skip
 C05 = plant(A=[[-2.0]], Bf=[[-1, 0]], Bw=[[1]], C=[[1]], Df=[[1, 1]], Dw=[[0]], dt=0.0)
@@ -95,6 +96,7 @@ CASES = [
     ("matching 1/z", LATE, matched(ONE_SAMPLE_LATE), 2**-0.5),
     ("exact, continuous", LAG, {"reference": ONE}, 2**-0.5),
     ("exact 5/(s+5)", SLOW, {"reference": {"bandwidth": 5.0}}, 5.0),
+    ("index 2, y = f_+1 + w", AHEAD, {"delay": 0}, 1.0),
     ("index 2, f' + f + w", INDEX_2, {"reference": {"bandwidth": 5.0}}, 1.0),
     *((f"C04 of FDITOOLS, {eps}", C04[eps], matched({"bandwidth": 1.0}), (1 + (1 + 8 / (1 + eps)) ** 0.5) / 4)
       for eps in C04),
@@ -110,8 +112,9 @@ PRINTED = [
     ("Varga 5.16", VARGA_5_16, matched({"bandwidth": 10.0}), 0.450, 5e-4),
     ("Varga 5.16, exact", VARGA_5_16, {"reference": {"bandwidth": 10.0}}, 0.5145490, 1e-6),
 ]
-#: A zero of multiplicity two: every zero is enclosed as a simple one.
-UNPROVED = {"C04 of FDITOOLS, 1.0"}
+#: A zero of multiplicity two, where every zero is enclosed as a simple one; and what a plant of index two does after
+#: its last sample, which no bound follows.  The reference's delay of -1 of the latter cannot be asked for.
+UNPROVED = {"C04 of FDITOOLS, 1.0", "index 2, y = f_+1 + w"}
 
 
 @pytest.mark.parametrize(("name", "case", "options", "truth"), [pytest.param(*case, id=case[0]) for case in CASES])
@@ -134,12 +137,20 @@ def test_gain_and_bound_are_those_that_others_print(name, case, options, printed
     assert design.gain * (1 - 1e-7) <= design.least <= design.gain
 
 
-@pytest.mark.parametrize("delay", [0, 1, 3])
+@pytest.mark.parametrize("delay", [0, 1, 3, pytest.param(25, marks=pytest.mark.long)])
 def test_mean_square_of_a_random_walk(delay: int) -> None:
+    """Of 25 samples the filter reads the oldest by 1e-11, and still follows the plant in every digit."""
     design = obsynth.optimal_filter(WALK, delay=delay, norm="h2")
     assert design.report.passed
     assert design.gain == pytest.approx(walk_deviation(delay), rel=1e-9)
     assert design.least == pytest.approx(walk_deviation(delay), rel=1e-9)
+
+
+def test_noise_that_is_measured_a_sample_later_does_nothing_with_one_sample_of_delay() -> None:
+    design = obsynth.optimal_filter(BEHIND, delay=1)
+    assert design.report.passed
+    assert design.least == 0.0
+    assert design.gain < 1e-8
 
 
 def test_mean_square_in_continuous_time() -> None:
@@ -357,6 +368,7 @@ def test_points_that_are_moved_give_no_false_bound(good) -> None:
         assert bound is None or bound <= good.gain
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [18, 30])
 def test_a_bound_that_is_not_close_to_the_gain_is_proved_again(seed: int) -> None:
     """Few steps of inverse iteration found one bound from the gain's level, and a smaller one from its own."""
@@ -380,7 +392,7 @@ def test_a_bound_that_is_not_close_to_the_gain_is_proved_again(seed: int) -> Non
     assert design.gain * (1.0 - 1e-4) <= design.least <= design.gain
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2, 3))])
 def test_a_filter_of_finite_response_has_no_modes_of_rounding(seed: int) -> None:
     """Two states, two hidden inputs: a window says all, and entries of 1e-16 were four states that followed nothing."""
     rng = np.random.default_rng([471, seed])
@@ -404,7 +416,7 @@ def test_the_gain_set_comes_back_and_is_verified(good, tmp_path) -> None:
     assert (back.gain, back.least, back.trade_off) == (good.gain, good.least, good.trade_off)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_units_of_states_and_outputs_change_nothing(seed: int) -> None:
     rng = np.random.default_rng(seed)
     own = WANG.replace(Bw=np.zeros((4, 3)), Dw=0.1 * np.eye(3), noise_names=("a", "b", "c"))

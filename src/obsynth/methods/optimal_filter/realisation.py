@@ -6,10 +6,12 @@ modes of the plant that die out by themselves and that it reads are followed by 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
@@ -18,7 +20,7 @@ from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.standard_form import INFINITE_EIGENVALUE, reachable_basis
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.verification.error_system import with_past
+from obsynth.verification.error_system import LEAST_ROW, with_past
 
 #: The identities of T and T0 hold to this, of the numbers in them.
 IDENTITY_LEFT = 1e-9
@@ -61,14 +63,38 @@ def minimal(filter_: Model, *, discrete: bool = False) -> Model:
     return _cleaned(a), _cleaned(b), _cleaned(c), _cleaned(d, passed)
 
 
+def realisations(filter_: Model, *, discrete: bool) -> list[Model]:
+    """Return the minimal realisation, and one without the states that by their zeros are not reached or not read.
+
+    Of a long window the first keeps no digits of coefficients that are as small as rounding; the second does.
+    """
+    found = [minimal(filter_, discrete=discrete)]
+    if discrete:
+        a, b, c, d = filter_
+        kept = _linked(a != 0.0, np.any(b != 0.0, axis=1)) & _linked(a.T != 0.0, np.any(c != 0.0, axis=0))
+        found.append((a[np.ix_(kept, kept)], b[kept], c[:, kept], d))
+    return found
+
+
+def _linked(link: NDArray[np.bool_], first: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which states are linked to the first ones, ``link[i, j]``: from j to i."""
+    found = first
+    for _ in range(len(link)):
+        more = found | (link @ found)
+        if np.array_equal(more, found):
+            break
+        found = more
+    return found
+
+
 def _cleaned(matrix: FloatArray, size: float = 0.0) -> FloatArray:
     """Return a matrix without entries that are rounding, of its largest or of ``size``."""
     least = ROUNDING_SHARE * max(size, float(np.max(np.abs(matrix), initial=0.0)))
     return np.where(np.abs(matrix) > least, matrix, 0.0)
 
 
-def followed(plant: DescriptorSystem, filter_: Model, longest: int) -> Followed:
-    """Return a filter that follows the plant; raise `SolverError` where none is found.
+def followed(plant: DescriptorSystem, filters: Sequence[Model], longest: int) -> Followed:
+    """Return the first of some realisations of a filter that follows the plant; raise `SolverError` where none does.
 
     ``plant``: with the disturbances that are decoupled; ``longest``: the most past states that T may be on.
     """
@@ -77,9 +103,10 @@ def followed(plant: DescriptorSystem, filter_: Model, longest: int) -> Followed:
     for lag, (rows, moved) in ((0, none), (0, copies), *((lag, none) for lag in range(1, longest + 1))):
         if lag == 0 and rows is copies[0] and not len(rows):
             continue
-        found = _followed(plant, filter_, rows, moved, lag)
-        if found is not None:
-            return found
+        for filter_ in filters:
+            found = _followed(plant, filter_, rows, moved, lag)
+            if found is not None:
+                return found
     raise SolverError(
         "The filter of least gain reads the plant's state by rounding: the result is inconclusive. Measure with noise "
         "(sensor_noise), or give a longer delay."
@@ -193,12 +220,13 @@ def _solved(system: FloatArray, wanted: FloatArray) -> FloatArray:
 
 
 def _holds(system: FloatArray, found: FloatArray, wanted: FloatArray, heights: tuple[int, ...], width: int) -> bool:
-    """Whether equations hold, each to a share of the largest term of its row of the filter."""
+    """Whether equations hold, each to a share of the largest term of its row of the filter, as they are verified."""
     missed, terms = np.abs(system @ found - wanted), np.abs(system) @ np.abs(found) + np.abs(wanted)
     ends = np.cumsum(heights)
     for part, height in ((slice(0, ends[0]), heights[0]), (slice(ends[1], ends[2]), heights[2])):
         if height:
             largest = np.max(terms[part].reshape(-1, width), axis=1)
+            largest = np.maximum(largest, LEAST_ROW * np.max(largest))
             if np.any(np.max(missed[part].reshape(-1, width), axis=1) > IDENTITY_LEFT * largest):
                 return False
     return bool(np.max(missed, initial=0.0) <= IDENTITY_LEFT * (1.0 + np.max(terms, initial=0.0)))

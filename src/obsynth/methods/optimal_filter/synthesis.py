@@ -22,7 +22,7 @@ from obsynth.methods.optimal_filter.fault_maps import (
     unit_of_gains,
 )
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
-from obsynth.methods.optimal_filter.realisation import followed, minimal, observer_of
+from obsynth.methods.optimal_filter.realisation import followed, observer_of, realisations
 from obsynth.methods.optimal_filter.reference import plain
 from obsynth.methods.refusals import require_all_conditions
 from obsynth.numerics.arrays import FloatArray
@@ -73,7 +73,7 @@ def synthesis_of_gains(
 def _made(plant: DescriptorSystem, asked: OptimalFilterMethod, curve: list[_Row], chosen: Designed) -> Synthesis:
     """Return realisation and certificate of a filter, on the plant with its disturbances that are not decoupled."""
     fault_map, problem = chosen.fault_map, chosen.problem
-    found = followed(plant, minimal(chosen.filter, discrete=plant.is_discrete), problem.window + problem.shift)
+    found = followed(plant, realisations(chosen.filter, discrete=plant.is_discrete), problem.window + problem.shift)
     rows = len(found.C)
     names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
     observer = observer_of(plant, found, names, fault_map.delay or 0)
