@@ -23,7 +23,6 @@ from typing import Any
 
 import flint
 import numpy as np
-import scipy.linalg
 
 from obsynth.analysis.time_varying import IntArray
 from obsynth.numerics.arrays import FloatArray, remembered
@@ -262,10 +261,12 @@ def _settles(model: ErrorModel) -> bool:
 
 def _grows(plant: DescriptorSystem) -> bool:
     """Return whether faults drive an unstable mode of the plant: its state leaves the one at which it would stay."""
+    from scipy.linalg import eig
+
     scaling = natural_scaling(plant)
     e, a, bf = scaling.scale_dynamics(plant.E), scaling.scale_dynamics(plant.A), scaling.scale_input(plant.Bf)
     with np.errstate(all="ignore"):
-        poles, left = scipy.linalg.eig(a, e, left=True, right=False)
+        poles, left = eig(a, e, left=True, right=False)
     unstable = [bool(np.isfinite(pole)) and is_outside(complex(pole), plant.dt) for pole in poles]
     driven = np.abs(left[:, unstable].conj().T @ bf)
     return bool(np.any(driven > HIDDEN_MODE_TOLERANCE * np.linalg.norm(bf, axis=0)))
