@@ -20,7 +20,7 @@ import pytest
 #: Without ``--whole`` or ``--rest`` one of so many cases that are drawn at random is looked at.
 PARTS = 4
 #: With ``--turn`` one of so many tests is run, drawn by its argument.
-TURNS = 4
+TURNS = 6
 #: Files of tests that decide something numerically.
 NUMERIC = frozenset({
     "test_balls.py", "test_ball_arithmetic.py", "test_certain_covariance.py", "test_compiled_run.py",

@@ -75,6 +75,7 @@ def least_gain(name: str) -> float:
     return least(name).gain
 
 
+@pytest.mark.one_in(4)
 @INACCURATE
 @pytest.mark.parametrize("name", PLANTS)
 def test_least_gains_agree(name):
@@ -112,6 +113,7 @@ def smallest(problem, P, R, level: float) -> float:
     return float(np.linalg.eigvalsh(form * units * units[:, None]).min())
 
 
+@pytest.mark.one_in(4)
 @INACCURATE
 @pytest.mark.parametrize("name", PLANTS)
 def test_points_of_the_printed_filter_inequality_are_the_engine_s(name):
@@ -146,6 +148,7 @@ def pd_task(plant, theorem: int, delta: float, decay: float) -> pd_inequalities.
     )  # fmt: skip
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("decay", [0.0, 0.7])
 @pytest.mark.parametrize("theorem", [1, 2])
 def test_the_engine_of_the_pd_observer_solves_the_printed_problem(theorem, decay):

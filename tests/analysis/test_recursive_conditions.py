@@ -78,6 +78,7 @@ class TestDetectability:
 class TestRank:
     E, A = np.diag([1.0, 0, 0]), np.array([[0.9, 0.1, 0.2], [1, 0.5, -1], [0.3, 1, 1]])
 
+    @pytest.mark.long
     def test_early_constraints_count(self) -> None:
         plant = sampled(self.A, [[1.0, 0, 0]], E=self.E, Bf=[[1.0], [0], [0]])
         error = refusal(plant)

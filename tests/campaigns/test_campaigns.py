@@ -22,7 +22,7 @@ NAMES = [pytest.param(name, marks=[pytest.mark.long] * (name in LONG)) for name 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_share_of_the_campaign(name, part, share):
     campaign = frame.load_campaign(name)
-    outcomes = frame.run_campaign(campaign, share(list(frame.share_of(campaign))[part::PARTS], 32))
+    outcomes = frame.run_campaign(campaign, share(list(frame.share_of(campaign))[part::PARTS], 64))
     wrong = {seed: outcome for seed, outcome in outcomes.items() if outcome.wrong}
     assert not wrong, wrong
 

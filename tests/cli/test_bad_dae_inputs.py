@@ -53,6 +53,7 @@ def run(document: dict[str, Any], folder: Path, capsys: pytest.CaptureFixture[st
     return code, captured.err if code else captured.out
 
 
+@pytest.mark.long
 def test_the_good_one_is_designed_saved_and_verified(tmp_path, capsys) -> None:
     code, text = run(GOOD, tmp_path, capsys)
     assert code == 0
@@ -61,6 +62,7 @@ def test_the_good_one_is_designed_saved_and_verified(tmp_path, capsys) -> None:
     assert main(["check", "--system", str(tmp_path / "spec.yaml")]) == 0
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("path", "value", "code", "words"),
     [

@@ -506,6 +506,7 @@ def test_the_base_is_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     assert files_in(tmp_path) == {"spec.yaml", "case.gains.json"}
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_bad_spec(
     case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -85,6 +85,7 @@ def written(folder: Path, plant: dict[str, Any] | None, options: dict[str, Any])
     return path
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("case", CASES)
 def test_bad_input(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

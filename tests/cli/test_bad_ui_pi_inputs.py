@@ -122,6 +122,7 @@ def run(folder: Path, plant: dict, options: dict, verb: str = "design") -> int:
     return main([verb, "--system", "spec.yaml", "--json", *extra])
 
 
+@pytest.mark.long
 def test_the_bases_are_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     monkeypatch.chdir(tmp_path)
     for plant, options in ((PAPER, {"fault_model": "ramp", "poles": FIVE}), (FIXED, {"poles": [-1.0, -3.0]})):
@@ -131,6 +132,7 @@ def test_the_bases_are_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap
         capsys.readouterr()
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("case", CASES)
 def test_bad_input(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

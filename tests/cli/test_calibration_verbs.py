@@ -127,6 +127,7 @@ def test_what_is_wrong_has_an_exit_code(folder, monkeypatch, arguments, code):
     assert main(arguments) == code
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("change", "code"),
     [

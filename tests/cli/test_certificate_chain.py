@@ -56,6 +56,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.long
 def test_a_gain_set_names_its_calibration(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["verify", "gains.json", "-v"]) == 0
     assert "assumed" in capsys.readouterr().out

@@ -70,6 +70,7 @@ def paragraph(text: str, claim: str) -> tuple[str, re.Match[str]]:
     raise AssertionError(f"{claim} is not in the output:\n{text}")
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", TABLE)
 def test_each_claim_says_what_it_holds_for(
     name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -143,6 +144,7 @@ def test_the_bound_of_estimates_is_of_the_exact_model_and_moving_disturbances(
     assert 0.9 * bound <= found <= bound * 1.005
 
 
+@pytest.mark.long
 def test_a_threshold_over_tolerances_is_for_corners_and_courses_between_samples(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

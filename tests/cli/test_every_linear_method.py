@@ -119,6 +119,7 @@ def export_as_far_as_it_goes(design: obsynth.ObserverDesign) -> None:
     assert design.to_control().ninputs == len(design.plant.input_names) + len(design.plant.output_names)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["descriptor-kalman", "adaptive-observer"])
 def test_recursive_methods_on_a_network_with_an_operating_point(method, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -33,6 +33,7 @@ def export(gains: Path, target: str, *more: str) -> int:
     return main(["export", "--gains", str(gains), "--to", target, *more])
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("target", ["a.mat", "a.npz", "a.c"])
 def test_export_writes_what_its_name_says(folder, capsys, target):
     assert export(folder / "wang2015.json", target) == 0
@@ -47,6 +48,7 @@ def test_export_samples_and_speaks_json(folder, capsys):
     assert np.load("a.npz")["Ts"] == 0.01
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("gains", "arguments", "message"),
     [
@@ -64,6 +66,7 @@ def test_export_refuses(folder, capsys, gains, arguments, message):
     assert list(Path().iterdir()) == []
 
 
+@pytest.mark.long
 def test_report_verifies_again_and_writes_the_page(folder, capsys):
     assert main(["report", "--gains", str(folder / "wang2015.json"), "--out", "report.html"]) == 0
     assert capsys.readouterr().out == "Written: report.html\n"
@@ -72,6 +75,7 @@ def test_report_verifies_again_and_writes_the_page(folder, capsys):
     assert json.loads((folder / "wang2015.json").read_text())["sha256"] in page
 
 
+@pytest.mark.long
 def test_report_of_wrong_gains_says_so_and_ends_in_six(folder, capsys):
     """The saved report still says that all is well; what counts is the new one."""
     document = json.loads((folder / "wang2015.json").read_text())
@@ -109,6 +113,7 @@ def test_no_file_gets_the_name_of_another_format(folder, capsys, arguments, targ
     assert list(Path().iterdir()) == []
 
 
+@pytest.mark.long
 def test_report_shows_the_design_on_the_scenario_of_a_spec(folder, capsys):
     spec = ROOT / "designs" / "wang2015" / "spec.yaml"
     gains = str(folder / "wang2015.json")
@@ -129,6 +134,7 @@ def test_report_shows_the_design_on_the_scenario_of_a_spec(folder, capsys):
     assert not Path("other.html").exists()
 
 
+@pytest.mark.long
 def test_the_block_how_to_reproduce_this_runs(tmp_path, monkeypatch, capsys):
     """Every setting of the command is in it: run in the same folder, it writes the same page again."""
     import re

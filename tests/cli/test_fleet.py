@@ -85,6 +85,7 @@ def test_a_log_that_does_not_fit_is_a_row(places: tuple[Path, Path], tmp_path: P
     assert "y2" in next(run.message for run in found.runs if run.status == "malformed")
 
 
+@pytest.mark.long
 def test_the_verb(places: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     arguments = ["run", "--gains", str(places[0]), "--data", str(places[1]), "--out", str(out), "--quiet"]

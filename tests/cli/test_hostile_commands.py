@@ -77,6 +77,7 @@ RUN = ["run", "--gains", "g.json", "--data", "log.csv", "--quiet", "--out"]
 
 
 class TestInputsAreNeverOutputs:
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize(
         ("words", "inputs"),
         [
@@ -162,18 +163,21 @@ def command(*words: str, shell: str = "", **how) -> subprocess.CompletedProcess:
 
 
 class TestStandardStreams:
+    @pytest.mark.long
     @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device")
     def test_a_full_output(self):
         done = command("verify", "g.json", shell="> /dev/full")
         assert done.returncode == 2
         assert done.stderr == "Error: Standard output cannot be written: No space left on device.\n"
 
+    @pytest.mark.long
     def test_a_closed_output(self):
         done = command("verify", "g.json", shell=">&-")
         assert (done.returncode, done.stderr) == (0, "")
         done = command("check", "--system", "nowhere.yaml", shell=">&- 2>&-")
         assert (done.returncode, done.stdout) == (2, "")
 
+    @pytest.mark.long
     def test_a_reader_that_has_left(self):
         done = command("verify", "g.json", shell="| true; exit ${PIPESTATUS[0]}")
         assert done.returncode in (0, 141)
@@ -222,6 +226,7 @@ def with_digest(document, part):
 
 
 class TestNumbers:
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize("value", [10**400, None, float("nan"), "1", [], {}, True, {"shape": [1], "data": [None]}])
     @pytest.mark.parametrize("place", ["claims", "gains", "Az", "plant", "names"])
     def test_in_a_gain_set(self, value, place, capsys):
@@ -241,6 +246,7 @@ class TestNumbers:
         assert told.err.startswith("Error: g.json") or "NOT verified" in told.out or "fail" in told.out
         assert main(["run", "--gains", "g.json", "--data", "log.csv", "--out", "o.csv", "--quiet"]) in (0, 2)
 
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize("value", [1e308, -1e308, 5e-324])
     @pytest.mark.parametrize("matrix", ["plant A", "plant C", "plant Bf", "observer Az", "observer By", "observer Dy"])
     def test_numbers_that_overflow_fail_their_checks_without_a_warning(self, matrix, value, capsys):
@@ -253,6 +259,7 @@ class TestNumbers:
         assert "Warning" not in told.err
         assert "FAIL" in told.out or "NOT verified" in told.out or told.err.startswith(("Error", "Inconclusive"))
 
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize("value", [10**400, float("nan"), "1", [], True, {"shape": [1], "data": [None]}])
     def test_in_a_saved_state(self, value, capsys):
         assert main([*RUN, "o.csv", "--state", "state.json"]) == 0
@@ -336,6 +343,7 @@ class TestNames:
         assert main([*SIMULATE, "s.csv"]) == 0
         assert main(["run", "--gains", "g.json", "--data", "s.csv", "--out", "o.csv", "--quiet"]) == 0
 
+    @pytest.mark.long
     def test_dollars_are_dollars_in_pictures(self):
         assert main([*REPORT, "o.html"]) == 0
         assert Path("o.html").read_text("utf-8").count("data:image/png") >= 1
@@ -390,6 +398,7 @@ class TestFoldersOfResults:
         assert not Path("new").exists()
         assert contents() == before
 
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize("jobs", ["0", "-1", "2.5", "many"])
     def test_no_process_is_a_word_that_the_command_line_refuses(self, jobs, capsys):
         before = contents()

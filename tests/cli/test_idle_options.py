@@ -40,6 +40,7 @@ RUN = "run --gains g.json --data l.csv --out e.csv"
 EVALUATE = f"evaluate --system {DRIVE} --quiet"
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("line", "named"),
     [

@@ -269,6 +269,7 @@ def test_calibrations_find_the_noise_of_the_clean_log_with_each_flaw(folder: Pat
     assert said.get(flaw, "") in told
 
 
+@pytest.mark.long
 def test_a_log_of_another_sampling_time_is_refused_by_calibrations_as_by_runs() -> None:
     plant, data = spec_of("linear").plant, clean("linear")
     with pytest.raises(obsynth.SpecError, match=r"a step takes 0\.1 s: the sampling time does not fit"):
@@ -277,6 +278,7 @@ def test_a_log_of_another_sampling_time_is_refused_by_calibrations_as_by_runs() 
     assert obsynth.calibrate(plant, data.drop(index=range(1, 60)), {}, input_delay=0, starts=1).R["ya"] > 5e-5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("which", ["yb", "both in turn"])
 def test_calibrations_take_a_sensor_that_is_slower_than_the_rows(which: str) -> None:
     """Numpy warned of differences that do not exist, and the noise of the sensor was taken as none."""
@@ -288,6 +290,7 @@ def test_calibrations_take_a_sensor_that_is_slower_than_the_rows(which: str) -> 
     assert 0.7e-4 <= R["yb"] <= 1.3e-4
 
 
+@pytest.mark.long
 def test_infinite_outputs_count_as_not_measured_and_rows_without_stamps_are_named() -> None:
     plant, data = spec_of("linear").plant, clean("linear")
     data.loc[60, "yb"] = np.inf
@@ -298,6 +301,7 @@ def test_infinite_outputs_count_as_not_measured_and_rows_without_stamps_are_name
         obsynth.calibrate(plant, data, {})
 
 
+@pytest.mark.long
 def test_comparisons_refuse_signals_that_are_never_measured_and_show_truths_with_blanks(tmp_path: Path) -> None:
     plant, data = spec_of("linear").plant, clean("linear").assign(f=0.5)
     for name in ("u", "yb"):

@@ -63,6 +63,7 @@ def test_json_says_what_was_done_and_of_which_gain_set(gains, capsys):
     assert printed["gains_sha256"] == json.loads(gains.read_text())["sha256"]
 
 
+@pytest.mark.long
 def test_a_stream_gives_what_a_file_gives_a_row_in_a_row_out(gains):
     log(*ROWS)
     assert run(gains, "--quiet") == 0
@@ -100,6 +101,7 @@ def test_a_run_goes_on_from_a_saved_state(gains):
     assert found == whole[1:]
 
 
+@pytest.mark.long
 def test_a_restart_removes_what_a_killed_run_has_left_and_nothing_that_is_being_written(gains):
     log(*ROWS)
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
@@ -173,6 +175,7 @@ BAD_LOGS = {
 }
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", BAD_LOGS)
 @pytest.mark.parametrize("way", ["file", "stream"])
 def test_a_bad_log_is_refused_and_leaves_nothing(gains, capsys, monkeypatch, name, way):

@@ -45,6 +45,7 @@ def test_json_and_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert head[:6] == ["time", "u1", "u2", "x2", "x3", "x4"]
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", ["wang2015_printed_psi", "sharepasand", "filasova", "smib", "kundur"])
 def test_every_shipped_scenario_runs(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", "--system", str(ROOT / "designs" / name / "spec.yaml"), "--quiet", "--json"]) == 0

@@ -23,6 +23,7 @@ def spec(tmp_path):
     return str(file)
 
 
+@pytest.mark.long
 def test_folder_table_and_picture(spec, tmp_path, capsys):
     out = tmp_path / "many"
     arguments = ["sweep", "--system", spec, "--set", "gamma_margin=[0.05, 0.1, -1]", "--out", str(out)]
@@ -40,6 +41,7 @@ def test_folder_table_and_picture(spec, tmp_path, capsys):
     assert [case["gamma_min"] for case in told["cases"][:2]] == [float(row["gamma_min"]) for row in rows[:2]]
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("ending", [".gains.json", ".result.json"])
 @pytest.mark.parametrize("content", [None, "{", "{}"], ids=["missing", "cut", "empty"])
 def test_a_sweep_goes_on_where_a_file_was_lost(spec, tmp_path, capsys, ending, content):

@@ -42,6 +42,7 @@ def log(gains: Path, folder: Path, *, fault: float, steps: int = 150) -> Path:
     return file
 
 
+@pytest.mark.long
 def test_a_run_has_thresholds_intervals_and_shares(gains, tmp_path, capsys) -> None:
     out = tmp_path / "out.csv"
     data = str(log(gains, tmp_path, fault=0.0))
@@ -56,6 +57,7 @@ def test_a_run_has_thresholds_intervals_and_shares(gains, tmp_path, capsys) -> N
     assert "stated tolerance" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_an_alarm_is_proved_written_and_verified(gains, tmp_path, capsys) -> None:
     data, out = str(log(gains, tmp_path, fault=2.0)), tmp_path / "alarm.json"
     command = ["prove-alarm", "--gains", str(gains), "--data", data, "--window", "12", *MONITOR]
@@ -71,6 +73,7 @@ def test_an_alarm_is_proved_written_and_verified(gains, tmp_path, capsys) -> Non
     assert main([*command, "--row", "600"]) == 2
 
 
+@pytest.mark.long
 def test_a_run_proves_its_first_alarm(gains, tmp_path, capsys) -> None:
     data, certificate = str(log(gains, tmp_path, fault=2.0)), tmp_path / "alarm.json"
     command = ["run", "--gains", str(gains), "--data", data, "--out", str(tmp_path / "out.csv"), "--warm-up", "0"]

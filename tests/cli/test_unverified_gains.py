@@ -57,6 +57,7 @@ def written(file: Path) -> str:
     return file.read_text()
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("line", VERBS)
 def test_failing_gains_are_refused_or_marked(folder: Path, line: str, capsys: pytest.CaptureFixture[str]) -> None:
     verb, *rest = line.split()
@@ -107,6 +108,7 @@ def test_functions_refuse_what_fails_and_many_runs_say_so(folder: Path) -> None:
     assert pd.read_csv(folder / "all" / "table.csv")["status"].tolist() == ["run"]
 
 
+@pytest.mark.long
 def test_proved_never_stands_beside_fails(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["verify", "wrong.gains.json"]) == 6
     told = capsys.readouterr().out
@@ -142,6 +144,7 @@ def test_a_file_that_has_changed_is_verified_afresh(folder: Path) -> None:
     assert main(words) == 0
 
 
+@pytest.mark.long
 def test_a_page_of_gains_that_fail_says_on_the_terminal_why_the_exit_code_is_6(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

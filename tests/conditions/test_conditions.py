@@ -64,6 +64,7 @@ def test_two_solvers_end_in_a_verified_design(name, solver):
     assert found.existence.passed
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", EACH)
 def test_they_are_told_in_a_few_lines(name):
     found = EACH[name]()
@@ -187,6 +188,7 @@ NOTHING = {
 }  # fmt: skip
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("solver", SETTINGS)
 @pytest.mark.parametrize("name", NOTHING)
 def test_where_nothing_exists_the_solver_says_infeasible_and_existence_says_why(name, solver):

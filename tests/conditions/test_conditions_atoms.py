@@ -101,6 +101,7 @@ def test_a_region_is_what_it_says(name):
     assert not region.contains([-3.0, 10.0])
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", REGIONS)
 def test_the_inequality_of_a_region_is_that_of_the_eigenvalues(name):
     region, inside = REGIONS[name]
@@ -156,6 +157,7 @@ HARD = pytest.mark.filterwarnings("ignore:Solution may be inaccurate:UserWarning
 NO = ("infeasible", "infeasible_inaccurate")
 
 
+@pytest.mark.one_in(4)
 @HARD
 @pytest.mark.parametrize("seed", range(12))
 def test_no_gain_moves_what_no_output_sees(seed):
@@ -172,6 +174,7 @@ def test_no_gain_moves_what_no_output_sees(seed):
             assert np.max(np.abs(np.linalg.eigvals(a - gain @ cy))) < 1.0
 
 
+@pytest.mark.one_in(4)
 @HARD
 @pytest.mark.parametrize("dt", [0.0, 1.0])
 @pytest.mark.parametrize("seed", range(8))

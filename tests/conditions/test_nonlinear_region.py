@@ -29,6 +29,7 @@ def test_a_full_multiplier_is_as_good_as_the_corners_and_a_diagonal_one_nearly(g
     assert corners * (1 - 1e-3) <= diagonal <= 1.2 * corners
 
 
+@pytest.mark.long
 def test_the_design_reaches_what_the_inequalities_allow() -> None:
     made = obsynth.region_observer(tanks(), region=REGION, sample_time=2.0, noise=_NOISE)
     assert made.certificate.claims["region_deviation"] == pytest.approx(_least("power", "vertices"), rel=0.03)

@@ -60,6 +60,7 @@ def test_growth_of_two_matrices_is_the_golden_ratio() -> None:
     assert not prove_decay(errors.closed(gains), witness, 1.617, discrete=True).proved
 
 
+@pytest.mark.long
 def test_frozen_stability_is_not_stability_over_the_region() -> None:
     rate, _, _ = best_decay(_spring(3.99), gains=_NO_GAIN)
     assert rate >= 0.0
@@ -102,6 +103,7 @@ def test_flexible_joint_has_no_limit_by_one_atom() -> None:
     assert np.linalg.norm(made.gains[0]) < 100.0
 
 
+@pytest.mark.long
 def test_descriptor_inequality_is_tighter_than_the_hull_of_the_reduced_map() -> None:
     A11, A12 = np.array([[-1.0, 0.5], [0, 0.2]]), np.array([[0.6, 0, 0.2], [0, 0.5, 0.5]])
     A21, C = np.array([[1.0, 0], [0, 1], [0.5, 0.5]]), np.array([[1.0, 0]])
@@ -149,6 +151,7 @@ def _random(seed: int, count: int = 2, n: int = 3) -> ErrorPolytope:
     return ErrorPolytope([1.1 * a / size for a in A], np.eye(1, n), B=B, D=[[0, 0, 0.5]], Cz=np.eye(2, n))
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("seed", range(6))
 def test_no_switching_exceeds_what_is_proved(seed: int) -> None:
     errors = _random(seed)
@@ -163,6 +166,7 @@ def test_no_switching_exceeds_what_is_proved(seed: int) -> None:
     assert prove_decay(errors.closed(made.gains), made.witness, made.decay, discrete=True).proved
 
 
+@pytest.mark.long
 def test_slow_parameters_allow_a_smaller_gain_and_the_pairs_are_a_hexagon() -> None:
     fast, slow = (certified(_random(11), lyapunov="vertex", steps=steps).level for steps in (None, 0.05))
     assert slow < fast

@@ -97,6 +97,7 @@ def test_what_is_shipped_satisfies_the_printed_inequality(name):
 LETTERS = {"wang": "TNLW", "pd": "JL", "ui-pi": ("U_a", "D_a", "K_a", "Ahat", "Bhat", "Jhat"), "kalman": "LK"}
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", MADE)
 def test_its_gains_are_those_that_are_shipped(name):
     design = made(name)

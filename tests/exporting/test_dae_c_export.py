@@ -109,6 +109,7 @@ def test_the_heat_exchanger_with_gaps_and_a_start_off_its_constraint(form, tmp_p
     assert_equal(run_c(design, y, u, tmp_path, quick=form != "forgetting"), expected)
 
 
+@pytest.mark.long
 def test_a_pendulum_by_radau_without_inputs(tmp_path) -> None:
     """Fifteen unknowns in a step: factorised, where fewer are eliminated."""
     design = designed("pendulum")
@@ -117,6 +118,7 @@ def test_a_pendulum_by_radau_without_inputs(tmp_path) -> None:
     assert_equal(run_c(design, y, u, tmp_path, quick=True), as_run(design).run(y, u, compiled=False))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("move", "least"), [(None, 1), (1.0, 10)])
 def test_a_diode_whose_source_jumps_by_300_v(move, least, tmp_path) -> None:
     """Damped Newton, and with a largest move the homotopy, are in the C as well."""
@@ -130,6 +132,7 @@ def test_a_diode_whose_source_jumps_by_300_v(move, least, tmp_path) -> None:
     assert_equal(run_c(design, y, u, tmp_path), expected)
 
 
+@pytest.mark.long
 def test_a_missing_input_is_taken_as_in_python_and_a_step_without_a_solution_leaves_the_state_as_it_was(
     tmp_path,
 ) -> None:

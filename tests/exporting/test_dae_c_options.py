@@ -79,6 +79,7 @@ def assert_same(found: dict[str, np.ndarray], expected) -> None:
     assert np.abs(found["nis"][:, 0] - expected.nis).max() <= 1e-9 * expected.nis.max()
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("form", "name"), [("forgetting", "gate"), ("augmented-kalman", "gate"),
                                             ("augmented-kalman", "sizes"), ("random-walk", "huber")])  # fmt: skip
 def test_outliers_in_c(form, name, tmp_path) -> None:
@@ -94,6 +95,7 @@ def test_outliers_in_c(form, name, tmp_path) -> None:
     assert_same(run_c(design, y, u, tmp_path), expected)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", ["gate", "huber"])
 @pytest.mark.parametrize("sizes", [None, [0.2, 0.0, 0.3], [0.02, 0.02, 0.02]])
 def test_samples_that_the_others_of_their_row_exclude_in_c(kind, sizes, tmp_path) -> None:
@@ -126,6 +128,7 @@ def state_after(observer, y):
     return state
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("asked", ["none", "huber"])
 def test_an_export_takes_outliers_as_a_run_is_told_to(asked, tmp_path) -> None:
     """C could not be told to use every sample, as `run --outliers none` does."""
@@ -163,6 +166,7 @@ def test_a_sample_beside_a_missing_input_is_left_out_however_near_it_is(tmp_path
     assert whole.states[33, 0] - states[33, 0] < -10.0 * expected[33].state_deviations[0, 0]
 
 
+@pytest.mark.long
 def test_two_outliers_in_a_row_and_one_after_missing_inputs_in_c(tmp_path) -> None:
     """They are left out where the sensor's outliers are known; the third of a row is believed."""
     design = tank_observer("augmented-kalman", OPTIONS["sizes"])
@@ -195,6 +199,7 @@ def test_everything_at_once_in_c(form, tmp_path) -> None:
     assert_same(run_c(design, y, u, tmp_path), expected)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("form", "name"), [("forgetting", "reset"), ("augmented-kalman", "reset"),
                                             ("forgetting", "bounds"), ("random-walk", "late"),
                                             ("augmented-kalman", "slow")])  # fmt: skip

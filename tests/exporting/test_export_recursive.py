@@ -97,6 +97,7 @@ def test_its_gains_are_those_of_the_riccati_equation():
     np.testing.assert_allclose(found.Cz[:3], state.L, atol=1e-12)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", ["filter", "early", "innovation", "walk"])
 def test_c_equals_python_over_ten_thousand_steps(name, tmp_path):
     design = designed(name)

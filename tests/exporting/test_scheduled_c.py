@@ -72,6 +72,7 @@ def _plants() -> dict[str, PolytopicSystem]:
     }  # fmt: skip
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler")
 @pytest.mark.parametrize("name", ["linear", "effectiveness", "functions", "vertices"])
 def test_c_equals_the_run_on_a_log(name: str, tmp_path: Path) -> None:

@@ -60,6 +60,7 @@ def test_gain_is_one_everywhere_and_proved(seed: int) -> None:
         assert values == pytest.approx([1.0, 1.0], abs=1e-9)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("seed", range(4))
 def test_units_decide_nothing(seed: int) -> None:
     # Riccati equations were solved in units of the data: of 100 random plants in others 58 were refused.
@@ -99,6 +100,7 @@ def test_a_gain_is_proved_wherever_noise_drives_every_state(time: float) -> None
     assert np.max(closed.real) == pytest.approx(-0.3964974 * time, rel=1e-6)  # by SciPy's Riccati equation
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("noise", "most"), [(0.1, 1e-5), (1e-3, 1e-2), (1e-4, 0.1)])
 def test_a_larger_bound_is_claimed_where_the_least_is_below_rounding(noise: float, most: float) -> None:
     # Three integrators in a row, and a sensor ever better: the poles go to -50 1/s, and all of these were refused.

@@ -124,6 +124,7 @@ def stepping(design: obsynth.ObserverDesign) -> Any:
     return obsynth.sample_observer(observer, 0.1) if observer.dt == 0.0 else observer
 
 
+@pytest.mark.one_in(4)
 @EACH
 def test_a_design_is_verified_and_survives_its_file(method: str, tmp_path: Path) -> None:
     design = design_of(method)
@@ -191,6 +192,7 @@ def test_a_run_that_was_interrupted_goes_on_as_if_it_was_not(method: str, tmp_pa
     assert [*parts[0], *parts[1][1:]] == out.getvalue().splitlines()
 
 
+@pytest.mark.one_in(4)
 @EACH
 def test_what_is_given_is_not_changed(method: str) -> None:
     plant, options = plant_of(method), OPTIONS.get(method, {})
@@ -243,6 +245,7 @@ def in_other_units(method: str) -> tuple[Any, dict[str, Any]]:
     return changed, options
 
 
+@pytest.mark.one_in(4)
 @EACH
 def test_units_do_not_change_the_verdict(method: str, tmp_path: Path) -> None:
     changed, options = in_other_units(method)
@@ -272,6 +275,7 @@ def test_a_claim_that_the_method_does_not_know_fails(method: str) -> None:
 ODD_OPTIONS = (None, -1, 2.5, True, "x", "x1", [1.0], {}, {"x1": [0.0, 1.0]}, {"units": {}}, float("nan"))
 
 
+@pytest.mark.one_in(4)
 @EACH
 def test_an_option_of_another_kind_in_a_file_is_a_row_that_fails_or_an_error_of_ours(
     method: str, share: Callable[..., Any]
@@ -329,6 +333,7 @@ for gains, log in zip(sys.argv[1::2], sys.argv[2::2]):
 """
 
 
+@pytest.mark.long
 def test_verify_and_run_need_no_solver(tmp_path: Path) -> None:
     """In a process in which no solver can be imported."""
     arguments: list[str] = []
@@ -386,6 +391,7 @@ def test_sensors_of_their_own_times_are_taken_or_refused_by_name(method: str, tm
 NO_NUMBERS = (True, np.True_, [True], {"leak": True}, object())
 
 
+@pytest.mark.one_in(4)
 @EACH
 def test_no_option_takes_what_is_no_number_for_one(method: str) -> None:
     """True is not 1.0: every option that is no truth itself refuses it, in Python and in lists."""

@@ -69,6 +69,7 @@ def test_no_alarm_without_a_fault_at_all_bounds_at_once(seed: int) -> None:
     assert np.all(table["highest loss of torque"] >= 0.0)
 
 
+@pytest.mark.long
 def test_a_run_that_was_stopped_goes_on_to_the_last_digit(tmp_path: Path) -> None:
     data = log(test_of().threshold).drop(index=[17, 18])
     data.iloc[25, 2] = np.nan
@@ -106,6 +107,7 @@ def blanked() -> pd.DataFrame:
     return data.drop(index=[50])
 
 
+@pytest.mark.long
 def test_missing_samples_drop_their_rows_or_take_the_verdict() -> None:
     waiting, solved = run(blanked()).table, run(blanked(), missing="solve").table
     undecided = np.isnan(waiting["threshold"].to_numpy(dtype=float))

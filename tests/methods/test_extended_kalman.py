@@ -92,6 +92,7 @@ def failing(design):
     return {row.name for row in obsynth.verify(design).checks if not row.passed}
 
 
+@pytest.mark.long
 def test_its_checks_can_fail():
     design = design_of()
     observer = design.observer

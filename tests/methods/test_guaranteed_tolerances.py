@@ -41,6 +41,7 @@ def made(name: str) -> obsynth.GuaranteedTest:
     return obsynth.guaranteed_test(spec().plant, scenario=spec().scenario, **options)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", MEASURED)
 def test_the_drive_s_thresholds_with_constants_off_by_five_per_cent(name: str) -> None:
     found = made(name)

@@ -128,6 +128,7 @@ def test_each_row_has_the_threshold_of_its_gain() -> None:
     assert "the last 2 samples are used" in str(test)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("singular", [False, True])
 @pytest.mark.parametrize("name", ASKED)
 def test_thresholds_are_those_of_a_dense_programme(name: str, singular: bool) -> None:

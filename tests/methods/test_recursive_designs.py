@@ -50,6 +50,7 @@ method:
 """
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", FORMS)
 def test_every_form_is_verified_saved_and_verified_again(name: str, tmp_path: Path) -> None:
     design = obsynth.adaptive_observer(varying(horizon=60), **NOISE, window=10, **FORMS[name], name=name)
@@ -287,6 +288,7 @@ class TestManyStates:
             )
         )
 
+    @pytest.mark.long
     def test_fewer_steps_and_rows_that_say_so(self, design):
         rows = {row.name: row for row in design.report.checks}
         assert design.report.passed

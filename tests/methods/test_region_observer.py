@@ -63,6 +63,7 @@ def _lyapunov(design: ObserverDesign, errors: FloatArray) -> FloatArray:
     return np.einsum("ki,ij,kj->k", ordered, P, ordered)
 
 
+@pytest.mark.long
 def test_what_is_proved_is_said_in_words(design: ObserverDesign) -> None:
     assert design.report.passed
     claim = design.report["mean square over the region"].claim
@@ -104,6 +105,7 @@ def test_estimates_deviate_by_less_than_is_proved(design: ObserverDesign) -> Non
     assert design.report["worst corner at rest"].value > 0.85 * level
 
 
+@pytest.mark.long
 def test_the_gain_is_not_exceeded() -> None:
     made = obsynth.region_observer(tanks(), region=REGION, sample_time=STEP, noise=NOISE, goal="gain")
     level, observer = made.certificate.claims["region_gain"], made.over_region[1]

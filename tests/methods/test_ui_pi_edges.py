@@ -119,6 +119,7 @@ def test_a_rate_that_cannot_be_had_says_what_is_left() -> None:
         ui_pi_observer(plant, decay=1e4)
 
 
+@pytest.mark.long
 def test_a_long_fault_model_that_exists_is_designed() -> None:
     design = ui_pi_observer(PAPER, fault_model={"polynomial": 12})
     s = 0.01

@@ -227,6 +227,7 @@ def _continuous_log(seconds: float, step: float) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["time", "u1", "x", "y1", "y2"])
 
 
+@pytest.mark.long
 def test_a_continuous_observer_runs_on_a_log(continuous: ObserverDesign, tmp_path: Path) -> None:
     log = _continuous_log(40.0, 0.01)
     log.loc[3000, "x"] = 9.0

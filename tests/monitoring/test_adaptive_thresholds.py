@@ -226,6 +226,7 @@ def test_plants_are_drawn_from_the_box() -> None:
         adaptive.watch(obsynth.simulate(design, quiet).estimates)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("size", [0.05, 0.3, 1.0])
 def test_what_an_evaluation_counts_does_not_depend_on_what_is_left_out(design, size: float) -> None:
     plant, _ = design.linear

@@ -227,6 +227,7 @@ def test_every_shipped_design_is_one_of_these() -> None:
     assert set(WINDOWS) <= {*SHIPPED}
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", NONE)
 def test_what_has_no_c_says_why(name: str, tmp_path: Path) -> None:
     refused = {"motor/one_encoder": "torque detectable", "moussaali2013_ltv/as_printed": "residual directions"}
@@ -239,6 +240,7 @@ def test_what_has_no_c_says_why(name: str, tmp_path: Path) -> None:
         obsynth.export(design, tmp_path / "a.c", unverified=True)
 
 
+@pytest.mark.long
 def test_an_fmu_holds_the_c_that_is_tested_here(shipped: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of every design, with the same monitor; test_fmu_export runs the wrapper around it."""
     from obsynth.exporting.fmu import archive

@@ -21,6 +21,7 @@ def measured():
     return calibrate(tanks(), LOG, BOUNDS, rows="0:56", initial_covariance=1e-4)
 
 
+@pytest.mark.long
 def test_the_measured_tanks_agree_with_the_reference(measured):
     """An independent implementation found these numbers (reference, section 2)."""
     wanted = {"a1": (0.0163, 0.0090, 0.0229), "a2": (0.0199, 0.0154, 0.0249), "b1": (0.0350, 0.0302, 0.0402),
@@ -58,6 +59,7 @@ def test_what_was_found_reads_as_a_table_and_as_data(measured):
     assert measured.box.constants()["b1"]["nominal"] == measured.nominal["b1"]
 
 
+@pytest.mark.long
 def test_a_kink_of_the_model_at_the_maximum_spoils_no_box(measured, share) -> None:
     """With a start between the pairs of levels the likelihood's slope jumps at its maximum (abs of a difference)."""
     # With --whole the variances are found as well.
@@ -85,6 +87,7 @@ def found_inside(rows):
     assert any("not homogeneous" in sentence for sentence in found.verdict)
 
 
+@pytest.mark.long
 def test_a_leak_that_never_opened_has_an_open_box_or_holds_zero(measured):
     known = {name: measured.nominal[name] for name in BOUNDS}
     model = tanks(constants={**tanks().constants, **known})
@@ -113,6 +116,7 @@ def record(model: DAEModel, n: int = 150, seed: int = 4, R: float = 1e-4, Q: flo
     return {"time": 0.5 * np.arange(n), "u": u, "y": true.outputs[:, 0]}
 
 
+@pytest.mark.long
 def test_known_constants_are_in_their_boxes_and_the_rest_is_said():
     model = first_order()
     found = calibrate(model, record(model, T=2.2, k=1.3), {"T": (0.5, 10.0), "k": (0.2, 5.0)}, noisy=["balance"],

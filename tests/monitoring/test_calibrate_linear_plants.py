@@ -52,6 +52,7 @@ def spring_log(
     return {"time": dt * np.arange(n), "push": u + push, "seen speed": seen[:, 0], "seen place": seen[:, 1] + y}
 
 
+@pytest.mark.long
 def test_constants_in_E_A_and_C_of_a_continuous_descriptor_plant_are_found():
     true = {"m": 1.3, "c": 0.6, "k": 2.6, "g": 1.1}
     found = calibrate(two_masses(), spring_log(**true), {"m": (0.3, 3), "c": (0.05, 2), "k": (0.5, 6), "g": (0.5, 2)},
@@ -66,6 +67,7 @@ def test_constants_in_E_A_and_C_of_a_continuous_descriptor_plant_are_found():
     assert not found.undetermined
 
 
+@pytest.mark.long
 def test_logs_are_absolute_and_a_sampled_plant_is_calibrated_as_it_was_written():
     from obsynth import discretise
 

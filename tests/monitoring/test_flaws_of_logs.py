@@ -441,6 +441,7 @@ def flawed(flaw: str, rows: int = 200) -> pd.DataFrame:
 FLAWS = ("blank cell", "blank row", "gap", "repeated stamp", "out of order", "jitter", "text cell", "column order")
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("flaw", FLAWS)
 @pytest.mark.parametrize("method", METHODS[1:])
 @pytest.mark.parametrize("way", ["frame", "stream"])

@@ -329,6 +329,7 @@ def test_estimates_that_no_walk_explains_are_watched_as_before(options: dict[str
     assert parameter_walk(observer) is None
 
 
+@pytest.mark.long
 def test_files_keep_what_is_watched(tmp_path: Path) -> None:
     again = obsynth.load_thresholds(learned().save(tmp_path / "t.json"))
     assert again.statistics.names == learned().statistics.names

@@ -48,6 +48,7 @@ def stamped(kind: str) -> pd.DataFrame:
     return data.assign(Date=[at.strftime("%d.%m.%Y") for at in moments]) if kind.startswith("two columns") else data
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", list(STAMPS))
 def test_stamps_of_other_programs_are_read(tmp_path: Path, kind: str) -> None:
     data, design, file = stamped(kind), designed("ui-pi-observer"), tmp_path / "log.csv"

@@ -302,6 +302,7 @@ def with_words(rows: list[int], count: int = WORD_ROWS) -> pd.DataFrame:
     return log
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("way", ["frame", "csv", "stream", "parquet"])
 @pytest.mark.parametrize("first", [0, 300])
 def test_words_are_bad_samples_wherever_they_stand_and_however_a_log_is_read(design, tmp_path, way, first):

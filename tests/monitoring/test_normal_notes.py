@@ -67,6 +67,7 @@ def stretch_of(note: str) -> list[str]:
     return [*rows.split(" to "), *times.replace(" s", "").split(" to ")]
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("memory", "step"), [(0.0, 0.0), (0.8, 0.0), (0.8, 0.02), (0.95, 0.05)])
 def test_nothing_is_told_of_usual_rows(seed: int, memory: float, step: float) -> None:

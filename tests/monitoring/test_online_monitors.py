@@ -397,6 +397,7 @@ def parameter_log(seed: int, *, change: float = 0.0, samples: int = 200) -> pd.D
     return table
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("made", "kind", "latest"),
     [(adaptive, "chi-square", 110), (adaptive, "cusum", 110), (adaptive, "nis", 110), (filtering, "nis", 110)],

@@ -43,6 +43,7 @@ def fresh(seed: int, jump: float, missing: bool, adapt: dict):
     return observer, observer.run(y, u)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("statistic", STATISTICS)
 def test_false_alarms_are_as_rare_as_asked(statistic: str, share: Callable[..., Any]) -> None:
     """At 5 % more than seven of forty runs without a change alarm with 0.0007, more than four of twenty with 0.003."""
@@ -54,6 +55,7 @@ def test_false_alarms_are_as_rare_as_asked(statistic: str, share: Callable[..., 
     assert alarms <= {40: 7, 20: 4}[len(seeds)]
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("statistic", STATISTICS)
 def test_a_change_is_found_and_named(statistic: str) -> None:
     delays, onsets, named = [], [], []

@@ -93,6 +93,7 @@ def run(name: str, kind: str, data: pd.DataFrame, **options: Any) -> pd.DataFram
     return found
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("name", "kind"), CASES)
 def test_stamps_that_jitter_decide_as_regular_ones(name: str, kind: str) -> None:
     data, rng = blanked(name), np.random.default_rng(7)
@@ -105,6 +106,7 @@ def test_stamps_that_jitter_decide_as_regular_ones(name: str, kind: str) -> None
     assert (wanted["alarm"][FAULT_AT:] != "").any()
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("name", "kind"), CASES)
 def test_rows_that_are_missing_decide_as_rows_without_signals(name: str, kind: str, tmp_path: Path) -> None:
     data = blanked(name)

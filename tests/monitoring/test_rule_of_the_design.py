@@ -62,6 +62,7 @@ def states_of(table):
     return table.filter(regex="^xhat").to_numpy().ravel()
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("stated", STATED)
 @pytest.mark.parametrize("kind", DESIGNS)
 def test_every_run_follows_what_is_stated(kind, stated, tmp_path):

@@ -85,6 +85,7 @@ def columns(table: pd.DataFrame, start: str) -> np.ndarray:
     return table[[name for name in table.columns if name.startswith(start)]].to_numpy()
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", DESIGNS)
 def test_a_run_gives_what_the_observer_gives_in_absolute_values(name):
     table = log_of(name)
@@ -111,6 +112,7 @@ def test_missing_outputs_are_the_filters_own_business(name):
     assert done.table["status"][43] == "ok"
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", LINEAR)
 def test_rows_that_are_not_there_are_samples_without_outputs(name):
     table = log_of(name)
@@ -149,6 +151,7 @@ def test_a_missing_input_is_held_within_its_changes_and_said():
     pd.testing.assert_frame_equal(late.iloc[1:].reset_index(drop=True), alone)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", LINEAR)
 def test_a_bad_row_never_poisons_the_state(name, share):
     holed = log_of(name)
@@ -175,6 +178,7 @@ def test_nor_does_an_outlier_that_leads_a_nonlinear_model_astray(bad):
     assert np.abs(columns(found, "xhat[")[-20:, 1] - truth).max() < 0.05
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", DESIGNS)
 def test_a_run_that_stops_and_goes_on_gives_the_same_bytes(name, tmp_path, share):
     table = log_of(name)

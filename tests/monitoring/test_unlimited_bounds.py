@@ -66,6 +66,7 @@ def worst(parts: tuple[np.ndarray, ...], k: int, window: int, initial_error: flo
     return found
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("steps", [3, 40])
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_nothing_passes_the_bounds_at_any_sample(name: str, steps: int) -> None:

@@ -29,6 +29,7 @@ def noisy(f: np.ndarray, c: np.ndarray, dt: float = 0.0) -> KalmanProblem:
 
 
 class TestPoles:
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize("objective", ["conditioning", "gain"])
     @pytest.mark.parametrize(
         "poles",
@@ -47,6 +48,7 @@ class TestPoles:
         # By the characteristic polynomial, which a multiple pole does not make ill-conditioned.
         np.testing.assert_allclose(np.poly(PAIR - gain @ OUTPUTS), np.real(np.poly(wanted)), rtol=1e-6)
 
+    @pytest.mark.long
     def test_the_objectives_differ_as_promised(self) -> None:
         wanted = [complex(pole) for pole in (-2, -3, -4, -5, -6)]
         best, least = (place(PAIR, OUTPUTS, wanted, objective=name) for name in ("conditioning", "gain"))
@@ -86,6 +88,7 @@ class TestSplit:
         turn = np.linalg.qr(rng.standard_normal((4 + count, 4 + count)))[0]
         return turn @ f @ turn.T, c @ turn.T
 
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize("modes", [[-1], [-1, -2], [-1, -1], [-1 + 2j, -1 - 2j], [-0.5, -1 + 2j, -1 - 2j]])
     def test_hidden_modes_are_found_and_the_rest_can_be_placed(
         self, modes: list[complex], share: Callable[..., Any]
@@ -163,6 +166,7 @@ class TestKalman:
 
 
 class TestRegion:
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize(
         "region", [Region(decay=1.0), Region(radius=6.0), Region(decay=1.5, radius=8.0), Region(1.0, 10.0, 0.8)]
     )

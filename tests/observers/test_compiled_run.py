@@ -89,6 +89,7 @@ COVERED = {
 }
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", COVERED)
 def test_it_gives_what_the_normal_path_gives(name: str, single_steps) -> None:
     observer = COVERED[name]()

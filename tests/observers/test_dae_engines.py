@@ -62,6 +62,7 @@ def derivatives(step: ImplicitStep, *point: np.ndarray) -> tuple[np.ndarray, ...
     return Compiled(step.functions.derivative_function)(*point, np.array([step.dt]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("weight", "compiled"), [("innovation", None), ("innovation", True), ("paper", None)])
 def test_the_numbers_are_those_of_the_audits_steps(weight, compiled) -> None:
     y, u = record()
@@ -171,6 +172,7 @@ def chain(cells: int) -> DAEModel:
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_a_plant_too_large_to_unroll() -> None:
     """Above `SMALL` unknowns a factorisation is called: the same numbers as plain NumPy."""
     model, rng = chain(6), np.random.default_rng(1)
@@ -213,6 +215,7 @@ def trials(samples: int = 60, count: int = 7) -> tuple[np.ndarray, np.ndarray]:
     return np.array(y), u
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("compiled", "shared"), [(False, True), (False, False), (True, True), (True, False)])
 def test_a_batch_is_its_trials(compiled, shared, monkeypatch) -> None:
     monkeypatch.setattr(dae_batch, "BATCH_SAMPLES_PER_CALL", 180)

@@ -44,6 +44,7 @@ def record(samples=40):
     return rng.normal(size=(samples, 2)), rng.normal(size=(samples, 2))
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", DESIGNS)
 def test_estimates_are_those_of_the_outputs_without_it(name):
     without, direct = pair(name)
@@ -59,6 +60,7 @@ def test_estimates_are_those_of_the_outputs_without_it(name):
         assert np.abs(one.states[20]).max() < 10.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["filter", "early", "walk"])
 def test_many_runs_and_the_kernel(name):
     without, direct = pair(name)
@@ -72,6 +74,7 @@ def test_many_runs_and_the_kernel(name):
         np.testing.assert_allclose(kernel.states, one.states, atol=1e-9)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", ["filter", "early", "parameters", "walk"])
 def test_the_steady_state_has_it(name):
     steady = steady_observer(pair(name)[1].observer)

@@ -52,6 +52,7 @@ def log(delay: int, *, fault: float = 0.5) -> pd.DataFrame:
     return pd.DataFrame(found, columns=["time", "u", "a", "b"])
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("delay", [-2, -1, 0, 1, 3])
 @pytest.mark.parametrize("way", ["frame", "small chunks", "stream"])
 def test_inputs_are_taken_when_they_act(delay: int, way: str) -> None:
@@ -81,6 +82,7 @@ def test_a_saved_state_goes_on_with_the_inputs_of_the_rows_before(tmp_path: Path
         obsynth.run_on_data(heated(), data, state=state)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("inputs", "delay"),
     [("{hold: begins}", 0), ("{hold: ends}", -1), ("{hold: ends, delay: 2}", 1), ("{delay: 3}", 3)],

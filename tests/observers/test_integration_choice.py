@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from obsynth import DAEModel, dae_adaptive_observer, simulate_dae
 from obsynth.observers.nonlinear.building import largest_turn
@@ -25,11 +26,13 @@ def test_the_turn_of_a_step_is_that_of_the_fastest_mode():
     assert abs(largest_turn(oscillator(2.0), 0.1) - 0.1 * np.sqrt(4.0 - 0.01)) < 1e-12
 
 
+@pytest.mark.long
 def test_auto_takes_radau_where_it_matters_and_backward_euler_elsewhere():
     assert designed(oscillator(), "auto").observer.integration == "radau"
     assert designed(oscillator(), "auto", dt=0.01).observer.integration == "backward-euler"
 
 
+@pytest.mark.long
 def test_backward_euler_is_noted_and_finds_a_wrong_damping_where_radau_finds_the_right_one():
     model = oscillator()
     u = np.sign(np.sin(np.arange(400) * 0.1))[:, None]

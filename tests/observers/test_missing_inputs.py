@@ -58,6 +58,7 @@ SHARES = {
 }
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("integration", list(SHARES))
 @pytest.mark.parametrize("form", list(FORMS))
 def test_a_step_without_its_input_is_as_uncertain_as_its_past_changes_allow(form: str, integration: str) -> None:
@@ -85,6 +86,7 @@ def test_a_step_without_its_input_is_as_uncertain_as_its_past_changes_allow(form
         off += reach
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("form", list(FORMS))
 def test_an_input_that_moves_while_it_is_missing_moves_no_fault(form: str) -> None:
     """Each gap hides a jump of the input, the first one the largest of all."""
@@ -202,6 +204,7 @@ def alarms_in_c(data: pd.DataFrame, level: float, folder: Path) -> np.ndarray:
     return alarms > 0
 
 
+@pytest.mark.long
 def test_levels_are_as_many_times_higher_as_faults_are_less_certain_after_missing_samples(tmp_path) -> None:
     u, y = measured(rows=600)
     data, rng = log_of(u, y), np.random.default_rng(3)

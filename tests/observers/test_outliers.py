@@ -204,6 +204,7 @@ def test_a_sample_nearer_than_outliers_are_is_believed_at_once(kind):
     assert np.abs(far.innovations[at]).max() > 1.5 * np.abs(near.innovations[at]).max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["recursive", "nonlinear"])
 def test_of_a_sensor_whose_outliers_are_known_two_in_a_row_are_left_out(kind):
     """Two wrong samples on one side may come together; three are a sensor, or a plant, that has moved. Of outliers that

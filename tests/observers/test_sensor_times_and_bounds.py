@@ -98,6 +98,7 @@ def test_late_values_of_a_nonlinear_plant(form) -> None:
     np.testing.assert_array_equal(rows, found.states)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("taken_as_verified")
 def test_a_log_with_slow_and_late_sensors(tmp_path) -> None:
     """A row without a value that is not due is no partial one; a run goes on from its state; the gain set keeps it."""

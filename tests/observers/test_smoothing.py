@@ -277,6 +277,7 @@ def test_the_end_of_a_nonlinear_record_is_the_observers_estimate() -> None:
         np.testing.assert_allclose(found.parameters[-1], filtered.parameters[-1], atol=1e-12)
 
 
+@pytest.mark.long
 def test_deviations_are_those_of_the_errors() -> None:
     """Monte Carlo: squared errors in units of their variances, and smaller than those of the filter."""
     rng = np.random.default_rng(6)

@@ -74,6 +74,7 @@ def test_the_copy_is_what_runs_and_lacks_both_rooms(design_half: Path, tmp_path:
     assert not any(verb in listed for verb in ("calibrate", "sweep"))
 
 
+@pytest.mark.long
 def test_every_shipped_spec_is_designed_by_python(
     design_half: Path, tmp_path: Path, share: Callable[..., Sequence[Any]]
 ) -> None:

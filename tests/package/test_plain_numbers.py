@@ -49,6 +49,7 @@ def found_in(**results: Any) -> list[str]:
     return [place for name, result in results.items() for place in numpy_scalars(result, name, {})]
 
 
+@pytest.mark.one_in(4)
 @EACH
 def test_designs_hold_plain_numbers(method: str) -> None:
     plant, design = plant_of(method), design_of(method)

@@ -23,6 +23,7 @@ def by_text():
     )  # fmt: skip
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("symbol", [casadi.SX, casadi.MX])
 @pytest.mark.parametrize("as_function", [False, True])
 def test_it_is_the_plant_of_the_same_texts(symbol, as_function):

@@ -72,6 +72,7 @@ class Reference:
 DELAY = st.integers(0, 60).map(lambda hundredths: hundredths / 100)
 
 
+@pytest.mark.long
 @given(
     seed=st.integers(0, 10_000), delays=st.tuples(DELAY, DELAY, DELAY, DELAY), step=st.sampled_from([0.05, 0.1, 0.13])
 )
@@ -203,6 +204,7 @@ def test_names_and_texts_of_delays():
     assert "delays" not in delayed(delays=None).as_dict()
 
 
+@pytest.mark.long
 def test_continuous_designs_are_refused_with_what_was_tried():
     for method in ("auto", "pd-observer", "ui-pi-observer", "functional-filter"):
         with pytest.raises(obsynth.PreconditionError, match=r"obsynth\.discretise\(plant, 0\.05\)") as caught:
@@ -362,6 +364,7 @@ def test_transforms_of_a_spec_with_delays(tmp_path):
         obsynth.load_spec(path)
 
 
+@pytest.mark.long
 def test_on_logs_in_c_and_in_python_the_same(tmp_path):
     loaded = obsynth.load_spec(spec(tmp_path))
     design = obsynth.design(loaded.transformation, loaded.method)
@@ -384,6 +387,7 @@ def test_on_logs_in_c_and_in_python_the_same(tmp_path):
     np.testing.assert_allclose(found[:, nx], run.estimates.faults[:, 0], atol=1e-12)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     "method", ["fault-estimation-filter", "ui-pi-observer", "functional-filter", "descriptor-kalman"]
 )

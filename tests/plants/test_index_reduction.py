@@ -45,6 +45,7 @@ def scrambled(rng, index, *, in_constraints):
     return plant, (a, b, c, -seen @ into)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("in_constraints", [False, True])
 @pytest.mark.parametrize("index", [0, 1, 2, 3, 4])
 @pytest.mark.parametrize("seed", range(6))
@@ -108,6 +109,7 @@ def test_an_output_that_needs_a_derivative_names_the_signal():
     assert caught.value.signals == ("speed", "stroke")
 
 
+@pytest.mark.long
 def test_an_output_that_needs_a_derivative_of_an_unknown_input_is_left_out_and_the_rest_works():
     e, a = np.diag([1.0, 1.0, 0.0, 1.0]), np.array([[0.0, 1, 0, 0], [-2, -1, 1, 0], [1, 0, 0, 0], [0, 0, 0, -1]])
     plant = obsynth.DescriptorSystem(
@@ -156,6 +158,7 @@ def test_a_rigid_bar_has_the_minimal_form_of_one_mass():
     assert found.dropped == ()
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("method", ["ui-pi-observer", "pd-observer", "functional-filter"])
 def test_methods_take_a_mechanism_at_position_level_as_its_minimal_form(method):
     own = obsynth.design(bar("position"), method)

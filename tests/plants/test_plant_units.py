@@ -71,6 +71,7 @@ def facts(found: obsynth.types.Structure) -> Iterator[object]:
     yield from (decision.clear for decision in found.decisions.values())
 
 
+@pytest.mark.one_in(4)
 @CASES
 def test_structure_does_not_hang_on_units(seed: int) -> None:
     plant = random_plant(seed)
@@ -97,6 +98,7 @@ def test_elimination_does_not_hang_on_units(seed: int) -> None:
     assert found[0].nx == found[1].nx
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("seed", [0, 33, 46, 57, 59])
 def test_whether_a_fault_shows_does_not_hang_on_units(seed: int) -> None:
     # Of a stiff plant in other units it was said that the fault reaches no output, that another T be given, or that

@@ -47,6 +47,7 @@ METHODS: dict[str, tuple[float, Callable[[obsynth.DescriptorSystem], obsynth.Obs
 }
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("share", "entering"), [(1.0, -1 - 2.0**-51), (0.333333333333333, -3.0)])
 @pytest.mark.parametrize("spread", [0, 13])
 @pytest.mark.parametrize("method", METHODS)

@@ -83,6 +83,7 @@ class TestKept:
 
 
 class TestElimination:
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize("make", FORMATS[1:])
     def test_like_lapack(self, make):
         rng = np.random.default_rng(1)
@@ -219,6 +220,7 @@ class TestIdleVariables:
             with pytest.raises(obsynth.PreconditionError, match=r"'x3' is in too few .* 3 \(of 'x3'\)"):
                 obsynth.eliminate_algebraic_states(obsynth.DescriptorSystem(make(e), make(a), **others))
 
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize("make", FORMATS)
     def test_washouts_in_a_chain(self, make):
         # 0 = x1 - x2, 0 = 9 (x1 - x2) for the output x3; 0 = x3 - x4, 0 = 2 (x3 - x4) for the output x5.
@@ -484,6 +486,7 @@ def chain_of_parts(seed: int, states: int = 70) -> obsynth.DescriptorSystem:
     return obsynth.DescriptorSystem(None, a, C=c, Bf=faults)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, 4])
 def test_units_that_drift_along_a_plant_hide_no_fault(seed: int) -> None:
     plant = chain_of_parts(seed)

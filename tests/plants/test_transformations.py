@@ -63,6 +63,7 @@ def states(plant, s, signals):
 
 
 class TestElimination:
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize("explicit", [True, False])
     @pytest.mark.parametrize("dt", [0.0, 0.1])
     @pytest.mark.parametrize("seed", range(8))
@@ -234,6 +235,7 @@ class TestSampling:
             factor = discretise(plant, h).plant.Bw
             np.testing.assert_allclose(factor @ factor.T, [[h**3 / 3, h**2 / 2], [h**2 / 2, h]], rtol=1e-12)
 
+    @pytest.mark.long
     @pytest.mark.parametrize("sample_time", [0.01, 5.0])
     def test_process_noise_of_a_stiff_plant(self, sample_time):
         """Where exp(-A h) overflows, the covariance is still the stationary one of the fast state."""

@@ -121,6 +121,7 @@ def fast_and_slow() -> DescriptorSystem:
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_a_random_walk_that_a_sensor_sees_is_calibrated_and_no_sign_is_blamed():
     rng, n = np.random.default_rng(0), 200
     u, x, y = np.repeat(rng.uniform(-1.0, 1.0, n // 10), 10), np.zeros(2), np.zeros((n, 2))
@@ -135,6 +136,7 @@ def test_a_random_walk_that_a_sensor_sees_is_calibrated_and_no_sign_is_blamed():
     assert not any("sign" in sentence for sentence in found.verdict)
 
 
+@pytest.mark.long
 def test_a_plant_that_an_unknown_input_drives_is_calibrated_with_a_walk():
     rng, n = np.random.default_rng(1), 200
     u, x, d, y = np.repeat(rng.uniform(-1.0, 1.0, n // 10), 10), 0.0, 0.0, np.zeros(n)

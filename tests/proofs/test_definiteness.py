@@ -88,6 +88,7 @@ def without_more_digits(monkeypatch):
     monkeypatch.setattr(balls, "LARGEST_ORDER", 0)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.__name__)
 def test_no_false_proof_in_2000_matrices(family, share):
     """Five families: 10,000 matrices with --whole.  With ball arithmetic none that is definite is missed, either."""
@@ -117,6 +118,7 @@ def test_no_false_proof_without_ball_arithmetic(family, without_more_digits, sha
         assert proof.means != "ball arithmetic"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("size", "count"), [(50, 5), (120, 2)])
 def test_no_false_proof_of_larger_singular_matrices(size, count, monkeypatch):
     """Sizes at which LAPACK's blocked kernels run; whole numbers make the rank certain."""
@@ -174,6 +176,7 @@ def conditioned(rng, size, condition):
     return symmetric((basis * condition ** -np.linspace(0.0, 1.0, size)) @ basis.T)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("condition", [1.0, 1e3, 1e6, 1e8, 1e10])
 def test_every_matrix_with_a_margin_is_proved(condition):
     rng = np.random.default_rng(13)

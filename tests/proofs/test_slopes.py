@@ -23,6 +23,7 @@ _EXPRESSIONS = [
 ]
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("text", "box"), _EXPRESSIONS)
 def test_every_difference_quotient_lies_in_the_slope(text: str, box: dict[str, tuple[float, float]]) -> None:
     expression, rng = parse_expression(text), np.random.default_rng(3)
@@ -50,6 +51,7 @@ def test_monotone_slopes_are_exact_to_rounding() -> None:
     assert found.high >= 0.5 / math.sqrt(0.02)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("text", "told"),
     [

@@ -74,6 +74,7 @@ def test_there_are_enough_plants():
     assert len(unstable) >= 100
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_plant_is_solved(family, share):
     plants = share(plants_of(family), 8)
@@ -82,6 +83,7 @@ def test_every_plant_is_solved(family, share):
     assert solved == len(plants), "\n".join(f"{text}\n    {recipe}" for text, recipe in failures)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     "options",
     [
@@ -106,6 +108,7 @@ def least_weight(number: int) -> float:
     return float(1.0 / np.linalg.svd(design.gains["Upsilon"])[1][-1])
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("engine", "factor", "count"), [("lmi", 2.0, 30), ("auto", 2.0, 30), ("auto", 1.2, 10)])
 def test_limit_on_the_residual_weight_is_kept(engine, factor, count, share):
     failures = []

@@ -80,6 +80,7 @@ def test_structure_does_not_depend_on_coordinates(seed, kind):
         same_values([zero.value for zero in fault_zeros(other)[0]], known.zeros, 1e-4)
 
 
+@pytest.mark.long
 @given(SEEDS)
 def test_designs_exist_in_all_coordinates(seed):
     rng = np.random.default_rng(seed)
@@ -96,6 +97,7 @@ def test_designs_exist_in_all_coordinates(seed):
         assert design.observer.fault_delays == known.indexes
 
 
+@pytest.mark.long
 @given(SEEDS, KINDS, st.sampled_from([1e3, 1e-3]))
 def test_units_do_not_flip_the_verdict(seed, kind, factor):
     rng = np.random.default_rng(seed)
@@ -121,6 +123,7 @@ def test_units_do_not_flip_the_verdict(seed, kind, factor):
 FORBIDDEN = [1.0, -1.0, 1.0001, -1.5, 3.0, complex(0.6, 0.8), complex(1.0, 1.0), complex(-0.2, 1.4)]
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("zero", FORBIDDEN)
 def test_planted_zero_outside_is_named(zero, share):
     # Each zero begins with another plant, so that the shares of all zeros together have every kind.

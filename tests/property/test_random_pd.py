@@ -84,6 +84,7 @@ def test_there_are_enough_plants_and_they_are_what_they_should_be():
     assert unstable >= 120
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("theorem", "every"), [(1, 1), (2, 3)])
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_plant_is_solved(family, theorem, every, share):
@@ -184,6 +185,7 @@ def asked_beside(plain: obsynth.ObserverDesign, option: str) -> dict[str, Any]:
     }[option]
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("option", "least"),
     [("disk", 15), ("noise gain", 15), ("adaptation range", 15), ("adaptation gain", 15), ("gain bound", 13),

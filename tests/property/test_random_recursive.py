@@ -54,6 +54,7 @@ def case(seed: int, mode: float) -> Case:
     )  # fmt: skip
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("seed", range(12))
 def test_detectability_decides(seed: int, mode: float) -> None:
@@ -82,6 +83,7 @@ def test_of_plants_that_change_the_product_decides(seed: int, mode: float) -> No
         assert caught.value.condition == "contraction"
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("seed", range(12))
 def test_as_many_parameters_as_outputs_and_not_one_more(seed: int) -> None:
     """At rest, ny outputs hold ny numbers: so many random parameters show, and the last may be made to hide."""

@@ -42,6 +42,7 @@ def may_exist(plant):
     return all(condition.holds for condition in method_class("fault-estimation-filter")().existence(plant))
 
 
+@pytest.mark.long
 def test_every_sparse_plant_is_solved_or_refused_with_its_condition(share):
     solved, refused, failures = 0, 0, []
     seeds = share(range(120), 5)

@@ -46,6 +46,7 @@ def noise_of(design):
     return float(np.sqrt((row @ scipy.linalg.solve_continuous_lyapunov(observer.Az, -into @ into.T) @ row.T)[0, 0]))
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", MORE)
 @pytest.mark.parametrize("seed", range(3))
 def test_placed_poles_have_no_more_noise_with_a_sensor_more(seed, kind):

@@ -61,6 +61,7 @@ def test_a_dask_cluster_gives_the_same_numbers(linear, recursive, here) -> None:
     assert there == [*here]
 
 
+@pytest.mark.long
 def test_a_dask_worker_of_another_process_gives_the_same_numbers(linear, here) -> None:
     distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'obsynth[cluster]'")
     with (

@@ -607,6 +607,7 @@ def test_every_single_entry_of_the_gain_set_counts(name: str, letter: str, share
         assert failed(gain_entry(letter, row, column)(good(name))), (row, column)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("case", TABLE)
 def test_exactly_the_rows_that_are_untrue_fail(case: str) -> None:
     assert_exactly_the_untrue_rows_fail(TABLE, case, good)
@@ -627,6 +628,7 @@ CAUGHT_BY = {
 }
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("matrix", CAUGHT_BY)
 @pytest.mark.parametrize("name", PLANTS)
 def test_every_single_entry_of_the_observer_counts(name: str, matrix: str, share: Callable[..., Any]) -> None:
@@ -708,6 +710,7 @@ def in_units(design: ObserverDesign, powers: np.ndarray) -> ObserverDesign:
     )
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", PLANTS)
 def test_units_of_the_states_do_not_hide_a_corruption(name: str, share: Callable[..., Any]) -> None:
     """What fails is the same when the states are measured in units from 2^-14 to 2^14."""

@@ -359,6 +359,7 @@ def test_a_good_design_passes(name: str) -> None:
     assert failed(design) == set()
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("case", TABLE)
 def test_exactly_the_rows_that_are_untrue_fail(case: str) -> None:
     assert_exactly_the_untrue_rows_fail(TABLE, case, good)
@@ -391,6 +392,7 @@ def failed_by(name: str, matrix: str, row: int, column: int) -> set[str]:
     return failed(entry(matrix, row, column)(good(name)))
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("matrix", CAUGHT_BY)
 @pytest.mark.parametrize("name", GOOD)
 def test_every_single_entry_of_the_observer_counts(name: str, matrix: str, share: Callable[..., Any]) -> None:
@@ -403,6 +405,7 @@ def test_every_single_entry_of_the_observer_counts(name: str, matrix: str, share
             assert row not in rows or cause in failed_by(name, matrix, row, column), (row, column)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("matrix", ["A", "B", "C", "D", "Bf", "Df", "E"])
 @pytest.mark.parametrize("name", GOOD)
 def test_every_single_entry_of_the_plant_counts(name: str, matrix: str, share: Callable[..., Any]) -> None:
@@ -457,6 +460,7 @@ def test_a_report_is_about_the_design_it_is_made_of_not_about_the_one_saved() ->
     assert not verify(corrupted).passed
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", GOOD)
 def test_units_of_states_and_faults_hide_no_corruption(name: str, share: Callable[..., Any]) -> None:
     """What fails is the same when states, faults and outputs are measured in units from 2^-12 to 2^12."""
