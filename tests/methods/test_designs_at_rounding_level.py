@@ -1,12 +1,15 @@
 """Gains so large that rounding of the outputs hides a unit fault are no design."""
 
+import re
 from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import pytest
+from benchmarks.campaigns.static_and_chains import plant_of
 
-from obsynth import DescriptorSystem, PreconditionError, ui_pi_observer
+import obsynth
+from obsynth import DescriptorSystem, PreconditionError, VerificationError, ui_pi_observer
 from obsynth.methods.refusals import last_digits, require_above_rounding
 from obsynth.proofs.exact_arithmetic import stored_matrix
 
@@ -58,3 +61,67 @@ def test_the_last_digit_that_is_named_moves_the_estimate_by_so_much():
     moved = abs(estimate(changed) - estimate(coupled.C))
     assert float(moved) == pytest.approx(found["C"].size, rel=1e-9)
     assert moved >= 1
+
+
+def chain(order: int, inside: float, link: float) -> DescriptorSystem:
+    """States in a row with one pole near the boundary; the fault drives the last, a sensor reads the first."""
+    a = (1.0 - inside) * np.eye(order) + link * np.eye(order, k=1)
+    return DescriptorSystem(A=a, C=np.eye(order)[[0, order - 2]], Bf=np.eye(order)[:, [-1]], dt=1.0)
+
+
+def drift_in_operation(design: obsynth.ObserverDesign, samples: int = 1000) -> float:
+    """How far the estimate of a constant unit fault is off, begun where it stays, run in double precision."""
+    plant, observer = design.plant, design.observer
+    state = stored_matrix(plant.E - plant.A).solve(stored_matrix(plant.Bf))
+    seen = stored_matrix(plant.C) * state + stored_matrix(plant.Df)
+    inner = stored_matrix(np.eye(observer.order)) - stored_matrix(observer.Az)
+    settled = inner.solve(stored_matrix(observer.By) * seen)
+    y, z = ([float(Fraction(int(entry.p), int(entry.q))) for entry in part.entries()] for part in (seen, settled))
+    found = observer.run(np.tile(y, (samples, 1)), initial_state=z)
+    return float(np.max(np.abs(found.faults - 1.0)))
+
+
+TOLD = "is constant, rounding as the observer runs"
+
+
+def test_rounding_in_operation_under_a_constant_fault_is_told_where_it_matters() -> None:
+    """The row on constant faults is of exact arithmetic: proved to 1e-3, and 1e4 of the fault off as it runs."""
+    good, bad = chain(4, 0.3, 0.5), plant_of(1048)
+    ordinary, large = ui_pi_observer(good), ui_pi_observer(bad)
+    assert not any(TOLD in note for note in ordinary.notes)
+    assert drift_in_operation(ordinary) < 1e-9
+    (note,) = [note for note in large.notes if TOLD in note]
+    assert large.report["constant fault"].passed
+    told = float(re.search(r"about ([0-9.e+]+) of the fault", note).group(1))
+    # A first-order size of one rounding of each number, against a run: of the same order.
+    assert told / 100.0 <= drift_in_operation(large) <= 100.0 * told
+    assert told > 1.0
+    other = obsynth.functional_filter(bad)
+    assert not any(TOLD in note for note in other.notes)
+    assert drift_in_operation(other) < 1e-3
+
+
+@pytest.mark.parametrize("seed", [3008, 3014, 3028, 3035])
+def test_what_is_not_told_is_small_in_operation(seed: int) -> None:
+    plant = plant_of(seed)
+    for method in ("ui-pi-observer", "fault-estimation-filter", "functional-filter"):
+        try:
+            design = obsynth.design(plant, method)
+        except obsynth.ObsynthError:
+            continue
+        if not any(TOLD in note for note in design.notes):
+            assert drift_in_operation(design) < 1e-2, method
+
+
+def test_another_method_that_is_right_at_constant_faults_is_named() -> None:
+    plant = plant_of(1189)
+    with pytest.raises(VerificationError, match="No other method that estimates faults is verified") as error:
+        ui_pi_observer(plant)
+    assert {row.name for row in error.value.report.failures} == {"constant fault"}
+    for other in ("functional-filter", "fault-estimation-filter", "optimal-filter"):
+        with pytest.raises(obsynth.ObsynthError):
+            obsynth.design(plant, other)
+    hidden = plant_of(1357)
+    with pytest.raises(VerificationError, match="functional-filter was tried with its defaults and is verified"):
+        ui_pi_observer(hidden)
+    assert obsynth.functional_filter(hidden).report.passed

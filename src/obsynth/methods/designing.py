@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.existence.condition import Condition
-from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
+from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.methods.method import Method, Synthesis, silent
 from obsynth.methods.refusals import require_above_rounding, with_advice
 from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_class, methods_for
@@ -32,6 +32,7 @@ from obsynth.results.plant_source import source_of
 from obsynth.results.verification_report import VerificationReport, failed_rows
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.claims import before_the_mean
+from obsynth.verification.constant_faults import CONSTANT_FAULT
 from obsynth.verification.plant import condition_rows
 from obsynth.verification.stored_numbers import StoredErrors
 
@@ -195,7 +196,31 @@ def _designed(
         if notes:
             found = replace(found, notes=(*notes, *found.notes))
         progress("verifying the shipped realisation")
-        return verified(plant, asked.id, found, name=name, recovery=recovery)
+        try:
+            return verified(plant, asked.id, found, name=name, recovery=recovery)
+        except VerificationError as error:
+            if not advise or error.report is None or {row.name for row in error.report.failures} != {CONSTANT_FAULT}:
+                raise
+            progress("searching for a method that estimates constant faults of this plant")
+            instead = _right_at_constant_faults(plant, asked, name, recovery)
+            raise VerificationError(f"{error} {instead}", report=error.report) from None
+
+
+def _right_at_constant_faults(plant: Plant, asked: Method, name: str, recovery: StateRecovery | None) -> str:
+    """Return which other method is verified for a plant whose constant faults rounding of one method's gains hides."""
+    others = [
+        other for other in methods_for(kind_of(plant)) if "steady_error_limit" in field_types(method_class(other))
+    ]
+    for other in (other for other in others if other != asked.id):
+        known = method_class(other).of({"steady_error_limit": asked.as_given()["steady_error_limit"]})
+        try:
+            found = _designed(plant, known, name=name, recovery=recovery, progress=silent, advise=False)
+        except ObsynthError:
+            continue
+        if CONSTANT_FAULT in {row.name for row in found.report.checks}:
+            return f"{other} was tried with its defaults and is verified for this plant: design that."
+    tried = ", ".join(other for other in others if other != asked.id)
+    return f"No other method that estimates faults is verified for this plant with its defaults either ({tried})."
 
 
 @arguments_checked

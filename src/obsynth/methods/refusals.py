@@ -23,6 +23,7 @@ from obsynth.numerics.spectra import pole_text
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
+from obsynth.verification.constant_faults import STEADY_ERROR
 
 if TYPE_CHECKING:
     from obsynth.analysis.diagnosis.explanations import Sensor
@@ -45,6 +46,12 @@ LARGEST_ROUNDED_SHARE = 0.1
 
 #: Share of a unit fault from which on rounding of the observer's own numbers is told.
 TOLD_ROUNDING = 1e-6
+
+#: Share of a constant fault from which on rounding while the observer runs is told: what its estimate may miss.
+TOLD_STEADY_ROUNDING = STEADY_ERROR
+
+#: Observers of more states are not examined under constant faults: one inverse of this size takes 20 ms.
+MOST_STEADY_STATES = 400
 
 #: Observers of more states are not examined: their certificates bound what rounding of their numbers does.
 MOST_OBSERVER_STATES = 150
@@ -199,9 +206,10 @@ def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) ->
     """Return what rounding of the observer's own numbers may do to an estimate, where that matters.
 
     Raise `PreconditionError` (unclear) where rounding of the outputs hides the estimate of a unit fault."""
+    steady = tuple(_under_constant_faults(plant, observer))
     found = _least(plant, observer)
     if found is None:
-        return ()
+        return steady
     least, own = found
     worst = int(np.argmax(least))
     if least[worst] >= LARGEST_ROUNDED_SHARE:
@@ -214,13 +222,29 @@ def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) ->
             signals=(name,),
             unclear=True,
         )
-    return tuple(
+    cancelling = tuple(
         f"The entries of the observer cancel: their last digits alone may change the estimate of {name!r}"
         f" by {share:.2g} of the fault, and by more at some frequencies. State the noise of the sensors, or ask "
         "for a larger gamma."
         for name, share in zip(plant.fault_names, own, strict=True)
         if share >= TOLD_ROUNDING
     )
+    return (*cancelling, *steady)
+
+
+def _under_constant_faults(plant: DescriptorSystem, observer: LinearObserver) -> Iterator[str]:
+    """Yield a note for each fault whose estimate, while it stays constant, running in double precision may move."""
+    if not _is_examined(plant, observer, MOST_STEADY_STATES):
+        return
+    with np.errstate(all="ignore"):
+        shares = rounding_shares(plant, observer, _points(plant)[0])[1]
+    for name, share in zip(plant.fault_names, shares, strict=True):
+        if share >= TOLD_STEADY_ROUNDING:
+            yield (
+                f"While {name!r} is constant, rounding as the observer runs in double precision may move its estimate "
+                f"by about {share:.2g} of the fault (every rounding at its worst, to first order): what is proved of "
+                "the estimate in the end is for exact arithmetic. Compare with another method (obsynth.compare)."
+            )
 
 
 def _doubt(plant: DescriptorSystem, observer: LinearObserver, fault: int) -> Unclear:
@@ -275,16 +299,15 @@ def last_digits(plant: DescriptorSystem, observer: LinearObserver, fault: int, p
 def _least(plant: DescriptorSystem, observer: LinearObserver) -> FloatArray | None:
     """Return the least of `rounding_shares` over the points ``(2, nf)``, NaN where none is a number; ``None`` where it
     is not examined."""
-    if (
-        not plant.nf
-        or observer.order > MOST_OBSERVER_STATES
-        or plant.is_sparse
-        or len(observer.fault_names) != plant.nf
-    ):
+    if not _is_examined(plant, observer, MOST_OBSERVER_STATES):
         return None
     with np.errstate(all="ignore"):
         shares = [rounding_shares(plant, observer, point) for point in _points(plant)]
         return np.asarray(np.fmin.reduce(shares, axis=0))
+
+
+def _is_examined(plant: DescriptorSystem, observer: LinearObserver, most: int) -> bool:
+    return bool(plant.nf) and observer.order <= most and not plant.is_sparse and len(observer.fault_names) == plant.nf
 
 
 def _points(plant: DescriptorSystem) -> list[complex]:

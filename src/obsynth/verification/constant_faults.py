@@ -48,7 +48,8 @@ STEADY_BITS, MOST_STATES_IN_BITS = (212, 848, 3392), 300
 #: that settles: it differs from the one for faults that grow at this rate.
 SLOWEST_SETTLING, ALIKE = 1e-7, 0.5
 
-_NAME = "constant fault"
+#: Name of the row.
+CONSTANT_FAULT = "constant fault"
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,16 +113,19 @@ def constant_fault_row(given: ConstantFaults, limit: float, printed_digits: int 
     source = "stored numbers and plant together, outward rounded"
     sizes = _sizes(given)
     missed = _decided(given, _missed_together, sizes, limit)
-    detail = "of plant and observer together"
+    detail = "of plant and observer together, in exact arithmetic"
     if missed is None or not missed <= limit:
         alone = _decided(given, _missed_alone, sizes, limit) if not _settles(model) else None
         if alone is not None:
-            missed, detail = alone, "of the errors alone: the plant's state does not settle with such a fault"
+            missed, detail = (
+                alone,
+                "of the errors alone, in exact arithmetic: the plant's state does not settle with such a fault",
+            )
     if missed is None:
         if _order(model) > MOST_STATES_IN_BITS:
-            return information(_NAME, claim, np.nan, source=source, status="assumed", detail="not decided")
+            return information(CONSTANT_FAULT, claim, np.nan, source=source, status="assumed", detail="not decided")
         missed = np.nan
-    return upper_bound_check(_NAME, claim, missed, limit, source=source, kind="proved", detail=detail)
+    return upper_bound_check(CONSTANT_FAULT, claim, missed, limit, source=source, kind="proved", detail=detail)
 
 
 def _order(model: ErrorModel) -> int:

@@ -271,11 +271,13 @@ class _Equation:
             gain = self.gain(p)
         except np.linalg.LinAlgError:
             return np.inf
-        moved = self.a @ p @ self.a.T - p if self.sampled else self.a @ p + p @ self.a.T
-        taken = gain @ self.innovation(p) @ gain.T
-        size = sum(float(np.linalg.norm(term)) for term in (moved, taken, self.process))
-        size += float(np.linalg.norm(p)) if self.sampled else float(np.linalg.norm(self.a @ p))
-        missed = float(np.linalg.norm(moved - taken + self.process)) / max(size, SMALLEST)
+        # What overflows is no solution.
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved = self.a @ p @ self.a.T - p if self.sampled else self.a @ p + p @ self.a.T
+            taken = gain @ self.innovation(p) @ gain.T
+            size = sum(float(np.linalg.norm(term)) for term in (moved, taken, self.process))
+            size += float(np.linalg.norm(p)) if self.sampled else float(np.linalg.norm(self.a @ p))
+            missed = float(np.linalg.norm(moved - taken + self.process)) / max(size, SMALLEST)
         return missed if np.isfinite(missed) else np.inf
 
     def solution(self, *, stable: bool = False) -> tuple[FloatArray, float] | None:
