@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,6 +37,7 @@ def matched(reference) -> dict:
     return {"reference": reference, "exact": False}
 
 
+ONE_FAULT = (np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1)))
 ONE = {"D": [[1.0]]}
 ONE_LAG = {"bandwidth": 5.0}
 ONE_SAMPLE_LATE = ([[0.0]], [[1.0]], [[1.0]], [[0.0]])
@@ -103,6 +106,8 @@ CASES = [
     ("C05, Varga 5.6", C05, matched({"D": [[1, 1]]}), 2**-0.5),
     ("Varga 5.14", VARGA_5_14, matched(([[-3.0]], [[1.0]], [[1.0]], [[0.0]])),
      ((X14 + 1) / (X14 + 9) / (2 * X14 + 5)) ** 0.5),
+    ("Varga 5.16, which nothing follows at once", VARGA_5_16, matched({"D": [[1, 0], [0, 1]]}), 1.0),
+    ("Varga 5.14, half at once", VARGA_5_14, matched(([[-3.0]], [[1.0]], [[1.0]], [[0.5]])), 0.5),
     ("Wang, delay 1", WANG, {"delay": 1}, 1.0),
     ("Wang, other faults", WANG_2, {"delay": 1}, 2**0.5),
 ]  # fmt: skip
@@ -157,6 +162,46 @@ def test_mean_square_in_continuous_time() -> None:
     design = obsynth.optimal_filter(LAG, reference=ONE, norm="h2")
     assert design.report.passed
     assert design.gain == pytest.approx((2**0.5 - 1) ** 0.5, rel=1e-9)
+
+
+def test_a_plant_without_noise_in_continuous_time_gets_the_noise_that_its_digits_need() -> None:
+    """Its filters' poles run to infinity: with 1e-6 of noise the fault map was kept to 5e-6 only, and refused."""
+    case = obsynth.load_spec(DESIGNS / "sharepasand" / "spec.yaml").plant
+    design = obsynth.optimal_filter(case)
+    assert design.report.passed
+    assert design.gain * (1 - 1e-5) <= design.least <= design.gain
+    with pytest.raises(obsynth.PreconditionError, match="zero that is not strictly stable"):
+        obsynth.optimal_filter(case, decoupled="disturbance")  # s = 1/2
+
+
+def test_the_noise_that_is_offered_closes_the_gap() -> None:
+    case = obsynth.load_spec(DESIGNS / "sharepasand" / "spec.yaml").plant
+    options = {"reference": {"bandwidth": 1.0, "order": 2}}
+    design = obsynth.optimal_filter(case, **options)
+    assert design.report.passed
+    assert 3e-5 < 1 - design.least / design.gain < 1e-4
+    offered = re.search(r"With sensor_noise=(\{.*?\}).* then between ([\d.]+) and ([\d.]+)\.$", design.notes[1])
+    assert offered is not None
+    noise = ast.literal_eval(offered[1])
+    noisy = case.replace(Bw=np.zeros((3, 2)), Dw=np.diag([*noise.values()]), noise_names=("a", "b"))
+    again = obsynth.optimal_filter(noisy, **options)
+    assert again.report.passed
+    assert float(offered[2]) <= again.least <= again.gain <= float(offered[3])
+    assert 1 - again.least / again.gain < 3e-5
+
+
+@pytest.mark.parametrize(("case", "bound"), [(TWICE, 2 / 5**0.5), (HALF.replace(dt=0.0), 0.2**0.5)])
+def test_what_passes_at_once_bounds_every_filter(case, bound) -> None:
+    from obsynth.verification.invisible_at_infinity import proved_at_infinity
+    from obsynth.verification.invisible_faults import Setting
+
+    found = proved_at_infinity(case, Setting(0, ONE_FAULT, False))
+    assert bound * (1 - 1e-14) <= found <= bound
+    assert proved_at_infinity(case, Setting(0, (*ONE_FAULT[:3], np.zeros((1, 1))), False)) is None
+    assert proved_at_infinity(case.replace(dt=1.0), Setting(0, ONE_FAULT, False)) is None
+    # A derivative of the noise reaches the output: more of it, the faster it is.
+    derived = plant(E=[[0, 1], [0, 0]], A=np.eye(2), Bf=[[0], [0]], Bw=[[0], [-1]], C=[[1, 0]], Df=[[1]], dt=0.0)
+    assert proved_at_infinity(derived, Setting(0, ONE_FAULT, False)) is None
 
 
 def test_the_papers_plant_has_exactly_1_and_with_one_more_sample_0() -> None:
@@ -353,6 +398,15 @@ def test_changed_designs_fail_the_row_that_covers_the_change(good, change, row) 
     assert good.report.passed
     failures = {check.name for check in obsynth.verify(changed(good, **change(good))).failures}
     assert row in failures or (row == "fits" and any("match" in name or "fit" in name for name in failures)), failures
+
+
+def test_a_bound_at_infinite_frequency_is_proved_again_or_not() -> None:
+    design = obsynth.optimal_filter(VARGA_5_14, **matched(([[-3.0]], [[1.0]], [[1.0]], [[0.5]])))
+    assert not design.certificate.matrices["invisible"].size
+    more = changed(design, claims={"least": design.gain * (1 - 1e-10)})
+    assert {check.name for check in obsynth.verify(more).failures} == {"least gain"}
+    moved_plant = changed(design, plant=VARGA_5_14.replace(Df=[[0.2]]))
+    assert "least gain" in {check.name for check in obsynth.verify(moved_plant).failures}
 
 
 def test_points_that_are_moved_give_no_false_bound(good) -> None:

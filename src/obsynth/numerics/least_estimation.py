@@ -10,6 +10,7 @@ solution of the right signs exactly when a causal filter of gain below g exists 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -105,12 +106,14 @@ class Whitened(NamedTuple):
         return self.K + self.basis @ K @ self.factor, Z0 @ self.factor
 
 
-def least_estimation(problem: EstimationProblem, *, norm: str = "hinf") -> LeastEstimation:
+def least_estimation(
+    problem: EstimationProblem, *, norm: str = "hinf", noises: Sequence[float] = ADDED_NOISES
+) -> LeastEstimation:
     """Return the filter of least gain (``"hinf"``) or of least mean square (``"h2"``, the root of the trace).
 
-    Raise `PreconditionError` where no filter is stable.
+    ``noises`` are added, the first that gives a filter.  Raise `PreconditionError` where no filter is stable.
     """
-    white = whitened(problem)
+    white = whitened(problem, noises)
     core = white.problem
     P0 = gramian(core.A, core.B @ core.B.T) if len(core.C) else 0.0 * core.A
     K, Z0 = _central(core, P0)
@@ -226,7 +229,7 @@ def _size(problem: EstimationProblem) -> float:
     return max(shown, WANTED_SHARE * wanted, SMALLEST)
 
 
-def whitened(problem: EstimationProblem) -> Whitened:
+def whitened(problem: EstimationProblem, noises: Sequence[float] = ADDED_NOISES) -> Whitened:
     """Return the problem with an innovation for r, without errors that w cannot reach.
 
     Where an output has no noise, some is added: the filter is then one for the plant as given, and so is its gain.
@@ -243,7 +246,7 @@ def whitened(problem: EstimationProblem) -> Whitened:
         bare = replace(problem, C=problem.C[:0], D=problem.D[:0])
         return Whitened(bare, bare, None, np.zeros((n, 0)), np.eye(n), 0.0)
     reason: object = ""
-    for noise in ADDED_NOISES:
+    for noise in noises:
         B, D = problem.B, problem.D
         if noise:
             B, D = np.hstack([B, np.zeros((n, rows))]), np.hstack([D, noise * size * np.eye(rows)])

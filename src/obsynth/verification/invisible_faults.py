@@ -65,6 +65,18 @@ def seen_plant(plant: DescriptorSystem, decoupled: Sequence[str]) -> DescriptorS
     )
 
 
+def hidden_and_bounded(
+    plant: DescriptorSystem, setting: Setting
+) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+    """Return the columns ``(Bh, Dh)`` of what the error must not show, and ``(Bw, Dw)`` of what its gain is from."""
+    faults, unknown, noise = ((getattr(plant, f"B{name}"), getattr(plant, f"D{name}")) for name in ("f", "d", "w"))
+    hidden, bounded = ((faults, unknown), (noise,)) if setting.exact else ((unknown,), (faults, noise))
+    return (
+        (np.hstack([pair[0] for pair in hidden]), np.hstack([pair[1] for pair in hidden])),
+        (np.hstack([pair[0] for pair in bounded]), np.hstack([pair[1] for pair in bounded])),
+    )
+
+
 def proved_least(
     plant: DescriptorSystem, points: Sequence[complex], samples: int, setting: Setting, *, level: float
 ) -> float | None:
@@ -83,7 +95,7 @@ def proved_least(
     level : float
         The gain near which the worst combination is looked for; nothing is concluded from it.
     """
-    if plant.is_discrete and (samples < max(setting.delay, 1) or not _has_index_one(plant)):
+    if plant.is_discrete and (samples < max(setting.delay, 1) or not has_index_one(plant)):
         return None
     for bits in PRECISION_BITS:
         with flint.ctx.workprec(bits):
@@ -114,7 +126,7 @@ def proved_limit(plant: DescriptorSystem, point: complex, setting: Setting) -> f
     return None
 
 
-def _has_index_one(plant: DescriptorSystem) -> bool:
+def has_index_one(plant: DescriptorSystem) -> bool:
     """Whether every trajectory can be continued after now without inputs: ``rank [E A; 0 E] = n + rank E``."""
     nothing = np.zeros_like(plant.E)
     whole = np.block([[plant.E, plant.A], [nothing, plant.E]])
@@ -171,11 +183,8 @@ class _Trajectories:
         *,
         conjugates: bool = True,
     ) -> None:
-        faults, unknown, noise = ((getattr(plant, f"B{name}"), getattr(plant, f"D{name}")) for name in ("f", "d", "w"))
-        hidden, bounded = ((faults, unknown), (noise,)) if setting.exact else ((unknown,), (faults, noise))
         self.plant, self.setting, self.samples = plant, setting, samples
-        self.Bh, self.Dh = (np.hstack([pair[i] for pair in hidden]) for i in (0, 1))
-        self.Bw, self.Dw = (np.hstack([pair[i] for pair in bounded]) for i in (0, 1))
+        (self.Bh, self.Dh), (self.Bw, self.Dw) = hidden_and_bounded(plant, setting)
         self.members: list[_Member] = []
         for point in _with_conjugates(points) if conjugates else points:
             found = self._members(point)
@@ -217,34 +226,7 @@ class _Trajectories:
 
     def bound(self, level: float | None) -> float | None:
         """Return the proved ratio of the worst combination, rounded down; without a level of the largest one."""
-        error, noise = self._energies()
-        count = error.nrows()
-        if not count:
-            return None
-        # Energies of the basis differ by many orders: each member in its own unit.
-        sizes = [(noise[i, i].real + error[i, i].real).mid() for i in range(count)]
-        if not any(size > 0 for size in sizes):
-            return None
-        units = [1 / flint.acb(size).sqrt() if size > 0 else flint.acb(1) for size in sizes]
-        units = [unit.mid() for unit in units]
-        error, noise = (_scaled(_scaled(part, units).transpose(), units).transpose() for part in (error, noise))
-        level = _largest_ratio(error, noise) if level is None else level
-        square = flint.arb(level * (1.0 + LEVEL_ABOVE)) ** 2
-        shifted = _middle(error - noise * square)
-        for i in range(count):
-            shifted[i, i] -= flint.arb(REGULAR_SHARE) * (1 + square)
-        step = _middle(shifted.inv()) * _middle(noise)
-        found = flint.acb_mat(count, 1, [1.0 + 0.37 * (i % 7) for i in range(count)])
-        for _ in range(INVERSE_STEPS):
-            found = _middle(step * found)
-            largest = max(entry.abs_upper() for entry in found.entries())
-            found = _middle(found * (1 / flint.acb(largest)))
-        above, below = ((_adjoint(found) * part * found)[0, 0].real for part in (error, noise))
-        if not (above > 0 and below > 0):
-            return None
-        ratio = (above.lower() / below.upper()).sqrt().lower()
-        value = float(ratio) if ratio.is_finite() else 0.0
-        return math.nextafter(value, 0.0) if value > 0.0 else None
+        return worst_ratio(*self._energies(), level)
 
     def _energies(self) -> tuple[Any, Any]:
         """Return the energies of error and noise as matrices on the members' coefficients and the last samples'."""
@@ -283,6 +265,40 @@ class _Trajectories:
         return padded[0], padded[1]
 
 
+def worst_ratio(error: Any, noise: Any, level: float | None) -> float | None:
+    """Return the ratio of two energies for one combination near the worst, rounded down: without a level the largest.
+
+    Nothing is concluded from the level, near which the combination is looked for.
+    """
+    count = error.nrows()
+    if not count:
+        return None
+    # Energies of the basis differ by many orders: each member in its own unit.
+    sizes = [(noise[i, i].real + error[i, i].real).mid() for i in range(count)]
+    if not any(size > 0 for size in sizes):
+        return None
+    units = [1 / flint.acb(size).sqrt() if size > 0 else flint.acb(1) for size in sizes]
+    units = [unit.mid() for unit in units]
+    error, noise = (_scaled(_scaled(part, units).transpose(), units).transpose() for part in (error, noise))
+    level = _largest_ratio(error, noise) if level is None else level
+    square = flint.arb(level * (1.0 + LEVEL_ABOVE)) ** 2
+    shifted = _middle(error - noise * square)
+    for i in range(count):
+        shifted[i, i] -= flint.arb(REGULAR_SHARE) * (1 + square)
+    step = _middle(shifted.inv()) * _middle(noise)
+    found = flint.acb_mat(count, 1, [1.0 + 0.37 * (i % 7) for i in range(count)])
+    for _ in range(INVERSE_STEPS):
+        found = _middle(step * found)
+        largest = max(entry.abs_upper() for entry in found.entries())
+        found = _middle(found * (1 / flint.acb(largest)))
+    above, below = ((_adjoint(found) * part * found)[0, 0].real for part in (error, noise))
+    if not (above > 0 and below > 0):
+        return None
+    ratio = (above.lower() / below.upper()).sqrt().lower()
+    value = float(ratio) if ratio.is_finite() else 0.0
+    return math.nextafter(value, 0.0) if value > 0.0 else None
+
+
 def _largest_ratio(error: Any, noise: Any) -> float:
     """Return the root of the largest ratio of two energies in double precision: where to look, and no proof."""
     above, below = (np.array([[complex(entry) for entry in row] for row in part.tolist()]) for part in (error, noise))
@@ -318,11 +334,11 @@ def _from_rest(
         columns = [_placed(solved, pivots, others, j) for j in range(len(others))]
         kernel = _beside(columns) if columns else _zeros(system.shape[1], 0)
     except ZeroDivisionError:
-        kernel = _exact_kernel(system)
+        kernel = exact_kernel(system)
     return [_rows(kernel, range(len(loose) + j * block, len(loose) + j * block + count)) for j in range(samples)]
 
 
-def _exact_kernel(system: FloatArray) -> Any:
+def exact_kernel(system: FloatArray) -> Any:
     """Return a basis of the kernel of a matrix whose rows are dependent, in rational numbers; none of a large one."""
     rows, width = system.shape
     if width > MOST_UNKNOWNS:

@@ -19,6 +19,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import claimed, listed_gains
 from obsynth.verification.error_system import IDENTITY_SHARE, ErrorModel
 from obsynth.verification.inequalities import proof_row, prove_norm, prove_norm_by_eigenvalues, stability_row
+from obsynth.verification.invisible_at_infinity import proved_at_infinity
 from obsynth.verification.invisible_faults import (
     LONGEST_DELAY,
     Setting,
@@ -180,9 +181,25 @@ def _setting(design: ObserverDesign) -> Setting:
 
 
 def _fault_map(design: ObserverDesign, model: ErrorModel) -> Check:
-    """Compare the transfer from the faults with the fault map at more points than the difference has states."""
-    plant, observer = design.linear
     reference, delay = _reference(design.certificate.matrices), int(design.certificate.claims.get("delay", 0))
+    missed, count = fault_map_missed(model, reference, delay)
+    late = f"late by {delay} samples" if reference is None else "as by the reference model"
+    return upper_bound_check(
+        "fault map",
+        f"faults pass exactly, {late}, whatever their time course",
+        missed,
+        FAULT_MAP_SHARE,
+        source=f"transfer functions at {count} points, which determine them",
+        kind="equality",
+    )
+
+
+def fault_map_missed(model: ErrorModel, reference: Model | None, delay: int) -> tuple[float, int]:
+    """Return by which share of its largest entry the transfer from the faults misses the fault map, and the points.
+
+    These are more than the difference has states.
+    """
+    plant, observer = model.plant, model.observer
     c, df, _, _ = model.output(slice(0, len(observer.Cz)))
     own = 0 if reference is None else len(reference[0])
     count = 2 * (observer.order + own + delay) + 3
@@ -197,15 +214,7 @@ def _fault_map(design: ObserverDesign, model: ErrorModel) -> Check:
         wanted = point**-delay * np.eye(plant.nf) if reference is None else _response(reference, point)
         worst = max(worst, float(np.max(np.abs(found - wanted), initial=0.0)))
         largest = max(largest, float(np.max(np.abs(wanted), initial=0.0)))
-    late = f"late by {delay} samples" if reference is None else "as by the reference model"
-    return upper_bound_check(
-        "fault map",
-        f"faults pass exactly, {late}, whatever their time course",
-        worst / largest if largest > 0.0 else worst,
-        FAULT_MAP_SHARE,
-        source=f"transfer functions at {count} points, which determine them",
-        kind="equality",
-    )
+    return (worst / largest if largest > 0.0 else worst), count
 
 
 def _response(system: Model, point: complex) -> Any:
@@ -218,13 +227,20 @@ def _least(design: ObserverDesign, plant: DescriptorSystem) -> Check:
     matrices, stated = design.certificate.matrices, claimed(design.certificate.claims, "least")
     points = [complex(*pair) for pair in matrices["invisible"]]
     samples = int(matrices["samples"][0, 0])
-    bound = proved_least(plant, points, samples, _setting(design), level=stated)
+    # Without points a bound of continuous time is that of infinite frequency.
+    at_once = not points and not plant.is_discrete
+    if at_once:
+        bound = proved_at_infinity(plant, _setting(design))
+    else:
+        bound = proved_least(plant, points, samples, _setting(design), level=stated)
     return _bound_row(
         "least gain",
         "every causal filter, linear or not, with this fault map has at least this gain",
         bound,
         stated,
-        f"{len(points)} points of faults and noise that no output shows",
+        "faults and noise of ever higher frequency that no output shows"
+        if at_once
+        else f"{len(points)} points of faults and noise that no output shows",
     )
 
 

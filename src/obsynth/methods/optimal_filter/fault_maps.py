@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
@@ -15,6 +15,7 @@ from obsynth.methods.optimal_filter.reference import lag_model, reference_model
 from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
 from obsynth.numerics.decoupling_windows import Channels, EstimationProblem, Model, estimation_problem
 from obsynth.numerics.least_estimation import (
+    ADDED_NOISES,
     LeastEstimation,
     least_estimation,
     least_mean_square,
@@ -198,8 +199,13 @@ def filter_in_plant_units(plant: DescriptorSystem, filter_: Model) -> Model:
     return a, b * own.outputs, units.error * c, units.error * d * own.outputs
 
 
-def designed(plant: DescriptorSystem, fault_map: FaultMap, norm: str) -> Designed:
-    """Return the filter of least norm; raise `PreconditionError` where there is none."""
+def designed(
+    plant: DescriptorSystem, fault_map: FaultMap, norm: str, noises: Sequence[float] = ADDED_NOISES
+) -> Designed:
+    """Return the filter of least norm, for the first of the added ``noises`` that gives one.
+
+    Raise `PreconditionError` where there is none.
+    """
     problem, ratio = problem_of(plant, fault_map), unit_of_gains(plant, fault_map)
     size = float(np.linalg.norm(problem.D1) + np.linalg.norm(problem.L) * np.linalg.norm(problem.B))
     try:
@@ -209,7 +215,7 @@ def designed(plant: DescriptorSystem, fault_map: FaultMap, norm: str) -> Designe
             filter_ = continuous.A, continuous.B, continuous.C, continuous.D
             gain = continuous.deviation
         else:
-            found = least_estimation(problem, norm=norm)
+            found = least_estimation(problem, norm=norm, noises=noises)
             filter_, gain = realised(problem, found.K, found.Z0, plant.ny), found.gain
             filter_ = filter_ if plant.is_discrete else uncayley(*filter_, problem.alpha)
     except np.linalg.LinAlgError as error:

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from obsynth.analysis.existence.condition import OPTIONS_PATH
-from obsynth.errors import PreconditionError, SpecError
+from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.method import Synthesis
 from obsynth.methods.optimal_filter.certificate import certified
+from obsynth.methods.optimal_filter.checks import FAULT_MAP_SHARE, fault_map_missed
 from obsynth.methods.optimal_filter.fault_maps import (
     Designed,
     FaultMap,
@@ -22,14 +23,17 @@ from obsynth.methods.optimal_filter.fault_maps import (
     unit_of_gains,
 )
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
-from obsynth.methods.optimal_filter.realisation import followed, observer_of, realisations
+from obsynth.methods.optimal_filter.realisation import Followed, followed, observer_of, realisations
 from obsynth.methods.optimal_filter.reference import plain
 from obsynth.methods.refusals import require_all_conditions
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.least_estimation import achieved, realised, whitened
+from obsynth.numerics.least_estimation import ADDED_NOISES, achieved, realised, whitened
 from obsynth.numerics.standard_form import uncayley
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.plant_units import PlantUnits
 from obsynth.results.design import Certificate
+from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.inequalities import stability_factor
 from obsynth.verification.invisible_faults import seen_plant
 
@@ -37,6 +41,12 @@ from obsynth.verification.invisible_faults import seen_plant
 DELAY_ROOM = 1.05
 #: Delays that are tried after the first one that exists, and at most where each is better than that by `DELAY_ROOM`.
 MORE_DELAYS, MOST_MORE_DELAYS = 4, 8
+#: The fault map of a filter for added noise is kept to this share, which leaves room below what verification allows.
+EXACT_SHARE = 0.3 * FAULT_MAP_SHARE
+#: Gain and least gain that differ by no more than this share are together.
+CLOSED_GAP = 3e-5
+#: Noise of the sensors that is tried to bring them together, of the outputs' sizes; with more states it takes too long.
+OFFERED_NOISES, MOST_STATES_OF_OFFERS = (1e-4, 1e-3, 1e-2), 16
 #: Significant digits of a bound in words.
 FEWEST_DIGITS, MOST_DIGITS = 4, 8
 
@@ -72,11 +82,8 @@ def synthesis_of_gains(
 
 def _made(plant: DescriptorSystem, asked: OptimalFilterMethod, curve: list[_Row], chosen: Designed) -> Synthesis:
     """Return realisation and certificate of a filter, on the plant with its disturbances that are not decoupled."""
-    fault_map, problem = chosen.fault_map, chosen.problem
-    found = followed(plant, realisations(chosen.filter, discrete=plant.is_discrete), problem.window + problem.shift)
-    rows = len(found.C)
-    names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
-    observer = observer_of(plant, found, names, fault_map.delay or 0)
+    fault_map = chosen.fault_map
+    chosen, found, observer = _with_enough_noise(plant, chosen, asked.norm)
     matrices, claims = certified(plant, chosen, observer, found, asked.norm)
     matrices |= {"T": found.T, "T0": found.T0, "stability": stability_factor(observer)}
     reference = fault_map.reference
@@ -96,8 +103,35 @@ def _made(plant: DescriptorSystem, asked: OptimalFilterMethod, curve: list[_Row]
         "trade_off": [[row.found.fault_map.delay, row.gain, row.deviation] for row in curve],
     }
     gains = {"T": found.T, "T0": found.T0}
-    notes = tuple(_notes(curve, chosen, asked, claims))
+    notes = tuple(_notes(plant, curve, chosen, asked, claims))
     return Synthesis(options, gains, observer, Certificate(matrices, claims), solver=solver, notes=notes)
+
+
+def _with_enough_noise(
+    plant: DescriptorSystem, chosen: Designed, norm: str
+) -> tuple[Designed, Followed, LinearObserver]:
+    """Return a filter and its realisation, for the least added noise with which this keeps its digits.
+
+    The poles of a filter without noise run to infinity: the nearer they are to it, the fewer digits are left.
+    """
+    more = [noise for noise in ADDED_NOISES if noise > chosen.added_noise and chosen.least is None]
+    while True:
+        problem, delay = chosen.problem, chosen.fault_map.delay or 0
+        try:
+            ways = realisations(chosen.filter, discrete=plant.is_discrete)
+            found = followed(plant, ways, problem.window + problem.shift)
+            rows = len(found.C)
+            names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
+            observer = observer_of(plant, found, names, delay)
+            model = ErrorModel(plant, observer, found.T, -found.T0, lag=found.lag, decoupled=True)
+            exact = chosen.fault_map.exact and bool(more)
+            if not exact or fault_map_missed(model, chosen.fault_map.reference, delay)[0] <= EXACT_SHARE:
+                return chosen, found, observer
+        except SolverError:
+            if not more:
+                raise
+        chosen = designed(plant, chosen.fault_map, norm, more)
+        more = [noise for noise in more[1:] if noise > chosen.added_noise]
 
 
 class _Row(NamedTuple):
@@ -144,7 +178,13 @@ def _row(plant: DescriptorSystem, found: Designed, norm: str) -> _Row:
     return _Row(found, found.gain, least) if norm == "hinf" else _Row(found, least, found.gain)
 
 
-def _notes(curve: list[_Row], chosen: Designed, asked: OptimalFilterMethod, claims: Mapping[str, float]) -> list[str]:
+def _notes(
+    plant: DescriptorSystem,
+    curve: list[_Row],
+    chosen: Designed,
+    asked: OptimalFilterMethod,
+    claims: Mapping[str, float],
+) -> list[str]:
     notes = [_statement(curve, chosen, asked, claims)]
     if len(curve) > 1:
         listed = "; ".join(f"delay {row.found.fault_map.delay}: {row.gain:.6g}, {row.deviation:.6g}" for row in curve)
@@ -152,8 +192,8 @@ def _notes(curve: list[_Row], chosen: Designed, asked: OptimalFilterMethod, clai
     if chosen.added_noise:
         notes.append(
             "An output, or a combination of outputs, has no noise: the filter is the one for "
-            f"{chosen.added_noise:g} of the plant's own sizes more on every output. State the noise of every sensor "
-            "(sensor_noise) to close the gap between the gain and the least gain."
+            f"{chosen.added_noise:g} of the plant's own sizes more on every output. "
+            + _gap(plant, chosen, asked, claims)
         )
     if chosen.is_nothing and asked.norm == "hinf":
         notes.append(
@@ -188,6 +228,49 @@ def _statement(curve: list[_Row], chosen: Designed, asked: OptimalFilterMethod, 
         low, _ = bracketed(claims["non_causal_limit"], np.inf)
         text += f" No delay brings it below {low}."
     return text
+
+
+def _gap(plant: DescriptorSystem, chosen: Designed, asked: OptimalFilterMethod, claims: Mapping[str, float]) -> str:
+    """Return how far gain and least gain are apart, and which noise, that was tried, brings them together."""
+    least, gain = claims.get("least", 0.0), claims.get("gain", 0.0)
+    if asked.norm == "h2" or chosen.is_nothing or chosen.least is not None:
+        return "State the noise of every sensor (sensor_noise)."
+    text = f"The least gain is {(gain - least) / gain:.2g} of the gain below it"
+    if gain - least <= CLOSED_GAP * gain:
+        return f"{text}."
+    offered = _noise_that_closes(plant, chosen)
+    if offered is None:
+        return f"{text}."
+    noise, low, high = offered
+    listed = ", ".join(f"{name!r}: {value:g}" for name, value in noise.items())
+    return (
+        f"{text}. With sensor_noise={{{listed}}} of the plant, which was tried, both meet: the least gain is then "
+        f"between {low} and {high}."
+    )
+
+
+def _noise_that_closes(plant: DescriptorSystem, chosen: Designed) -> tuple[dict[str, float], str, str] | None:
+    """Return the least noise of the sensors without any, of some that are tried, with which the gap is closed."""
+    quiet = [i for i in range(plant.ny) if not plant.Dw[i].any()] or list(range(plant.ny))
+    sizes = 1.0 / PlantUnits.of(plant).outputs
+    for share in OFFERED_NOISES if plant.nx <= MOST_STATES_OF_OFFERS else ():
+        noise = {plant.output_names[i]: float(f"{share * sizes[i]:.0e}") for i in quiet}
+        columns = np.zeros((plant.ny, len(quiet)))
+        columns[quiet, range(len(quiet))] = [*noise.values()]
+        noisy = plant.replace(
+            Bw=np.hstack([plant.Bw, np.zeros((plant.nx, len(quiet)))]),
+            Dw=np.hstack([plant.Dw, columns]),
+            noise_names=[*plant.noise_names, *(f"noise {name}" for name in noise)],
+        )
+        try:
+            least = designed(noisy, chosen.fault_map, "hinf", ADDED_NOISES[:1])
+            least, found, observer = _with_enough_noise(noisy, least, "hinf")
+            _, claims = certified(noisy, least, observer, found, "hinf")
+        except (PreconditionError, SolverError):
+            continue
+        if not least.added_noise and claims["gain"] - claims.get("least", 0.0) <= CLOSED_GAP * claims["gain"]:
+            return noise, *bracketed(claims["least"], claims["gain"])
+    return None
 
 
 def bracketed(low: float, high: float) -> tuple[str, str]:
