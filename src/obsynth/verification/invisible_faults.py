@@ -273,13 +273,18 @@ def worst_ratio(error: Any, noise: Any, level: float | None) -> float | None:
     count = error.nrows()
     if not count:
         return None
-    # Energies of the basis differ by many orders: each member in its own unit.
+    # Energies of the basis differ by many orders: each member in its own unit, without those that only rounding has.
     sizes = [(noise[i, i].real + error[i, i].real).mid() for i in range(count)]
-    if not any(size > 0 for size in sizes):
+    nothing = max(sizes) * flint.arb(2) ** -(flint.ctx.prec // 2)
+    kept = [i for i, size in enumerate(sizes) if size > nothing]
+    if not kept:
         return None
-    units = [1 / flint.acb(size).sqrt() if size > 0 else flint.acb(1) for size in sizes]
-    units = [unit.mid() for unit in units]
-    error, noise = (_scaled(_scaled(part, units).transpose(), units).transpose() for part in (error, noise))
+    units = [(1 / flint.acb(sizes[i]).sqrt()).mid() for i in kept]
+    error, noise = (
+        _scaled(_scaled(_columns(_rows(part, kept), kept), units).transpose(), units).transpose()
+        for part in (error, noise)
+    )
+    count = len(kept)
     level = _largest_ratio(error, noise) if level is None else level
     square = flint.arb(level * (1.0 + LEVEL_ABOVE)) ** 2
     shifted = _middle(error - noise * square)
