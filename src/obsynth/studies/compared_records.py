@@ -14,6 +14,7 @@ from obsynth.methods.fault_figures import on_the_clock
 from obsynth.monitoring.logs.log_tables import log_table
 from obsynth.monitoring.logs.signals import TIME_HEADER
 from obsynth.monitoring.logs.stuck_sensors import stuck_rows, stuck_texts
+from obsynth.monitoring.logs.unpacked_logs import as_frame
 from obsynth.numerics.arguments import (
     require_kind,
 )
@@ -98,6 +99,7 @@ class ComparedLog:
         data, columns, scales = self.data, self.columns, self.scales
 
         if not isinstance(data, (str, Path)):
+            data = as_frame(data)
             require_kind(data, pd.DataFrame, "data", "a file name or a pandas.DataFrame")
         measured = (*plant.input_names, *plant.output_names)
         wanted = {name: (columns or {}).get(name, name) for name in (*measured, *plant.fault_names)}

@@ -18,6 +18,8 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.files.inputs import input_file
 from obsynth.methods.verifying import verify
 from obsynth.monitoring.logs.run import DataRun, run_on_data
+from obsynth.monitoring.logs.sources import LOG_SUFFIXES
+from obsynth.monitoring.logs.unpacked_logs import log_suffix
 from obsynth.numerics.arguments import arguments_checked, require_kind
 from obsynth.report.plots.panels import tidy
 from obsynth.results.design import ObserverDesign, require_verified
@@ -32,10 +34,8 @@ if TYPE_CHECKING:
 
 _FLEET_KIND = "obsynth fleet result"
 
-#: What ends the name of a gain set; logs by their suffix.
+#: What ends the name of a gain set.
 GAINS_ENDING = ".gains.json"
-
-LOG_ENDINGS = (".csv", ".tsv", ".parquet", ".tdms", ".mf4", ".mdf", ".dat")
 
 #: Runs that a picture shows.
 MOST_SHOWN = 12
@@ -177,8 +177,8 @@ def run_fleet(
     progress : callable, optional
         Called with the number of runs done and their total.
     **options
-        As for `run_on_data`: ``columns, time_column, time_zone, scales, thresholds, gap, warm_up, recovered,
-        outliers``; and ``unverified``: whether designs that fail their verification are run all the same.
+        As for `run_on_data`: ``columns, time_column, time_zone, time_unit, scales, thresholds, gap, warm_up,
+        recovered, outliers``; and ``unverified``: whether designs that fail their verification are run all the same.
 
     Returns
     -------
@@ -208,13 +208,14 @@ def run_fleet(
     1
     """
     known = (
-        *("columns", "time_column", "time_zone", "scales", "thresholds", "gap", "warm_up", "recovered", "outliers"),
+        *("columns", "time_column", "time_zone", "time_unit", "scales", "thresholds", "gap", "warm_up", "recovered"),
+        "outliers",
         "unverified",
     )
     wrong = sorted(set(options) - set(known))
     if wrong:
         raise SpecError(f"{', '.join(wrong)}: use some of {', '.join(known)}.", path=wrong[0])
-    pairs = _pairs(_files(gains, (GAINS_ENDING,), "gains"), _files(data, LOG_ENDINGS, "data"), options)
+    pairs = _pairs(_files(gains, (GAINS_ENDING,), "gains"), _files(data, LOG_SUFFIXES, "data"), options)
     place = ResultFolder(folder, _FLEET_KIND, FleetRun, ending=".csv")
     return Fleet(
         carried_out(
@@ -246,11 +247,12 @@ def _files(given: Any, endings: tuple[str, ...], what: str) -> list[Path]:
 def _pairs(gains: Sequence[Path], logs: Sequence[Path], options: Mapping[str, Any]) -> list[Work]:
     names = {path: path.name.removesuffix(GAINS_ENDING).removesuffix(".json") for path in gains}
     digests = {path: file_digest(input_file(path)) for path in (*gains, *logs)}
-    own = {log: log.stem for log in logs if log.stem in names.values()}
+    called = {log: log.name[: -len(log_suffix(log))] for log in logs}
+    own = {log: name for log, name in called.items() if name in names.values()}
     said = json.dumps(options, sort_keys=True, default=str)
     return [
         Work(
-            f"{names[gain]} on {log.stem}",
+            f"{names[gain]} on {called[log]}",
             hashlib.sha256(f"{__version__} {digests[gain]} {digests[log]} {said}".encode()).hexdigest(),
             partial(_estimates, gain, log, **options),
         )

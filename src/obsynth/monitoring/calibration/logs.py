@@ -18,6 +18,7 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.monitoring.logs.clock import MOST_STALE
 from obsynth.monitoring.logs.log_tables import log_table, parsed_rows
 from obsynth.monitoring.logs.stuck_sensors import stuck_rows, stuck_texts, without_repeats
+from obsynth.monitoring.logs.unpacked_logs import as_frame
 from obsynth.numerics.arrays import FloatArray, read_only
 
 if TYPE_CHECKING:
@@ -207,6 +208,7 @@ def read_log(
 def _table(log: Any, wanted: Sequence[str]) -> tuple[dict[str, Any], list[str], str, tuple[str, ...]]:
     """Return columns that are wanted, the time first, names of all columns, where they come from, and what is to be
     said of their cells."""
+    log = log if isinstance(log, str | Path | Mapping) else as_frame(log)
     if isinstance(log, str | Path) or (hasattr(log, "columns") and hasattr(log, "index")):
         found, names, said = log_table(log, wanted[1:], wanted[0])
         return found, names, Path(log).name if isinstance(log, str | Path) else "", said

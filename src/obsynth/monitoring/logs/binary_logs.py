@@ -1,4 +1,4 @@
-"""Logs in files that need a package: Parquet, TDMS and MDF, in chunks of data frames."""
+"""Logs in files that a package reads: Parquet, TDMS, MDF, NumPy and MATLAB, in chunks of data frames."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from obsynth.monitoring.logs.signals import (
     status_places,
 )
 from obsynth.monitoring.logs.stamps import Stamps
+from obsynth.monitoring.logs.unpacked_logs import channel_frame, mat_channels, npz_channels
 from obsynth.numerics.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -36,6 +38,10 @@ NEEDED_PACKAGES = {
     ".mf4": ("asammdf", "mdf"),
     ".mdf": ("asammdf", "mdf"),
     ".dat": ("asammdf", "mdf"),
+    ".xlsx": ("openpyxl", "excel"),
+    ".xlsm": ("openpyxl", "excel"),
+    ".npz": ("numpy", ""),
+    ".mat": ("scipy", ""),
 }
 
 #: How pandas calls the column of an index without a name.
@@ -48,6 +54,7 @@ LARGEST_SHIFT = 0.5
 
 #: How files of these kinds begin.
 _BEGINNINGS = {".parquet": b"PAR1", ".tdms": b"TDSm", ".mf4": b"MDF ", ".mdf": b"MDF ", ".dat": b"MDF "}
+_BEGINNINGS |= {".npz": b"PK\3\4", ".mat": b"MATLAB"}
 
 
 @contextmanager
@@ -317,6 +324,22 @@ def _cells_of(samples: Any) -> Any:
     return np.asarray(samples, dtype=object if samples.dtype.kind == "U" else np.float64)
 
 
+_Channels: TypeAlias = "Callable[[Path], list[tuple[str, str, Any]]]"
+
+
+def _arrays(channels_of: _Channels, path: Path, signals: LogSignals, _: Stamps, rows: int) -> Iterator[pd.DataFrame]:
+    """Yield the arrays of a file that are read."""
+    channels = channels_of(path)
+    found = {name: _only(path, name, channels) for name in signals.columns}
+    frame = channel_frame({name: values for name, values in found.items() if values is not None}, path)
+    others = dict.fromkeys(name for _, name, _ in channels if name not in frame)
+    yield from _frames({str(name): frame[name] for name in frame}, others, signals, rows)
+
+
+def _array_names(channels_of: _Channels, path: Path, wanted: Sequence[str]) -> list[str]:
+    return _called(channels_of(path), wanted, have_times=False)
+
+
 def _frames(found: dict[str, Any], others: dict[str, Any], signals: LogSignals, rows: int) -> Iterator[pd.DataFrame]:
     """Yield columns in chunks; names that are not there are told with all that are."""
     import pandas as pd
@@ -338,4 +361,6 @@ READERS: dict[
     ".mf4": (_mdf, _mdf_names),
     ".mdf": (_mdf, _mdf_names),
     ".dat": (_mdf, _mdf_names),
+    ".npz": (partial(_arrays, npz_channels), partial(_array_names, npz_channels)),
+    ".mat": (partial(_arrays, mat_channels), partial(_array_names, mat_channels)),
 }

@@ -11,11 +11,19 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
-from obsynth.monitoring.logs.binary_logs import NEEDED_PACKAGES, READERS, read_by_package
+from obsynth.monitoring.logs.binary_logs import READERS, read_by_package
 from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals, column_of
-from obsynth.monitoring.logs.sources import CHUNK_ROWS, TEXT_SUFFIXES, check_suffix, chunks, require_readable_log
+from obsynth.monitoring.logs.sources import (
+    CHUNK_ROWS,
+    LOG_SUFFIXES,
+    READ_AS_TEXT,
+    check_suffix,
+    chunks,
+    require_readable_log,
+)
 from obsynth.monitoring.logs.stamps import Stamps
-from obsynth.monitoring.logs.text_logs import WINDOWS_TEXT, encoding_of, no_text, opened_text
+from obsynth.monitoring.logs.text_logs import no_text, opened_text
+from obsynth.monitoring.logs.unpacked_logs import as_frame, log_suffix, opened_log
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 
@@ -29,6 +37,7 @@ def log_table(
     """Return those of some columns that a log has ``(rows,)``, dates as seconds since the first, the names of all
     columns, and what is to be said of the cells; ``data`` is the name of a file or a data frame, ``time`` the column of
     the stamps."""
+    data = data if isinstance(data, str | Path) else as_frame(data)
     header = _header(data, [time, *names])
     there = [name for name in dict.fromkeys(names) if column_of(header, name) and name != time]
     # A log without stamps is read like others: a column stands where they would.
@@ -57,11 +66,11 @@ def _header(data: Any, wanted: Sequence[str]) -> list[str]:
             *names,
         ]
     path = Path(data)
-    check_suffix(path, (*TEXT_SUFFIXES, *NEEDED_PACKAGES))
+    check_suffix(path, LOG_SUFFIXES)
     input_file(path)
-    if path.suffix.lower() in TEXT_SUFFIXES:
+    if log_suffix(path) in READ_AS_TEXT:
         try:
-            with path.open(encoding=encoding_of(path), errors=WINDOWS_TEXT, newline="") as stream:
+            with opened_log(path, wanted) as stream:
                 return list(opened_text(stream, wanted)[0])
         except UnicodeDecodeError as error:
             raise no_text(path, error) from error

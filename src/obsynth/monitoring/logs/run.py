@@ -25,6 +25,7 @@ from obsynth.monitoring.logs.smoothing import LaterRows
 from obsynth.monitoring.logs.sources import CHUNK_ROWS, Data, chunks
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.stuck_sensors import stuck_texts
+from obsynth.monitoring.logs.unpacked_logs import as_frame
 from obsynth.monitoring.thresholds.monitor import Monitor
 from obsynth.numerics.arguments import arguments_checked, require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray
@@ -131,6 +132,7 @@ def run_on_data(
     columns: Mapping[str, str] | None = None,
     time_column: str | None = None,
     time_zone: str | None = None,
+    time_unit: str | None = None,
     scales: Mapping[str, float] | None = None,
     thresholds: Mapping[str, float] | None = None,
     monitor: Monitor | None = None,
@@ -155,12 +157,13 @@ def run_on_data(
     ----------
     design : ObserverDesign
         Of any method.
-    data : path, text stream or pandas.DataFrame
-        With a column ``time`` and a column for each known input and output.  Files are text (``.csv``, ``.tsv``),
-        Parquet, TDMS or MDF (``.mf4``, ``.mdf``, ``.dat``) by their suffix; a stream is text and is answered row by
-        row.  Columns of text are separated by commas, semicolons, tabs or bars, and numbers may have a decimal comma
-        where commas separate nothing.  The time is in seconds, or dates and times of ISO 8601 with or without a zone
-        (taken as UTC without one), which are written back as such; the index of a frame is the time where it is a
+    data : path, text stream, pandas.DataFrame, or mapping of columns
+        With a column ``time`` and a column for each known input and output.  Files are text (``.csv``, ``.tsv``, also
+        with ``.gz``), ``.xlsx``, Parquet, TDMS, MDF (``.mf4``, ``.mdf``, ``.dat``), ``.npz`` or ``.mat`` by their
+        suffix; a stream is text and is answered row by row.  Frames of polars and tables of pyarrow are taken as well.
+        Columns of text are separated by commas, semicolons, tabs or bars, and numbers may have a decimal comma where
+        commas separate nothing.  The time is in seconds, or dates and times of ISO 8601 with or without a zone (taken
+        as UTC without one), which are written back as such; the index of a frame is the time where it is a
         DatetimeIndex.
     out : path or text stream, optional
         CSV or Parquet file, written whole or not at all; or a stream for CSV.  By default a data frame is returned.
@@ -171,6 +174,9 @@ def run_on_data(
     time_zone : str, optional
         Zone of dates that name none, such as ``Europe/Berlin`` or ``+01:00``, in which they are written back: the hour
         that comes twice in autumn is told apart by the order of the rows.
+    time_unit : {"s", "ms", "us", "ns", "min", "h", "d"}, optional
+        Unit of stamps that are numbers, where the log does not say it; ``"d"`` (or ``"days"``) for serial days of
+        spreadsheets and of MATLAB.  Times are then in seconds everywhere.
     scales : mapping, optional, signal's unit per column's unit
         Factor of a signal's column; by default the plant's.
     thresholds : mapping, optional
@@ -256,7 +262,7 @@ def run_on_data(
     _require_files(state=state, out=out, data=data)
     if time_column is not None:
         columns = {**(columns or {}), TIME_HEADER: time_column}
-    stamps = Stamps(time_zone)
+    stamps = Stamps(time_zone, time_unit)
     run = LogRun(
         design,
         columns,
@@ -274,6 +280,7 @@ def run_on_data(
     resumed = state is not None and Path(state).exists()
     if resumed:
         resume_state(Path(str(state)), run, digest)
+    data = data if isinstance(data, str | Path) or hasattr(data, "readline") else as_frame(data)
     room = len(data) if isinstance(data, Sized) and not isinstance(data, str) else CHUNK_ROWS
     kept = FrameSink((TIME_HEADER, *run.signals.names), stamps, room) if out is None else None
     # What has left a stream cannot be taken back: there the state is saved however the run ends.

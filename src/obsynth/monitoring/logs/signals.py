@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -162,12 +163,25 @@ def is_bad(status: str) -> bool:
 
 
 def column_of(header: Sequence[str], name: str) -> str | None:
-    """Return what a header calls a column: as it is called, or so with a unit in brackets behind it; `None` where no
-    column, or more than one of the latter, is called so."""
+    """Return what a header calls a column: as it is called, in whatever code points, or so with a unit in brackets
+    behind it; `None` where no column, or more than one of the latter, is called so."""
     if name in header:
         return name
-    found = [each for each in header if name in each and (unit := WITH_UNIT.fullmatch(each)) and unit[1] == name]
+    name = _one_spelling(name)
+    same = [each for each in header if not each.isascii() and _one_spelling(each) == name]
+    if len(same) == 1:
+        return same[0]
+    found = [
+        each
+        for each in header
+        if (unit := WITH_UNIT.fullmatch(_one_spelling(each) if not each.isascii() else each)) and unit[1] == name
+    ]
     return found[0] if len(found) == 1 else None
+
+
+def _one_spelling(name: str) -> str:
+    """Return a name in one of its encodings: letters with their marks as one code point, the sign for micro as mu."""
+    return name if name.isascii() else unicodedata.normalize("NFC", name).replace("\u00b5", "\u03bc")
 
 
 def date_place(header: Sequence[str], places: Sequence[int]) -> int | None:

@@ -25,6 +25,13 @@ from obsynth.monitoring.logs.signals import (
 )
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.text_logs import WINDOWS_TEXT, no_text, number_in_cell, stream_rows, text_chunks
+from obsynth.monitoring.logs.unpacked_logs import (
+    COMPRESSED_SUFFIXES,
+    WORKBOOK_SUFFIXES,
+    as_frame,
+    log_suffix,
+    opened_log,
+)
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 
@@ -33,8 +40,12 @@ if TYPE_CHECKING:
     from typing_extensions import TypeIs
 
 
-#: Files that are read as text.
+#: Files that are text, and all that are read as text.
 TEXT_SUFFIXES = (".csv", ".tsv")
+READ_AS_TEXT = (*TEXT_SUFFIXES, *COMPRESSED_SUFFIXES, *WORKBOOK_SUFFIXES)
+
+#: All kinds of logs.
+LOG_SUFFIXES = (*READ_AS_TEXT, *READERS)
 
 #: Rows that are held in memory at a time.
 CHUNK_ROWS = 10_000
@@ -118,10 +129,10 @@ def _advanced(found: Iterator[FloatArray], signals: LogSignals) -> Iterator[Floa
 def _chunks(data: Data, signals: LogSignals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
     if isinstance(data, str | Path):
         path = Path(data)
-        check_suffix(path, (*TEXT_SUFFIXES, *NEEDED_PACKAGES))
+        check_suffix(path, LOG_SUFFIXES)
         with require_readable_log(path):
-            if path.suffix.lower() in TEXT_SUFFIXES:
-                yield from text_chunks(path, signals, stamps, rows)
+            if log_suffix(path) in READ_AS_TEXT:
+                yield from text_chunks(path, opened_log(path, signals.columns), signals, stamps, rows)
             else:
                 with read_by_package(path):
                     read_rows, _ = READERS[path.suffix.lower()]
@@ -133,8 +144,9 @@ def _chunks(data: Data, signals: LogSignals, stamps: Stamps, rows: int) -> Itera
     else:
         import pandas as pd
 
-        require_kind(data, pd.DataFrame, "data", "the name of a file, a text stream or a pandas.DataFrame")
-        frame = _with_time(data, signals)
+        table = as_frame(data)
+        require_kind(table, pd.DataFrame, "data", "the name of a file, a text stream or a pandas.DataFrame")
+        frame = _with_time(table, signals)
         numbers = all(pd.api.types.is_numeric_dtype(kind) for kind in frame.dtypes)
         # Of numbers a part says no less than the whole: no copy of all of them is made.
         parts = range(0, max(len(frame), 1), rows) if numbers else range(1)
@@ -157,7 +169,7 @@ def is_stream(data: TextIO | pd.DataFrame) -> TypeIs[TextIO]:
 
 def check_suffix(path: Path, suffixes: tuple[str, ...] = TABLE_SUFFIXES) -> None:
     """Raise `SpecError` unless a file is of a known kind by its name, and its package is installed."""
-    suffix = path.suffix.lower()
+    suffix = log_suffix(path)
     if suffix not in suffixes:
         raise SpecError(f"{path} has an unknown suffix: use one of {', '.join(suffixes)}.", path=str(path))
     if suffix in NEEDED_PACKAGES:

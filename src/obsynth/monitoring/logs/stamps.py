@@ -161,10 +161,20 @@ def zone_of(name: str) -> tzinfo:
         ) from error
 
 
+def _per_second(unit: str) -> float:
+    """Return how many of a unit of time are a second."""
+    found = _UNITS_OF_TIME.get(str(unit).strip().lower()) if str(unit).strip() else None
+    if found is None:
+        raise SpecError(
+            f"{unit!r} is no unit of time: give one of s, ms, us, ns, min, h, d (or days).", path="time_unit"
+        )
+    return found
+
+
 class Stamps:
     """Which kind of stamps a log has, decided by its first one, and the zone in which they are written back."""
 
-    def __init__(self, time_zone: str | None = None) -> None:
+    def __init__(self, time_zone: str | None = None, time_unit: str | None = None) -> None:
         #: The zone of dates that name none, where it is stated.
         self.stated = None if time_zone is None else zone_of(time_zone)
         #: Whether dates name no zone, the latest of them, and the interval before it, in seconds.
@@ -177,6 +187,9 @@ class Stamps:
         self.day_first: bool | None = None  # of dates with slashes, by the first one
         self.per_second: float | None = None  # how many of the numbers of the log are a second, by the first one
         self.has_unit = False  # whether the file states the unit of its stamps
+        self.unit = time_unit  # the unit that is stated beside the file
+        if time_unit is not None:
+            self.per_second, self.has_unit = _per_second(time_unit), True
         self.notes: list[str] = []  # what is to be said of the file
         #: Cells that hold a word instead of a number, which are missing, by column: how many; first row and text.
         self.words: dict[str, tuple[int, int, str]] = {}
@@ -240,12 +253,23 @@ class Stamps:
         """Take the units that stand behind names of columns, which are called otherwise where they are ``wanted``."""
         found = WITH_UNIT.fullmatch(header[places[0]])
         per_second = None if found is None else _UNITS_OF_TIME.get(found.group(2).strip().lower())
-        if per_second not in (None, 1.0):
-            self.per_second = per_second
-        self.has_unit = per_second is not None
+        if per_second is not None:
+            self._take_unit(per_second, header[places[0]])
         named = [repr(header[place]) for name, place in zip(wanted, places, strict=True) if header[place] != name]
         if named:
             self.notes.append(f"Columns are found by their names without units: {', '.join(named)}.")
+
+    def _take_unit(self, per_second: float, text: str) -> None:
+        """Take the unit of the time that the file states; one that is stated beside it must be the same."""
+        if self.unit is not None and self.per_second != per_second:
+            raise SpecError(
+                f"The time of the log is called {text!r}, but its unit is stated as {self.unit!r}: leave time_unit "
+                "(--time-unit) out, or correct it.",
+                path="time_unit",
+            )
+        self.has_unit = True
+        if per_second != 1.0:
+            self.per_second = per_second
 
     def take_word(self, column: str, row: int, text: str) -> None:
         """Count a cell that holds a word instead of a number."""
@@ -262,8 +286,7 @@ class Stamps:
         if per_second is None or not any(cell.lower() not in MISSING_TEXTS for cell in cells):
             return False
         if unit:
-            self.per_second = per_second
-            self.has_unit = True
+            self._take_unit(per_second, cells[0])
         self.notes.append(f"The line below the header is taken as units: {', '.join(map(repr, cells))}.")
         return True
 
@@ -334,8 +357,8 @@ class Stamps:
         if within and np.all(steps > 0.0) and np.max(steps) <= _STEP_IN_DAYS:
             raise SpecError(
                 f"The time begins with {float(known[0]):.10g} and rises by {float(np.median(steps)):.3g} a row: these "
-                "are serial days of a spreadsheet or of MATLAB, not seconds. State the unit in the name of the column, "
-                "'time [d]' or 'time [s]'.",
+                "are serial days of a spreadsheet or of MATLAB, not seconds. State the unit (time_unit, --time-unit "
+                "days), or in the name of the column, 'time [d]' or 'time [s]'.",
                 path="data",
             )
 
@@ -414,6 +437,10 @@ class Stamps:
 
     def _dated(self, zone: tzinfo | None) -> None:
         """Take the first stamp as a date in a zone, or in none."""
+        if self.unit is not None:
+            raise SpecError(
+                "The stamps are dates, which have no unit: leave time_unit (--time-unit) out.", path="time_unit"
+            )
         if self.stated is not None and zone is not None:
             raise SpecError("The stamps name their time zone: leave time_zone (--time-zone) out.", path="time_zone")
         self.is_dated, self.are_local = True, zone is None

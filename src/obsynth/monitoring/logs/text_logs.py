@@ -7,7 +7,8 @@ import csv
 import itertools
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
+from io import BufferedIOBase
 from pathlib import Path
 from typing import TextIO
 
@@ -28,6 +29,9 @@ _SEPARATOR_LINE = re.compile(r"\s*sep=(.)\s*", re.IGNORECASE)
 
 #: What a remark of the logger begins with, before the header.
 REMARK = "#"
+
+#: Lines without any column that is read, among which a header is looked for.
+MOST_REMARKS = 50
 
 #: Lines that may end with CR alone.
 _OLD_LINES = re.compile(r"[^\r]*\r\n?|[^\r]+")
@@ -101,10 +105,9 @@ def _as_windows(error: UnicodeError) -> tuple[str, int]:
 codecs.register_error(WINDOWS_TEXT, _as_windows)
 
 
-def encoding_of(path: Path) -> str:
+def encoding_of(stream: BufferedIOBase) -> str:
     """Return the encoding of a text: UTF-8 but where its first bytes say UTF-16 or UTF-32, with or without a mark."""
-    with path.open("rb") as stream:
-        first = stream.read(4)
+    first = stream.read(4)
     if first in (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE):
         return "utf-32"
     if first[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
@@ -119,9 +122,11 @@ def no_text(path: Path, error: UnicodeDecodeError) -> SpecError:
     return SpecError(f"{path} is no {name} text (byte {error.start}). {SAVE_AS_TEXT}", path=str(path))
 
 
-def text_chunks(path: Path, signals: LogSignals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
-    """Yield ``(rows, 1 + nu + ny)`` of a file."""
-    with path.open(encoding=encoding_of(path), errors=WINDOWS_TEXT, newline="") as stream:
+def text_chunks(
+    path: Path, opened: AbstractContextManager[TextIO], signals: LogSignals, stamps: Stamps, rows: int
+) -> Iterator[FloatArray]:
+    """Yield ``(rows, 1 + nu + ny)`` of a file that is opened as text."""
+    with opened as stream:
         if not stream.readline():
             raise SpecError(f"{path} cannot be read: it is empty.", path=str(path))
         stream.seek(0)
@@ -135,7 +140,7 @@ def text_chunks(path: Path, signals: LogSignals, stamps: Stamps, rows: int) -> I
 
 def stream_rows(stream: TextIO, signals: LogSignals, stamps: Stamps) -> Iterator[FloatArray]:
     """Yield one row at a time, ``(1, 1 + nu + ny)``, as soon as its line is there."""
-    header, comma, table = opened_text(stream, signals.columns)
+    header, comma, table = opened_text(stream, signals.columns, stamps.notes)
     if not header:
         raise SpecError("The data are empty: their first line is the names of the columns.", path="data")
     places = signals.positions(header)
@@ -167,10 +172,12 @@ def stream_rows(stream: TextIO, signals: LogSignals, stamps: Stamps) -> Iterator
         raise SpecError("The data have no rows.", path="data")
 
 
-def opened_text(stream: TextIO, wanted: Sequence[str]) -> tuple[tuple[str, ...], bool, Iterator[list[str]]]:
+def opened_text(
+    stream: TextIO, wanted: Sequence[str], notes: list[str] | None = None
+) -> tuple[tuple[str, ...], bool, Iterator[list[str]]]:
     """Return the names of the columns, whether numbers may have a decimal comma, and the cells of the lines below the
-    header.  What a logger remarks before the header, in blank lines and in lines that begin with ``#`` and name no
-    column that is read, is passed over."""
+    header.  What a logger remarks before the header, in blank lines, in lines that begin with ``#`` and name no column
+    that is read, and in other lines before one that names the time and another such column, is passed over."""
     lines = _text_lines(stream)
     head = next(lines, "")
     while (head and not head.strip()) or (
@@ -180,10 +187,34 @@ def opened_text(stream: TextIO, wanted: Sequence[str]) -> tuple[tuple[str, ...],
         head = next(lines, "")
     told = _SEPARATOR_LINE.fullmatch(head)
     head = next(lines, "") if told else head
+    if not told and not _named(head, wanted):
+        head, lines = _after_remarks(head, lines, wanted, notes)
     separator = told.group(1) if told else _separator_of(head, wanted)
     # A name in quotes may go on in the next line.
     table = _cells(itertools.chain([head], lines), separator)
     return tuple(unquoted(name.strip()) for name in next(table, [])), separator != ",", table
+
+
+def _named(head: str, wanted: Sequence[str]) -> int:
+    """Return how many of the columns that are wanted a line names, whatever separates them."""
+    named = (_names(head, separator) for separator in SEPARATORS)
+    return max(sum(column_of(names, name) is not None for name in wanted) for names in named)
+
+
+def _after_remarks(
+    head: str, lines: Iterator[str], wanted: Sequence[str], notes: list[str] | None
+) -> tuple[str, Iterator[str]]:
+    """Return the first of the next lines that names the time and another column that is read, and the lines below it;
+    where there is none, the lines as they are."""
+    needed = min(len(wanted), 2)
+    passed: list[str] = []
+    for line in itertools.islice(lines, MOST_REMARKS):
+        if _named(line, wanted[:1]) and _named(line, wanted) >= needed:
+            if notes is not None:
+                notes.append(f"{len(passed) + 1} line(s) before the header are passed over, first {head.strip()!r}.")
+            return line, lines
+        passed.append(line)
+    return head, itertools.chain(passed, lines)
 
 
 def _together(rows: Iterator[FloatArray], count: int) -> Iterator[FloatArray]:

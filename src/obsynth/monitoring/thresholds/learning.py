@@ -68,6 +68,7 @@ def learn_thresholds(
     columns: Mapping[str, str] | None = None,
     time_column: str | None = None,
     time_zone: str | None = None,
+    time_unit: str | None = None,
     scales: Mapping[str, float] | None = None,
     gap: float | None = None,
     warm_up: float | None = None,
@@ -94,7 +95,7 @@ def learn_thresholds(
         closer than 20 rows are one.
     rows : str, slice or pair of int, optional
         Rows of each log that are free of faults, as Python counts; all by default.  The observer runs over all before.
-    columns, time_column, time_zone, scales, gap, warm_up
+    columns, time_column, time_zone, time_unit, scales, gap, warm_up
         As for `obsynth.run_on_data`.
     seed : int, optional
         Of the bootstrap.
@@ -150,7 +151,7 @@ def learn_thresholds(
         return LogRun(known, columns, scales, gap=gap, warm_up=warm_up)
 
     first_run = started()
-    read = [_read(one, first_run.signals, time_zone) for one in several(data)]
+    read = [_read(one, first_run.signals, time_zone, time_unit) for one in several(data)]
     log, borders = np.vstack([one for one, _ in read]), np.cumsum([0, *(len(one) for one, _ in read)])
     ends = list(zip(borders[:-1].tolist(), borders[1:].tolist(), strict=True))
     if len(log) < LEAST_NORMAL:
@@ -367,9 +368,9 @@ def several(data: Logs) -> list[Data]:
     return [*files]
 
 
-def _read(data: Data, signals: LogSignals, time_zone: str | None) -> tuple[FloatArray, Stamps]:
+def _read(data: Data, signals: LogSignals, time_zone: str | None, time_unit: str | None) -> tuple[FloatArray, Stamps]:
     """Return the rows of a log ``(n, 1 + nu + ny)``, and how to write its times."""
-    stamps = Stamps(time_zone)
+    stamps = Stamps(time_zone, time_unit)
     return np.vstack([np.zeros((0, 1 + len(signals.names))), *chunks(data, signals, stamps, CHUNK_ROWS)]), stamps
 
 

@@ -12,6 +12,7 @@ from obsynth.report.terminal.common_options import (
     INPUT_DELAY,
     MAP,
     TIME_COLUMN,
+    TIME_UNIT,
     TIME_ZONE,
     count,
     positive,
@@ -77,6 +78,7 @@ DATA_OPTIONS = (
     Settings(
         (
             TIME_COLUMN,
+            TIME_UNIT,
             TIME_ZONE,
             INPUT_DELAY,
             option(

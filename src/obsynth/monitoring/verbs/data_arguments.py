@@ -72,6 +72,7 @@ def run_of(
             out,
             columns=columns_of(options),
             time_zone=options.time_zone,
+            time_unit=options.time_unit,
             scales=numbers_of(options.scale),
             thresholds=numbers_of(options.threshold),
             monitor=watched,
@@ -221,11 +222,16 @@ def rows_done(data: str, *, quiet: bool) -> Iterator[Callable[[int], None] | Non
 
 def _rows_in(path: Path) -> int | None:
     """Return how many rows a file of data has, about; `None` where that cannot be told without reading it whole."""
+    from obsynth.monitoring.logs.sources import TEXT_SUFFIXES
+    from obsynth.monitoring.logs.unpacked_logs import log_suffix
+
     try:
         if path.suffix.lower() == ".parquet":
             import pyarrow.parquet
 
             return int(pyarrow.parquet.ParquetFile(path).metadata.num_rows)
+        if log_suffix(path) not in TEXT_SUFFIXES:
+            return None
         with path.open("rb") as stream:
             sample = stream.read(1 << 20)
         # The rows of the beginning stand for all.
@@ -245,6 +251,12 @@ def certificate_target(options: argparse.Namespace) -> Path | None:
         raise SpecError("--prove is for alarms of --monitor pointwise.", path="--prove")
     if options.time_zone is not None:
         raise SpecError("--prove counts rows by stamps with a zone, or in UTC: leave --time-zone out.", path="--prove")
+    if options.time_unit is not None:
+        raise SpecError(
+            "--prove reads the unit of the time in the log alone: call the column 'time [d]', and leave --time-unit "
+            "out.",
+            path="--prove",
+        )
     if options.data == STREAM or options.state is not None:
         raise SpecError(
             "--prove reads the data again from their first row on: give --data a file, and no --state.", path="--prove"

@@ -20,6 +20,7 @@ from obsynth.report.terminal.common_options import (
     SCALE,
     SYSTEM,
     TIME_COLUMN,
+    TIME_UNIT,
     TIME_ZONE,
     UNVERIFIED,
 )
@@ -230,6 +231,7 @@ VERBS = {
             *LOG_OPTIONS,
             Settings(
                 (
+                    TIME_UNIT,
                     TIME_ZONE,
                     INPUT_DELAY,
                     option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),

@@ -38,6 +38,7 @@ def run_thresholds(options: argparse.Namespace) -> int:
         rows=options.rows,
         columns=columns_of(options),
         time_zone=options.time_zone,
+        time_unit=options.time_unit,
         scales=numbers_of(options.scale),
         gap=options.gap,
         warm_up=options.warm_up,

@@ -68,6 +68,13 @@ TIME_ZONE = option(
     "by the order of the rows (default: UTC)",
 )
 
+TIME_UNIT = option(
+    "--time-unit",
+    "UNIT",
+    "unit of stamps that are numbers: s, ms, us, ns, min, h, or d for days of spreadsheets and MATLAB "
+    "(default: as the log says)",
+)
+
 #: How a log without faults is read.
 LOG_OPTIONS = (
     MAP,

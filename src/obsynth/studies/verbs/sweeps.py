@@ -98,6 +98,7 @@ def run_many(options: argparse.Namespace) -> int:
         "columns": dict(options.map) or None,
         "time_column": options.time_column,
         "time_zone": options.time_zone,
+        "time_unit": options.time_unit,
         "outliers": options.outliers,
         "scales": numbers_of(options.scale) or None,
         "thresholds": numbers_of(options.threshold) or None,
