@@ -240,3 +240,90 @@ def test_bad_input_is_told(name):
     call, told = BAD[name]
     with pytest.raises(obsynth.SpecError, match=told):
         call(*a_system(1.0))
+
+
+def with_a_mode_outside(seed: int, dt: float) -> tuple[np.ndarray, ...]:
+    """A, B, C, Cy in some coordinates, with a mode outside that neither z nor y has a part in; w drives it or not."""
+    rng = np.random.default_rng([46, 10, seed])
+    n = int(rng.integers(2, 5))
+    a = rng.standard_normal((n - 1, n - 1))
+    a = (
+        0.8 * a / np.max(np.abs(np.linalg.eigvals(a)))
+        if dt
+        else a - (0.3 + np.linalg.eigvals(a).real.max()) * np.eye(n - 1)
+    )
+    whole = np.zeros((n, n))
+    whole[: n - 1, : n - 1], whole[n - 1, : n - 1], whole[n - 1, n - 1] = (
+        a,
+        rng.standard_normal(n - 1),
+        1.3 if dt else 0.4,
+    )
+    b, (c, cy) = rng.standard_normal((n, 1)), np.pad(rng.standard_normal((2, 1, n - 1)), ((0, 0), (0, 0), (0, 1)))
+    b[n - 1] *= seed % 2
+    turn = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    return turn @ whole @ turn.T, turn @ b, c @ turn.T, cy @ turn.T
+
+
+@pytest.mark.one_in(8)
+@HARD
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+@pytest.mark.parametrize("seed", range(30))
+def test_a_mode_outside_that_nothing_shows_is_never_called_stable(seed, dt):
+    """Infeasible by construction, in inequalities whose scale w and z fix elsewhere: once most were optimal."""
+    a, b, c, cy = with_a_mode_outside(seed, dt)
+    n, zero = len(a), np.zeros((1, 1))
+    for given in (False, True):
+        p, z, g = cp.Variable((n, n), symmetric=True), cp.Variable((1, 1), symmetric=True), cp.Variable()
+        more = {"Y": cp.Variable((n, 1)), "Cy": cy, "Dy": zero} if given else {}
+        for goal, found in (
+            (g, conditions.bounded_real(a, b, c, zero, p, None, dt, gamma_squared=g, **more)),
+            (0, conditions.bounded_real(a, b, c, zero, p, 100.0, dt, **more)),
+            (cp.trace(z), conditions.h2(a, b, c, zero, p, z, dt, **more)),
+        ):
+            problem = cp.Problem(cp.Minimize(goal), found)
+            try:
+                problem.solve(solver="CLARABEL")
+            except cp.error.SolverError:
+                continue  # it does not say yes
+            assert problem.status in NO, given
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_where_the_mode_is_known_to_be_stable_its_inequality_is_left_out(dt):
+    a, b, c, d = a_system(dt)
+    d = 0.0 * d
+    values = []
+    for known in (False, True):
+        p, g = cp.Variable((3, 3), symmetric=True), cp.Variable()
+        found = conditions.bounded_real(a, b, c, d, p, None, dt, gamma_squared=g, detectable=known)
+        assert len(found) == (2 if known else 4)
+        values.append(cp.Problem(cp.Minimize(g), found).solve(solver="CLARABEL"))
+        z = cp.Variable((2, 2), symmetric=True)
+        assert len(conditions.h2(a, b, c, d, p, z, dt, detectable=known)) == (2 if known else 4)
+    assert values[0] == pytest.approx(values[1], rel=1e-4)
+
+
+@pytest.mark.one_in(4)
+@HARD
+@pytest.mark.parametrize("seed", range(12))
+def test_the_papers_inequality_is_not_met_where_no_gain_is_stable(seed):
+    rng = np.random.default_rng([46, 11, seed])
+    n = int(rng.integers(3, 5))
+    own = rng.standard_normal((n, n))
+    own[:, -1] = 0.0
+    own[: n - 1, : n - 1] *= 0.8 / np.max(np.abs(np.linalg.eigvals(own[: n - 1, : n - 1])))
+    c, b = np.pad(rng.standard_normal((2, n - 1)), ((0, 0), (0, 1))), rng.standard_normal((n, 1))
+    turn = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    own[-1, -1] = 0.5
+    stable = obsynth.DescriptorSystem(A=turn @ own @ turn.T, C=c @ turn.T, Bf=turn @ b, dt=1.0)
+    own[-1, -1] = 1.3
+    plant = stable.replace(A=turn @ own @ turn.T)
+    found = conditions.wang2015(plant)
+    assert not found.existence.passed
+    good = conditions.wang2015(stable)
+    assert list(good.constraints) == ["P", "(45)"] or not good.existence.passed
+    try:
+        found.problem.solve(solver="CLARABEL")
+    except cp.error.SolverError:
+        return  # it does not say yes
+    assert found.problem.status in NO

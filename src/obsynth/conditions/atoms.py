@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 #: keeps nothing, and a feasible P can be as large as one likes.
 HOMOGENEOUS_MARGIN = 1.0
 
+#: The same beside inequalities whose scale is fixed: of the size of theirs, since solvers of first order (SCS) take ten
+#: times as many steps for a larger one; 1e7 times the tolerances.
+BESIDE_MARGIN = 0.1
+
 
 @arguments_checked
 def bounded_real(
@@ -44,6 +48,7 @@ def bounded_real(
     Cy: Any = None,
     Dy: Any = None,
     gamma_squared: Any = None,
+    detectable: bool = False,
     margin: float = MARGIN,
 ) -> list[cvxpy.Constraint]:
     r"""Return the bounded real inequality: A is stable and the H-infinity norm from w to z is below gamma.
@@ -68,13 +73,18 @@ def bounded_real(
         ``(n, ny)``, ``(ny, n)``, ``(ny, nw)``: the gain that is still to be found, ``Y = P L``.
     gamma_squared : cvxpy.Expression, optional
         The square of the level, as a variable or a parameter.
+    detectable : bool, optional
+        True where A is known to be stable, or with Y the pair ``(A, Cy)`` to be detectable: the constraints that ask it
+        are left out then.
     margin : float, optional
         What is kept to the boundary of the cone.
 
     Returns
     -------
     list of cvxpy.Constraint
-        The inequality, and ``P > 0``.
+        ``P > 0``, the inequality, and the two of a matrix of their own that is free in scale, by which some gain makes
+        A stable: z and w fix the scale of P, and where neither has a part in a mode, a P that is nothing there would be
+        within the tolerance of any solver.
 
     Raises
     ------
@@ -114,7 +124,8 @@ def bounded_real(
         )
     else:
         whole = -lmi.symmetric_blocks([[pa + pa.T], [pb.T, -level * np.eye(nw)], [C, D, -np.eye(nz)]])
-    return [lmi.at_least(P, margin), lmi.at_least(whole, margin)]
+    own = [] if detectable else some_gain_stabilises(A, dt, Cy, margin=BESIDE_MARGIN)
+    return [lmi.at_least(P, margin), lmi.at_least(whole, margin), *own]
 
 
 @arguments_checked
@@ -130,6 +141,7 @@ def h2(
     Y: Any = None,
     Cy: Any = None,
     Dy: Any = None,
+    detectable: bool = False,
     margin: float = MARGIN,
 ) -> list[cvxpy.Constraint]:
     r"""Return the H2 inequalities: A is stable and the squared H2 norm from w to z is below the trace of Z.
@@ -154,13 +166,15 @@ def h2(
         0 for continuous time, else seconds.
     Y, Cy, Dy : optional
         ``(n, ny)``, ``(ny, n)``, ``(ny, nw)``: the gain that is still to be found, ``Y = P L``.
+    detectable : bool, optional
+        As for `bounded_real`.
     margin : float, optional
         What is kept to the boundary of the cone.
 
     Returns
     -------
     list of cvxpy.Constraint
-        The two inequalities.
+        The two inequalities, and those by which some gain makes A stable, see `bounded_real`.
 
     Raises
     ------
@@ -195,7 +209,8 @@ def h2(
             raise SpecError("D is not zero: in continuous time the H2 norm is infinite then.", path="D")
         first = -lmi.symmetric_blocks([[pa + pa.T], [C, -np.eye(nz)]])
         second = lmi.symmetric_blocks([[Z], [pb, P]])
-    return [lmi.at_least(first, margin), lmi.at_least(second, margin)]
+    own = [] if detectable else some_gain_stabilises(A, dt, Cy, margin=BESIDE_MARGIN)
+    return [lmi.at_least(first, margin), lmi.at_least(second, margin), *own]
 
 
 def region(A: Any, P: Any, where: Any = None, *, Y: Any = None, Cy: Any = None, **options: Any) -> Any:
@@ -352,6 +367,16 @@ def admissible(
         return [lmi.at_least(kept), lmi.at_most(a.T @ P @ a - kept, -margin)]
     moving = P.T @ a if Y is None else P.T @ a - Y @ Cy
     return [P.T @ e == e.T @ P, lmi.at_least(e.T @ P), lmi.at_most(moving + moving.T, -margin)]
+
+
+def some_gain_stabilises(A: Any, dt: float, Cy: Any, *, margin: float = HOMOGENEOUS_MARGIN) -> list[cvxpy.Constraint]:
+    """Return Lyapunov's inequality with a matrix and a gain of its own; free in scale."""
+    n = _shape(A)[0]
+    Q = lmi.symmetric_variable(n)
+    Y = None if Cy is None else lmi.matrix_variable(n, _shape(Cy)[0])
+    moved = _moved(A, Q, Y, Cy)
+    whole = lmi.symmetric_blocks([[Q], [moved, Q]]) if dt > 0.0 else -(moved + moved.T)
+    return [lmi.at_least(Q, margin), lmi.at_least(whole, margin)]
 
 
 def _moved(matrix: Any, P: Any, Y: Any, measured: Any) -> Any:

@@ -136,6 +136,7 @@ def steady_gain(
         Y=Y,
         Cy=-N1A,
         Dy=np.hstack([-N1 @ W, N2 @ V]),
+        detectable=True,
         margin=margin,
     )
     constraints = {"(13) stable": stable, "(13) covariance": covariance}

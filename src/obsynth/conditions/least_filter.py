@@ -88,7 +88,16 @@ def hinf_filter(
     P, Y, Z0 = _variables(data)
     level = cp.Variable(name="gamma_squared")
     positive, bounded = atoms.bounded_real(
-        *_error(data, Z0), P, None, 1.0, Y=Y, Cy=data["C"], Dy=data["D"], gamma_squared=level, margin=margin
+        *_error(data, Z0),
+        P,
+        None,
+        1.0,
+        Y=Y,
+        Cy=data["C"],
+        Dy=data["D"],
+        gamma_squared=level,
+        detectable=True,
+        margin=margin,
     )
     constraints = {"P > 0": positive, "bounded real": bounded}
     return Conditions(
@@ -158,7 +167,9 @@ def h2_filter(
     data, design, held = _problem(plant, options)
     P, Y, Z0 = _variables(data)
     Z = cp.Variable((data["B"].shape[1],) * 2, symmetric=True, name="Z")
-    stable, covariance = atoms.h2(*_error(data, Z0), P, Z, 1.0, Y=Y, Cy=data["C"], Dy=data["D"], margin=margin)
+    stable, covariance = atoms.h2(
+        *_error(data, Z0), P, Z, 1.0, Y=Y, Cy=data["C"], Dy=data["D"], detectable=True, margin=margin
+    )
     constraints = {"stable": stable, "covariance": covariance}
     return Conditions(
         "de Souza, Shaked 1999: least mean square of any causal linear filter",

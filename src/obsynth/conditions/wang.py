@@ -38,8 +38,9 @@ from obsynth.numerics.arguments import arguments_checked, chosen, real_number, r
 from obsynth.numerics.arrays import FloatArray, as_matrix, require_no_overflow
 from obsynth.numerics.central_filter import search_least_gain
 from obsynth.numerics.injection_problem import GainProblem, normalise, null_basis
+from obsynth.numerics.invariant_zeros import is_outside
 from obsynth.numerics.norms import hinf_norm
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.ranks import HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.delays import linear_plant
@@ -88,7 +89,9 @@ def wang2015(
     -------
     Conditions
         Variables ``P``, ``Y``, ``gamma_squared``, and ``W`` where it is free; data ``T, N, Psi, Upsilon, A1, C1, TD``
-        and ``W``; constraints ``"P"`` and ``"(45)"``; gains ``T, N, L, W, Psi, Upsilon, R``.
+        and ``W``; constraints ``"P"`` and ``"(45)"``, and where ``existence`` fails for a mode that neither the outputs
+        nor the estimates show, two by which some gain makes the errors stable, with a Q of their own; gains
+        ``T, N, L, W, Psi, Upsilon, R``.
 
     Raises
     ------
@@ -186,6 +189,10 @@ def wang2015(
     driven = P @ A1 - Y @ C1, P @ TD - Y @ D1
     whole = _matrix_45(P, gamma_squared / unit**2, driven, Z, Zd, free=free)
     constraints = {"P": lmi.at_least(P, margin), "(45)": lmi.at_most(whole, -margin)}
+    if not all(condition.holds for condition in held) and _hides_a_mode(A1, np.vstack([C1, W0 @ C @ X])):
+        # A P that is nothing in a mode that no gain moves would be within the tolerance of any solver.
+        own, stable = atoms.some_gain_stabilises(A1, 1.0, C1)
+        constraints |= {"Q": own, "some gain is stable": stable}
 
     def gains(values: Values) -> dict[str, FloatArray]:
         R = R0 + X @ np.linalg.solve(values["P"], values["Y"]) @ rest  # (63)
@@ -206,6 +213,13 @@ def wang2015(
         design_of("wang2015", plant, convex),
         weight=Wx if free else None,
     )
+
+
+def _hides_a_mode(A: FloatArray, seen: FloatArray) -> bool:
+    """Return whether a mode on or outside the unit circle has no part in what is seen."""
+    poles = [pole for pole in np.linalg.eigvals(A) if is_outside(complex(pole), 1.0)]
+    pencils = (np.vstack([A - pole * np.eye(len(A)), seen]) for pole in poles)
+    return any(not decide_rank(pencil, expected=len(A), tolerance=HIDDEN_MODE_TOLERANCE).full for pencil in pencils)
 
 
 def _matrix_45(P: Any, level: Any, driven: tuple[Any, Any], Z: Any, Zd: Any, *, free: bool) -> Any:
@@ -321,6 +335,7 @@ def h2_terms(
         Y=found.variables["Y"],
         Cy=data["C1"],
         Dy=data["rest"] @ free,
+        detectable=True,
     )
     return stable, variance, Z
 
