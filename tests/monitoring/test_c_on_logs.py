@@ -202,7 +202,7 @@ def shipped(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     widths, runs, sources = {}, [], []
     for name, design in designs.items():
         continuous = design.observer.dt == 0.0
-        monitor = obsynth.online_monitor(design, "learned", normal=told(design))
+        monitor = obsynth.online_monitor(design, "learned", normal=told(design), sensor_faults=False)
         stem = c_identifier(name)
         sources += obsynth.export(
             design, folder / f"{stem}.c", sample_time=SAMPLE_TIME if continuous else None, monitor=monitor
@@ -248,7 +248,7 @@ def test_an_fmu_holds_the_c_that_is_tested_here(shipped: SimpleNamespace, monkey
     monkeypatch.setattr(archive, "_binary", lambda *_: None)
     for name, design in shipped.designs.items():
         stem, rate = c_identifier(name), {"sample_time": SAMPLE_TIME} if design.observer.dt == 0.0 else {}
-        monitor = obsynth.online_monitor(design, "learned", normal=told(design))
+        monitor = obsynth.online_monitor(design, "learned", normal=told(design), sensor_faults=False)
         (unit,) = obsynth.export(design, shipped.folder / f"{stem}.fmu", monitor=monitor, **rate)
         with zipfile.ZipFile(unit) as packed:
             inside = packed.read("sources/observer.c").decode()
@@ -290,7 +290,9 @@ def test_c_finds_changes_of_faults_as_a_run_does(shipped: SimpleNamespace) -> No
     statistics = replace(alone.statistics, estimates=())
     alone = replace(alone, statistics=statistics, levels=alone.levels[: len(statistics.names)])
     with_changes, without = (
-        obsynth.run_on_data(design, log_of(design), monitor=obsynth.online_monitor(design, "learned", normal=one)).table
+        obsynth.run_on_data(
+            design, log_of(design), monitor=obsynth.online_monitor(design, "learned", normal=one, sensor_faults=False)
+        ).table
         for one in (told(design), alone)
     )
     assert (with_changes.statistic > 1.5 * without.statistic).sum() >= 50
@@ -301,7 +303,7 @@ def test_c_finds_changes_of_faults_as_a_run_does(shipped: SimpleNamespace) -> No
 @pytest.mark.long
 def test_floats_find_changes_of_faults_too(shipped: SimpleNamespace, tmp_path: Path) -> None:
     design = shipped.designs[WALKING]
-    monitor = obsynth.online_monitor(design, "learned", normal=told(design))
+    monitor = obsynth.online_monitor(design, "learned", normal=told(design), sensor_faults=False)
     sources = obsynth.export(design, tmp_path / "walking.c", monitor=monitor, precision="float", unverified=True)
     text, width = harness(design, "walking")
     (tmp_path / "run.c").write_text('#include "walking.h"\n' + text.replace("double", "float"))
@@ -373,7 +375,7 @@ def same_as_c(
     """C says at each row of its clock what a run says at that row of a log."""
     design = shipped.designs[name]
     dt = design.observer.dt or SAMPLE_TIME
-    monitor = obsynth.online_monitor(design, "learned", normal=told(design), unverified=True)
+    monitor = obsynth.online_monitor(design, "learned", normal=told(design), sensor_faults=False, unverified=True)
     nonlinear = isinstance(design.observer, DAEObserver)
     names = [f"fhat[{f}]" for f in design.observer.fault_names]
     names += [f"r[{r}]" for r in (design.plant.output_names if nonlinear else design.observer.residual_names)]
@@ -419,7 +421,7 @@ def test_floats_keep_the_bound_that_their_header_states(shipped: SimpleNamespace
     found = {}
     for precision, kind in (("double", ctypes.c_double), ("float", ctypes.c_float)):
         stem = f"wang_{precision}"
-        monitor = obsynth.online_monitor(design, "learned", normal=told(design))
+        monitor = obsynth.online_monitor(design, "learned", normal=told(design), sensor_faults=False)
         source, header = obsynth.export(design, tmp_path / f"{stem}.c", precision=precision, monitor=monitor)
         nu, ny = len(design.observer.input_names), len(design.observer.output_names)
         rows = len(design.observer.row_names)

@@ -52,7 +52,9 @@ class LearnedMonitorInC:
         return (
             MonitorVariable(STATISTIC, f"largest statistic in units of its level: {self.statement}", "statistic"),
             MonitorVariable(
-                "isolated", f"number of the fault that an alarm points to, 0 for none ({listed})", "fault + 1.0"
+                "isolated",
+                f"number of the fault of the plant that an alarm points to, 0 for none ({listed})",
+                "fault + 1.0",
             ),
             MonitorVariable("event", held, "event"),
         )

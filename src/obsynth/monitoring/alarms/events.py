@@ -12,7 +12,9 @@ from typing import Any
 
 from obsynth.monitoring.logs.clock import OUT_OF_ORDER, REPEATED_STAMP
 from obsynth.monitoring.logs.log_observer import GAP, OUT, PARTIAL, RECOVERING, WARM_UP
+from obsynth.monitoring.thresholds.alarm_ranking import NONE_OF_THESE, Ranking
 from obsynth.monitoring.thresholds.learned_levels import HOLD
+from obsynth.monitoring.thresholds.learned_statistics import AGES
 from obsynth.observers.estimates import BAND_WIDTH
 
 #: What stands for the status of rows that are well, but in which the monitor decides nothing.
@@ -29,6 +31,15 @@ NOT_VALID = (
     "Not valid: the alarm contradicts the noise and random walks that the interval assumes, so that the fault may lie "
     "outside."
 )
+
+#: Rows in alarm without a fault that fits after which an alarm is shelved: the oldest change that is looked for.
+SHELVED_AFTER = max(AGES)
+
+#: What is said of one.
+SHELVED = "shelved: unexplained offset since {}"
+
+#: Shares of hypotheses below this are not listed.
+LEAST_SHARE = 0.01
 
 #: How a run begins to say that nothing alarmed.
 NO_ALARM = "No alarm"
@@ -73,6 +84,15 @@ class AlarmEvent:
         Largest share of the threshold that was reached.
     distinguished : bool
         Whether the evidence distinguishes the faults; no fault is named otherwise.
+    shares : tuple of (str, float)
+        What the alarm may be by posterior shares, the likeliest first: faults of the plant, ``sensor NAME``, and
+        ``none of these faults``; empty where these are not ranked.
+    ties : tuple of str
+        Which of these are as likely as the one that is named.
+    drifts : bool
+        Whether what is named drifts rather than jumped.
+    shelved : float, seconds
+        Since when there has been an offset that no fault explains, where it has stood for 200 rows; else NaN.
     """
 
     by: str
@@ -87,11 +107,16 @@ class AlarmEvent:
     high: float
     evidence: float
     distinguished: bool = True
+    shares: tuple[tuple[str, float], ...] = ()
+    ties: tuple[str, ...] = ()
+    drifts: bool = False
+    shelved: float = math.nan
 
     @property
     def clear(self) -> bool:
-        """Whether the fault's interval, where one is known, excludes zero: else another fault may be meant."""
-        return bool(self.fault) and not self.low < 0.0 < self.high
+        """Whether a fault is named alone, and its interval, where one is known, excludes zero: else another fault may
+        be meant."""
+        return bool(self.fault) and not self.ties and self.fault != NONE_OF_THESE and not self.low < 0.0 < self.high
 
     @property
     def valid(self) -> bool:
@@ -100,7 +125,8 @@ class AlarmEvent:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the event as plain data."""
-        return {**asdict(self), "interval_valid": self.valid}
+        shares = {name: share for name, share in self.shares if share >= LEAST_SHARE}
+        return {**asdict(self), "shares": shares, "ties": list(self.ties), "interval_valid": self.valid}
 
 
 class AlarmLog:
@@ -111,6 +137,7 @@ class AlarmLog:
         self._open, self._closed = dict[str, AlarmEvent](), list[AlarmEvent]()
         self._named_by = dict[str, float]()  # the evidence at which the fault of an open event was named
         self._place, self._places_of = 0, dict[str, int]()  # of this row, and of the last row of an open event
+        self._unexplained = dict[str, tuple[int, float]]()  # place and time since when no fault explains an open event
         self.silent = Counter[str]()
 
     def advance(self, missing: int) -> None:
@@ -127,21 +154,27 @@ class AlarmLog:
         cells: Sequence[float],
         *,
         distinguished: bool = True,
+        ranking: Ranking | None = None,
     ) -> None:
         """Take a row above a threshold; ``cells`` are the numbers of its output; ``distinguished``: whether a
-        fault would be named if there was one."""
+        fault would be named if there was one; ``ranking``: what it may be."""
         before = self._open.get(by)
         if before is not None and self._place - self._places_of[by] > HOLD:
             self._closed.append(self._open.pop(by))
             before = None
         if before is None:
             self._named_by[by] = -math.inf
+            self._unexplained.pop(by, None)
         self._places_of[by] = self._place
         largest = before is None or evidence > before.evidence or math.isnan(before.evidence)
         known = (math.nan,) * 3 if before is None else (before.size, before.low, before.high)
         named = "" if before is None else before.fault
         tells = before is None or (distinguished and not evidence <= self._named_by[by])
-        size, low, high = self._size(fault, cells) if tells else known
+        shelved = self._shelved(by, fault, time)
+        # What explains an alarm that was shelved is told, whatever it was called at larger evidence.
+        if before is not None and not math.isnan(before.shelved) and math.isnan(shelved):
+            tells = True
+        size, low, high = self._size(fault, cells, ranking) if tells else known
         if tells:
             named = fault
             self._named_by[by] = evidence if distinguished else -math.inf
@@ -158,13 +191,37 @@ class AlarmLog:
             high=high,
             evidence=evidence if largest or before is None else before.evidence,
             distinguished=distinguished or (before is not None and before.distinguished),
+            shelved=shelved,
+            **self._ranked(before, ranking, tells=tells),
         )
 
-    def _size(self, fault: str, cells: Sequence[float]) -> tuple[float, float, float]:
+    @staticmethod
+    def _ranked(before: AlarmEvent | None, ranking: Ranking | None, *, tells: bool) -> dict[str, Any]:
+        """Return what an alarm may be, as ranked at the evidence at which it is named."""
+        if tells:
+            return {} if ranking is None else {"shares": ranking.shares, "ties": ranking.ties, "drifts": ranking.drifts}
+        return {} if before is None else {"shares": before.shares, "ties": before.ties, "drifts": before.drifts}
+
+    def _shelved(self, by: str, fault: str, time: float) -> float:
+        """Return since when an open alarm has been unexplained, where that is long enough; else NaN."""
+        if fault != NONE_OF_THESE:
+            self._unexplained.pop(by, None)
+            return math.nan
+        place, since = self._unexplained.setdefault(by, (self._place, time))
+        return since if self._place - place >= SHELVED_AFTER else math.nan
+
+    def shelved_since(self, by: str) -> float:
+        """Return since when an alarm by a monitor has been shelved; NaN where it is not."""
+        return self._open[by].shelved if by in self._open else math.nan
+
+    def _size(self, fault: str, cells: Sequence[float], ranking: Ranking | None = None) -> tuple[float, float, float]:
         def cell(name: str) -> float:
             place = self._places.get(name)
             return math.nan if place is None else float(cells[place])
 
+        if ranking is not None and ranking.is_sensor and fault == ranking.named:
+            reach = BAND_WIDTH * ranking.deviation
+            return ranking.size, ranking.size - reach, ranking.size + reach
         size, deviation = cell(f"fhat[{fault}]"), cell(f"sd fhat[{fault}]")
         low, high = cell(f"lowest {fault}"), cell(f"highest {fault}")
         if math.isnan(low) and math.isfinite(deviation):
@@ -189,11 +246,25 @@ def alarm_rows(events: Sequence[AlarmEvent], shown: Callable[[float], str]) -> t
         interval = "" if math.isnan(event.low) else f"{number(event.low)} to {number(event.high)}"
         interval += " (not valid)" if interval and not event.valid else ""
         ends = shown(event.start), shown(event.end)
-        fault = event.fault if event.clear or not event.fault else f"{event.fault} (unclear)"
-        fault = fault if event.distinguished else NOT_DISTINGUISHED_YET
+        fault = fault_text(event, shown)
         rows.append((event.by, *ends, str(event.rows), fault, number(event.size), interval, f"{event.evidence:.3g}"))
     kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows[1:])]
     return [tuple(row[i] for i in kept) for row in rows], len(events) - len(rows) + 1
+
+
+def fault_text(event: AlarmEvent, shown: Callable[[float], str]) -> str:
+    """Return what an alarm is said to be: with all that is as likely, whether it drifts, and since when it is
+    shelved."""
+    if not math.isnan(event.shelved):
+        return f"{event.fault} ({SHELVED.format(shown(event.shelved))})"
+    if not event.distinguished:
+        return NOT_DISTINGUISHED_YET
+    if not event.fault:
+        return ""
+    named = " or ".join([event.fault, *event.ties])
+    notes = [*(["drifts"] if event.drifts else []), *([] if event.clear or event.ties else ["unclear"])]
+    notes = [] if event.fault == NONE_OF_THESE else notes
+    return f"{named} ({', '.join(notes)})" if notes else named
 
 
 def rows_in_alarm(events: Sequence[AlarmEvent]) -> dict[str, int]:

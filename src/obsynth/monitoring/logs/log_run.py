@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.monitoring.alarms.events import NO_DECISION, AlarmEvent, AlarmLog
+from obsynth.monitoring.alarms.events import NO_DECISION, SHELVED, AlarmEvent, AlarmLog
 from obsynth.monitoring.logs.clock import STALE, Clock, StampError
 from obsynth.monitoring.logs.log_observer import DECIDING, GAP, RECOVERING, Row
 from obsynth.monitoring.logs.observer_of_design import log_observer
@@ -393,11 +393,16 @@ class LogRun:
             if seen.alarm:
                 evidence = seen.statistic / seen.threshold if seen.threshold else math.inf
                 kind, known = self.monitor.kind, bool(seen.fault) or not self.monitor.fault_names
-                self.events.take(kind, seen.fault, evidence, time, number, [*before, *cells], distinguished=known)
+                self.events.take(
+                    kind, seen.fault, evidence, time, number, [*before, *cells], distinguished=known,
+                    ranking=seen.ranking,
+                )  # fmt: skip
                 self.alarms.setdefault(self.monitor.kind, time)
                 self.isolated = self.isolated or seen.fault
                 self.alarm_rows.setdefault(self.monitor.kind, number)
-                names.append(f"{self.monitor.kind}: {seen.fault}" if seen.fault else self.monitor.kind)
+                since = self.events.shelved_since(kind)
+                told = seen.fault if math.isnan(since) else SHELVED.format(self._shown_time(since))
+                names.append(f"{kind}: {told}" if told else kind)
         for name, evidence in self._stuck(row):
             self.events.take(name, "", evidence, time, number, [*before, *cells])
             self.alarms.setdefault(name, time)
@@ -409,6 +414,9 @@ class LogRun:
         if undecided:
             self.events.silent[row.status if row.status not in DECIDING else NO_DECISION] += 1
         return [*cells, "; ".join(names)]
+
+    def _shown_time(self, time: float) -> str:
+        return f"{time:.15g}" if self.stamps is None else self.stamps.shown(time)
 
     def _stuck(self, row: Row) -> list[tuple[str, float]]:
         """Return the alarms of sensors that have been stuck for long, with the share of their threshold."""

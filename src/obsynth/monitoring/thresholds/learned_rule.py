@@ -7,8 +7,11 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
+from obsynth.monitoring.thresholds.fault_effects import NO_EFFECTS, EffectState, FaultEffects, effects_of
+from obsynth.monitoring.thresholds.hypotheses import ranked
 from obsynth.monitoring.thresholds.learned import LearnedThresholds
 from obsynth.monitoring.thresholds.learned_statistics import AGES, FORGETTING
 from obsynth.monitoring.thresholds.monitor import Evidence, Monitor, Rule, RuleOutput, Sample
@@ -44,6 +47,7 @@ class LearnedState(NamedTuple):
     waiting: int = 0  # rows until the effect of the last one in which something was missing has settled
     before: FloatArray = NOTHING  # ``(1 + nf, nf)``: estimates and covariance of the faults after the last sample
     scores: FloatArray = NOTHING  # ``(ages, 2 nf)``: what samples said of faults, scores and information, latest last
+    effects: EffectState = NO_EFFECTS  # of faults and sensors on the residuals
 
 
 class LearnedRule(Rule):
@@ -65,8 +69,9 @@ class LearnedRule(Rule):
         *,
         by_sensor: bool = False,
         walk: FloatArray | None = None,
+        effects: FaultEffects | None = None,
     ) -> None:
-        self.learned, self.by_sensor = learned, by_sensor
+        self.learned, self.by_sensor, self.effects = learned, by_sensor, effects
         self._walk = walk if learned.statistics.estimates else None
         self._residual = np.array([not name.startswith("fhat[") for name in learned.columns])
         self._faults = {f"fault {name}": i for i, name in enumerate(faults)}
@@ -75,8 +80,8 @@ class LearnedRule(Rule):
         templates = learned.statistics.templates()
         self._templates = templates.reshape(len(templates) * len(AGES), -1)
         self._model = learned.statistics.model
-        effects = learned.statistics.offset_effects() / np.sqrt(learned.statistics.levels_by_age)
-        self._effects = effects.ravel()
+        offsets = learned.statistics.offset_effects() / np.sqrt(learned.statistics.levels_by_age)
+        self._effects = offsets.ravel()
         bands = learned.statistics.fault_bands
         self._bands = np.zeros(len(learned.centres)) if bands is None else bands
 
@@ -84,7 +89,8 @@ class LearnedRule(Rule):
         """Return the state before the first sample."""
         model = self._model
         white, means = np.zeros((max(AGES), model.channels)), np.zeros((len(FORGETTING), model.channels))
-        found = LearnedState(np.tile(model.mean, (model.order, 1)), white, means)
+        effects = NO_EFFECTS if self.effects is None else self.effects.init()
+        found = LearnedState(np.tile(model.mean, (model.order, 1)), white, means, effects=effects)
         if self._walk is None:
             return found
         return found._replace(before=before_any(len(self._walk)), scores=np.zeros((max(AGES), 2 * len(self._walk))))
@@ -107,10 +113,10 @@ class LearnedRule(Rule):
             state = state._replace(waiting=self._model.order + 1)
         state = state._replace(waiting=max(state.waiting - 1, 0))
         if found is None or not (whole or (varying and (counts or np.isfinite(found[self._places]).all()))):
-            return self._added(state, None), RuleOutput(math.nan, math.nan)
+            return self._followed(self._added(state, None), sample.said), RuleOutput(math.nan, math.nan)
         seen = found[self._places]
         kept = seen if shown is None else np.where(np.isfinite(seen), seen, shown)
-        state = self._added(state, kept, most, shown)
+        state = self._followed(self._added(state, kept, most, shown), sample.said, np.isfinite(seen), counts=counts)
         if not counts:
             return state, RuleOutput(math.nan, math.nan)
         # Products of numbers that overflow have passed any level.
@@ -125,7 +131,19 @@ class LearnedRule(Rule):
             values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares]) / self.learned.levels
         values = np.where(np.isnan(values), np.inf, values)
         which = self._fault(found, ratios) if self._walk is None else most_likely_change(changes)
-        return state, RuleOutput(float(values.max()), 1.0, which)
+        ranking = None
+        if self.effects is not None and values.max() > 1.0:
+            effects, explained = self.effects.explained(state.effects)
+            state, ranking = state._replace(effects=effects), ranked(self.effects.hypotheses, explained)
+        return state, RuleOutput(float(values.max()), 1.0, which, (), ranking)
+
+    def _followed(
+        self, state: LearnedState, said: Any, seen: NDArray[np.bool_] | None = None, *, counts: bool = False
+    ) -> LearnedState:
+        """Return the state with the effects of faults and sensors on a row, of which so much was ``seen (m,)``."""
+        if self.effects is None:
+            return state
+        return state._replace(effects=self.effects.step(state.effects, said, state.white[-1], seen, counts=counts))
 
     def _scored(self, state: LearnedState, said: Any, missing: int) -> LearnedState:
         """Return the state with what a sample says of the faults."""
@@ -203,12 +221,13 @@ class LearnedRule(Rule):
         return state
 
     def options(self) -> Any:
-        """Return the digest of what was learned."""
-        return digest_of(plain(self.learned.as_dict()))
+        """Return the digest of what was learned, and whether sensors are ranked."""
+        return [digest_of(plain(self.learned.as_dict())), self.effects is not None]
 
 
-def learned_monitor(design: ObserverDesign, learned: LearnedThresholds) -> Monitor:
-    """Return the monitor of thresholds that were learned with a design; raise `SpecError` for another design."""
+def learned_monitor(design: ObserverDesign, learned: LearnedThresholds, *, sensor_faults: bool = True) -> Monitor:
+    """Return the monitor of thresholds that were learned with a design; raise `SpecError` for another design. Without
+    ``sensor_faults`` an alarm is one of the faults of the design."""
     if learned.gains != gain_set_digest(design):
         raise SpecError("The thresholds were learned with another gain set: learn them again.", path="normal")
     observer, names = design.observer, watched_names(design)
@@ -235,6 +254,7 @@ def learned_monitor(design: ObserverDesign, learned: LearnedThresholds) -> Monit
             observer.fault_names,
             by_sensor=has_innovations_by_sensor(observer),
             walk=parameter_walk(observer),
+            effects=effects_of(design, learned) if sensor_faults else None,
         ),
         residuals=residuals,
         fault_names=observer.fault_names,

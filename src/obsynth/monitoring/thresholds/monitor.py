@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
+from obsynth.monitoring.thresholds.alarm_ranking import Ranking
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.detection import Detection
@@ -119,6 +120,7 @@ class RuleOutput(NamedTuple):
     threshold: float
     fault: int | None = None
     cells: tuple[float, ...] = ()
+    ranking: Ranking | None = None  # of what an alarm may be, sensors among it, where that is known
 
 
 class MonitorOutput(NamedTuple):
@@ -129,6 +131,7 @@ class MonitorOutput(NamedTuple):
     alarm: bool
     fault: str
     more: tuple[float, ...] = ()
+    ranking: Ranking | None = None  # of what an alarm may be, where that is known
 
 
 class MonitorState(NamedTuple):
@@ -284,7 +287,7 @@ class Monitor:
         bridged = self.rule.bridges and sample.bridged
         if not bridged and (sample.skipped or (state.decided and not sample.deciding)):
             inner = self.rule.restart(inner, sample.skipped)
-        inner, (statistic, threshold, which, more) = self.rule.step(inner, sample)
+        inner, (statistic, threshold, which, more, ranking) = self.rule.step(inner, sample)
         after = MonitorState(sample.deciding, inner)
         # A statistic that has overflowed has passed any threshold.
         if math.isnan(statistic) or not math.isfinite(threshold):
@@ -293,7 +296,8 @@ class Monitor:
             return after, MonitorOutput(statistic, threshold, False, "", more)
         if which is None and self.fault_names and np.isfinite(sample.faults).all():
             which = int(np.argmax(np.abs(sample.faults) / self.fault_scales))
-        return after, MonitorOutput(statistic, threshold, True, self._named(which), more)
+        fault = self._named(which) if ranking is None else ranking.called(self.fault_names)
+        return after, MonitorOutput(statistic, threshold, True, fault, more, ranking)
 
     def _named(self, which: int | None) -> str:
         """Return the fault of a number, or the group of faults one of which is there for certain."""

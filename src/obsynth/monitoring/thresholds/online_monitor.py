@@ -78,6 +78,7 @@ def online_monitor(
     normal: Any = None,
     unverified: bool = False,
     disturbance: Literal["any", "held"] = "any",
+    sensor_faults: bool = True,
 ) -> Monitor:
     """Return a monitor for measured data, for `run_on_data`: its threshold holds however long the data are.
 
@@ -129,6 +130,10 @@ def online_monitor(
         ``pointwise`` and ``window``: what disturbances do between the samples of a plant that was sampled from a
         continuous one: anything within their bounds, or nothing, which the statement then repeats.  Of a plant in
         discrete time they are held; for guaranteed tests an option of their design.
+    sensor_faults : bool, optional
+        ``learned``: whether an alarm may be a fault of any measured output (``sensor NAME``), or none of these faults,
+        beside those of the design: all are ranked by posterior shares, of linear designs and of the nonlinear form
+        ``augmented-kalman``.  Other designs, and exported code, name the faults of the design alone.
 
     Returns
     -------
@@ -163,11 +168,12 @@ def online_monitor(
         "scenario": scenario, "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound,
         "initial_error": initial_error, "gamma": gamma, "window": window, "false_alarms": false_alarms,
         "change": change, "sample_time": sample_time, "constants": constants, "initial_set": initial_set,
-        "normal": normal, "disturbance": None if chosen(disturbance, "disturbance", DISTURBANCES) == "any" else "held",
+        "normal": normal, "sensor_faults": None if sensor_faults else False,
+        "disturbance": None if chosen(disturbance, "disturbance", DISTURBANCES) == "any" else "held",
     }  # fmt: skip
     window, false_alarms, change = checked_options(PARAMETER_OPTIONS if recursive else LINEAR_OPTIONS, kind, given)
     if kind == "learned":
-        return _learned(design, normal)
+        return _learned(design, normal, sensor_faults=sensor_faults)
     if isinstance(design.observer, (RecursiveObserver, DAEObserver)):
         return parameter_monitor(design.observer, kind, nominal or {}, change, false_alarms)
     require_no_region(design, kind)
@@ -221,7 +227,7 @@ def online_monitor(
     return made(statement_of(kind, model, assumed, estimates=estimates, **numbers) + ending + NO_TOLERANCE, rule)
 
 
-def _learned(design: ObserverDesign, normal: Any) -> Monitor:
+def _learned(design: ObserverDesign, normal: Any, *, sensor_faults: bool) -> Monitor:
     """Return the monitor of thresholds that were learned, or are to be."""
     if normal is None:
         raise SpecError(
@@ -232,7 +238,7 @@ def _learned(design: ObserverDesign, normal: Any) -> Monitor:
         normal = load_thresholds(normal)
     if not isinstance(normal, LearnedThresholds):
         normal = learn_thresholds(design, normal)
-    return learned_monitor(design, normal)
+    return learned_monitor(design, normal, sensor_faults=sensor_faults)
 
 
 def _require_linear_kind(kind: str, nominal: Mapping[str, float] | None) -> None:

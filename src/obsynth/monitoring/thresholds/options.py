@@ -23,7 +23,7 @@ LINEAR_OPTIONS: Mapping[str, tuple[str, ...]] = {
     "paper": ("disturbance_bounds", "initial_error", "gamma", "scenario", "sample_time"),
     "chi-square": _STATISTICAL,
     "cusum": (*_STATISTICAL, "change"),
-    "learned": ("normal",),
+    "learned": ("normal", "sensor_faults"),
 }
 
 #: The same of designs that estimate parameters.
@@ -31,7 +31,7 @@ PARAMETER_OPTIONS: Mapping[str, tuple[str, ...]] = {
     "chi-square": ("nominal", "false_alarms"),
     "cusum": ("nominal", "false_alarms", "change"),
     "nis": ("nominal", "false_alarms"),
-    "learned": ("normal",),
+    "learned": ("normal", "sensor_faults"),
 }
 
 #: Samples that are looked back; probability of a false alarm in a whole run; the change that sums are tuned for.

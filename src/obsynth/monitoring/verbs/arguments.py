@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from obsynth.monitoring.thresholds.options import DISTURBANCES, FALSE_ALARMS, LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW
-from obsynth.report.terminal.arguments import OPTION_NAMES, Group, Settings, numbers_of, option, ranges_of
+from obsynth.report.terminal.arguments import OPTION_NAMES, Group, Settings, flag, numbers_of, option, ranges_of
 from obsynth.report.terminal.common_options import (
     _SCALE,
     INPUT_DELAY,
@@ -86,6 +86,7 @@ DATA_OPTIONS = (
                 "FILE",
                 "monitor 'learned': what obsynth thresholds wrote (.json), or a log without faults",
             ),
+            flag("--no-sensor-faults", "monitor 'learned': an alarm is one of the design's faults, and no sensor's"),
             _SCALE,
             option(
                 "--threshold",
@@ -118,4 +119,5 @@ def stated_settings(options: argparse.Namespace) -> dict[str, Any]:
         "nominal": numbers_of(getattr(options, "nominal", [])),
         "disturbance": "held" if options.disturbance_course == "held" else None,
         "normal": getattr(options, "normal", None),
+        "sensor_faults": False if getattr(options, "no_sensor_faults", False) else None,
     }

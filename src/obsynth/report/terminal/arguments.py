@@ -22,7 +22,10 @@ STREAM = "-"
 
 
 #: Arguments of the command line that are not called as the options that they give.
-OPTION_NAMES = {"disturbance_bounds": "disturbance", "initial_set": "initial", "disturbance": "disturbance_course"}
+OPTION_NAMES = {
+    "disturbance_bounds": "disturbance", "initial_set": "initial", "disturbance": "disturbance_course",
+    "sensor_faults": "no_sensor_faults",
+}  # fmt: skip
 
 
 class Argument(NamedTuple):

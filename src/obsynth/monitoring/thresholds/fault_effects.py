@@ -1,0 +1,334 @@
+"""Effects of faults and of sensors' offsets on whitened residuals, and what each explains of the latest rows.
+
+An extended Kalman filter of states and parameters follows what changes. For a change that begins at row k0, the error d
+of its estimates and the effect g on the innovations obey, with the filter's own steps and gains,
+
+.. math::
+    d^-_k = A_k d_{k-1}, \\qquad g_k = H_k d^-_k + s_k, \\qquad d_k = d^-_k - K_k g_k
+
+where a fault that jumps begins with ``d = e_j`` and a sensor's offset is s (Willsky & Jones 1976). The residuals are
+whitened by what was learned of them, and their effects likewise. Linear observers have one response for every begin.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from obsynth.methods.registry import error_model
+from obsynth.monitoring.thresholds.hypotheses import Explanation, Hypothesis, hypotheses_of
+from obsynth.monitoring.thresholds.learned import LearnedThresholds
+from obsynth.monitoring.thresholds.learned_from_rows import expects_fault_courses
+from obsynth.monitoring.thresholds.learned_levels import HOLD
+from obsynth.monitoring.thresholds.parameter_scores import parameter_walk
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.autoregression import Autoregression
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.nonlinear.estimates import DAERow
+from obsynth.observers.nonlinear.observer import DAEObserver
+from obsynth.results.design import ObserverDesign
+
+#: A begin is followed for so many rows, twice as many for each factor of two in its row, and at most for the last
+#: number: all of the latest rows, and ever fewer of those before.
+FOLLOWED, MOST_DOUBLINGS = 8, 5
+
+#: Begins that are followed at once, without those of an alarm: four for each factor of two, and some more.
+BEGINS = 4 * (MOST_DOUBLINGS + 1) + 12
+
+#: The likeliest begins of so many hypotheses are followed as long as an alarm lasts.
+HELD = 12
+
+#: Rows after a begin that count: what is further away says more of the model than of the change.
+COUNTED = FOLLOWED * 2**MOST_DOUBLINGS
+
+#: Rows of an alarm in which its likeliest begins are looked for; after that they stay, as long as it lasts.
+LOOKED_FOR = 20
+
+#: Numbers that are followed in each row at most, a hundredth of a second: of larger designs nothing is ranked.
+MOST_NUMBERS = 2_000_000
+
+
+class EffectState(NamedTuple):
+    """The state of `FaultEffects`: of each begin that is followed (``b`` of them)."""
+
+    begun: (
+        FloatArray  # begun, until: ``(b,)``: its row, NaN where there is none, and the one up to which it is followed
+    )
+    until: FloatArray
+    error: FloatArray  # ``(b, n, h)``: what each hypothesis does to the error of the estimates
+    past: FloatArray  # ``(b, order, m, h)``: to the residuals of the rows before, latest first
+    score: FloatArray  # score, information: ``(b, h)``
+    information: FloatArray
+    sums: FloatArray  # ``(b, m)``: of white rows
+    counts: FloatArray  # ``(b,)``: how many these are
+    held: FloatArray  # ``(b,)``: one for begins of an alarm, which are followed as long as it lasts
+    row: float = 0.0  # of the last sample
+    alarmed: float = 0.0  # alarmed, quiet: rows of an alarm, and rows since the last one of it
+    quiet: float = 0.0
+
+
+_NOTHING = read_only(np.zeros(0))
+
+#: The state where effects are not followed.
+NO_EFFECTS = EffectState(
+    _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING
+)  # fmt: skip
+
+
+class FaultEffects(ABC):
+    """Effects of hypotheses on whitened residuals, row by row, and what they explain."""
+
+    def __init__(self, faults: Sequence[str], outputs: Sequence[str], learned: LearnedThresholds) -> None:
+        self.hypotheses: tuple[Hypothesis, ...] = hypotheses_of(faults, outputs)
+        self.model = learned.statistics.model
+
+    @property
+    @abstractmethod
+    def sizes(self) -> tuple[int, int]:
+        """How many errors are followed, and how many rows of residuals of the past."""
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers are followed in each row."""
+        each = self.model.channels + self.sizes[0] + self.sizes[1] * self.model.channels
+        return (BEGINS + HELD) * len(self.hypotheses) * each
+
+    def init(self) -> EffectState:
+        """Return the state before the first sample."""
+        (n, order), h, m, b = self.sizes, len(self.hypotheses), self.model.channels, BEGINS + HELD
+        return EffectState(
+            np.full(b, np.nan), np.zeros(b), np.zeros((b, n, h)), np.zeros((b, order, m, h)), np.zeros((b, h)),
+            np.zeros((b, h)), np.zeros((b, m)), np.zeros(b), np.zeros(b),
+        )  # fmt: skip
+
+    def step(
+        self, state: EffectState, said: Any, white: FloatArray, seen: NDArray[np.bool_] | None, *, counts: bool
+    ) -> EffectState:
+        """Return the state after a sample of which the observer ``said`` something: its residuals are ``white (m,)``,
+        of which those that were ``seen (m,)`` are measured, or none (`None`)."""
+        if isinstance(said, DAERow) and said.k == 0:
+            return self.init()
+        state = self._with_begin(state)
+        followed = np.isfinite(state.begun)
+        rows = np.where(followed, state.row - state.begun + 1.0, 0.0)
+        with np.errstate(all="ignore"):
+            error, past, added = self._moved(state, said, rows, seen)
+            error = error * followed[:, None, None]
+            score, information, sums, count = state.score, state.information, state.sums, state.counts
+            if counts and seen is not None:
+                told = followed & (rows <= COUNTED)
+                added = added * told[:, None, None]
+                score = score + np.einsum("bmh,m->bh", added, white)
+                information = information + np.einsum("bmh,bmh->bh", added, added)
+                sums, count = sums + told[:, None] * white, count + told
+        found = state._replace(error=error, past=past, score=score, information=information, sums=sums, counts=count)
+        return found if all(np.isfinite(part).all() for part in found[2:8]) else self.init()
+
+    @abstractmethod
+    def _moved(
+        self, state: EffectState, said: Any, rows: FloatArray, seen: NDArray[np.bool_] | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return ``error`` and ``past`` after a sample, which is one of so many ``rows (b,)`` from each begin, and the
+        effects on its white residuals ``(b, m, h)``."""
+
+    @abstractmethod
+    def _at_begin(self, error: FloatArray) -> None:
+        """Write the errors ``(n, h)`` with which hypotheses begin."""
+
+    def _with_begin(self, state: EffectState) -> EffectState:
+        """Return the state with one more begin, in the place of one that is followed no longer."""
+        row, quiet = state.row + 1.0, state.quiet + 1.0
+        begun = np.where((row < state.until) | (state.held > 0.0), state.begun, np.nan)
+        place, until = int(np.isnan(begun).argmax()), state.until.copy()
+        error, past, score, information, sums, counts, held = map(np.array, state[2:9])
+        for part in (error, past, score, information, sums, counts, held):
+            part[place] = 0.0
+        self._at_begin(error[place])
+        if quiet > HOLD:
+            held[:] = 0.0
+        begun[place], until[place] = row, row + FOLLOWED * 2.0 ** _doublings(int(row))
+        alarmed = state.alarmed if quiet <= HOLD else 0.0
+        return EffectState(begun, until, error, past, score, information, sums, counts, held, row, alarmed, quiet)
+
+    def explained(self, state: EffectState) -> tuple[EffectState, Explanation]:
+        """Return what the hypotheses explain of the rows up to one in alarm, and the state that keeps their begins."""
+        parts, known = (state.score, state.information, state.sums, state.counts), state.held > 0.0
+        if state.alarmed >= LOOKED_FOR and known.any():
+            return state._replace(quiet=0.0), _explanation(*(part[known] for part in parts))[0]
+        found, best = _explanation(*parts)
+        held = np.zeros_like(state.held)
+        held[best[np.argsort(-found.ratios)[:HELD]]] = 1.0
+        return state._replace(held=held, alarmed=state.alarmed + 1.0, quiet=0.0), found
+
+
+class FilterEffects(FaultEffects):
+    """Effects on an extended Kalman filter of states and parameters."""
+
+    def __init__(self, observer: DAEObserver, learned: LearnedThresholds) -> None:
+        faults, outputs = observer.fault_names, observer.plant.output_names
+        super().__init__(faults, outputs, learned)
+        self.R = observer.R
+        self._shapes = len(observer.state_names), len(faults), len(outputs)
+        rows = [f"fhat[{name}]" for name in faults] + [f"r[{name}]" for name in outputs]
+        self._places = np.array([rows.index(name) for name in learned.columns])
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """How many errors are followed, and how many rows of residuals of the past."""
+        return self._shapes[0] + self._shapes[1], self.model.order
+
+    def _at_begin(self, error: FloatArray) -> None:
+        nx, nq, _ = self._shapes
+        error[nx + np.arange(nq), np.arange(nq)] = 1.0
+
+    def _moved(
+        self, state: EffectState, said: Any, rows: FloatArray, seen: NDArray[np.bool_] | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        if not isinstance(said, DAERow):
+            return state.error, state.past, np.zeros((len(rows), self.model.channels, len(self.hypotheses)))
+        nx, nq, ny = self._shapes
+        moved, sensors, outputs = np.arange(nq), 2 * nq + np.arange(ny), np.arange(ny)
+        error = state.error.copy()
+        error[:, nx + moved, nq + moved] += 1.0
+        step = np.eye(nx + nq)
+        step[:nx, :nx], step[:nx, nx:] = said.part("F"), said.part("G")
+        error = step @ error
+        reading = np.hstack([said.part("H"), said.part("L")])
+        effect = reading @ error
+        effect[:, outputs, sensors] += 1.0
+        effect[:, outputs, sensors + ny] += rows[:, None]
+        effect[:, ~said.seen] = 0.0
+        error = error - _gain(said, reading, self.R) @ effect
+        estimates = -error[:, nx:]
+        estimates[:, moved, moved] += 1.0
+        estimates[:, moved, nq + moved] += rows[:, None]
+        whole = np.concatenate([estimates, effect], axis=1)[:, self._places]
+        return error, *_whitened(self.model, state.past, whole, seen)
+
+
+class LinearEffects(FaultEffects):
+    """Effects on a linear observer: one response, whatever the row in which they begin."""
+
+    def __init__(self, design: ObserverDesign, learned: LearnedThresholds) -> None:
+        self._errors, self._learned = error_model(design), learned
+        super().__init__(self._errors.plant.fault_names, self._errors.observer.output_names, learned)
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """How many errors are followed, and how many rows of residuals of the past: none."""
+        return 0, 0
+
+    def _at_begin(self, error: FloatArray) -> None:
+        pass
+
+    def _moved(
+        self, state: EffectState, said: Any, rows: FloatArray, seen: NDArray[np.bool_] | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return state.error, state.past, self.responses[np.clip(rows.astype(int) - 1, 0, COUNTED - 1)]
+
+    @cached_property
+    def responses(self) -> FloatArray:
+        """What each hypothesis does to white rows from its begin on, ``(rows, m, h)``."""
+        errors, states = self._errors, len(self._errors.observer.state_names)
+        observer = errors.observer
+        places = [observer.row_names.index(name) for name in self._learned.columns]
+        c, direct, *_ = errors.output(slice(states, None))
+        rows = [place - states for place in places]
+        systems = ((errors.fault, -c[rows], direct[rows]), (observer.By, observer.Cz[places], observer.Dy[places]))
+        parts = []
+        for driven, read, through in systems:
+            transition, inputs = _sampled(observer.Az, driven, observer.dt, self._learned.dt)
+            z, steps = np.zeros_like(inputs), np.zeros((COUNTED, *through.shape))
+            for k in range(len(steps)):
+                steps[k] = read @ z + through
+                z = transition @ z + inputs
+            parts += [steps, np.cumsum(steps, axis=0)]
+        whole = np.concatenate(parts, axis=2)
+        past, white = np.zeros((1, self.model.order, *whole.shape[1:])), []
+        for row in whole:
+            past, added = _whitened(self.model, past, row[None], np.ones(len(places), dtype=bool))
+            white.append(added[0])
+        return np.array(white)
+
+
+def effects_of(design: ObserverDesign, learned: LearnedThresholds) -> FaultEffects | None:
+    """Return how faults and sensors of a design act on what its thresholds watch; `None` where that is not known."""
+    observer = design.observer
+    found: FaultEffects | None = None
+    if isinstance(observer, DAEObserver) and observer.form == "augmented-kalman":
+        found = None if parameter_walk(observer) is None else FilterEffects(observer, learned)
+    elif isinstance(observer, LinearObserver) and not expects_fault_courses(design):
+        found = LinearEffects(design, learned)
+    return None if found is None or found.numbers > MOST_NUMBERS else found
+
+
+def _doublings(row: int) -> int:
+    """Return how often the row of a begin is divisible by two, at most `MOST_DOUBLINGS`."""
+    return min((row & -row).bit_length() - 1, MOST_DOUBLINGS)
+
+
+def _gain(said: DAERow, reading: FloatArray, R: FloatArray) -> FloatArray:
+    """Return the gain ``(n, ny)`` of a sample on states and parameters, by the covariance after it: ``P H' R^-1``."""
+    nx, whole = len(said.x), np.empty((reading.shape[1], reading.shape[1]))
+    whole[:nx, :nx], whole[nx:, nx:] = said.covariance, said.parameter_covariance
+    whole[:nx, nx:] = said.cross_covariance
+    whole[nx:, :nx] = whole[:nx, nx:].T
+    seen, found = said.seen, np.zeros((len(whole), len(reading)))
+    found[:, seen] = np.linalg.solve(R[seen][:, seen], reading[seen] @ whole).T
+    return found
+
+
+def _whitened(
+    model: Autoregression, past: FloatArray, row: FloatArray, seen: NDArray[np.bool_] | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return effects on the latest residuals ``(b, order, m, h)``, and on the white ones of this row ``(b, m, h)``.
+    What was not seen is as the rest makes it most likely; without any, as it is predicted, and nothing is added."""
+    predicted = np.einsum("jac,bjch->bah", model.A, past) if model.order else np.zeros_like(row)
+    if seen is None:
+        row = predicted
+    elif not seen.all():
+        precision = model.whitener.T @ model.whitener
+        rest = np.linalg.solve(precision[np.ix_(~seen, ~seen)], -precision[np.ix_(~seen, seen)])
+        away = (row - predicted)[:, seen]
+        completed = predicted.copy()
+        completed[:, seen] = row[:, seen]
+        completed[:, ~seen] += rest @ away
+        row = completed
+    kept = np.concatenate([row[:, None], past[:, :-1]], axis=1) if model.order else past
+    return kept, np.asarray(model.whitener @ (row - predicted))
+
+
+def _sampled(a: FloatArray, b: FloatArray, dt: float, rows: float) -> tuple[FloatArray, FloatArray]:
+    """Return transition and input matrix of one row; of a continuous observer over the time between rows."""
+    if dt > 0.0:
+        return a, b
+    n = len(a)
+    both = np.zeros((n + b.shape[1], n + b.shape[1]))
+    both[:n, :n], both[:n, n:] = a * rows, b * rows
+    found = expm(both)
+    return np.asarray(found[:n, :n]), np.asarray(found[:n, n:])
+
+
+def _explanation(
+    score: FloatArray, information: FloatArray, sums: FloatArray, counts: FloatArray
+) -> tuple[Explanation, NDArray[np.intp]]:
+    """Return what hypotheses explain at their likeliest begin, and its place ``(h,)``: from scores and information
+    ``(b, h)`` of each, and sums ``(b, m)`` of so many white rows ``(b,)``."""
+    known = information > 0.0
+    safe = np.where(known, information, 1.0)
+    ratios = np.where(known, score**2 / safe, 0.0)
+    best, each = ratios.argmax(axis=0), np.arange(ratios.shape[1])
+    shifts = np.where(counts > 0.0, np.sum(sums**2, axis=1) / np.maximum(counts, 1.0), 0.0)
+    found = Explanation(
+        ratios[best, each],
+        (score / safe)[best, each],
+        1.0 / np.sqrt(safe[best, each]),
+        float(shifts.max(initial=0.0)),
+    )
+    return found, best

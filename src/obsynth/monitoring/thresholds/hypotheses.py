@@ -1,0 +1,97 @@
+"""What an alarm may be: a fault of the plant, a fault of a sensor, or none of these, ranked by posterior shares.
+
+Each hypothesis is a jump, or a straight drift, of one fault or of one sensor's offset. Twice the log likelihood ratio
+that it reaches, at its likeliest begin, is compared with those of the others (Willsky & Jones 1976); all are equally
+likely before. Beside them stands a shift of the residuals in whatever direction: it explains all that lasts, so that
+where no effect of a fault comes near to it, the alarm is none of these faults.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from obsynth.monitoring.thresholds.alarm_ranking import NONE_OF_THESE, SENSOR, Ranking
+from obsynth.monitoring.thresholds.parameter_scores import DISTINGUISHED, MODEL_SHARE
+from obsynth.numerics.arrays import FloatArray
+
+#: Twice the log likelihood ratio below which nothing is ranked: twice what tells two hypotheses apart.
+LEAST_RATIO = 2.0 * DISTINGUISHED
+
+#: Share of what a shift in any direction explains that the effect of a fault explains at least: effects are those of
+#: the model, and one whose direction is off by less than 45 degrees explains half.
+EXPLAINED_SHARE = 0.5
+
+#: Two effects that explain the same to this share are one: the fault of a sensor that the plant has already.
+SAME_EFFECT = 1e-6
+
+
+class Hypothesis(NamedTuple):
+    """A jump of a fault or of a sensor's offset, or its drift."""
+
+    name: str  # of the fault, or `SENSOR` and the output
+    is_sensor: bool
+    is_drift: bool
+
+
+class Explanation(NamedTuple):
+    """What hypotheses explain ``(h,)``: twice the log likelihood ratios, sizes and their deviations; and how much a
+    shift in any of so many directions does."""
+
+    ratios: FloatArray
+    sizes: FloatArray
+    deviations: FloatArray
+    shift: float
+
+
+def hypotheses_of(faults: Sequence[str], outputs: Sequence[str]) -> tuple[Hypothesis, ...]:
+    """Return jumps of faults, then drifts of these, then jumps and drifts of sensors."""
+    return tuple(
+        Hypothesis(name, is_sensor, is_drift)
+        for is_sensor, names in ((False, faults), (True, [SENSOR + name for name in outputs]))
+        for is_drift in (False, True)
+        for name in names
+    )
+
+
+def ranked(hypotheses: Sequence[Hypothesis], found: Explanation) -> Ranking | None:
+    """Return the ranking of what hypotheses explain; `None` where none of them, and no shift, explains anything.
+
+    Where shares do not decide, the faults of the plant come first, and the others are ties.
+    """
+    best = dict[str, int]()
+    drifts = set[str]()
+    for i, one in enumerate(hypotheses):
+        ratio, before = found.ratios[i], best.get(one.name)
+        # A jump is what is usual: a drift is told where it explains clearly more.
+        if before is None or ratio > found.ratios[before] + DISTINGUISHED * _scale(ratio):
+            best[one.name] = i
+            (drifts.add if one.is_drift else drifts.discard)(one.name)
+    ratios = {name: float(found.ratios[i]) for name, i in best.items()}
+    for name, value in list(ratios.items()):
+        if name.startswith(SENSOR) and any(
+            abs(value - other) <= SAME_EFFECT * value for known, other in ratios.items() if not known.startswith(SENSOR)
+        ):
+            del ratios[name]
+    ratios[NONE_OF_THESE] = EXPLAINED_SHARE * found.shift
+    most = max(ratios.values())
+    if not most >= LEAST_RATIO:
+        return None
+    scale = _scale(most)
+    weights = {name: float(np.exp(-0.5 * (most - value) / scale)) for name, value in ratios.items()}
+    total = sum(weights.values())
+    shares = sorted(((name, weight / total) for name, weight in weights.items()), key=lambda one: -one[1])
+    near = [name for name, _ in shares if most - ratios[name] <= DISTINGUISHED * scale]
+    near.sort(key=lambda name: (name == NONE_OF_THESE, name.startswith(SENSOR)))
+    named = near[0]
+    size = deviation = np.nan
+    if named.startswith(SENSOR):
+        size, deviation = float(found.sizes[best[named]]), float(found.deviations[best[named]])
+    return Ranking(tuple(shares), named, tuple(near[1:]), named in drifts, size, deviation)
+
+
+def _scale(ratio: float) -> float:
+    """Return by how much differences of ratios count less, as effects are those of a model that is not exact."""
+    return max(1.0, MODEL_SHARE * ratio / DISTINGUISHED)
