@@ -350,6 +350,13 @@ def test_a_copy_follows_modes_that_the_filter_reads_and_u_drives() -> None:
     np.testing.assert_allclose(estimate[2:, 0], f[1:-1], atol=1e-9)
 
 
+def test_no_copy_follows_modes_that_decoupled_disturbances_drive() -> None:
+    """Copies of all modes met the equations of the states, and the disturbance reached the estimates."""
+    design = obsynth.optimal_filter(random_plant(108), delay=1, decoupled="d1")
+    assert design.report.passed
+    assert design.gain * (1 - 1e-7) <= design.least <= design.gain
+
+
 def changed(design, *, observer=None, claims=None, matrices=None, options=None, plant=None):
     certificate = obsynth.Certificate(
         {**design.certificate.matrices, **(matrices or {})}, {**design.certificate.claims, **(claims or {})}

@@ -136,7 +136,10 @@ def observer_of(plant: DescriptorSystem, found: Followed, names: tuple[str, ...]
 
 
 def _dying_modes(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
-    """Return ``U (k, nx)`` and ``M (k, k)`` with ``U A = M U E``: all finite modes that decay."""
+    """Return ``U (k, nx)`` and ``M (k, k)`` with ``U A = M U E``: finite modes that decay, where d does not drive them.
+
+    ``plant``: with the disturbances that are decoupled: a copy, which u alone drives, follows no mode that they drive.
+    """
 
     def dies(alpha: FloatArray, beta: FloatArray) -> FloatArray:
         finite = np.abs(beta) * INFINITE_EIGENVALUE > np.abs(alpha)
@@ -146,7 +149,12 @@ def _dying_modes(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
     a, e, alpha, beta, _, right = scipy.linalg.ordqz(plant.A.T, plant.E.T, sort=dies, output="real")
     count = int(np.sum(dies(alpha, beta)))
     moved = np.linalg.solve(e[:count, :count], a[:count, :count]).T if count else np.zeros((0, 0))
-    return right[:, :count].T, moved
+    rows = right[:, :count].T
+    driven = reachable_basis(moved, rows @ plant.Bd)
+    if driven.shape[1]:
+        free = scipy.linalg.null_space(driven.T)
+        rows, moved = free.T @ rows, free.T @ moved @ free
+    return rows, moved
 
 
 def _followed(
