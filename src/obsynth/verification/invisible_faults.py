@@ -78,7 +78,13 @@ def hidden_and_bounded(
 
 
 def proved_least(
-    plant: DescriptorSystem, points: Sequence[complex], samples: int, setting: Setting, *, level: float
+    plant: DescriptorSystem,
+    points: Sequence[complex],
+    samples: int,
+    setting: Setting,
+    *,
+    level: float,
+    enough: float | None = None,
 ) -> float | None:
     """Return a number that the gain of every causal filter reaches, rounded down; ``None`` where nothing is proved.
 
@@ -94,13 +100,15 @@ def proved_least(
         What the filter must do.
     level : float
         The gain near which the worst combination is looked for; nothing is concluded from it.
+    enough : float, optional
+        A bound that is enough, by default the level: a combination in double precision that reaches it is taken.
     """
     if plant.is_discrete and (samples < max(setting.delay, 1) or not has_index_one(plant)):
         return None
     for bits in PRECISION_BITS:
         with flint.ctx.workprec(bits):
             try:
-                found = _Trajectories(plant, points, samples if plant.is_discrete else 0, setting).bound(level)
+                found = _Trajectories(plant, points, samples if plant.is_discrete else 0, setting).bound(level, enough)
             except ZeroDivisionError:  # a matrix is singular to these digits
                 continue
         if found is not None:
@@ -224,9 +232,9 @@ class _Trajectories:
 
     # Combinations: coefficients of the members, then the last samples.
 
-    def bound(self, level: float | None) -> float | None:
+    def bound(self, level: float | None, enough: float | None = None) -> float | None:
         """Return the proved ratio of the worst combination, rounded down; without a level of the largest one."""
-        return worst_ratio(*self._energies(), level)
+        return worst_ratio(*self._energies(), level, level if enough is None else enough)
 
     def _energies(self) -> tuple[Any, Any]:
         """Return the energies of error and noise as matrices on the members' coefficients and the last samples'."""
@@ -265,10 +273,11 @@ class _Trajectories:
         return padded[0], padded[1]
 
 
-def worst_ratio(error: Any, noise: Any, level: float | None) -> float | None:
+def worst_ratio(error: Any, noise: Any, level: float | None, enough: float | None = None) -> float | None:
     """Return the ratio of two energies for one combination near the worst, rounded down: without a level the largest.
 
-    Nothing is concluded from the level, near which the combination is looked for.
+    Nothing is concluded from the level, near which the combination is looked for.  One in double precision is taken
+    where its ratio is ``enough``: more digits are a hundred times the work.
     """
     count = error.nrows()
     if not count:
@@ -284,8 +293,27 @@ def worst_ratio(error: Any, noise: Any, level: float | None) -> float | None:
         _scaled(_scaled(_columns(_rows(part, kept), kept), units).transpose(), units).transpose()
         for part in (error, noise)
     )
-    count = len(kept)
-    level = _largest_ratio(error, noise) if level is None else level
+    largest, found = _largest_ratio(error, noise)
+    roughly = _ratio(error, noise, _complex(found[:, None]))
+    if roughly is not None and enough is not None and roughly >= enough:
+        return roughly
+    closely = _ratio(error, noise, _worst_combination(error, noise, largest if level is None else level))
+    return max((bound for bound in (roughly, closely) if bound is not None), default=None)
+
+
+def _ratio(error: Any, noise: Any, combination: Any) -> float | None:
+    """Return the ratio of two energies for a combination, rounded down; ``None`` where one of them may be zero."""
+    above, below = ((_adjoint(combination) * part * combination)[0, 0].real for part in (error, noise))
+    if not (above > 0 and below > 0):
+        return None
+    ratio = (above.lower() / below.upper()).sqrt().lower()
+    value = float(ratio) if ratio.is_finite() else 0.0
+    return math.nextafter(value, 0.0) if value > 0.0 else None
+
+
+def _worst_combination(error: Any, noise: Any, level: float) -> Any:
+    """Return the combination whose ratio of energies is near a level, by inverse iteration in all digits."""
+    count = error.nrows()
     square = flint.arb(level * (1.0 + LEVEL_ABOVE)) ** 2
     shifted = _middle(error - noise * square)
     for i in range(count):
@@ -296,19 +324,15 @@ def worst_ratio(error: Any, noise: Any, level: float | None) -> float | None:
         found = _middle(step * found)
         largest = max(entry.abs_upper() for entry in found.entries())
         found = _middle(found * (1 / flint.acb(largest)))
-    above, below = ((_adjoint(found) * part * found)[0, 0].real for part in (error, noise))
-    if not (above > 0 and below > 0):
-        return None
-    ratio = (above.lower() / below.upper()).sqrt().lower()
-    value = float(ratio) if ratio.is_finite() else 0.0
-    return math.nextafter(value, 0.0) if value > 0.0 else None
+    return found
 
 
-def _largest_ratio(error: Any, noise: Any) -> float:
-    """Return the root of the largest ratio of two energies in double precision: where to look, and no proof."""
+def _largest_ratio(error: Any, noise: Any) -> tuple[float, Any]:
+    """Return the root of the largest ratio of two energies in double precision, and its combination: no proof."""
     above, below = (np.array([[complex(entry) for entry in row] for row in part.tolist()]) for part in (error, noise))
     below = below + np.finfo(float).eps * np.trace(below).real * np.eye(len(below))
-    return float(np.sqrt(max(scipy.linalg.eigh(above, below, eigvals_only=True)[-1], 0.0)))
+    ratios, combinations = scipy.linalg.eigh(above, below)
+    return float(np.sqrt(max(ratios[-1], 0.0))), combinations[:, -1]
 
 
 def _from_rest(
