@@ -385,7 +385,8 @@ def _linearised(
         if tolerances:
             given = arguments.get("given", {})
             arguments["constants"] = box_of_model(model, tolerances, given, variation=section.variation, **box)
-        return linearise(model, **arguments)
+        found: DescriptorSystem = linearise(model, **arguments)
+        return found
     except SpecError as error:
         raise SpecError(f"{source}: {where}.linearise: {error}", path=f"{where}.linearise") from error
 

@@ -82,9 +82,19 @@ def entries_in_constants(
     """Return entries of the matrices that depend on the box, and of the equilibrium's shift in equations and outputs.
     ``columns``: inputs, known (``B``) and not (``Bd``), and parameters that are faults (``Bf``); ``moving``: the
     motion of the point is an input after the known ones."""
-    symbols = {name: ca.SX.sym(name) for name in box.names}
-    theta = [symbols.get(name, float(value)) for name, value in zip(model.parameter_names, point.theta, strict=True)]
-    local = symbolic_equations(model)(point.rates, point.x, point.u, ca.vertcat(*theta) if theta else ca.SX(0, 1))
+    return entries_in(model, point, {name: box.constants[name].nominal for name in box.names}, columns, moving=moving)
+
+
+def entries_in(
+    model: DAEModel, point: Point, nominal: Mapping[str, float], columns: Mapping[str, Sequence[int]], *, moving: bool
+) -> tuple[dict[str, list[Entry]], list[Entry], list[Entry]]:
+    """Return the same for parameters and inputs by their nominal values."""
+    symbols = {name: ca.SX.sym(name) for name in nominal}
+    u, theta = (
+        ca.vertcat(ca.SX(0, 1), *(symbols.get(name, float(value)) for name, value in zip(names, values, strict=True)))
+        for names, values in ((model.input_names, point.u), (model.parameter_names, point.theta))
+    )
+    local = symbolic_equations(model)(point.rates, point.x, u, theta)
     value, e, by_state, by_input, by_parameter, y, c, seen = local
     known, unknown, faults = ([int(i) for i in columns[name]] for name in ("B", "Bd", "Bf"))
     b = -by_input[:, known]
@@ -99,8 +109,31 @@ def entries_in_constants(
     }
     writer = _Writer(symbols)
     entries = {name: texts for name, matrix in found.items() if (texts := writer.entries(matrix, name))}
-    nominal = {name: box.constants[name].nominal for name in box.names}
     return entries, writer.changes(value, -1.0, nominal), writer.changes(y, 1.0, nominal)
+
+
+def require_linear_beside(model: DAEModel, scheduled: Sequence[str], faults: Sequence[str]) -> None:
+    """Raise `PreconditionError` for an entry of the linear model that depends on a signal that is not scheduled."""
+    kinds = (model.state_names, model.state_names, model.input_names, model.parameter_names)
+    rates, x, u, theta = ([ca.SX.sym(name) for name in names] for names in kinds)
+    moving = [*rates, *x, *(s for s in u if s.name() not in scheduled), *(s for s in theta if s.name() in faults)]
+    local = symbolic_equations(model)(*(ca.vertcat(ca.SX(0, 1), *each) for each in (rates, x, u, theta)))
+    _, e, by_state, by_input, by_parameter, _, c, seen = local
+    chosen = [i for i, name in enumerate(model.parameter_names) if name in faults]
+    others = [i for i, name in enumerate(model.input_names) if name not in scheduled]
+    equations = ca.horzcat(e, by_state, by_input[:, others], by_parameter[:, chosen])
+    for matrix, names in ((equations, model.equation_names), (ca.horzcat(c, seen[:, chosen]), model.output_names)):
+        for row, place in enumerate(names):
+            causes = [each.name() for each in moving if ca.depends_on(matrix[row, :].T, each)]
+            if causes:
+                raise PreconditionError(
+                    f"{place!r} is not linear in the signals that are not scheduled: its derivatives depend on "
+                    f"{', '.join(map(repr, causes))}. A model over a region has no remainder. Take the nonlinear "
+                    "equations (obsynth.region_observer); or, where what multiplies there is a measured input, a "
+                    "parameter or a constant, schedule by it.",
+                    condition="linear beside the scheduling",
+                    signals=tuple(causes),
+                )
 
 
 class _Writer:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, overload
 
 import numpy as np
 
@@ -15,9 +15,18 @@ from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.dae_functions import LocalEquations, local_equations
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.signal_names import index_of
 from obsynth.plants.transformations.entries_in_constants import at_nominal, box_of_model, entries_in_constants
 from obsynth.plants.transformations.equilibrium import Point, consistent_point, equilibrium, nominal_point
+from obsynth.plants.transformations.linearisation_over_region import (
+    at_scheduling,
+    over_scheduling,
+    scheduled_names,
+    shift_name,
+    unscheduled_faults,
+    with_shift,
+)
 from obsynth.plants.uncertain_system import filled_plant
 from obsynth.plants.uncertainty import Uncertainty
 
@@ -27,10 +36,41 @@ LARGEST_MOTION = 1e-9
 #: Input of a linear model at a moving point: it is one, always.
 DRIFT = "drift"
 
-#: Input of a linear model whose equilibrium depends on constants with tolerances: it is one, always.
-SHIFT_INPUT = "shift"
 
-
+@overload
+def linearise(
+    model: DAEModel,
+    *,
+    at: Literal["equilibrium", "point"] = ...,
+    given: Mapping[str, float] | None = ...,
+    free: Sequence[str] | Mapping[str, tuple[float, float]] = ...,
+    faults: Sequence[str] | None = ...,
+    disturbances: Sequence[str] = ...,
+    start: Mapping[str, float] | None = ...,
+    drift: bool = ...,
+    constants: Mapping[str, Any] | ConstantsBox | None = ...,
+    sensor_noise: Mapping[str, float] | None = ...,
+    process_noise: Mapping[str, float] | None = ...,
+    region: None = ...,
+    scheduling: None = ...,
+) -> DescriptorSystem: ...
+@overload
+def linearise(
+    model: DAEModel,
+    *,
+    at: Literal["equilibrium", "point"] = ...,
+    given: Mapping[str, float] | None = ...,
+    free: Sequence[str] | Mapping[str, tuple[float, float]] = ...,
+    faults: Sequence[str] | None = ...,
+    disturbances: Sequence[str] = ...,
+    start: Mapping[str, float] | None = ...,
+    drift: bool = ...,
+    constants: Mapping[str, Any] | ConstantsBox | None = ...,
+    sensor_noise: Mapping[str, float] | None = ...,
+    process_noise: Mapping[str, float] | None = ...,
+    region: Mapping[str, Any],
+    scheduling: Sequence[str] | None = ...,
+) -> PolytopicSystem: ...
 @arguments_checked
 def linearise(
     model: DAEModel,
@@ -45,7 +85,9 @@ def linearise(
     constants: Mapping[str, Any] | ConstantsBox | None = None,
     sensor_noise: Mapping[str, float] | None = None,
     process_noise: Mapping[str, float] | None = None,
-) -> DescriptorSystem:
+    region: Mapping[str, Any] | None = None,
+    scheduling: Sequence[str] | None = None,
+) -> DescriptorSystem | PolytopicSystem:
     r"""Linearise a nonlinear plant: exact Jacobians, names, units and operating point.
 
     With ``F(d/dt q(x, theta), x, u, theta) = 0`` and ``G(x', x, u, theta) = F(q_x x', x, u, theta)``
@@ -85,10 +127,18 @@ def linearise(
     process_noise : mapping, optional
         Intensity of white noise by equation, in the unit of the equation times the root of a second: columns of
         ``Bw (nx, nw)``, which come before those of the sensors.
+    region : mapping, optional
+        Ranges ``[low, high]`` of inputs, parameters or constants that are measured while they change (or ``{"range":
+        [low, high], "rate": ..., "column": ...}``, as `obsynth.PolytopicSystem` takes them).  Entries are then
+        expressions in them, and the equations must be linear in everything else, so that the model is exact at every
+        point of the region.  They are no inputs and no faults then; what they move beside the point acts as an input
+        ``shift``, which is 1 in every row.
+    scheduling : list of str, optional
+        Names of these; all that ``region`` names by default.
 
     Returns
     -------
-    DescriptorSystem
+    DescriptorSystem, or PolytopicSystem for a region
         Continuous in time, in deviations from ``operating_point``.  A state whose name an output has, with another
         value, is called ``"... (state)"``.  With ``constants`` it knows its tolerances; those that stand in no entry
         are left out.
@@ -120,6 +170,9 @@ def linearise(
        moving point we keep E x' as an input, which is exact to first order.
     """
     values, freed = dict(given or {}), _names(free, "free")
+    asked = scheduled_names(model, region, scheduling, constants=constants, drift=drift)
+    if asked:
+        model, values = at_scheduling(model, asked, values)
     for name, bounds in free.items() if isinstance(free, Mapping) else ():
         if np.shape(bounds) != (2,) or not float(bounds[0]) <= float(bounds[1]):
             raise SpecError(f"free.{name} must be [low, high].", path=f"free.{name}")
@@ -146,8 +199,11 @@ def linearise(
                 f"The output {wrong[0]!r} cannot be given at a point: give states.", path=f"given.{wrong[0]}"
             )
         point = consistent_point(model, nominal_point(model, values), values)
-    found = linear_model(model, point, faults=faults, disturbances=disturbances, drift=drift, box=box)
-    return _with_noise(found, model.equation_names, process_noise, sensor_noise)
+    if asked:
+        faults = unscheduled_faults(model, asked, faults, disturbances)
+    found = linear_model(model, point, faults=faults, disturbances=disturbances, drift=drift, box=box, scheduled=asked)
+    found = _with_noise(found, model.equation_names, process_noise, sensor_noise)
+    return over_scheduling(found, model, point, asked, faults or (), disturbances) if asked else found
 
 
 def _with_noise(
@@ -175,8 +231,10 @@ def linear_model(
     disturbances: Sequence[str],
     drift: bool,
     box: ConstantsBox | None = None,
+    scheduled: Collection[str] = (),
 ) -> DescriptorSystem:
-    """Return the linear model at a point that satisfies the equations, over the box of its constants if it has one."""
+    """Return the linear model at a point that satisfies the equations, over the box of its constants if it has one;
+    ``scheduled`` are no inputs."""
     local = local_equations(model, point.rates, point.x, point.u, point.theta)
     if not local.is_defined:
         raise PreconditionError(
@@ -190,7 +248,7 @@ def linear_model(
     chosen = every if faults is None else _names(faults, "faults")
     fault_columns = [index_of(name, model.parameter_names, what="faults") for name in chosen]
     unknown = [index_of(name, model.input_names, what="disturbances") for name in _names(disturbances, "disturbances")]
-    known = [i for i in range(model.nu) if i not in unknown]
+    known = [i for i in range(model.nu) if i not in unknown and model.input_names[i] not in scheduled]
     inputs, B = [model.input_names[i] for i in known], -local.by_input[:, known]
     if motion is not None:
         inputs, B = [*inputs, DRIFT], np.column_stack([B, motion])
@@ -268,25 +326,12 @@ def _over_box(
     entries, moved, shown = entries_in_constants(model, point, box, columns, moving=moving)
     shift = ""
     if moved or shown:
-        taken = {
-            *linear.state_names,
-            *linear.input_names,
-            *linear.output_names,
-            *linear.fault_names,
-            *linear.disturbance_names,
-        }
-        shift = SHIFT_INPUT if SHIFT_INPUT not in taken else f"equilibrium {SHIFT_INPUT}"
+        shift = shift_name(linear)
         nu = linear.nu
         for name, found in (("B", moved), ("D", shown)):
             if found:
                 entries[name] = [*entries.get(name, []), *((i, nu, text) for i, _, text in found)]
-        linear = linear.replace(
-            B=np.column_stack([linear.B, np.zeros(linear.nx)]),
-            D=np.column_stack([linear.D, np.zeros(linear.ny)]),
-            input_names=[*linear.input_names, shift],
-            operating_point={**linear.operating_point, shift: 0.0},
-            units={**linear.units, shift: "1"} if linear.units else linear.units,
-        )
+        linear = with_shift(linear, shift)
     uncertainty = Uncertainty(box, {name: tuple(found) for name, found in entries.items()}, shift=shift)
     kept = {name: item for name, item in box.constants.items() if name in uncertainty.used}
     return filled_plant(linear, uncertainty.with_box(replace(box, constants=kept)), set(kept))
