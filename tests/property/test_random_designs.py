@@ -1,7 +1,7 @@
 """Whatever is returned holds: it verifies, survives a file, changes no input, and does in simulation what it says."""
 
 import numpy as np
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from trajectories import fault_signals, matched_start, trajectory, transfer
 
@@ -58,6 +58,8 @@ def test_file_holds_the_design_bit_for_bit(tmp_path_factory, seed, kind):
     assert again.read_bytes() == path.read_bytes()
 
 
+#: Outputs of this one are nearly dependent: merged, W is another left inverse than the paper's.
+@example(424, {"sensor_faults": 1})
 @given(SEEDS, KINDS)
 def test_inputs_are_not_modified(seed, kind):
     rng = np.random.default_rng(seed)

@@ -98,6 +98,22 @@ def test_a_matrix_that_is_given_for_independent_outputs_is_named():
     assert obsynth.fault_estimation_filter(plant).report.passed
 
 
+@pytest.mark.parametrize("nd", [0, 1])
+@pytest.mark.parametrize("seed", range(3))
+def test_outputs_that_depend_on_others_get_another_left_inverse_than_the_paper_s(seed, nd):
+    rng = np.random.default_rng([77, seed])
+    independent = rng.normal(size=(3, 4))
+    c = np.vstack([independent, rng.normal(size=(1, 3)) @ independent])
+    plant = obsynth.DescriptorSystem(
+        A=0.2 * rng.normal(size=(4, 4)), C=c, Bf=rng.normal(size=(4, 1)), Bd=rng.normal(size=(4, nd)), dt=0.1
+    )
+    design = obsynth.fault_estimation_filter(plant)
+    assert design.report.passed
+    assert design.options["weight"] == "free"
+    with pytest.raises(obsynth.PreconditionError, match="The paper's W is for independent outputs"):
+        obsynth.fault_estimation_filter(plant, weight="paper")
+
+
 def test_a_copy_in_another_unit_changes_no_choice_of_outputs():
     # 10 times 1.076 in doubles is not ten times the number as written: the rows depend within rounding alone.
     c = np.array([[1.076, -0.806, 0.767]])

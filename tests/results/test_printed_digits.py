@@ -35,7 +35,8 @@ def designed(seed: int) -> ObserverDesign:
     rng = np.random.default_rng(seed)
     kind = {"sensor_faults": 1} if seed % 4 == 0 else {}
     recipe = random_recipe(rng, largest=6, longest_index=LONGEST[seed], feedthrough=bool(seed % 2), **kind)
-    return fault_estimation_filter(build(rng, recipe).plant)
+    # As papers print them: with a free weight an entry of W may hold many values.
+    return fault_estimation_filter(build(rng, recipe).plant, weight="paper")
 
 
 def rounded(seed: int, digits: int) -> dict[str, np.ndarray]:

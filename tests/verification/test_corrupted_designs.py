@@ -600,10 +600,16 @@ def test_good_claims_and_a_good_recovery_pass(name: str) -> None:
     assert verify(design)[KEPT].passed
 
 
+#: The first output shows no fault: what is added to R there, in the row of T A Psi, makes another left inverse G.
+ALSO_RIGHT = {("drifting", "R", (1, 0))}
+
+
 @pytest.mark.parametrize("letter", ["T", "N", "L", "W", "Psi", "Upsilon", "R"])
 @pytest.mark.parametrize("name", PLANTS)
 def test_every_single_entry_of_the_gain_set_counts(name: str, letter: str, share: Callable[..., Any]) -> None:
     for row, column in share(scattered(good(name).gains[letter].shape)):
+        if (name, letter, (row, column)) in ALSO_RIGHT:
+            continue
         assert failed(gain_entry(letter, row, column)(good(name))), (row, column)
 
 

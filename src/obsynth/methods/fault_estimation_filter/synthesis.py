@@ -40,6 +40,7 @@ from obsynth.methods.fault_estimation_filter.convex_problem import (
 )
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.fault_estimation_filter.over_region import synthesise_over_region
+from obsynth.methods.fault_estimation_filter.printed_gains import paper_weight_row
 from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
 from obsynth.methods.fault_estimation_filter.search import NOMINAL_GAIN, FoundGains, found_within
 from obsynth.methods.fault_estimation_filter.small_gains import PrintedInequality
@@ -80,7 +81,8 @@ def synthesise(
     require_all(held)
     merged = merged_outputs(plant)
     dependent = merged is not None and _is_prepared_without(plant, prepared)
-    near = nearly_merged_outputs(plant) if asked.S is None and not plant.nd else None
+    paper = asked.asks_for_free_weight is False
+    near = nearly_merged_outputs(plant) if asked.S is None and not plant.nd and not paper else None
     if merged is None or not dependent:
         made = _synthesised(plant, held, prepared, asked, progress)
         return made if near is None else _less_noisy(plant, near, made, asked, progress)
@@ -92,6 +94,16 @@ def synthesise(
             condition="rank C",
         )
     made = _of_merged(plant, merged, _synthesised(merged.plant, held, prepared, asked, progress))
+    if not _is_as_labelled(made):
+        if paper:
+            raise PreconditionError(
+                "The paper's W is for independent outputs (Wang 2015, below eq. (1), assumes "
+                f"rank C = {plant.ny}), but {plant.ny - merged.plant.ny} of the outputs "
+                "depend on others. Leave weight out: a filter exists, and such outputs are merged by their noise then.",
+                condition="rank C",
+            )
+        free = replace(asked, weight="free")
+        made = _of_merged(plant, merged, _synthesised(merged.plant, held, prepared, free, progress))
     return made if near is None else _less_noisy(plant, near, made, asked, progress)
 
 
@@ -110,9 +122,17 @@ def _less_noisy(
         other = _of_merged(plant, near, _synthesised(near.plant, held, prepared, asked, progress))
     except ObsynthError:
         return made
+    if not _is_as_labelled(other):
+        # A W that is the paper's of the merged outputs is another left inverse for those as given.
+        other = replace(other, options=other.options | {"weight": "free"})
     assert isinstance(other.observer, LinearObserver)
     assert isinstance(made.observer, LinearObserver)
     return other if fault_deviation(plant, other.observer) < fault_deviation(plant, made.observer) else made
+
+
+def _is_as_labelled(made: Synthesis) -> bool:
+    """Whether W is the paper's where the options say so."""
+    return made.options["weight"] == "free" or paper_weight_row(made.gains).passed
 
 
 def _of_merged(plant: DescriptorSystem, merged: MergedOutputs, found: Synthesis) -> Synthesis:
