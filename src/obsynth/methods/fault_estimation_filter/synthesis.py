@@ -124,7 +124,7 @@ def _less_noisy(
         return made
     if not _is_as_labelled(other):
         # A W that is the paper's of the merged outputs is another left inverse for those as given.
-        other = replace(other, options=other.options | {"weight": "free"})
+        other = replace(other, options={**other.options, "weight": "free"})
     assert isinstance(other.observer, LinearObserver)
     assert isinstance(made.observer, LinearObserver)
     return other if fault_deviation(plant, other.observer) < fault_deviation(plant, made.observer) else made
