@@ -89,7 +89,8 @@ class SpecError(ObsynthError):
 
 
 class PreconditionError(ObsynthError):
-    """An existence condition fails: no design of this kind exists, whatever the solver.
+    """No design of this kind exists, whatever the solver, or the method does not take the plant as it is: the message
+    says which.
 
     Parameters
     ----------

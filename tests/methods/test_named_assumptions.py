@@ -34,3 +34,33 @@ def test_nothing_exists_only_where_no_method_does(method):
         obsynth.design(plant, method)
     assert "assumes more" not in str(caught.value)
     assert not any(report.passed for name, report in obsynth.check(plant).items() if name == method)
+
+
+def _spring() -> obsynth.PolytopicSystem:
+    return obsynth.PolytopicSystem(
+        plant={
+            "A": [[1.0, 0.1], ["-0.1 * k", 0.9]], "C": [[1, 0], [0, 1]], "Bf": [[0], [1]], "dt": 1.0,
+            "output_names": ["x", "v"], "fault_names": ["push"],
+        },
+        scheduling={"k": [1.0, 2.0]},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("method", ["descriptor_kalman", "pd_observer", "functional_filter", "optimal_filter"])
+def test_a_method_that_does_not_take_a_region_says_nothing_of_other_observers(method: str) -> None:
+    with pytest.raises(obsynth.PreconditionError, match=r"^This method does not take the plant") as e:
+        getattr(obsynth, method)(_spring())
+    assert "methods for such plants are: fault-estimation-filter, ui-pi-observer" in str(e.value)
+    # What is named was tried: the one that takes noise of sensors as the Kalman filter would.
+    assert obsynth.ui_pi_observer(_spring(), noise={"x": 0.1, "v": 0.2}).report.passed
+    assert obsynth.fault_estimation_filter(_spring()).report.passed
+
+
+def test_a_continuous_plant_is_no_plant_without_an_observer() -> None:
+    plant = obsynth.DescriptorSystem(None, [[-1.0, 0.0], [1.0, -2.0]], None, [[0.0, 1.0]], Bf=[[1.0], [0.0]])
+    with pytest.raises(obsynth.PreconditionError) as caught:
+        obsynth.fault_estimation_filter(plant)
+    text = str(caught.value)
+    assert "No observer of this kind exists" not in text
+    assert "'discrete time' fails" in text
+    assert obsynth.fault_estimation_filter(obsynth.discretise(plant, 0.1)) is not None

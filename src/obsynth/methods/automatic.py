@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.analysis.existence.condition import without_opening
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.rates import settling_time
@@ -123,7 +124,7 @@ def one_line(text: str) -> str:
 
 def _cut(text: str) -> str:
     """Return so many whole sentences of a text as have room, and the first in any case."""
-    first, *others = re.split(r"(?<=[.]) (?=[A-Z])", text.removeprefix("No observer of this kind exists: ").strip())
+    first, *others = re.split(r"(?<=[.]) (?=[A-Z])", (without_opening(text) or text).strip())
     for sentence in others:
         if len(first) + len(sentence) >= MOST_LETTERS:
             break

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from obsynth.analysis.existence.condition import Condition
+from obsynth.analysis.existence.condition import Condition, without_opening
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.method import Method
@@ -30,9 +30,6 @@ if TYPE_CHECKING:
 
 #: Plants with more states are not searched for pairs, and those with more still not at all.
 MOST_FOR_PAIRS, MOST_FOR_ONE = 16, 48
-
-#: How a refusal begins where nothing of the kind exists, see `Condition.require`.
-NONE_OF_THIS_KIND = "No observer of this kind exists: "
 
 #: Methods that estimate every state beside the faults.
 _OF_THE_WHOLE_STATE = ("pd-observer", "ui-pi-observer")
@@ -103,9 +100,9 @@ def with_advice(
 
     if holds(plant):
         return error
-    if len(notes) > 1 and str(error).startswith(NONE_OF_THIS_KIND):
+    text = without_opening(str(error))
+    if len(notes) > 1 and text is not None:
         # Outputs were left out: nothing is proved of the plant with them.
-        text = str(error).removeprefix(NONE_OF_THIS_KIND)
         error = PreconditionError(
             f"{asked.id} works on a proper form of this plant, which does not allow it: {text}",
             condition=error.condition,
@@ -136,7 +133,8 @@ def with_advice(
 
 def _named_assumption(error: PreconditionError, plant: DescriptorSystem, asked: Method) -> PreconditionError:
     """Return the refusal as one of this method alone where others estimate the faults of the plant: they are named."""
-    if not str(error).startswith(NONE_OF_THIS_KIND) or plant.nx > MOST_FOR_ONE or "faults" not in asked.purposes:
+    text = without_opening(str(error))
+    if text is None or plant.nx > MOST_FOR_ONE or "faults" not in asked.purposes:
         return error
     others = [name for name in _methods_for_faults(asked) if _takes(name, plant)]
     states = bool(getattr(asked, "states", None))
@@ -145,7 +143,6 @@ def _named_assumption(error: PreconditionError, plant: DescriptorSystem, asked: 
         others = [name for name in others if name in _OF_THE_WHOLE_STATE]
     if not others:
         return error
-    text = str(error).removeprefix(NONE_OF_THIS_KIND)
     exist = "exists" if len(others) == 1 else "exist"
     return PreconditionError(
         f"{asked.id} assumes more than this plant has: {text} "

@@ -13,6 +13,26 @@ from obsynth.plants.descriptor import DescriptorSystem
 #: Where errors say that options are.
 OPTIONS_PATH = "method.options"
 
+#: How a refusal begins where no observer of the kind exists, and where the method does not take the plant as it is, or
+#: as it is stated: nothing is decided then about other observers.
+NONE_OF_THIS_KIND = "No observer of this kind exists: "
+NOT_TAKEN = "This method does not take the plant as it is: "
+
+#: Conditions of the second kind.
+OF_THE_METHOD = frozenset(
+    (
+        *("kind of plant", "plant of this kind", "discrete time", "continuous time", "index", "constant E"),
+        *("faults", "fault named", "parameters", "known parameters", "bounds stated", "region stated"),
+        *("constant outputs", "directions of the faults", "effectiveness", "one sample to the outputs"),
+        *("bounded slopes", "residual directions"),
+    )
+)
+
+
+def without_opening(text: str) -> str | None:
+    """Return a refusal by a condition that fails without its opening; `None` for other texts."""
+    return next((text.removeprefix(each) for each in (NONE_OF_THIS_KIND, NOT_TAKEN) if text.startswith(each)), None)
+
 
 @dataclass(frozen=True)
 class Condition:
@@ -37,7 +57,7 @@ class Condition:
                 f"Unclear: whether the condition {self.name!r} holds ({self.source}) cannot be decided from the "
                 "digits of the data. "
                 if self.unclear
-                else f"No observer of this kind exists: the condition {self.name!r} fails ({self.source}). "
+                else f"{self._opening}the condition {self.name!r} fails ({self.source}). "
             )
             missing = [repr(name) for name in self.signals if repr(name) not in self.detail]
             involved = f" Signals involved: {', '.join(missing)}." if missing else ""
@@ -48,6 +68,10 @@ class Condition:
                 signals=self.signals,
                 unclear=bool(self.unclear),
             )
+
+    @property
+    def _opening(self) -> str:
+        return NOT_TAKEN if self.name.partition(" at ")[0] in OF_THE_METHOD else NONE_OF_THIS_KIND
 
     def in_doubt(self, found: Unclear, plant: DescriptorSystem) -> Condition:
         """Return the condition as one that rounding of the data could change, with what tells so in its detail."""
