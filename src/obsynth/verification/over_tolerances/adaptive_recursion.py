@@ -13,6 +13,9 @@ from obsynth.verification.over_tolerances.adaptive_bound import AdaptiveBound
 #: What rounding of the threshold itself may take from it.
 THRESHOLD_ROUNDING = 1.0 + 1e-10
 
+#: Samples of all runs together that are taken at once.
+SAMPLES_AT_ONCE = 512
+
 
 class Thresholds(NamedTuple):
     """Bounds ``(..., no)`` of fault estimates, then residuals: ``nominal + start + sum of first + rest``; of a sample
@@ -87,6 +90,10 @@ class AdaptiveState(NamedTuple):
         return cls(psi, ring, eps, largest, past, moved)
 
 
+#: What of a state has runs in its first axis.
+_ARRAYS = ("psi", "ring", "eps", "largest", "past", "moved")
+
+
 def thresholds_of_records(
     bound: AdaptiveBound, estimates: FloatArray, inputs: FloatArray, outputs: FloatArray
 ) -> Thresholds:
@@ -96,36 +103,65 @@ def thresholds_of_records(
     shapes = (no,), (p, no), (no,), (no,), (no,)
     found = Thresholds(*(np.empty((runs, steps, *shape)) for shape in shapes))
     state = AdaptiveState.of(bound, (runs,))
-    for k in range(steps):
-        state, sample = adaptive_step(bound, state, estimates[:, k], inputs[:, k], outputs[:, k])
-        for whole, part in zip(found, sample, strict=True):
-            whole[:, k] = part
+    # A few samples at a time stay in the processor's cache.
+    size = max(1, SAMPLES_AT_ONCE // max(1, runs))
+    for k in range(0, steps, size):
+        part = slice(k, k + size)
+        state, samples = _adaptive_samples(bound, state, estimates[:, part], inputs[:, part], outputs[:, part])
+        for whole, some in zip(found, samples, strict=True):
+            whole[:, part] = some
     return found
 
 
 def adaptive_step(
     bound: AdaptiveBound, state: AdaptiveState, estimates: FloatArray, inputs: FloatArray, outputs: FloatArray
 ) -> tuple[AdaptiveState, Thresholds]:
-    """Take one sample: ``estimates (..., n)`` as `ErrorStructure.reading` gives them; return the state after it too."""
+    """Take one sample of one run: ``estimates (n,)`` as `ErrorStructure.reading` gives them; return the state after it
+    too."""
+    one = state._replace(**{name: getattr(state, name)[None] for name in _ARRAYS})
+    after, found = _adaptive_samples(bound, one, estimates[None, None], inputs[None, None], outputs[None, None])
+    return after._replace(**{name: getattr(after, name)[0] for name in _ARRAYS}), Thresholds(
+        *(item[0, 0] for item in found)
+    )
+
+
+def _adaptive_samples(
+    bound: AdaptiveBound, state: AdaptiveState, estimates: FloatArray, inputs: FloatArray, outputs: FloatArray
+) -> tuple[AdaptiveState, Thresholds]:
+    """Take some samples ``(runs, samples, ...)``: what follows from signals alone at once, what follows from older
+    samples one by one."""
     *_, m, no = bound.counts
-    v = np.concatenate([estimates, inputs], axis=-1)
+    count, length = estimates.shape[1], bound.length
+    v = np.concatenate([estimates, inputs], axis=2)
     if bound.first is not None and state.k == 0:
-        last = (inputs @ bound.first.T)[..., None, :]
-        state = state._replace(psi=np.concatenate([state.psi[..., :-1, :], last], axis=-2))
+        last = (inputs[:, 0] @ bound.first.T)[:, None]
+        state = state._replace(psi=np.concatenate([state.psi[:, :-1], last], axis=1))
     state, moved, first, shift = (_varying if bound.varying else _constant)(bound, state, v)
-    sizes = np.abs(np.concatenate([inputs, outputs, estimates, np.ones((*v.shape[:-1], 1))], axis=-1))
-    state = state._replace(largest=np.maximum(state.largest, sizes))
+    largest = np.empty((*v.shape[:2], state.largest.shape[1]))
+    largest[..., -1] = 1.0
+    np.abs(np.concatenate([inputs, outputs, estimates], axis=2), out=largest[..., :-1])
+    np.maximum(largest[:, 0], state.largest, out=largest[:, 0])
+    np.maximum.accumulate(largest, axis=1, out=largest)
     known = bound.known(estimates, inputs)
-    start = bound.start_at(state.k)
-    rounding = state.largest @ bound.rounding.T
-    older = state.ring.reshape(*v.shape[:-1], -1) @ bound.kernels + state.eps[..., 0, :] @ bound.tail.T
+    begun = [bound.start_at(state.k + k) for k in range(count)]
+    start = np.stack(begun) if count > 1 else begun[0][None]
+    rounding = largest @ bound.rounding.T
     fixed = rounding + known @ bound.same + bound.nominal + start
-    h = known.copy()
-    h[..., :m] += older[..., :m] + fixed[..., :m] + _channels(bound, moved) @ bound.solved.T
-    rest = older[..., m : m + no] + rounding[..., m:] + h @ bound.same[:, m:]
-    total = (bound.nominal[m:] + start[m:] + first.sum(axis=-2) + np.abs(shift) + rest) * THRESHOLD_ROUNDING
-    after = state._replace(ring=_followed(state.ring, h), eps=_followed(state.eps, older[..., m + no :]), k=state.k + 1)
-    return after, Thresholds(total, first, shift, start[m:], rest)
+    entering = known[..., :m] + fixed[..., :m] + _channels(bound, moved) @ bound.solved.T
+    ring, eps = _continued(state.ring, count), _continued(state.eps, count)
+    ring[:, length:, m:] = known[..., m:]
+    older = np.empty((*v.shape[:2], bound.kernels.shape[1]))
+    tail = bound.tail.T
+    for k in range(count):
+        now = ring[:, k : k + length].reshape(len(v), -1) @ bound.kernels
+        now += eps[:, k] @ tail
+        ring[:, length + k, :m] = entering[:, k] + now[:, :m]
+        eps[:, length + k] = now[:, m + no :]
+        older[:, k] = now
+    rest = older[..., m : m + no] + rounding[..., m:] + ring[:, length:] @ bound.same[:, m:]
+    total = (bound.nominal[m:] + start[:, m:] + first.sum(axis=2) + np.abs(shift) + rest) * THRESHOLD_ROUNDING
+    after = state._replace(ring=ring[:, count:], eps=eps[:, count:], largest=largest[:, -1], k=state.k + count)
+    return after, Thresholds(total, first, shift, start[None, :, m:], rest)
 
 
 #: State, bounds of the channel rows, ``|phi|`` of each constant, and the shift of the outputs' middle.
@@ -134,41 +170,58 @@ _FirstOrder: TypeAlias = tuple[AdaptiveState, FloatArray, FloatArray, FloatArray
 
 def _constant(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _FirstOrder:
     p, nz, rows, _, no = bound.counts
-    runs = v.shape[:-1]
-    w = (v @ bound.drive.reshape(-1, v.shape[-1]).T).reshape(*runs, p, nz + rows + no)
-    seen = w[..., nz:] + state.psi @ bound.shown.T
-    state = state._replace(psi=state.psi @ bound.structure.Az.T + w[..., :nz])
+    runs, count, nv = v.shape
+    w = (v.reshape(-1, nv) @ bound.drive.reshape(-1, nv).T).reshape(runs, count, p, nz + rows + no)
+    psi = np.empty((runs, count, p, nz))
+    now, turned = state.psi, bound.structure.Az.T
+    for k in range(count):
+        psi[:, k] = now
+        now = (now.reshape(-1, nz) @ turned).reshape(runs, p, nz) + w[:, k, :, :nz]
+    seen = (psi.reshape(-1, nz) @ bound.shown.T).reshape(runs, count, p, rows + no)
+    seen += w[..., nz:]
     sizes, offsets = np.abs(seen), bound.structure.offsets
-    moved, shift = sizes[..., :rows].sum(axis=-2), np.zeros((*runs, no))
+    moved, shift = sizes[..., :rows].sum(axis=-2), np.zeros((runs, count, no))
     if offsets.any():
         middle = offsets @ seen
         moved, shift = moved + np.abs(middle[..., :rows]), -middle[..., rows:]
-    return state, moved, sizes[..., rows:], shift
+    return state._replace(psi=now), moved, sizes[..., rows:], shift
 
 
 def _varying(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _FirstOrder:
     """Return the same for constants that may change at each sample: sums of absolute values, sample by sample."""
     p, nz, rows, _, no = bound.counts
-    runs = v.shape[:-1]
-    # For each sample of the ring ``(L, runs, p (rows + no + nz))``: one product of matrices each.
-    memory = bound.memory.reshape(bound.length, -1, v.shape[-1])
-    past = np.moveaxis(state.past.reshape(-1, bound.length, v.shape[-1]), 1, 0)
-    eps = np.abs(past @ memory.transpose(0, 2, 1)).sum(axis=0).reshape(*runs, p, rows + no + nz) * bound.spans[:, None]
-    now = (v @ bound.drive[:, nz:].reshape(-1, v.shape[-1]).T).reshape(*runs, p, rows + no)
+    (runs, count, nv), length = v.shape, bound.length
+    past, moved = _continued(state.past, count), _continued(state.moved, count)
+    past[:, length:] = v
+    eps = np.zeros((runs, count, p * (rows + no + nz)))
+    for j, memory in enumerate(bound.memory.reshape(length, -1, nv)):
+        eps += np.abs(past[:, j : j + count] @ memory.T)
+    eps = eps.reshape(runs, count, p, rows + no + nz) * bound.spans[:, None]
+    now = (v @ bound.drive[:, nz:].reshape(-1, nv).T).reshape(runs, count, p, rows + no)
     sizes = np.abs(now) * bound.spans[:, None] + eps[..., : rows + no]
-    older = state.moved[..., 0, :]
-    into = eps[..., rows + no :].sum(axis=-2) + older @ bound.responses.tail_eps.T
-    state = state._replace(past=_followed(state.past, v), moved=_followed(state.moved, into))
+    into, tail = eps[..., rows + no :].sum(axis=2), bound.responses.tail_eps.T
+    for k in range(count):
+        moved[:, length + k] = into[:, k] + moved[:, k] @ tail
+    older = moved[:, :count]
     # What is older than the ring belongs to all constants: it is shared out evenly.
-    first = sizes[..., rows:] + (older @ bound.responses.tail_outputs.T)[..., None, :] / p if p else sizes[..., rows:]
-    return state, sizes[..., :rows].sum(axis=-2) + older @ bound.tail_rows.T, first, np.zeros((*runs, no))
+    first = sizes[..., rows:]
+    if p:
+        first = first + (older @ bound.responses.tail_outputs.T)[..., None, :] / p
+    state = state._replace(past=past[:, count:], moved=moved[:, count:])
+    return state, sizes[..., :rows].sum(axis=2) + older @ bound.tail_rows.T, first, np.zeros((runs, count, no))
 
 
 def _channels(bound: AdaptiveBound, rows: FloatArray) -> FloatArray:
-    """Return the size of each channel ``(..., m)`` from its rows ``(..., rows)``."""
-    return np.moveaxis(bound.structure.channel_sizes(np.moveaxis(rows, -1, 0)), 0, -1)
+    """Return the size of each channel ``(..., m)`` from the sizes of its rows ``(..., rows)``."""
+    single = bound.structure.single
+    if single == rows.shape[-1]:
+        return rows
+    return np.concatenate([rows[..., :single], rows[..., single:].max(axis=-1, keepdims=True)], axis=-1)
 
 
-def _followed(ring: FloatArray, row: FloatArray) -> FloatArray:
-    """Return a ring ``(..., L, n)`` without its oldest row, with the newest ``(..., n)`` at its end."""
-    return np.concatenate([ring[..., 1:, :], row[..., None, :]], axis=-2)
+def _continued(ring: FloatArray, count: int) -> FloatArray:
+    """Return a ring ``(runs, L, n)`` with room for further rows behind it."""
+    runs, length, width = ring.shape
+    found = np.empty((runs, length + count, width))
+    found[:, :length] = ring
+    return found
