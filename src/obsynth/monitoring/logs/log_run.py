@@ -22,6 +22,7 @@ from obsynth.monitoring.logs.recovered_states import FIRST_SECONDS, MOST_FIRST_R
 from obsynth.monitoring.logs.signals import TIME_HEADER, LogSignals
 from obsynth.monitoring.logs.stamps import Stamps
 from obsynth.monitoring.logs.stuck_sensors import STUCK_ALARM_ROWS, RepeatedValues, Unrepeated, rising
+from obsynth.monitoring.logs.unit_check import UnitCheck
 from obsynth.monitoring.thresholds.learned_levels import HOLD
 from obsynth.monitoring.thresholds.learned_rule import LearnedRule
 from obsynth.monitoring.thresholds.monitor import LinearSample, Monitor, Sample
@@ -159,6 +160,7 @@ class LogRun:
         monitor: Monitor | None = None,
         recovered: str | Sequence[str] | None = "none",
         stamps: Stamps | None = None,
+        units_as_is: bool = True,
     ) -> None:
         #: Of thresholds that were learned: what leaves out the samples of sensors that may be stuck.
         self.unrepeated: Unrepeated | None = None
@@ -210,6 +212,7 @@ class LogRun:
         ends = {f"{end} {name}": value for name, value in point.items() for end in ("lowest", "highest")}
         self._shifts = np.array([ends.get(name, 0.0) for name in (() if monitor is None else monitor.columns)])
         self.first, self.rows = OperatingPointCheck(self.signals), 0
+        self.units = None if units_as_is else UnitCheck(design, self.signals)
         #: The file of the state that the first rows go on from: only they show whether its parts fit together.
         self.resumed_from: Path | None = None
         self.statuses, self.alarms, self.isolated = Counter[str](), dict[str, float](), ""
@@ -238,7 +241,10 @@ class LogRun:
 
     def read(self, chunk: FloatArray) -> list[Row]:
         """Take rows ``[time, u, y]`` as read; return the estimates at them (``chunk (rows, 1 + nu + ny)``)."""
-        return self.estimates(chunk[:, 0].tolist(), self.signals.deviations(chunk))
+        deviations = self.signals.deviations(chunk)
+        if self.units is not None:
+            self.units.take(deviations)
+        return self.estimates(chunk[:, 0].tolist(), deviations)
 
     def estimates(self, times: Sequence[float], values: FloatArray) -> list[Row]:
         """Return the estimates at rows as they come, deviations ``values (rows, nu + ny)``; those whose stamps do not
@@ -328,6 +334,8 @@ class LogRun:
 
     def finish(self) -> list[list[Any]]:
         """Return the rows of output that waited for what does not come any more."""
+        if self.units is not None:
+            self.units.finish()
         return [] if self.later is None else self._shown([ready for ready, *_ in self.later.flush()])
 
     def _shown(self, taken: Sequence[Row]) -> list[list[Any]]:
@@ -486,6 +494,8 @@ class LogRun:
             self.recovered.resume(data["recovered"])
         if self.monitor is not None:
             self._watching = self.monitor.from_data(data["monitor"])
+        # Its first rows were judged when they came.
+        self.units = None
 
 
 def save_state(path: Path, run: LogRun, digest: str) -> None:

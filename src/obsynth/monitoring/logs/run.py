@@ -146,6 +146,7 @@ def run_on_data(
     state_every: int = STATE_ROWS,
     chunk_rows: int = CHUNK_ROWS,
     progress: Callable[[int], None] | None = None,
+    units_as_is: bool = False,
 ) -> DataRun:
     """Run a design on measured data, in constant memory.
 
@@ -213,6 +214,11 @@ def run_on_data(
         Rows that are read and written at a time; the results do not depend on it.
     progress : callable, optional
         Called with the number of rows done, after each chunk.
+    units_as_is : bool, optional
+        Whether to go on where one signal is not what the design expects from its first row on (20 rows are looked at),
+        but would be after a usual change of unit: kelvin for degrees Celsius, Pa for bar, g for kg, percent, minutes,
+        hours, or the other sign.  By default such a log is refused, with the likely factor: for recursive and nonlinear
+        designs by their innovations, for linear ones by operating points that are not zero.
 
     Returns
     -------
@@ -222,7 +228,7 @@ def run_on_data(
     Raises
     ------
     SpecError
-        Columns are missing, a cell is no number, a time is missing, repeated, decreasing or
+        Columns are missing or likely in another unit, a cell is no number, a time is missing, repeated, decreasing or
         does not fit the design's dt (the row is named), or a file cannot be read or written.
 
     Notes
@@ -274,6 +280,7 @@ def run_on_data(
         monitor=monitor,
         recovered=recovered,
         stamps=stamps,
+        units_as_is=units_as_is,
     )
     _smoothed(run, data, smooth=smooth, lag=lag, state=state)
     digest = gain_set_digest(design)

@@ -79,6 +79,7 @@ def run_of(
             gap=options.gap,
             warm_up=options.warm_up,
             progress=progress,
+            units_as_is=getattr(options, "units_as_is", False),
             **more,
         )
     for text in found.warnings:

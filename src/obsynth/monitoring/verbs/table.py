@@ -173,6 +173,7 @@ VERBS = {
                     ),
                     JOBS,
                     CLUSTER,
+                    flag("--units-as-is", "go on where a signal is likely in another unit than the plant's"),
                     option(
                         "--outliers",
                         None,

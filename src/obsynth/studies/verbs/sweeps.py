@@ -100,6 +100,7 @@ def run_many(options: argparse.Namespace) -> int:
         "time_zone": options.time_zone,
         "time_unit": options.time_unit,
         "outliers": options.outliers,
+        "units_as_is": options.units_as_is or None,
         "scales": numbers_of(options.scale) or None,
         "thresholds": numbers_of(options.threshold) or None,
         "gap": options.gap,
