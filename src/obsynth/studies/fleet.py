@@ -178,7 +178,8 @@ def run_fleet(
         Called with the number of runs done and their total.
     **options
         As for `run_on_data`: ``columns, time_column, time_zone, time_unit, scales, thresholds, gap, warm_up,
-        recovered, outliers, units_as_is``; and ``unverified``: whether designs that fail their verification are run all the same.
+        recovered, outliers, units_as_is``; and ``unverified``: whether designs that fail their verification are run
+        all the same.
 
     Returns
     -------
