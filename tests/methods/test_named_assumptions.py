@@ -52,7 +52,7 @@ def test_a_method_that_does_not_take_a_region_says_nothing_of_other_observers(me
         getattr(obsynth, method)(_spring())
     assert "methods for such plants are: fault-estimation-filter, ui-pi-observer" in str(e.value)
     # What is named was tried: the one that takes noise of sensors as the Kalman filter would.
-    assert obsynth.ui_pi_observer(_spring(), noise={"x": 0.1, "v": 0.2}).report.passed
+    assert obsynth.ui_pi_observer(_spring(), noise={"measurement": {"x": 0.1, "v": 0.2}}).report.passed
     assert obsynth.fault_estimation_filter(_spring()).report.passed
 
 
