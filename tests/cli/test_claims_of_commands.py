@@ -8,6 +8,8 @@ that jump inside samples at the worst times (or rest there, where the claim says
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -57,6 +59,28 @@ TABLE: dict[str, tuple[list[str], str, tuple[str, ...]]] = {
     "design": (
         ["design", "--system", str(TEST), "--output", "test.json", "--quiet", "--verbose"],
         r"without the fault the residual never passes this", (MOVING_TEST,),
+    ),
+    "design, a gain": (
+        ["design", "--system", str(FILTER), "--output", "filter.json", "--quiet"],
+        r"gamma = [0-9.]+, proved bound", ("the model is exact with disturbances held between samples",),
+    ),
+    "design, a gain of a plant that was sampled by its paper": (
+        ["design", "--system", str(PAPER), "--output", "paper.json", "--quiet"],
+        r"gamma = [0-9.]+, proved bound", ("the model is exact; only --monitor pointwise accounts for tolerances",),
+    ),
+    "compare": (
+        ["compare", "--system", str(FILTER), "--runs", "2", "--quiet"],
+        r"least of any causal filter",
+        ("bound: largest estimate without a fault, for the exact model (tolerances not counted) and held disturbances",
+         "gains and the least of any causal filter are of the exact model, with faults and disturbances that are held"),
+    ),
+    "evaluate, noise that the scenario leaves out": (
+        ["evaluate", "--system", str(FILTER), "--runs", "2", "--monitor", "pointwise", "--noise-bound", "3", "--quiet"],
+        r"never passed without a fault", ("no noise, as the scenario has none",),
+    ),
+    "evaluate, noise in the bound of estimates": (
+        ["evaluate", "--system", str(FILTER), "--runs", "2", "--quiet"],
+        r"\|estimate of loss of torque\| <=", ("noise within 3 standard deviations", "once the start has died out"),
     ),
 }  # fmt: skip
 
@@ -140,8 +164,8 @@ def test_the_bound_of_estimates_is_of_the_exact_model_and_moving_disturbances(
     signs, noise = worst(plant, dt, row, held=False)
     sizes = 3.0 * np.abs(sampled.Dw).sum(axis=1)
     found = row(outputs(plant, dt, 0.2 * signs, noise * sizes))
-    # Three digits are printed; what is before these samples counts a little.
-    assert 0.9 * bound <= found <= bound * 1.005
+    # Three digits are printed, the last rounded up; what is before these samples counts a little.
+    assert 0.9 * bound <= found <= bound
 
 
 @pytest.mark.long
@@ -202,3 +226,86 @@ def test_the_least_gain_of_a_filter_is_that_of_its_matrices() -> None:
         obsynth.fault_estimation_filter(plant, weight="paper", gamma=1.1)
     # Another weight reaches it: the sentence is about these matrices alone.
     assert obsynth.fault_estimation_filter(plant, weight="free", gamma=1.1).certificate.claims["gamma"] <= 1.1
+
+
+def test_a_page_and_a_proof_say_for_what_gains_hold(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, design = filtered()
+    gains, page, proof = (tmp_path / name for name in ("filter.json", "page.html", "proof.json"))
+    design.save(gains)
+    assert main(["report", "--gains", str(gains), "--out", str(page)]) == 0
+    assert "the model is exact with disturbances held between samples" in page.read_text("utf-8")
+    assert main(["export", "--gains", str(gains), "--to", str(proof), "--checker"]) == 0
+    capsys.readouterr()
+    told = subprocess.run(
+        [sys.executable, "-I", str(tmp_path / "check_proof.py"), str(proof)], capture_output=True, text=True, check=True
+    ).stdout
+    assert re.search(r"^PROVED +gain: the l2 gain from the disturbances", told, re.MULTILINE)
+    assert "NOT COVERED by this file: that the plant follows from the plant as written (elimination, sampling)" in told
+    assert "All 6 claims are proved, for the numbers in this file." in told
+
+
+#: An oscillator whose input and second sensor have dead times; its disturbance turns once within eight samples.
+DEAD_TIME = """
+schema_version: 1
+name: dead-time
+plant:
+  dt: 0
+  A: [[0, 1], [-60, -0.6]]
+  E: [[1, 0], [0, 1]]
+  B: [[0], [1]]
+  Bf: [[0], [1]]
+  Bd: [[1], [0.3]]
+  C: [[1, 0], [0, 1]]
+  input_names: [u]
+  fault_names: [f]
+  disturbance_names: [d]
+  sensor_noise: {y1: 0.001, y2: 0.001}
+  delays: {u: 0.2, y2: 0.3}
+  transform: {sample_time: 0.1}
+method: {id: fault-estimation-filter}
+scenario:
+  horizon: 6
+  faults: {f: {kind: step, size: 1, start: 4}}
+  disturbances: {d: {kind: uniform, low: -0.2, high: 0.2}}
+  inputs: {u: {kind: sine, amplitude: 1, frequency: 1.0}}
+  noise: 1
+"""
+
+
+def test_a_threshold_of_a_plant_with_dead_time_is_for_any_course(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """The estimate of the sampled plant with its delay lines, driven by the plant as written, whose sensor is late."""
+    file = tmp_path / "dead_time.yaml"
+    file.write_text(DEAD_TIME, "utf-8")
+    command = ["evaluate", "--system", str(file), "--runs", "2", "--quiet"]
+    assert main([*command, "--monitor", "pointwise", "--noise-bound", "3"]) == 0
+    text = capsys.readouterr().out
+    told, found = paragraph(text, r"threshold \(([0-9.]+) at the end")
+    for word in (MOVING_MONITOR, "d within 0.2", "sensor noise within 3 standard deviations", "assumes an exact model"):
+        assert word in told, word
+    estimate, size = paragraph(text, r"\|estimate of f\| <= ([0-9.]+)")
+    assert HELD in estimate
+    spec = obsynth.load_spec(file)
+    sampled, observer = obsynth.design(spec.plant, spec.method, **spec.options).linear
+    # Sensitivity of the last estimate to the outputs, and of these to the disturbance in each part of a sample.
+    weights = np.zeros((SAMPLES, 2))
+    for k, j in np.ndindex(SAMPLES, 2):
+        y = np.zeros((SAMPLES, 2))
+        y[k, j] = 1.0
+        weights[k, j] = observer.run(y, np.zeros((SAMPLES, sampled.nu))).faults[-1, 0]
+    inside = PARTS * 2
+    a, b = np.array([[0.0, 1.0], [-60.0, -0.6]]), np.array([[1.0], [0.3]])
+    part = expm(np.block([[a, b], [np.zeros((1, 3))]]) * 0.1 / inside)
+    pulses = [part[:2, 2]]
+    for _ in range(SAMPLES * inside):
+        pulses.append(part[:2, :2] @ pulses[-1])
+    effect = np.zeros(SAMPLES * inside)
+    for k, j in np.ndindex(SAMPLES, 2):
+        ends = k * inside - (0, 3 * inside)[j]
+        effect[: max(ends, 0)] += weights[k, j] * np.array([pulses[ends - 1 - m][j] for m in range(max(ends, 0))])
+    noise = 3.0 * 1e-3 * np.abs(weights).sum()
+    moving = 0.2 * np.abs(effect).sum() + noise
+    held = 0.2 * np.abs(effect.reshape(SAMPLES, inside).sum(axis=1)).sum() + noise
+    assert 0.5 * float(found.group(1)) <= moving <= float(found.group(1)) * 1.0002
+    assert 0.5 * float(size.group(1)) <= held <= float(size.group(1))

@@ -11,6 +11,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.text import Text
 
@@ -21,6 +22,7 @@ from obsynth.methods.guaranteed_test.method import is_guaranteed
 from obsynth.methods.optimal_filter.least_possible import least_possible
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.modes import SETTLED_TO, transient
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.nonlinear.region_observer import RegionObserver
 from obsynth.observers.scheduled.observer import ScheduledObserver
 from obsynth.observers.window.observer import WindowObserver
@@ -43,6 +45,7 @@ from obsynth.report.plants import plain_table
 from obsynth.report.plots.frequency import FaultGains
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import number, verdict_line
+from obsynth.verification.assumptions import Assumptions
 
 #: Faults, warnings and notes that are listed; the others are counted.
 _MOST_IN_SUMMARY, _MOST_NOTES = 5, 1
@@ -275,7 +278,8 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
     if isinstance(design.plant, DescriptorSystem):
         uncertain = design.plant.uncertainty
         some = uncertain is not None and bool(uncertain.box.names)
-        yield "the model is exact; only --monitor pointwise accounts for tolerances" if some else "the model is exact"
+        held = " with disturbances held between samples" if _is_of_held_disturbances(design) else ""
+        yield f"the model is exact{held}" + ("; only --monitor pointwise accounts for tolerances" if some else "")
     elif isinstance(design.observer, WindowObserver):
         yield "a model with the stated bounds"
     elif isinstance(design.observer, RegionObserver):
@@ -298,6 +302,15 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
             yield "white noise of deviation 1 on every sensor, as none is stated"
             return
         yield f"white noise on {noisy} of {design.plant.ny} sensors" if noisy else "no sensor noise given"
+
+
+def _is_of_held_disturbances(design: ObserverDesign) -> bool:
+    """Return whether gains are claimed of a sampled plant whose disturbances may move between samples."""
+    plant, written = design.plant, None if design.source is None else design.source.plant
+    if not isinstance(plant, DescriptorSystem) or not isinstance(design.observer, LinearObserver) or not plant.nd:
+        return False
+    sampled = isinstance(written, DescriptorSystem) and written.dt == 0.0 < plant.dt
+    return "gamma" in design.certificate.claims and (sampled or Assumptions(plant, np.ones(plant.nd), 0.0).moves)
 
 
 def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[str, FaultFigures]) -> Iterator[str]:

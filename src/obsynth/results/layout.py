@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from decimal import ROUND_CEILING, Decimal
 from io import StringIO
 
 from rich import box
@@ -66,6 +67,14 @@ def number(value: float, *, digits: int = 4) -> str:
         rounded = float(text)
         return f"{rounded:,.0f}" if abs(rounded) >= LEAST_WITH_COMMAS else f"{rounded:.0f}"
     return f"{mantissa}e{int(exponent)}"
+
+
+def upper_number(value: float, *, digits: int = 3) -> str:
+    """Return an upper bound with a few significant digits, the last rounded up: what is printed is a bound as well."""
+    if not math.isfinite(value) or value == 0.0:
+        return number(value, digits=digits)
+    exact = Decimal(repr(float(value)))
+    return number(float(exact.quantize(Decimal(1).scaleb(exact.adjusted() + 1 - digits), ROUND_CEILING)), digits=digits)
 
 
 def duration(seconds: float, *, digits: int = 3) -> str:

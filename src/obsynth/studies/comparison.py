@@ -30,7 +30,7 @@ from obsynth.results.certificate_files import SHOWN_DIGITS, result_text
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import design_as_dict
 from obsynth.results.gain_sets import COMPARISON
-from obsynth.results.layout import number
+from obsynth.results.layout import number, upper_number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -105,6 +105,12 @@ _FIGURE_MEANINGS = {
     ),
     "ms": "milliseconds to design and verify",
 }
+
+#: For what the figures hold that no run was made for.
+_OF_THE_EXACT_MODEL = (
+    "Times, deviations, gains and the least of any causal filter are of the exact model, with faults and disturbances "
+    "that are held between samples."
+)
 
 
 @dataclass(frozen=True)
@@ -269,16 +275,17 @@ class Comparison:
                     fault.bias,
                     fault.detection_delay,
                     fault.smallest_found,
-                    fault.bound,
-                    fault.bound / fault.least if fault.least > 0.0 else np.nan,
-                    fault.rms,
                 )
+                beside = (fault.bound / fault.least if fault.least > 0.0 else np.nan, fault.rms)
+                bound = upper_number(fault.bound) if np.isfinite(fault.bound) else _number(fault.bound)
                 rows.append(
                     (
                         entry.method if k == 0 else "",
                         figures.fault,
                         str(entry.order) if k == 0 else "",
                         *(_number(value) for value in numbers),
+                        bound,
+                        *(_number(value) for value in beside),
                         *(_number(share) if k == 0 else "" for share in entry.shares),
                         f"{entry.milliseconds:.0f}" if k == 0 else "",
                     )
@@ -302,7 +309,8 @@ class Comparison:
         str
             Each header with its meaning.
         """
-        return "; ".join(f"{name}: {_FIGURE_MEANINGS[name]}" for name in columns if name in _FIGURE_MEANINGS) + "."
+        told = [f"{name}: {_FIGURE_MEANINGS[name]}" for name in columns if name in _FIGURE_MEANINGS]
+        return "; ".join(told) + f". {_OF_THE_EXACT_MODEL}"
 
     @property
     def beside_the_least(self) -> tuple[str, ...]:
@@ -479,6 +487,7 @@ class Comparison:
 
         picture = data_url(written(self._drawn(Figure)))
         meanings = "".join(f"<li>{escape(f'{name}: {text}')}</li>" for name, text in _FIGURE_MEANINGS.items())
+        meanings += f"<li>{escape(_OF_THE_EXACT_MODEL)}</li>"
         refused = "".join(f"<li>{escape(text)}</li>" for text in self.refusals)
         head, *rows = self.rows()
         # With the unit of each fault, in which its figures are.

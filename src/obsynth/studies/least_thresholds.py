@@ -19,6 +19,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.transformations.moving_disturbances import moving_columns
 from obsynth.results.design import ObserverDesign
+from obsynth.results.layout import upper_number
 from obsynth.simulation.scenario import Scenario
 from obsynth.studies.comparison import LONGEST_WINDOW
 
@@ -124,12 +125,21 @@ def _least(
     return size if np.isfinite(size) else float("nan")
 
 
-def in_words(fault: str, bound: float, least: float, unit: str = "", *, moving: bool = False) -> str:
-    """Return a sentence on one fault; ``moving``: whether disturbances move between samples."""
-    size = f"{bound:.3g}{f' {unit}' if unit else ''}"
+def in_words(
+    fault: str, bound: float, least: float, unit: str = "", *, moving: bool = False, noisy: bool = False
+) -> str:
+    """Return a sentence on one fault; ``moving``: whether disturbances move between samples; ``noisy``: whether the
+    plant has noise, which counts as within `DEVIATIONS`."""
+    size = f"{upper_number(bound, digits=3)}{f' {unit}' if unit else ''}"
     course = "move within their bounds" if moving else "are held"
+    noise = (
+        f" (those of the scenario; noise within {DEVIATIONS:g} standard deviations)"
+        if noisy
+        else " (those of the scenario)"
+    )
     own = (
-        f"Fault-free, if the model is exact and disturbances {course} between samples, |estimate of {fault}| <= {size}"
+        f"Fault-free, once the start has died out, if the model is exact and disturbances {course} between "
+        f"samples{noise}, |estimate of {fault}| <= {size}"
     )
     if not np.isfinite(least):
         return f"{own}. The smallest possible threshold is not known."

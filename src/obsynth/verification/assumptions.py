@@ -31,6 +31,8 @@ class Assumptions:
     initial_error: float | None = None
     #: ``any``: disturbances move within their bounds between samples too; ``held``: they do not.
     disturbance: str = "any"
+    #: Whether the plant's noise is left out, since a scenario has none.
+    noise_left_out: bool = False
 
     @property
     def moves(self) -> bool:
@@ -83,6 +85,8 @@ class Assumptions:
             found.append(_enough(each, "disturbances within their bounds"))
         if plant.nw:
             found.append(self._noise())
+        elif self.noise_left_out:
+            found.append("no noise, as the scenario has none")
         for given, what in ((self.initial_set, "a start"), (self.state_bounds, "states")):
             if given is not None:
                 each = [f"{name} {_range(value, plant.units.get(name, ''))}" for name, value in given.items()]

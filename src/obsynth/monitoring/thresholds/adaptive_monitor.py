@@ -269,6 +269,7 @@ def over_box(
     sample_time: float | None = None,
     scenario: Scenario | None = None,
     disturbance: str = "any",
+    noise_left_out: bool = False,
 ) -> tuple[Rule, str]:
     """Return the pointwise rule over the box of the plant of a design with the noise that is bounded, and what it
     promises: for a record of a scenario, from its start unless one is given, or for data, which may have gaps."""
@@ -296,7 +297,13 @@ def over_box(
         disturbance=disturbance,
     )
     assumed = Assumptions(
-        plant, bounds, noise_bound or 0.0, initial_set, initial_error=initial_error, disturbance=disturbance
+        plant,
+        bounds,
+        noise_bound or 0.0,
+        initial_set,
+        initial_error=initial_error,
+        disturbance=disturbance,
+        noise_left_out=noise_left_out,
     )
     rule = AdaptiveRule(first, later if scenario is None else first, nominal)
     return rule, adaptive_statement(first, assumed)

@@ -174,13 +174,22 @@ def monitor(
             threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
         rule = NormRule(threshold, np.inf, window=window if kind == "window" else 1, dt=bench.signals.dt)
     noisy = noisy_design(design, scenario)
-    assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=start)
+    quiet = bool(design.linear[0].nw and not noisy.linear[0].nw)
+    assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=start, noise_left_out=quiet)
     bounded = assumed if kind in ("pointwise", "window") else None
     statement = statement_of(kind, model, bounded, estimates=estimates, **numbers) + NO_TOLERANCE
     if adaptive:
         nominal = cast(NormRule, rule)
         rule, statement = over_box(
-            noisy, nominal, bounds, noise_bound, initial_error, initial_set, scenario=scenario, disturbance=disturbance
+            noisy,
+            nominal,
+            bounds,
+            noise_bound,
+            initial_error,
+            initial_set,
+            scenario=scenario,
+            disturbance=disturbance,
+            noise_left_out=quiet,
         )
     return Monitor(
         kind,

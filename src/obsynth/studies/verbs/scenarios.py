@@ -124,7 +124,8 @@ def run_evaluate(options: argparse.Namespace) -> int:
 
     least = design_beside_least(design, scenario)
     units, moving = design.plant.units, bool(least) and is_moving(design)
-    sentences = [in_words(name, *pair, units.get(name, ""), moving=moving) for name, pair in least.items()]
+    noisy = bool(least) and bool(design.linear[0].Dw.any() or design.linear[0].Bw.any())
+    sentences = [in_words(name, *pair, units.get(name, ""), moving=moving, noisy=noisy) for name, pair in least.items()]
     told: dict[str, Any] | None = None
     if watched is not None:
         kind, statement = described(watched)
