@@ -278,7 +278,7 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
     if isinstance(design.plant, DescriptorSystem):
         uncertain = design.plant.uncertainty
         some = uncertain is not None and bool(uncertain.box.names)
-        held = " with disturbances held between samples" if _is_of_held_disturbances(design) else ""
+        held = ", disturbances held over each sample" if _is_of_held_disturbances(design) else ""
         yield f"the model is exact{held}" + ("; only --monitor pointwise accounts for tolerances" if some else "")
     elif isinstance(design.observer, WindowObserver):
         yield "a model with the stated bounds"
