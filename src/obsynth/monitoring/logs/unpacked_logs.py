@@ -86,7 +86,7 @@ def opened_log(path: Path, wanted: Sequence[str]) -> Iterator[TextIO]:
             if own.read(2) != _GZIP:
                 raise SpecError(f"{path} cannot be read: it is no gzip file.", path=str(path))
         try:
-            with gzip.open(path) as packed:
+            with gzip.open(path, "rb") as packed:
                 encoding = encoding_of(packed)
             with gzip.open(path, "rt", encoding=encoding, errors=WINDOWS_TEXT, newline="") as stream:
                 yield stream

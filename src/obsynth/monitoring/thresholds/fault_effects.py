@@ -230,7 +230,7 @@ class LinearEffects(FaultEffects):
     def _moved(
         self, state: EffectState, said: Any, rows: FloatArray, seen: NDArray[np.bool_] | None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        return state.error, state.past, self.responses[np.clip(rows.astype(int) - 1, 0, COUNTED - 1)]
+        return state.error, state.past, self.responses[np.clip(rows.astype(np.int64) - 1, 0, COUNTED - 1)]
 
     @cached_property
     def responses(self) -> FloatArray:
