@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from obsynth.conditions.wang import wang2015
     from obsynth.numerics.regions import LMIRegion, disk, half_plane, sector
     from obsynth.verification.error_polytope import ErrorPolytope
+    from obsynth.verification.sampled_polytope import drift_within_samples, sampled_polytope
 
 __all__ = [
     "Bisection",
@@ -36,6 +37,7 @@ __all__ = [
     "admissible",
     "bounded_real",
     "disk",
+    "drift_within_samples",
     "filasova_theorem1",
     "filasova_theorem2",
     "h2",
@@ -45,6 +47,7 @@ __all__ = [
     "kalman",
     "nonlinear_region",
     "region",
+    "sampled_polytope",
     "sector",
     "sharepasand",
     "slope_inequality",
@@ -69,6 +72,7 @@ _HOMES = {
         "conditions.wang": "wang2015",
         "numerics.regions": "LMIRegion disk half_plane sector",
         "verification.error_polytope": "ErrorPolytope",
+        "verification.sampled_polytope": "drift_within_samples sampled_polytope",
     }.items()
     for name in names.split()
 }

@@ -26,6 +26,11 @@ from obsynth.proofs.vertex_inequalities import prove_nonsingular
 #: What is kept of ``1 / |Delta^-1|`` in its proof, largest share first.
 EFFECTIVENESS_SHARES = (1.0 - 1e-9, 0.99, 0.5, 0.1)
 _SOURCE = "over the region: Wang 2015 with constant T, N"
+#: exp(dt A(mu)) has no vertices: what helps a filter of samples where the plant is continuous.
+_CONTINUOUS = (
+    "a continuous plant, whose samples over a region have no vertices. Take ui-pi-observer, which takes it as it is, "
+    "and steps from row to row by implicit Euler."
+)
 #: Matrices that a scheduled gain needs to be the same at all vertices.
 CONSTANT_MATRICES = ("C", "D", "Df", "Dd", "Dw")
 
@@ -93,6 +98,9 @@ def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion
         return
     for where, point in frozen_points(plant):
         for condition in fault_filter_conditions(point, exactly=exactly):
+            if condition.name == "discrete time" and not condition.holds:
+                yield replace(condition, detail=_CONTINUOUS)
+                return
             if not condition.holds:
                 yield replace(condition, name=f"{condition.name} at {where}")
                 return

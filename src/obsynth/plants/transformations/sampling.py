@@ -17,6 +17,7 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
 from obsynth.numerics.sparse import dense
 from obsynth.plants.descriptor import DescriptorSystem, note_source
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.delayed_signals import sampled_with_delays
 from obsynth.plants.transformations.elimination import columns_of, eliminate_algebraic_states
 from obsynth.plants.transformations.exact_elimination import EXACT_ELIMINATION_UP_TO, sampled_exact_numbers
@@ -35,7 +36,7 @@ SQUARING_BITS = 640
 
 @arguments_checked
 @on_one_thread_if_small
-def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> Transformation:
+def discretise(plant: DescriptorSystem | Transformation | PolytopicSystem, sample_time: float) -> Transformation:
     """Sample a continuous plant with a zero-order hold.
 
     Exact for inputs, faults and disturbances that are constant between samples, and for delays (``plant.delays``) of
@@ -63,7 +64,8 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
         ``plant.dt > 0``, or ``sample_time`` is not a positive number, or an unstable mode outgrows double precision
         within it, or a delay is hundreds of samples.
     PreconditionError
-        As for `eliminate_algebraic_states`; or continuous white noise reaches an output directly.
+        A polytopic plant, whose samples have no vertices; as for `eliminate_algebraic_states`; or continuous white
+        noise reaches an output directly.
 
     References
     ----------
@@ -77,6 +79,14 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
     >>> sampled.A.round(4).tolist(), sampled.B.round(4).tolist(), sampled.dt
     ([[0.9048]], [[0.0952]], 0.1)
     """
+    if isinstance(plant, PolytopicSystem):
+        raise PreconditionError(
+            "The samples of a plant over a region have no vertices: exp(A(mu) dt) is no mean of those at the vertices. "
+            "obsynth.ui_pi_observer takes the continuous plant as it is, and steps from row to row by implicit Euler "
+            "with the same certificate; obsynth.conditions.sampled_polytope samples an error system with a bound on "
+            "what is missed.",
+            condition="samples over a region",
+        )
     if isinstance(plant, Transformation):
         if plant.plant.delays:
             return _sampled(plant.plant, sample_time, before=plant)

@@ -1,0 +1,114 @@
+r"""Samples of a continuous polytope of error systems, whose parameter rests over each sample: vertices and a remainder.
+
+:math:`e^{T A(\mu)}` is no mean of the :math:`e^{T A_i}`, but nearly so.  Along a line in the hull its second derivative
+is at most :math:`T^2 |H|^2 e^{a T}`, a the largest logarithmic norm (0 or more), and what a function with such a
+derivative misses of the mean of its ends is, by Jensen's inequality,
+
+.. math::
+    |e^{T A(\mu)} - \textstyle\sum \mu_i e^{T A_i}| \le T^2 D^2 (1 - 1/N) e^{a T} / 4
+
+with D the diameter of the hull in Frobenius' norm.  An observer that uses :math:`e^{T A(\mu_k)}` itself has errors with
+this remainder beside A.  A parameter that moves within the sample has the transition of the plant differ by at most
+:math:`\nu T^2 e^{a T} / 2`, :math:`|dA/dt| \le \nu`; this multiplies the state and not the error.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import arguments_checked, real_number
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.affine import AffineMatrix, affine_exponential
+from obsynth.verification.error_polytope import ErrorPolytope
+
+#: By how much bounds are larger than computed, for all rounding of a few norms and eigenvalues.
+_ROOM = 1.0 + 1e-9
+
+
+@arguments_checked
+def sampled_polytope(errors: ErrorPolytope, dt: float) -> ErrorPolytope:
+    """Return a continuous error system without inputs at samples, for parameters that rest between them.
+
+    Parameters
+    ----------
+    errors : ErrorPolytope
+        In continuous time, all errors differential, nothing that drives them, and one C.
+    dt : float
+        Seconds between samples.
+
+    Returns
+    -------
+    ErrorPolytope
+        ``exp(dt A_i)`` at each vertex, and the remainder ``ball`` beside it, rounding among it.
+
+    Raises
+    ------
+    SpecError
+        The system is sampled, has algebraic errors or inputs, or dt is not positive.
+
+    Examples
+    --------
+    >>> spring = ErrorPolytope([[[0, 1], [-1, -1]], [[0, 1], [-3, -1]]], [[1.0, 0.0]], dt=0.0)
+    >>> found = sampled_polytope(spring, 0.1)
+    >>> found.dt, 0.005 < found.ball < 0.006
+    (0.1, True)
+    """
+    real_number(dt, "dt", "a positive number of seconds", above=0.0)
+    if errors.dt > 0.0:
+        raise SpecError("The error system is sampled already.", path="errors")
+    if errors.differential is not None and errors.differential < errors.order:
+        raise SpecError("Algebraic errors have no samples of their own: eliminate them first.", path="errors")
+    if errors.B[0].size or not errors.constant_output:
+        raise SpecError(
+            "Inputs of the errors, and outputs that change, are not sampled here: give A at the vertices, and one C.",
+            path="errors",
+        )
+    made = [affine_exponential(AffineMatrix.exact(dt * matrix, 0)) for matrix in errors.A]
+    rounding = max(float(np.linalg.norm(matrix.radius)) for matrix in made)
+    diameter = max(float(np.linalg.norm(one - other)) for one in errors.A for other in errors.A)
+    share = (1.0 - 1.0 / errors.count) / 4.0
+    ball = (dt * diameter) ** 2 * share * _growth(errors, dt) * _ROOM + rounding * _ROOM
+    return ErrorPolytope([matrix.center for matrix in made], errors.C[0], Cz=list(errors.Cz), dt=dt, ball=ball)
+
+
+@arguments_checked
+def drift_within_samples(errors: ErrorPolytope, dt: float, rate: float) -> float:
+    """Return a bound on how far the transition of a sample is off where the parameter moves within it.
+
+    Parameters
+    ----------
+    errors : ErrorPolytope
+        In continuous time.
+    dt : float
+        Seconds between samples.
+    rate : float
+        Largest norm of ``dA/dt``, 1/s2.
+
+    Returns
+    -------
+    float
+        Of ``|Phi - exp(dt A(mu_k))|``, which multiplies the state of the plant.
+
+    Examples
+    --------
+    >>> spring = ErrorPolytope([[[0, 1], [-1, -1]], [[0, 1], [-3, -1]]], [[1.0, 0.0]], dt=0.0)
+    >>> round(drift_within_samples(spring, 0.1, 4.0), 4)
+    0.0213
+    """
+    real_number(dt, "dt", "a positive number of seconds", above=0.0)
+    real_number(rate, "rate", "a positive number", above=0.0)
+    return rate * dt**2 * _growth(errors, dt) / 2.0 * _ROOM
+
+
+def _growth(errors: ErrorPolytope, dt: float) -> float:
+    """Return ``exp(a dt)`` for the largest logarithmic norm a at the vertices, 0 or more: it is convex, so that no
+    point of the hull has a larger one."""
+
+    def logarithmic_norm(matrix: FloatArray) -> float:
+        found = float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[-1])
+        return found + (_ROOM - 1.0) * float(np.linalg.norm(matrix))
+
+    return math.exp(max(0.0, *map(logarithmic_norm, errors.A)) * dt)
