@@ -20,6 +20,7 @@ from obsynth.methods.verifying import verify
 from obsynth.monitoring.logs.run import DataRun, run_on_data
 from obsynth.monitoring.logs.sources import LOG_SUFFIXES
 from obsynth.monitoring.logs.unpacked_logs import log_suffix
+from obsynth.monitoring.thresholds.online_monitor import online_monitor
 from obsynth.numerics.arguments import arguments_checked, require_kind
 from obsynth.report.plots.panels import tidy
 from obsynth.results.design import ObserverDesign, require_verified
@@ -63,6 +64,8 @@ class FleetRun:
         Largest absolute value of each fault estimate and residual, the warm-up left out.
     file : Path or None
         The estimates.
+    fault : str
+        What the first alarm of a monitor that names a fault points to; empty without one.
     """
 
     name: str
@@ -73,6 +76,7 @@ class FleetRun:
     alarms: Mapping[str, float] = field(default_factory=dict)
     largest: Mapping[str, float] = field(default_factory=dict)
     file: Path | None = None
+    fault: str = ""
 
 
 @dataclass(frozen=True)
@@ -95,12 +99,14 @@ class Fleet(ResultTable):
         """Return the table as a header and rows: one column for each alarm and each largest value of any run."""
         alarms = all_of(run.alarms for run in self.runs)
         largest = all_of(run.largest for run in self.runs)
+        named = ["fault"] if any(run.fault for run in self.runs) else []
         header = [
             "run",
             "status",
             "rows",
             "ok",
             *(f"alarm {n}, s" for n in alarms),
+            *named,
             *(f"largest {n}" for n in largest),
             "file",
             "message",
@@ -112,6 +118,7 @@ class Fleet(ResultTable):
                 run.rows,
                 run.statuses.get("ok", 0),
                 *(run.alarms.get(n, "") for n in alarms),
+                *(run.fault for _ in named),
                 *(run.largest.get(n, "") for n in largest),
                 "" if run.file is None else run.file.name,
                 run.message,
@@ -179,7 +186,10 @@ def run_fleet(
     **options
         As for `run_on_data`: ``columns, time_column, time_zone, time_unit, scales, thresholds, gap, warm_up,
         recovered, outliers, units_as_is``; and ``unverified``: whether designs that fail their verification are run
-        all the same.
+        all the same.  ``monitor``: the kind of a monitor of `online_monitor` that needs nothing but the design, such as
+        ``nis``; or ``learned``, with ``normal``: a folder of thresholds, each called as its gain set (``pump.json``
+        for ``pump.gains.json``), a file of thresholds, or a log without faults from which each design learns its own;
+        ``sensor_faults`` as there.
 
     Returns
     -------
@@ -213,10 +223,15 @@ def run_fleet(
         "outliers",
         "units_as_is",
         "unverified",
+        *("monitor", "normal", "sensor_faults"),
     )
     wrong = sorted(set(options) - set(known))
     if wrong:
         raise SpecError(f"{', '.join(wrong)}: use some of {', '.join(known)}.", path=wrong[0])
+    if options.get("normal") is not None:
+        if options.get("monitor") != "learned":
+            raise SpecError("normal is for the monitor learned: name it (monitor, --monitor).", path="normal")
+        options["normal"] = Path(options["normal"])
     pairs = _pairs(_files(gains, (GAINS_ENDING,), "gains"), _files(data, LOG_SUFFIXES, "data"), options)
     place = ResultFolder(folder, _FLEET_KIND, FleetRun, ending=".csv")
     return Fleet(
@@ -252,6 +267,11 @@ def _pairs(gains: Sequence[Path], logs: Sequence[Path], options: Mapping[str, An
     called = {log: log.name[: -len(log_suffix(log))] for log in logs}
     own = {log: name for log, name in called.items() if name in names.values()}
     said = json.dumps(options, sort_keys=True, default=str)
+    if options.get("normal") is not None:
+        # Thresholds that were learned anew are others.
+        normal = options["normal"]
+        files = sorted(normal.glob("*.json")) if normal.is_dir() else [normal]
+        said += "".join(file_digest(input_file(file)) for file in files)
     return [
         Work(
             f"{names[gain]} on {called[log]}",
@@ -275,6 +295,12 @@ def _verified(path: Path, digest: str, *, unverified: bool) -> ObserverDesign:
 def _estimates(gains: Path, log: Path, *, unverified: bool = False, **options: Any) -> tuple[DataRun, str]:
     """Return the run of a design on a log, and its estimates as CSV."""
     stream, design = io.StringIO(), _verified(gains, file_digest(gains), unverified=bool(unverified))
+    asked = {name: options.pop(name) for name in ("monitor", "normal", "sensor_faults") if name in options}
+    kind, normal = asked.pop("monitor", None), asked.get("normal")
+    if kind is not None:
+        if normal is not None and normal.is_dir():
+            asked["normal"] = normal / f"{gains.name.removesuffix(GAINS_ENDING).removesuffix('.json')}.json"
+        options["monitor"] = online_monitor(design, kind, unverified=bool(unverified), **asked)
     return run_on_data(design, log, stream, **options), stream.getvalue()
 
 
@@ -284,7 +310,10 @@ def _run(pair: Work) -> tuple[FleetRun, str]:
         found, text = pair.make()
     except ObsynthError as error:
         return FleetRun(pair.name, WORK_STATUSES[error.exit_code], str(error)), ""
-    return FleetRun(pair.name, "run", "", found.rows, dict(found.statuses), dict(found.alarms), _largest(text)), text
+    return FleetRun(
+        pair.name, "run", "", found.rows, dict(found.statuses), dict(found.alarms), _largest(text),
+        fault=found.isolated,
+    ), text  # fmt: skip
 
 
 def _largest(text: str) -> dict[str, float]:

@@ -81,12 +81,16 @@ def run_many(options: argparse.Namespace) -> int:
     """Run ``run`` for a folder of gain sets: a table, a picture, and the estimates of each design on each log."""
     from obsynth.studies.fleet import run_fleet
 
-    alone = ("system", "state", "prove", "monitor", "smooth", "lag")
+    alone = ("system", "state", "prove", "smooth", "lag")
     given = [name for name in alone if getattr(options, name)]
     if given:
         names = ", ".join(f"--{name}" for name in given)
         raise SpecError(f"{names}: for one gain set; --gains is a folder of many.", path=f"--{given[0]}")
-    refuse_given(options, ("state_every", "sample_time", *MONITOR_NAMES), "one gain set: --gains is a folder of many")
+    of_each = ("normal", "no_sensor_faults")
+    others = [name for name in MONITOR_NAMES if name not in of_each]
+    refuse_given(options, ("state_every", "sample_time", *others), "one gain set: --gains is a folder of many")
+    if options.monitor is None:
+        refuse_given(options, of_each, "a monitor: name it with --monitor")
     folder = Path(options.out)
     if options.out == STREAM or (folder.exists() and not folder.is_dir()):
         raise SpecError("Many designs need a folder for their estimates: give one to --out.", path="--out")
@@ -101,6 +105,9 @@ def run_many(options: argparse.Namespace) -> int:
         "time_unit": options.time_unit,
         "outliers": options.outliers,
         "units_as_is": options.units_as_is or None,
+        "monitor": options.monitor,
+        "normal": options.normal,
+        "sensor_faults": False if options.no_sensor_faults else None,
         "scales": numbers_of(options.scale) or None,
         "thresholds": numbers_of(options.threshold) or None,
         "gap": options.gap,
