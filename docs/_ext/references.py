@@ -63,7 +63,8 @@ def spec_reference() -> str:
 
 
 _OPENING = """\
-Made from the schema that checks every spec. Times are in seconds; other units are yours, as long as they fit together.
+Made from the schema that checks every spec. `dt`, `sample_time` and `horizon` are in seconds,
+or texts with a unit (`10 ms`, `5 min`); other times are in seconds, other units are yours, as long as they fit together.
 A key in **bold** must be given. An entry that is left out has its default.
 """
 

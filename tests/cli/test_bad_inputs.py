@@ -176,6 +176,8 @@ SCHEMA = [
     ),
     Case("dt negative", put("plant", "dt", -0.1), "plant.dt: must be at least 0"),
     Case("dt as text", put("plant", "dt", "1.0"), "plant.dt: must be a number, not the text '1.0'"),
+    Case("dt in volts", put("plant", "dt", "10 V"), "plant.dt: must be a number of seconds, or a time in us, "),
+    Case("dt below zero with a unit", put("plant", "dt", "-10 ms"), "plant.dt: must be at least 0"),
     Case("dt NaN", put("plant", "dt", math.nan), "plant.dt: must be a finite number"),
     Case("dt infinite", put("plant", "dt", math.inf), "plant.dt: must be a finite number"),
     Case("dt as truth value", put("plant", "dt", True), "plant.dt: must be a number, not the truth value true"),

@@ -76,3 +76,24 @@ def test_a_transform_of_a_plant_that_takes_none_is_refused(folder: str, tmp_path
     with pytest.raises(SpecError, match="transform is for linear plants") as caught:
         load_spec(spec)
     assert caught.value.path == "plant.transform"
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("100 ms", 0.1), ("1.1ms", 0.0011), ("250 us", 0.00025), ("2 s", 2.0), ("1.5 min", 90.0), ("1 h", 3600.0)],
+)
+def test_times_are_read_with_their_units(text: str, seconds: float, tmp_path: Path) -> None:
+    transform = f"transform: {{eliminate_algebraic_states: true, sample_time: {text}}}\n"
+    reference = f"{{file: plant.yaml}}\nscenario: {{horizon: {text}}}"
+    spec = loaded(tmp_path, PLANT + transform, reference)
+    assert spec.scenario is not None
+    assert (spec.plant.dt, spec.scenario.horizon) == (seconds, seconds)
+
+
+@pytest.mark.parametrize("text", ["5 m", "3 V", "2 minutes", "10 %"])
+def test_what_is_no_unit_of_time_is_refused(text: str, tmp_path: Path) -> None:
+    transform = f"transform: {{eliminate_algebraic_states: true, sample_time: {text}}}\n"
+    with pytest.raises(
+        SpecError, match=f"sample_time: must be a number of seconds, or a time in us, .*not the text '{text}'"
+    ):
+        loaded(tmp_path, PLANT + transform, "{file: plant.yaml}")

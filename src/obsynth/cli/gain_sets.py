@@ -10,7 +10,6 @@ from obsynth.errors import VerificationError
 from obsynth.files.outputs import require_distinct
 from obsynth.report.terminal.arguments import numbers_of, refuse_given
 from obsynth.report.terminal.output import emit, gains_to_hand_on, output_file, verified_again
-from obsynth.report.terminal.specs import required_scenario
 from obsynth.results.certificate_files import RESULT_FILE
 from obsynth.results.design import unverified_mark
 
@@ -53,7 +52,7 @@ def run_report(options: argparse.Namespace) -> int:
         refuse_given(options, [name for name in vars(options) if name not in own], "a log: give --data")
     from obsynth.report.page import PAGE, html_report
 
-    scenario = None if options.system is None else required_scenario(obsynth.load_spec(options.system))
+    scenario = None if options.system is None else obsynth.load_spec(options.system).scenario
     system = None if options.system is None else str(options.system)
     output_file(options.out, PAGE, options)
     design, report = verified_again(options.gains)
@@ -81,6 +80,8 @@ def run_report(options: argparse.Namespace) -> int:
     )
     if mark := unverified_mark(report):
         print(f"Warning: {options.gains}: {mark}", file=sys.stderr)
+    if options.system is not None and scenario is None:
+        print(f"Note: {options.system} has no scenario: the page shows no simulation of one.", file=sys.stderr)
     emit(options, {"gains": options.gains, "file": file, "passed": report.passed})
     return 0 if report.passed else VerificationError.exit_code
 

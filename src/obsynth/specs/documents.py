@@ -354,7 +354,7 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
         text = item["msg"]
     elif kind == "finite_number":
         text = f"must be a finite number, not {value}."
-    elif kind == "entry_of_k":
+    elif kind in ("entry_of_k", "time"):
         text = f"{item['msg']}, not {described(value)}."
     elif kind == "string_pattern_mismatch":
         text = f"use letters, digits, '.', '_' and '-' only (at most 100), not {described(value)}."

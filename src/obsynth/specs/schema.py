@@ -11,11 +11,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag, create_model
 
-from obsynth.numerics.arguments import Positive
 from obsynth.simulation.scenario import PROFILE_KINDS
 from obsynth.specs.schema_plants import PlantReference, PlantSection
 from obsynth.specs.schema_sections import CalibrateSection, DAESection, InputsSection, TimeVaryingSection
-from obsynth.specs.schema_values import LIST_TAG, ONE_TAG, Section, Text
+from obsynth.specs.schema_values import LIST_TAG, ONE_TAG, PositiveTime, Section, Text
 
 SPEC_VERSION = 1
 
@@ -67,8 +66,8 @@ class MethodSection(Section):
 class ScenarioSection(Section):
     """What happens in a simulation of the design."""
 
-    horizon: Positive
-    sample_time: Positive | None = None
+    horizon: PositiveTime
+    sample_time: PositiveTime | None = None
     inputs: dict[Text, Profiles] = Field(default_factory=dict)
     faults: dict[Text, Profiles] = Field(default_factory=dict)
     disturbances: dict[Text, Profiles] = Field(default_factory=dict)

@@ -19,11 +19,13 @@ from obsynth.specs.schema_values import (
     MatrixFile,
     Names,
     OutputMatrix,
+    PositiveTime,
     Range,
     Rows,
     Section,
     StatePick,
     Text,
+    Time,
     kind_of_matrix,
 )
 
@@ -60,7 +62,7 @@ class TransformSection(Section):
     linearise: LineariseSection | None = None
     eliminate_algebraic_states: bool = False
     pade: Annotated[int, Field(ge=1, le=8)] | None = None
-    sample_time: Positive | None = None
+    sample_time: PositiveTime | None = None
 
 
 class EntrySection(Section):
@@ -116,7 +118,7 @@ SensorNoises = dict[
 class PlantSection(Section):
     """A plant, matrix by matrix."""
 
-    dt: Annotated[float, Field(ge=0.0)]
+    dt: Time
     E: Matrix | None = None
     A: Matrix
     B: EquationMatrix | None = None
@@ -180,7 +182,7 @@ class PlantReference(Section):
     file: Text
     transform: TransformSection | None = None
     variable: Text | None = None
-    dt: Annotated[float, Field(ge=0.0)] | None = None
+    dt: Time | None = None
     faults: list[Text] | None = None
     disturbances: list[Text] | None = None
     actuator_faults: list[Text] | None = None

@@ -14,6 +14,7 @@ from obsynth.specs.schema_plants import BoxSection, SensorNoises, Sizes, Transfo
 from obsynth.specs.schema_values import (
     FILE_TAG,
     Names,
+    PositiveTime,
     Range,
     Section,
     Stack,
@@ -32,7 +33,7 @@ class TimeVaryingSection(Section):
     """A plant whose matrices change with k: rows of numbers and expressions."""
 
     kind: Literal["time-varying"]
-    dt: Positive
+    dt: PositiveTime
     horizon: Annotated[int, Field(ge=1)] | None = None
     constants: dict[Text, float] | None = None
     E: VaryingMatrix | None = None
@@ -79,7 +80,7 @@ class CalibrateSection(Section):
     rows: Text | Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
     columns: dict[Text, Text] | None = None
     scales: dict[Text, float] | None = None
-    dt: Positive | None = None
+    dt: PositiveTime | None = None
     unknown: dict[Text, Range] = Field(default_factory=dict)
     priors: dict[Text, Range] | None = None
     noisy: Names | None = None

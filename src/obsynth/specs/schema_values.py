@@ -6,6 +6,7 @@ This module imports pydantic, so it is imported only when a spec is read.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import cache
@@ -55,6 +56,37 @@ _ROWS, FILE_TAG, PICKED, LIST_TAG, _STACK_TAG, _NUMBER_TAG, ONE_TAG = (
 Text = Annotated[str, Field(min_length=1)]
 
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+#: A number with the word behind it.
+_QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\d\s.].*?)\s*")
+
+#: By what a number in each unit is multiplied, then divided, for seconds: 1.1 ms are 0.0011 s to the last digit.
+_SECONDS = {
+    "us": (1.0, 1e6),
+    "\u00b5s": (1.0, 1e6),
+    "ms": (1.0, 1e3),
+    "s": (1.0, 1.0),
+    "min": (60.0, 1.0),
+    "h": (3600.0, 1.0),
+}
+
+
+def _in_seconds(value: Any) -> Any:
+    """Return a text such as ``10 ms`` in seconds, anything else as it is."""
+    found = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
+    if found is None:
+        return value
+    number, unit = found.groups()
+    if unit not in _SECONDS:
+        raise PydanticCustomError("time", "must be a number of seconds, or a time in us, ms, s, min or h")
+    times, over = _SECONDS[unit]
+    return float(number) * times / over
+
+
+#: Times in seconds, or as texts with their unit.
+PositiveTime = Annotated[Positive, BeforeValidator(_in_seconds)]
+
+Time = Annotated[NonNegative, BeforeValidator(_in_seconds)]
 
 
 Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER_TAG)]
