@@ -13,6 +13,7 @@ from obsynth.methods.optimal_filter.error_channel import ErrorChannel
 from obsynth.methods.optimal_filter.fault_maps import Designed
 from obsynth.methods.optimal_filter.realisation import Followed
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.least_estimation import gramian
 from obsynth.numerics.matrix_equations import bounded_real_matrix
 from obsynth.numerics.standard_form import INFINITE_EIGENVALUE
 from obsynth.observers.linear.observer import LinearObserver
@@ -97,12 +98,21 @@ def gain_matrix(channel: ErrorChannel, level: float, dt: float, alpha: float) ->
     if dt == 0.0:
         inverse, root = np.linalg.inv(alpha * np.eye(len(a)) - a), np.sqrt(2.0 * alpha)
         a, b, c, d = inverse @ (alpha * np.eye(len(a)) + a), root * inverse @ b, root * c @ inverse, d + c @ inverse @ b
-    size = float(np.linalg.norm(c)) ** 2 + float(np.finfo(float).tiny)
-    for share in SLACKS:
-        P = bounded_real_matrix(a, b, c, d, own, slack=share * size)
-        if P is not None and prove_norm(channel, P, own, dt=dt).proved:
-            return P
+    for scale, size in ((np.ones(len(a)), float(np.linalg.norm(c)) ** 2), (_reached_sizes(a, b), own**2)):
+        for share in SLACKS:
+            slack = share * size + float(np.finfo(float).tiny)
+            P = bounded_real_matrix(a / scale[:, None] * scale, b / scale[:, None], c * scale, d, own, slack=slack)
+            P = None if P is None else P / scale[:, None] / scale
+            if P is not None and prove_norm(channel, P, own, dt=dt).proved:
+                return P
     return None
+
+
+def _reached_sizes(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the sizes, powers of two, to which unit white noise drives the states."""
+    sizes = np.sqrt(np.maximum(np.diag(gramian(a, b @ b.T)), 0.0))
+    known = np.isfinite(sizes) & (sizes > 0.0)
+    return np.where(known, np.exp2(np.round(np.log2(np.where(known, sizes, 1.0)))), 1.0)
 
 
 def _lower_bounds(plant: DescriptorSystem, chosen: Designed, claims: dict[str, float]) -> dict[str, FloatArray]:

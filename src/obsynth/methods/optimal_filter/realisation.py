@@ -6,6 +6,7 @@ modes of the plant that die out by themselves and that it reads are followed by 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -30,6 +31,8 @@ CLEANED_SHARE = 1e-13
 ROUNDING_SHARE = 1e-14
 #: Entries of a sampled filter's A below this are rounding: its states are of the size of the outputs.
 ROUNDED_MODE = 1e-12
+#: Sweeps over all states until their units are balanced, but for a factor.
+BALANCING_SWEEPS = 5
 #: Equations are solved so many times, each time for what is left: small rows of a filter keep their digits.
 SOLUTIONS = 3
 
@@ -72,8 +75,22 @@ def realisations(filter_: Model, *, discrete: bool) -> list[Model]:
     if discrete:
         a, b, c, d = filter_
         kept = _linked(a != 0.0, np.any(b != 0.0, axis=1)) & _linked(a.T != 0.0, np.any(c != 0.0, axis=0))
-        found.append((a[np.ix_(kept, kept)], b[kept], c[:, kept], d))
+        found.append(_balanced((a[np.ix_(kept, kept)], b[kept], c[:, kept], d)))
     return found
+
+
+def _balanced(filter_: Model) -> Model:
+    """Return a filter with states in units, powers of two, in which each is driven as much as it drives."""
+    a, b, c, d = filter_
+    units = np.ones(len(a))
+    for _ in range(BALANCING_SWEEPS):
+        for i in range(len(a)):
+            off = np.arange(len(a)) != i
+            driven = float(np.linalg.norm(a[i, off] * units[off]) + np.linalg.norm(b[i])) / units[i]
+            drives = float(np.linalg.norm(a[off, i] / units[off]) + np.linalg.norm(c[:, i])) * units[i]
+            if driven > 0.0 and drives > 0.0:
+                units[i] *= 2.0 ** round(0.5 * math.log2(driven / drives))
+    return a / units[:, None] * units, b / units[:, None], c * units, d
 
 
 def _linked(link: NDArray[np.bool_], first: NDArray[np.bool_]) -> NDArray[np.bool_]:
