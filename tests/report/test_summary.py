@@ -228,3 +228,18 @@ def test_the_largest_gain_is_that_of_its_peak(A, fault, unknown, decay):
         moved = np.linalg.solve(point * np.eye(observer.order) - observer.Az, observer.By @ seen)
         gains.append(abs((observer.Cz[row] @ moved + observer.Dy[row] @ seen).item()))
     assert fault_gains(design).disturbance_gains.item() == pytest.approx(max(gains), rel=2e-5)
+
+
+def test_a_summary_says_where_nothing_is_proved_of_constant_faults() -> None:
+    """Linear methods prove it; of recursive ones, those over a region and faults that are never constant it is open."""
+    told = ("unproved", "that the estimate of a constant fault equals it in the end")
+    plant = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0], [1.0]], Bf=[[1.0]], dt=1.0)
+    assert told not in summary(obsynth.functional_filter(plant)).facts
+    assert told in summary(obsynth.adaptive_observer(plant)).facts
+    waves = obsynth.ui_pi_observer(plant, fault_model={"sinusoid": 0.7})
+    assert told in summary(waves).facts
+    region = obsynth.PolytopicSystem(
+        plant={"A": [["a"]], "C": [[1.0], [1.0]], "Bf": [[1.0]], "dt": 1.0}, scheduling={"a": [0.2, 0.6]}
+    )
+    assert told in summary(obsynth.ui_pi_observer(region)).facts
+    assert told not in summary(obsynth.descriptor_kalman(plant)).facts

@@ -46,6 +46,7 @@ from obsynth.report.plots.frequency import FaultGains
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import number, verdict_line
 from obsynth.verification.assumptions import Assumptions
+from obsynth.verification.constant_faults import CONSTANT_FAULT
 
 #: Faults, warnings and notes that are listed; the others are counted.
 _MOST_IN_SUMMARY, _MOST_NOTES = 5, 1
@@ -173,6 +174,15 @@ def _facts(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterato
     yield "dynamics", _dynamics(design)
     yield from _speed(design, steps)
     yield "assumes", "; ".join(_assumptions(design))
+    if _is_open_about_constant_faults(design):
+        yield "unproved", "that the estimate of a constant fault equals it in the end"
+
+
+def _is_open_about_constant_faults(design: ObserverDesign) -> bool:
+    """Return whether faults are estimated and no row says what the estimate of a constant one is in the end."""
+    proved = any(row.name == CONSTANT_FAULT and row.status == "proved" for row in design.report.checks)
+    tests = isinstance(design.observer, WindowObserver)
+    return bool(getattr(design.observer, "fault_names", ())) and not proved and not tests and design.report.passed
 
 
 def _beside_the_least(design: ObserverDesign) -> Iterator[tuple[str, str]]:
