@@ -128,6 +128,12 @@ def test_the_definiteness_benchmark_proves_every_row(small_table):
     assert sum("ball arithmetic" in row[1] for row in rows) == 1
 
 
+def test_the_benchmark_of_designs_over_a_region_proves_every_row(small_table):
+    rows = small_table("over_region")
+    assert [row[:2] for row in rows] == [["2", "2"], ["2", "4"]]
+    assert all(row[2].endswith(" s") and row[4].rstrip(" |").endswith(" ms") for row in rows)
+
+
 def test_the_benchmark_of_threads_runs(small_table):
     assert [row[0] for row in small_table("blas_threads")] == ["6"]
 
