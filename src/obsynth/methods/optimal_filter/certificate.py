@@ -24,14 +24,14 @@ from obsynth.verification.invisible_at_infinity import proved_at_infinity
 from obsynth.verification.invisible_faults import Setting, proved_least, proved_limit
 
 #: What is claimed above the recomputed gain, as a share of it: the first that can be proved.
-CLAIM_ROOMS = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
+CLAIM_ROOMS = (1e-9, 1e-8, 1e-7, 5e-7, 1e-6, 1e-5, 1e-4, 1e-3)
 #: At so many of them all eigenvalues are enclosed, of at most so many states: a second each, and of defective ones,
 #: which are never enclosed, minutes at 40.
 MOST_ENCLOSURES, MOST_STATES_ENCLOSED = 2, 32
 #: Levels that are claimed of a gain that is zero but for rounding, in units of what counts as zero.
 ZERO_LEVELS = (1.0, 1e1, 1e2, 1e3, 1e4)
 #: Slacks of the inequality that the certificate solves, of the square of the output matrix.
-SLACKS = (1e-3, 1e-6, 1e-8, 1e-10, 1e-12)
+SLACKS = (1e-3, 1e-6, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 #: A bound this near the gain, as a share of it, is not improved further: the search of the gain ends at 1e-8.
 CLOSE_ENOUGH = 3e-8
 #: What is claimed of a proved bound: machines differ in the last digits of the combination that they find.
