@@ -126,7 +126,7 @@ def nan_at_5(k):
         ({"E": [[1, "1 / (k - 4)"], [0, 1]], "horizon": 9}, r"E\(4\) has inf", "E(4)"),
         ({"E": [[1, "1 / k"], [0, "log(3 - k)"]], "horizon": 9}, r"At k = 3: E\(3\) has -inf", "E(3)"),
         ({"A": [[1, "j"], [0, 1]]}, "row 1, column 2: 'j' is unknown; the known names are: half, k, pi", "A"),
-        ({"A": [[1, "1 +"], [0, 1]]}, "A, row 1, column 2: .*is no valid expression", "A"),
+        ({"A": [[1, "1 +"], [0, 1]]}, "A, row 1, column 2: .*is not a valid expression", "A"),
         ({"A": [[1, "k"], [0]]}, "different lengths", "A"),
         ({"A": [[1, None], [0, "k"]]}, "row 1, column 2: None is neither", "A"),
         ({"A": [np.eye(2), np.eye(3)]}, "shapes must not change with k", "A"),

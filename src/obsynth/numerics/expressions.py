@@ -159,7 +159,7 @@ class _Reader:
         power += " An equation has a single =." if "==" in self.text else ""
         power += " A derivative in an equation is written der(x)." if _DERIVATIVES.search(self.text) else ""
         return SpecError(
-            f"{self.text!r} is no valid expression: {reason}. Allowed are numbers, names, + - * / **, parentheses "
+            f"{self.text!r} is not a valid expression: {reason}. Allowed are numbers, names, + - * / **, parentheses "
             f"and the functions {', '.join([*FUNCTIONS, *FUNCTIONS_OF_TWO, 'where'])}.{power}{decides if asked else ''}"
         )
 

@@ -1,4 +1,4 @@
-"""Logs are read afterwards: estimates from what came later as well, on arrays and on logs."""
+"""Smoothing of recorded logs: estimates from what came later as well, on arrays and on logs."""
 
 from __future__ import annotations
 
