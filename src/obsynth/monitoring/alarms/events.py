@@ -261,7 +261,7 @@ def fault_text(event: AlarmEvent, shown: Callable[[float], str]) -> str:
         return NOT_DISTINGUISHED_YET
     if not event.fault:
         return ""
-    named = " or ".join([event.fault, *event.ties])
+    named = " or ".join(dict.fromkeys([event.fault, *event.ties]))
     notes = [*(["drifts"] if event.drifts else []), *([] if event.clear or event.ties else ["unclear"])]
     notes = [] if event.fault == NONE_OF_THESE else notes
     return f"{named} ({', '.join(notes)})" if notes else named

@@ -301,6 +301,8 @@ static int monitor_changes(const PREFIX_monitor *m, REAL *largest)
             REAL far = beyond(sums[i], monitor_bands[0][i] * power);
             REAL ratio = power > 0 ? far * far / power : 0;
             largest[i] = ratio <= largest[i] ? largest[i] : ratio;
+            /* Faults are compared without what their slow offsets explain: each has its own. */
+            ratio = power > 0 ? sums[i] * sums[i] / power : 0;
             if (ratio > first) {
                 next = which >= 0 ? first : 0;
                 first = ratio;

@@ -126,11 +126,12 @@ class LearnedRule(Rule):
             weights = np.array([(2.0 - share) / share for share in FORGETTING])
             smooth = weights * np.sum(state.means**2, axis=1)
             first = [np.sum(state.white[-1] ** 2)]
-            changes = self._changes(state)
+            changes = self._changes(state, self._bands)
             squares = self._squares(sample.said)
             values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares]) / self.learned.levels
         values = np.where(np.isnan(values), np.inf, values)
-        which = self._fault(found, ratios) if self._walk is None else most_likely_change(changes)
+        # Faults are compared without what their slow offsets explain: each has its own.
+        which = self._fault(found, ratios) if self._walk is None else most_likely_change(self._changes(state, 0.0))
         ranking = None
         if self.effects is not None and values.max() > 1.0:
             effects, explained = self.effects.explained(state.effects)
@@ -155,13 +156,14 @@ class LearnedRule(Rule):
         kept = np.vstack([state.scores, np.zeros((gone, len(row))), row])[-max(AGES) :]
         return state._replace(before=before, scores=kept)
 
-    def _changes(self, state: LearnedState) -> FloatArray:
-        """Return twice the log likelihood ratios of changes of each age and fault, ``(ages, nf)``."""
+    def _changes(self, state: LearnedState, bands: FloatArray | float) -> FloatArray:
+        """Return twice the log likelihood ratios of changes of each age and fault by more than ``bands``,
+        ``(ages, nf)``."""
         if self._walk is None:
             return np.zeros((1, 0))
         sums = np.cumsum(state.scores[::-1], axis=0)[np.array(AGES) - 1]
         away, power = np.hsplit(sums, 2)
-        return np.asarray(np.where(power > 0.0, beyond(away, self._bands * power) ** 2 / power, 0.0))
+        return np.asarray(np.where(power > 0.0, beyond(away, bands * power) ** 2 / power, 0.0))
 
     def _squares(self, said: Any) -> FloatArray:
         """Return the squares of the estimates, from where they were, in units of their deviations, ``(nf,)``."""

@@ -296,7 +296,9 @@ class Monitor:
             return after, MonitorOutput(statistic, threshold, False, "", more)
         if which is None and self.fault_names and np.isfinite(sample.faults).all():
             which = int(np.argmax(np.abs(sample.faults) / self.fault_scales))
-        fault = self._named(which) if ranking is None else ranking.called(self.fault_names)
+        # Between faults of the plant the rule decides; sensors, and none of these, are ranked beside them.
+        of_plant = ranking is None or (which is not None and ranking.named in self.fault_names)
+        fault = self._named(which) if of_plant or ranking is None else ranking.called(self.fault_names)
         return after, MonitorOutput(statistic, threshold, True, fault, more, ranking)
 
     def _named(self, which: int | None) -> str:
