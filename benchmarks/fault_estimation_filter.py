@@ -23,7 +23,7 @@ import numpy as np
 
 import obsynth
 from obsynth.analysis.existence.restricted_equivalent import prepare
-from obsynth.methods.fault_estimation_filter.convex_problem import gain_problem, with_weight_limit
+from obsynth.methods.fault_estimation_filter.convex_problem import centred, gain_problem, with_weight_limit
 from obsynth.numerics.injection_problem import GainProblem
 from obsynth.numerics.norms import hinf_norm
 from obsynth.proofs.definiteness import prove_positive_definite
@@ -147,8 +147,10 @@ def row(*cells: object) -> None:
 
 
 def problem_of(plant: obsynth.DescriptorSystem) -> GainProblem:
-    """Return the problem that all ways solve, in balanced coordinates."""
-    return gain_problem(prepare(plant, None), free_weight=False)[0]
+    """Return the problem that all ways solve, in balanced coordinates, with W = Upsilon^+ of the outputs as given."""
+    prepared = prepare(plant, None)
+    problem, parts = gain_problem(prepared, free_weight=False)
+    return centred(problem, prepared, parts)[0]
 
 
 def speed(*, small: bool) -> None:
