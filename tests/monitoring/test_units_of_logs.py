@@ -72,6 +72,28 @@ def test_a_start_that_is_not_the_designs_is_no_change_of_unit(vessel, start):
     assert obsynth.run_on_data(vessel, log(start)).rows == ROWS
 
 
+@pytest.mark.parametrize("name", ["press", "speed"])
+def test_what_any_small_factor_would_explain_is_no_change_of_unit(name):
+    """Near an operating point of zero a signal that is far off is as good as zero after any small factor."""
+    plant = obsynth.DescriptorSystem(
+        A=[[0.9]], B=[[1.0]], C=[[1.0]], Bw=[[0.1, 0.0]], Dw=[[0.0, 0.1]], dt=1.0,
+        input_names=["speed"], output_names=["press"],
+    )  # fmt: skip
+    design = obsynth.descriptor_kalman(plant)
+    rng = np.random.default_rng(4)
+    frame = pd.DataFrame({"time": np.arange(40.0), "speed": 0.0, "press": 0.1 * rng.standard_normal(40)})
+    frame[name] = 50.0 * rng.standard_normal(40)
+    assert len(obsynth.run_on_data(design, frame, outliers="none").table) == 40
+
+
+def test_a_sensor_that_is_stuck_at_zero_is_in_no_other_unit():
+    plant = obsynth.DescriptorSystem(
+        A=[[0.9]], C=[[1.0]], Bf=[[1.0]], dt=1.0, output_names=["T"], operating_point={"T": 300.0}
+    )  # fmt: skip
+    frame = pd.DataFrame({"time": np.arange(40.0), "T": np.zeros(40)})
+    assert len(obsynth.run_on_data(obsynth.fault_estimation_filter(plant), frame).table) == 40
+
+
 def test_outliers_and_blanks_at_the_start_are_none(vessel):
     data = log()
     data.loc[0, "press"], data.loc[3, "temp"] = 500.0, np.nan

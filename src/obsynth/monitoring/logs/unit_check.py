@@ -52,6 +52,9 @@ CHANGES = (
     ChangeOfUnit(-1.0, 0.0, "the other sign"),
 )
 
+#: A signal that is zero.
+NOTHING = ChangeOfUnit(0.0, 0.0, "")
+
 
 class UnitCheck:
     """Gathers the first rows of a log, and stops one that a change of unit of one signal explains."""
@@ -102,13 +105,16 @@ class UnitCheck:
     def _changed(self, rows: FloatArray) -> Iterator[tuple[int, ChangeOfUnit, FloatArray]]:
         """Yield each signal with each change of unit, and the rows after it."""
         for i in range(rows.shape[1]):
-            if i == self._signals.one:
+            if i == self._signals.one or not np.any(rows[:, i] + self._signals.offset[i]):
                 continue
             for change in CHANGES:
-                new = rows.copy()
-                offset = self._signals.offset[i]
-                new[:, i] = change.factor * (rows[:, i] + offset) + change.shift - offset
-                yield i, change, new
+                yield i, change, self._after(rows, i, change)
+
+    def _after(self, rows: FloatArray, i: int, change: ChangeOfUnit) -> FloatArray:
+        """Return the rows with a signal, which are deviations of its operating point, in another unit."""
+        new, offset = rows.copy(), self._signals.offset[i]
+        new[:, i] = change.factor * (rows[:, i] + offset) + change.shift - offset
+        return new
 
     def _by_innovations(self, observer: Any, rows: FloatArray) -> tuple[str, ChangeOfUnit] | None:
         """Compare mean squares of innovations, of inputs that are all there."""
@@ -117,11 +123,17 @@ class UnitCheck:
             return None
         found = [(_mean_square(observer, new, nu), i, change) for i, change, new in self._changed(rows)]
         value, i, change = min(found, key=lambda one: one[0])
-        return (self._signals.names[i], change) if value < EXPLAINED else None
+        # What would be explained without the signal, too, shows no unit: a small factor makes anything as good as zero.
+        if not value < EXPLAINED or not _mean_square(observer, self._after(rows, i, NOTHING), nu) > EXPLAINED:
+            return None
+        return self._signals.names[i], change
 
     def _by_operating_point(self, rows: FloatArray) -> tuple[str, ChangeOfUnit] | None:
         """Compare with operating points that are stated and not zero."""
         for i, change, new in self._changed(rows):
+            # A sensor that is stuck is a fault.
+            if not np.ptp(rows[:, i]) and i >= rows.shape[1] - self._design.plant.ny:
+                continue
             point = abs(float(self._signals.offset[i]))
             with np.errstate(invalid="ignore"):
                 far, near = np.abs(rows[:, i]) > FAR * point, np.abs(new[:, i]) < NEAR * point
