@@ -16,7 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
 
+#: Examples of each property with ``--whole`` or ``--rest``, and without: CI runs both.
+EXAMPLES, FEWER = 15, 5
 #: Without ``--whole`` or ``--rest`` one of so many cases that are drawn at random is looked at.
 PARTS = 4
 #: With ``--turn`` one of so many tests is run, drawn by its argument.
@@ -46,6 +49,19 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--rest", action="store_true", help="the cases of the tests marked sampled that a run without it leaves out"
     )
     parser.addoption("--turn", default="", help="run the share of the tests that this text draws, a commit for example")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Take one profile for every property: the same examples in each run, and no clock in the verdict."""
+    settings.register_profile(
+        "obsynth",
+        deadline=None,
+        derandomize=True,
+        database=None,
+        max_examples=EXAMPLES if config.option.whole or config.option.rest else FEWER,
+        suppress_health_check=[HealthCheck.too_slow],
+    )
+    settings.load_profile("obsynth")
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

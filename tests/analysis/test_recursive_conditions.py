@@ -126,6 +126,7 @@ class TestParameters:
             error = refusal(self.plant(Bf=[[0], [0]]), "adaptive-observer", **form)
             assert "the parameter 'f1' has no effect on the outputs" in str(error)
 
+    @pytest.mark.long
     def test_rank_in_a_random_plant_with_known_kernel(self) -> None:
         """Phi and Psi are chosen such that one combination, with one constant state, vanishes; then it is broken."""
         rng = np.random.default_rng(5)
@@ -170,6 +171,7 @@ class TestParameters:
             assert rows["identifiable parameters"].holds
 
 
+@pytest.mark.long
 def test_errors_that_decay_beyond_the_horizon_are_unclear_not_impossible() -> None:
     # Every state shows, exactly; as identities, Q and R hardly weigh x4 in these units.
     plant = obsynth.DescriptorSystem(

@@ -148,6 +148,7 @@ def worst(plant: obsynth.DescriptorSystem, dt: float, row: Any, *, held: bool) -
     return np.sign(signs), np.sign(weights)
 
 
+@pytest.mark.long
 def test_the_bound_of_estimates_is_of_the_exact_model_and_moving_disturbances(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

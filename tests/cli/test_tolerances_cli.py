@@ -87,6 +87,7 @@ def test_a_run_proves_its_first_alarm(gains, tmp_path, capsys) -> None:
     assert "pointwise" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_evaluate_draws_plants(gains, capsys) -> None:
     command = ["evaluate", "--system", str(DRIVE), "--gains", str(gains), "--runs", "10", "--plants", "10", "--quiet"]
     options = ["--monitor", "pointwise", "--noise-bound", "1.7320508", "--json"]

@@ -39,6 +39,7 @@ CASES = {
 
 
 # Whether the solver's last digits do is the processor's affair: what it found is compared.
+@pytest.mark.one_in(4)
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
 @pytest.mark.parametrize("norm", ["hinf", "h2"])
 @pytest.mark.parametrize("name", CASES)
@@ -60,6 +61,7 @@ def test_inequality_and_riccati_equation_agree(name: str, norm: str) -> None:
     assert design.least == pytest.approx(front.least, rel=1e-6)
 
 
+@pytest.mark.long
 def test_gains_are_those_of_the_innovation_and_may_be_worse() -> None:
     """Another constraint on Z0 gives a filter with a larger gain, which is what its design claims."""
     plant, options = CASES["4 states"]

@@ -252,6 +252,7 @@ def test_floats_keep_near_doubles_and_say_how_near_they_were_measured(name, tmp_
     assert (gaps <= 30.0 * np.array(list(stated.values()))).all()
 
 
+@pytest.mark.long
 def test_floats_are_refused_where_they_cannot_carry_an_observer_or_nobody_can_measure(tmp_path, monkeypatch) -> None:
     design = tank_observer("forgetting", {})
     exact = replace(design, observer=replace(design.observer, Q=1e-22 * np.eye(3), R=1e-20 * np.eye(3)))
@@ -263,6 +264,7 @@ def test_floats_are_refused_where_they_cannot_carry_an_observer_or_nobody_can_me
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_bounds_that_many_states_break_at_once_and_one_that_is_known_exactly(tmp_path) -> None:
     design = tank_observer("forgetting", {"state_bounds": {"h1": [0.1, 0.12], "h2": [0.1, 0.11], "h3": [0.1, 0.1005]}})
     y, u = leaking(design)

@@ -193,6 +193,7 @@ def start_of(observer: LinearObserver, dt: float, first: np.ndarray) -> np.ndarr
     return -first_order_hold(observer.Az, np.hstack([observer.Bu, observer.By]), dt)[2] @ first
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("which", "sample_time"), [("sampled", None), ("network", None), ("continuous", 0.01)])
 def test_c_equals_python_over_ten_thousand_steps(request, tmp_path, which, sample_time):
     design = request.getfixturevalue(which)

@@ -129,6 +129,7 @@ def test_arrays_and_state_space(tmp_path):
     assert system.input_labels == ["u1", "y1", "y2"]
 
 
+@pytest.mark.long
 def test_what_has_no_steady_state_is_refused(tmp_path):
     moving = PLANT.replace(A=[[0.9, "0.1 * sin(k)", 0], [-0.2, 0.7, 0.1], [1, 0.5, -1]], horizon=50)
     with pytest.raises(SpecError, match=r"^A may change with k"):

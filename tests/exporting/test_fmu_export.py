@@ -203,6 +203,7 @@ def test_the_sources_compile_without_a_warning(design, tmp_path, version, compil
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("compiler", "taken_as_verified")
 def test_the_observer_of_a_nonlinear_plant_is_a_unit_too(tmp_path):
     spec = obsynth.load_spec(ROOT / "designs" / "pendulum" / "spec.yaml")
@@ -224,6 +225,7 @@ def test_the_observer_of_a_nonlinear_plant_is_a_unit_too(tmp_path):
     assert np.abs(found - whole).max() <= 1e-9 * max(1.0, np.abs(whole).max())
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("compiler", "taken_as_verified")
 def test_the_unit_of_the_tanks_watches_its_leak_by_a_level_and_by_what_was_learned(tmp_path):
     """As a run on the same log: the leak, its deviation, the statistic, and both alarms."""

@@ -100,6 +100,7 @@ def test_c_equals_the_run_on_a_log(name: str, tmp_path: Path) -> None:
     assert np.nanmax(np.abs(numbers - found[:, 1:]) / np.maximum(np.abs(numbers), 1.0)) < 1e-12
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", ["linear", "effectiveness", "functions", "vertices"])
 @pytest.mark.parametrize("suffix", [".mat", ".npz"])
 def test_arrays_hold_the_observer_at_every_vertex(name: str, suffix: str, tmp_path: Path) -> None:

@@ -89,6 +89,7 @@ def test_figures_are_what_a_simulation_gives() -> None:
     assert found.unknown_input_gain < 1e-9
 
 
+@pytest.mark.long
 def test_auto_and_compare_say_why_they_differ() -> None:
     plant = obsynth.DescriptorSystem(
         None, [[0.5, 0.25, 0.0], [0.0, 0.75, -0.25], [0.25, 0.0, 0.25]], C=[[1, 0, 0], [0, 1, 1]],

@@ -113,6 +113,7 @@ def test_what_is_not_told_is_small_in_operation(seed: int) -> None:
             assert drift_in_operation(design) < 1e-2, method
 
 
+@pytest.mark.long
 def test_another_method_that_is_right_at_constant_faults_is_named() -> None:
     plant = plant_of(1189)
     with pytest.raises(VerificationError, match="No other method that estimates faults is verified") as error:

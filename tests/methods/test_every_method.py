@@ -138,6 +138,7 @@ def test_a_design_is_verified_and_survives_its_file(method: str, tmp_path: Path)
 WRONG_MODELS = ("zero", "a hundredth too large", "one entry", "other equations", "another shape", "none")
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("wrong", WRONG_MODELS)
 @EACH
 def test_a_wrong_error_model_fails(method: str, wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -254,6 +255,7 @@ def test_units_do_not_change_the_verdict(method: str, tmp_path: Path) -> None:
     assert obsynth.verify(obsynth.load(design.save(tmp_path / "gains.json"))).passed
 
 
+@pytest.mark.one_in(4)
 @EACH
 def test_a_corrupted_design_fails(method: str) -> None:
     design = design_of(method)
@@ -369,6 +371,7 @@ def test_a_record_is_smoothed_or_the_reason_is_said(method: str) -> None:
     )
 
 
+@pytest.mark.one_in(4)
 @EACH
 def test_sensors_of_their_own_times_are_taken_or_refused_by_name(method: str, tmp_path: Path) -> None:
     plant, options = plant_of(method), OPTIONS.get(method, {})

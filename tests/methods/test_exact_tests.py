@@ -46,6 +46,7 @@ def run(data: pd.DataFrame, **more: object) -> obsynth.types.DataRun:
     return obsynth.run_on_data(design, data, monitor=obsynth.online_monitor(design))
 
 
+@pytest.mark.long
 def test_the_exact_interval_raises_an_alarm_that_no_fixed_test_finds() -> None:
     size = 0.7 * test_of().threshold
     data = log(size)

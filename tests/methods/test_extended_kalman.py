@@ -51,6 +51,7 @@ def design_of(**more):
     )
 
 
+@pytest.mark.long
 def test_it_is_the_filter_by_hand():
     design, rng = design_of(), np.random.default_rng(2)
     assert design.report.passed
@@ -65,6 +66,7 @@ def test_it_is_the_filter_by_hand():
     np.testing.assert_allclose(found.states[1:, 2], 0.4 * np.sqrt(found.states[1:, 0] - found.states[1:, 1]), rtol=2e-2)
 
 
+@pytest.mark.long
 def test_auto_takes_it_and_the_adaptive_observer_without_parameters_is_it():
     options = {"dt": 0.5, "Q": {"first": 1e-4, "second": 1e-4}, "R": {"gauge": 1e-3}}
     assert obsynth.design(tanks(), **options).method == "extended-kalman"

@@ -39,6 +39,7 @@ def degenerate(seed: int) -> tuple[obsynth.DescriptorSystem, dict[str, Any]]:
     return plant, {name: value for name, value in options.items() if course == "step" or name != "before"}
 
 
+@pytest.mark.long
 def test_a_test_of_half_empty_plants_is_a_result_or_a_reason(share: Callable[..., Any]) -> None:
     made, reasons = 0, []
     for seed in share(range(80), 2):
@@ -86,6 +87,7 @@ def healthy(p: float, rng: np.random.Generator) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["time", "u1", "y1", "y2"])
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("free", ["others", "none"])
 @pytest.mark.parametrize("course", ["constant", "step", "any", "ramp"])
 def test_tests_of_one_of_several_faults_over_tolerances_watch_a_log(course: str, free: str) -> None:

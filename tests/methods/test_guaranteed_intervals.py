@@ -97,6 +97,7 @@ def test_a_known_disturbance_costs_nothing() -> None:
     assert abs(with_noise_known.residual(with_noise_known.observer.run(y))[-1]) <= with_noise_known.threshold + 1e-14
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", ASKED)
 def test_shifted_records_are_judged_like_those_about_zero(name: str, tmp_path: Path) -> None:
     shifted, plain = tank(name), tank(name, shifted=False)

@@ -66,6 +66,7 @@ def test_the_remainder_is_that_of_the_root_and_a_little_more() -> None:
         assert found["remainder in gauge"] < 1e-12
 
 
+@pytest.mark.long
 def test_what_an_output_shows_of_an_algebraic_state_has_its_remainder() -> None:
     fields = {**FIELDS, "units": {**FIELDS["units"], "meter": "m3/s"}}
     metered = obsynth.DAEModel(EQUATIONS, {"gauge": "level", "meter": "outflow"}, **fields)

@@ -130,6 +130,7 @@ def test_thresholds_of_shipped_designs(name: str, tmp_path: Path) -> None:
     assert obsynth.verify(obsynth.load(designed(name).save(tmp_path / "test.json"))).passed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", TABLE)
 def test_the_table_of_three_plants(name: str, share: Callable[..., Any]) -> None:
     spec = obsynth.load_spec(ROOT / name)

@@ -71,6 +71,7 @@ def run(name: str, y: np.ndarray, u: np.ndarray) -> pd.DataFrame:
     return obsynth.run_on_data(made(name), pd.DataFrame(data), monitor=monitor(name)).table
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["constant, 10", "step, 10 + 10"])
 def test_no_plant_of_the_box_alarms_without_a_fault(name: str, share: Callable[..., Any]) -> None:
     box, rng = spec().plant.uncertainty.box, np.random.default_rng(4)
@@ -155,6 +156,7 @@ def test_a_scenario_for_an_exact_plant_is_refused() -> None:
         obsynth.guaranteed_test(plant, scenario=spec().scenario, **BOUNDS)
 
 
+@pytest.mark.long
 def test_evaluating_on_the_command_line_draws_plants_of_the_box(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

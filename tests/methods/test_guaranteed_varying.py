@@ -408,6 +408,7 @@ def test_what_is_for_constant_matrices_says_so(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_the_command_line_designs_verifies_runs_and_reports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     document = {
         "schema_version": 1, "name": "tank",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 import obsynth
 from obsynth import DescriptorSystem
@@ -34,6 +35,7 @@ def static_plant(seed: int) -> DescriptorSystem:
                 return DescriptorSystem(E=np.zeros((n, n)), A=a, C=c, Bf=bf, Bd=bd, dt=0.5)
 
 
+@pytest.mark.long
 def test_every_verified_observer_tells_a_constant_fault() -> None:
     designed = 0
     for seed in range(24):

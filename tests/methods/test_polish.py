@@ -28,6 +28,7 @@ def filtering(nd: int) -> obsynth.ObserverDesign:
     return obsynth.fault_estimation_filter(plant(nd))
 
 
+@pytest.mark.long
 def test_the_inequality_is_asked_and_nothing_is_lost() -> None:
     design = obsynth.fault_estimation_filter(plant(nd=9), engine="lmi")
     runs = [run for run in design.solver["runs"] if run["what"] == "least gain"]

@@ -95,6 +95,7 @@ def test_a_time_invariant_plant_states_its_noise() -> None:
     assert "No noise is stated: Q and R taken as the identity" in bare.notes[0]
 
 
+@pytest.mark.long
 def test_callables_are_used_but_not_saved(tmp_path: Path) -> None:
     stacked = obsynth.descriptor_kalman(varying(horizon=60), Q=np.tile(0.1 * np.eye(3), (60, 1, 1)), R=0.2)
     assert obsynth.load(stacked.save(tmp_path / "s.json")).observer.Q.length == 60

@@ -72,6 +72,7 @@ def test_what_is_proved_is_said_in_words(design: ObserverDesign) -> None:
     assert "errors decay by" in str(design)
 
 
+@pytest.mark.long
 def test_errors_shrink_in_every_step_as_is_proved(design: ObserverDesign) -> None:
     rate = design.certificate.claims["region_decay"]
     model, observer = design.over_region
@@ -154,6 +155,7 @@ def test_a_plant_without_nonlinearities_is_the_kalman_filter() -> None:
     assert made.certificate.claims["region_deviation"] >= np.sqrt(X[2, 2])
 
 
+@pytest.mark.long
 def test_a_flexible_joint_has_no_limit_of_its_slope_and_units_do_not_matter() -> None:
     # Raghavan, Hedrick: a Lipschitz condition passes or fails by the units of the fourth state.
     made = []

@@ -81,6 +81,7 @@ def true_and_estimated(design, *, seed, dt, steps=4000):
     return np.array(errors)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("dt", [0.0, 0.01])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_functional_with_dynamics_of_its_own_takes_an_observer_of_order_one(seed, dt):
@@ -96,6 +97,7 @@ def test_a_functional_with_dynamics_of_its_own_takes_an_observer_of_order_one(se
     assert np.abs(errors[-1000:]).max() <= 1e-9 * max(1.0, np.abs(errors).max())
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("seed", range(6))
 def test_any_functional_of_an_observable_plant_is_estimated_at_the_rate_or_poles_asked_for(seed):
     rng = np.random.default_rng([3, seed])
@@ -186,6 +188,7 @@ def test_a_functional_that_makes_no_sense_is_refused(functionals, message):
     assert caught.value.path.startswith("functionals.")
 
 
+@pytest.mark.long
 def test_a_spec_with_functionals_goes_through_every_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "spec.yaml").write_text(yaml.safe_dump(SPEC))

@@ -53,11 +53,13 @@ def test_faults_that_only_hide_together_are_named_together() -> None:
         ui_pi_observer(plant)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", [{"polynomial": 10}, {"sum": ["step", {"sinusoid": 1e-6}]}])
 def test_stability_is_proved_where_no_lyapunov_equation_can_be_solved(model: object) -> None:
     assert ui_pi_observer(PAPER, fault_model=model).report["stability"].passed
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("dt", [0.0, 0.1])
 @pytest.mark.parametrize("frequency", [1e-6, 1e-7])
 def test_parts_of_a_fault_that_can_hardly_be_told_apart_are_said_to_make_it_slow(frequency: float, dt: float) -> None:

@@ -108,6 +108,7 @@ def test_stated_noise_in_other_units() -> None:
     assert spectrum_error(other.observer.Az, 1e3 * np.linalg.eigvals(own.observer.Az), 0.0) < 1e-5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("count", "sample_time"), [(30, 0.0), (30, 0.2), (80, 0.2)])
 def test_a_rod_with_many_weakly_seen_modes(count: int, sample_time: float) -> None:
     design = ui_pi_observer(rod(count, sample_time))

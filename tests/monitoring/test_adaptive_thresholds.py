@@ -193,6 +193,7 @@ def test_refusals_name_their_reason() -> None:
         obsynth.online_monitor(design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, constants={"J2": "150 %"})
 
 
+@pytest.mark.long
 def test_plants_are_drawn_from_the_box() -> None:
     from uncertain_plants import DESIGNS
 
@@ -283,6 +284,7 @@ def continuous() -> Any:
     return obsynth.pd_observer(obsynth.uncertain_system(written, constants))
 
 
+@pytest.mark.long
 def test_continuous_designs_hold_for_disturbances_that_move_between_samples(continuous) -> None:
     plant, _ = continuous.linear
     monitor = obsynth.online_monitor(
@@ -345,6 +347,7 @@ def test_intervals_hold_while_the_effect_of_a_fault_varies() -> None:
     assert closest > 0.8
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ranges", [{"J1": (0.45, 0.52)}, {"J2": (0.99, 1.15), "k": (17.0, 20.5)}])
 def test_a_box_whose_middle_is_not_nominal_has_bounds(ranges, share) -> None:
     """A calibrated box is not symmetric: the remainder of inverses then leaves something at the nominal plant."""

@@ -284,6 +284,7 @@ def test_every_source_is_cplusplus_too(shipped: SimpleNamespace) -> None:
     assert done.returncode == 0, done.stderr[:4000]
 
 
+@pytest.mark.long
 def test_c_finds_changes_of_faults_as_a_run_does(shipped: SimpleNamespace) -> None:
     design = shipped.designs[WALKING]
     alone = told(design)

@@ -41,6 +41,7 @@ def test_the_measured_tanks_agree_with_the_reference(measured):
     assert measured.box.holds({"a1": 0.0224, "a2": 0.0215, "b1": 0.0355, "b2": 0.0352})
 
 
+@pytest.mark.long
 def test_what_was_found_reads_as_a_table_and_as_data(measured):
     text = str(measured)
     assert 8 <= len(text.splitlines()) <= 16

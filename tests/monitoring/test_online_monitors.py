@@ -136,6 +136,7 @@ def test_the_plants_own_noise_needs_no_scenario(noisy):
 # Continuous designs
 
 
+@pytest.mark.long
 def test_the_continuous_bound_holds_for_any_disturbance_within_its_bound(machine):
     """Square waves of the worst sign, and fast sampling: never passed, and not far from what is reached."""
     scenario = obsynth.Scenario(horizon=20, sample_time=0.002, disturbances={"load": obsynth.Uniform(low=-1, high=1)})

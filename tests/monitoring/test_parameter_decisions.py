@@ -73,6 +73,7 @@ def test_a_change_is_found_and_named(statistic: str) -> None:
     assert named.count("" if statistic == "nis" else "theta2") >= (4 if statistic == "cusum" else 8)
 
 
+@pytest.mark.long
 def test_the_glr_knows_the_onset_of_an_abrupt_change() -> None:
     """theta(k) acts on x(k) by the algebraic equation, and on x(k + 1) by the others: either is the onset."""
     onsets = [decide(*run(seed, jump=6.0), statistic="glr").alarm.onset for seed in range(8)]

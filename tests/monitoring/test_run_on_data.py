@@ -561,6 +561,7 @@ def test_an_alarm_of_the_initial_condition_response_is_told_with_a_warm_up_that_
     assert found.warnings == ()
 
 
+@pytest.mark.long
 def test_a_log_that_begins_at_other_states_than_a_nonlinear_design_is_told_of_where_it_alarms():
     tank = obsynth.DAEModel(
         {"balance": "2.0 * der(level) = inflow - c * sqrt(level)"},

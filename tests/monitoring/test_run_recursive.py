@@ -99,6 +99,7 @@ def test_a_run_gives_what_the_observer_gives_in_absolute_values(name):
         np.testing.assert_allclose(columns(found, "sd fhat["), wanted.parameter_deviations, rtol=1e-13)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", DESIGNS)
 def test_missing_outputs_are_the_filters_own_business(name):
     table = log_of(name)

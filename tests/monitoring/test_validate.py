@@ -72,6 +72,7 @@ def test_a_leak_in_the_rows_is_found(right):
     assert any("leak" in sentence for sentence in found.verdict)
 
 
+@pytest.mark.long
 def test_a_recursive_design_is_validated_too():
     linear = linearise(tanks(), at="point", given={"h1": 0.55, "h2": 0.47, "h3": 0.56}, drift=True)
     plant = obsynth.discretise(linear, 1.0).plant
@@ -96,6 +97,7 @@ def test_a_recursive_design_is_validated_too():
         assert set(found.sensors) == set(plant.output_names)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("taken_as_verified")
 def test_a_sensor_that_the_model_never_predicts_is_told_and_drawn() -> None:
     """An algebraic state that nothing tells before it is measured: the report of a shipped design ended in an error."""
@@ -333,6 +335,7 @@ def test_no_run_is_made_twice(tank_design, monkeypatch):
     assert len(runs) == len(set(runs)) == len(walk_shares.VARIANCE_SHARES)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong", ["Q", "R"])
 def test_a_wrong_variance_is_told_by_its_letter_where_an_equation_and_a_sensor_share_a_name(wrong):
     model = obsynth.DAEModel(

@@ -309,6 +309,7 @@ def test_recursive_observers_keep_their_batches() -> None:
     assert run_batch(shipped, y).states[1] == pytest.approx(shipped.run(y[1]).states)
 
 
+@pytest.mark.long
 def test_functions_of_python_run_as_c_as_well() -> None:
     rng = np.random.default_rng(4)
     y, u = rng.standard_normal((40, 2)), drive(40)

@@ -144,6 +144,7 @@ def test_a_moving_point_needs_to_be_asked_for_and_then_follows_the_motion():
     assert np.abs(linear.B[:, 2] - motion).max() < 1e-15
 
 
+@pytest.mark.long
 def test_the_algebraic_state_of_a_point_is_solved_for_and_what_is_given_stays():
     linear = linearise(pendulum(ROD[1]), at="point", given={"x": 0.6, "y": -0.8, "vx": 0.4, "vy": 0.3}, drift=True)
     point = linear.operating_point

@@ -125,6 +125,7 @@ def test_products_by_blocked_kernels(size):
     assert contains(Ball.exact(right).T @ Ball.exact(right), whole(right).T @ whole(right), factors=2)
 
 
+@pytest.mark.long
 def test_chains_of_operations():
     rng = np.random.default_rng(4)
     for _ in range(500):

@@ -130,6 +130,7 @@ def test_no_false_proof_of_larger_singular_matrices(size, count, monkeypatch):
         assert not prove_positive_definite(factor @ factor.T).proved
 
 
+@pytest.mark.long
 def test_a_ball_with_a_member_that_is_not_definite_is_not_proved(share):
     """Margin and radius of the same size: the exact sign of the worst member decides."""
     rng, cases = np.random.default_rng(12), share(range(2000))

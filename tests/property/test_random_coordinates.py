@@ -143,6 +143,7 @@ def test_planted_zero_outside_is_named(zero, share):
         assert set(refusal.value.signals) <= set(known.plant.fault_names)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mode", [1.0, -1.2, 2.0])
 def test_hidden_unstable_mode_is_named(mode):
     for i in range(5):

@@ -37,6 +37,7 @@ def solved(share):
     return [(plant, least(plant)) for plant in share(plants, 4)]
 
 
+@pytest.mark.long
 def test_bisection_agrees_with_the_direct_solution(share):
     tolerance = 1e-4
     for plant in share([*disturbed_plants(10, 0), *disturbed_plants(5, 1, feedthrough=True)], 3):
@@ -55,6 +56,7 @@ def test_two_solvers_agree():
         assert least(plant, solver="SCS") == pytest.approx(least(plant, solver="CLARABEL"), rel=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fixed", [{}, {"feedthrough": True}, {"explicit": True, "singularity": 0}], ids=str)
 def test_no_filter_beats_the_least_gain(fixed, share):
     beaten = []
@@ -67,6 +69,7 @@ def test_no_filter_beats_the_least_gain(fixed, share):
     assert beaten == []
 
 
+@pytest.mark.long
 def test_free_weight_never_costs_gain_and_is_not_beaten(solved, share):
     worse, beaten = [], []
     for plant, fixed in share(solved, 3):
@@ -118,6 +121,7 @@ def test_gamma_above_the_least_is_reached(solved, factor):
     assert failures == []
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("options", [{}, {"gamma": 1.0}, {"weight": "free"}], ids=str)
 @pytest.mark.parametrize("square", [False, True])
 def test_disturbance_without_any_effect_is_served(options, square):

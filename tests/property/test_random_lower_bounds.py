@@ -34,6 +34,7 @@ def random_plant(seed: int, units: float) -> obsynth.DescriptorSystem:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("units", "gap"), [(1.0, 1e-4), (1e3, 1e-4), (1e6, 5e-3)])
 def test_the_proved_lower_bound_is_close_to_the_least_gain_found(units, gap):
     weak = []

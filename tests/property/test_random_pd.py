@@ -144,6 +144,7 @@ def test_a_zero_at_the_origin_is_named(share):
         assert (error.condition, error.mode, error.signals) == ("rank [A F; C Df]", 0.0, ("unseen",))
 
 
+@pytest.mark.long
 def test_dependent_faults_are_named():
     for i in range(10):
         rng = np.random.default_rng([3, i])

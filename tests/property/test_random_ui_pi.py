@@ -105,6 +105,7 @@ def test_repeated_poles_are_placed_or_refused(share: Share) -> None:
     assert len(refused) <= 0.04 * len(seeds), refused
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("number", range(0, BATCHES, 2))
 def test_default_designs_see_no_disturbance(number: int, share: Share) -> None:
     """Trajectories ``(x, d) e^{st}`` of the plant, at points that no grid of ours holds, give exact estimates."""
@@ -132,6 +133,7 @@ def test_default_designs_see_no_disturbance(number: int, share: Share) -> None:
     assert len(refused) <= 1, refused
 
 
+@pytest.mark.long
 def test_the_failing_condition_is_raised_with_its_mode_and_signals(share: Share) -> None:
     seen, seeds = Counter(), share(ALL, 3)
     for seed in seeds:

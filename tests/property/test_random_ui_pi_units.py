@@ -65,6 +65,7 @@ def moved_by_rounding(case: Case, poles: np.ndarray) -> float:
     return spectrum_error(ui_pi_observer(changed, fault_model=case.model).observer.Az, poles, case.plant.dt)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", range(BATCHES))
 def test_units_change_neither_verdict_nor_observer(number: int, share: Callable[..., Sequence[Any]]) -> None:
     # Eight kinds of plants come in turn: an odd number of parts leaves each of them in a share.

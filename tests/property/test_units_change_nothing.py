@@ -98,6 +98,7 @@ def test_estimates_settle_at_the_faults_in_all_units(method, seed):
     np.testing.assert_allclose(settled(plant, found.observer, 1.0 / units) * units, 1.0, rtol=1e-6)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("method", PLANTS)
 def test_hidden_faults_are_refused_for_the_same_reason_in_all_units(method, seed):

@@ -162,6 +162,7 @@ def test_a_failure_is_said_at_the_top_and_in_its_row(network, tmp_path):
     assert page_of(network, tmp_path, report=VerificationReport())[1].texts[2].startswith("FAILS: the report is empty")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("which", ["network", "continuous", "recursive"])
 def test_everything_is_there(request, tmp_path, which):
     design = request.getfixturevalue(which)
@@ -180,6 +181,7 @@ def test_everything_is_there(request, tmp_path, which):
     assert f"{gain.ravel()[0]:.6g}" in page.texts
 
 
+@pytest.mark.long
 def test_an_observer_that_does_not_fit_or_is_unstable_has_a_page_too(continuous, tmp_path):
     _, observer = continuous.linear
     short = type(observer)(**{**observer.as_dict(), "By": observer.By[:, :1], "Dy": observer.Dy[:, :1],
@@ -203,6 +205,7 @@ def test_a_kalman_filter_shows_its_states(tmp_path):
     assert "States in a run with the stated noise, and their estimates, with 95 % bands." in page.texts
 
 
+@pytest.mark.long
 def test_a_scenario_is_shown_with_its_alarm(tmp_path):
     spec = load_spec(ROOT / "designs" / "wang2015" / "spec.yaml")
     design = obsynth.fault_estimation_filter(exact(spec.plant))
@@ -213,6 +216,7 @@ def test_a_scenario_is_shown_with_its_alarm(tmp_path):
         page_of(design, tmp_path, scenario=spec.scenario.replace(faults={"nothing": obsynth.Step(size=1)}))
 
 
+@pytest.mark.long
 def test_every_text_is_escaped(continuous, tmp_path):
     plant, observer = continuous.linear
     changed = continuous.replace(

@@ -82,6 +82,7 @@ def test_the_papers_threshold_says_what_it_is_not(wang) -> None:
     assert any("not a pointwise bound" in text.get_text() for text in panel.get_legend().get_texts())
 
 
+@pytest.mark.long
 def test_a_recursive_simulation_with_its_decision() -> None:
     spec = load_spec(DESIGNS / "moussaali2013_ltv" / "two_outputs.yaml")
     design = obsynth.design(spec.plant, spec.method, **dict(spec.options))

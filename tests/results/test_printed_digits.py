@@ -61,6 +61,7 @@ def scattered(part: int) -> list[int]:
     return np.random.default_rng(1).permutation(list(LONGEST))[part::4].tolist()
 
 
+@pytest.mark.long
 def test_the_plants_have_short_and_long_indexes(share: Callable[..., Any]) -> None:
     looked_at = [seed for part in range(4) for seed in share(scattered(part), 2, together=True)]
     assert {max(designed(seed).observer.fault_delays) for seed in looked_at} == {1, 2, 3}
@@ -68,6 +69,7 @@ def test_the_plants_have_short_and_long_indexes(share: Callable[..., Any]) -> No
     assert {seed % 4 for seed in looked_at} == {0, 1, 2, 3}
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("part", range(4))
 def test_every_equality_holds_to_the_printed_digits(part: int, share: Callable[..., Any]) -> None:
     for seed in share(scattered(part), 2):
@@ -114,6 +116,7 @@ def test_an_index_at_which_nothing_shows_is_refused() -> None:
         design_from_gains(plant, "fault-estimation-filter", **gains, indexes=[1])
 
 
+@pytest.mark.long
 def test_an_allowance_relative_to_the_terms_would_refuse_some_of_them() -> None:
     """Roundings of gains are absolute: half a unit in each of nx + ny products may be too little, or far too much."""
 
@@ -126,6 +129,7 @@ def test_an_allowance_relative_to_the_terms_would_refuse_some_of_them() -> None:
     assert any(refused(seed) for seed in LONGEST)
 
 
+@pytest.mark.long
 def test_a_gain_wrong_by_a_hundred_units_fails_in_nearly_all_entries(share: Callable[..., Any]) -> None:
     noticed = total = 0
     for seed in share(scattered(0) + scattered(1) + scattered(2) + scattered(3), 6, together=True):

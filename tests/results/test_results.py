@@ -398,6 +398,7 @@ HEAVY = (
 )
 
 
+@pytest.mark.long
 def test_loading_and_verifying_needs_no_solver(design, tmp_path):
     file = design.save(tmp_path / "a.json")
     done = subprocess.run(

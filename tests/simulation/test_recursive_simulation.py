@@ -76,6 +76,7 @@ def test_a_time_varying_plant_obeys_its_equations(shifted) -> None:
     np.testing.assert_allclose(found.outputs[1:, 1], (found.states[:, 1] + bias)[1:], atol=1e-12)
 
 
+@pytest.mark.long
 def test_the_observer_beside_it_is_that_of_run(varying) -> None:
     design, scenario = varying
     found = obsynth.simulate(design, scenario.replace(horizon=60))
@@ -123,6 +124,7 @@ def test_a_resetting_observer_is_run_on_each_record() -> None:
     assert obsynth.evaluate(design, scenario, runs=3).runs == 3
 
 
+@pytest.mark.long
 def test_a_dae_is_integrated_on_its_own_equations(nonlinear) -> None:
     design, scenario = nonlinear
     quiet = scenario.replace(noise=0.0, horizon=2.5)
@@ -205,6 +207,7 @@ def test_decisions_over_many_runs(shifted) -> None:
     assert alone.state_rmse["flow"].value == pytest.approx(np.sqrt(np.mean(one.state_errors[1:, 1] ** 2)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("statistic", ["chi-square", "nis", "cusum"])
 def test_false_alarms_without_a_change_are_as_rare_as_asked(shifted, statistic: str) -> None:
     monitor = obsynth.ParameterMonitor(statistic=statistic, false_alarms=0.1)

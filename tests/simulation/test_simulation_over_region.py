@@ -104,6 +104,7 @@ def test_samples_faster_than_the_stated_rate_are_counted() -> None:
     assert any(f"In {forgetting} of 201 samples nothing is claimed" in note for note in notes)
 
 
+@pytest.mark.long
 def test_the_observer_of_a_nonlinear_plant_runs_on_a_scenario() -> None:
     tank = obsynth.DAEModel(
         {"balance": "2.0 * der(level) = inflow - 0.5 * sqrt(level) - leak"}, {"gauge": "level"},
@@ -121,6 +122,7 @@ def test_the_observer_of_a_nonlinear_plant_runs_on_a_scenario() -> None:
     assert obsynth.evaluate(design, scenario, runs=3).fault_rmse["leak"].value < 3e-3
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
@@ -151,6 +153,7 @@ def test_other_plants_have_no_scheduling_and_points_of_higher_index_are_named() 
         obsynth.simulate(plant, scheduling=[[1.0], [2.0]])
 
 
+@pytest.mark.long
 def test_learned_thresholds_of_a_nonlinear_region_and_what_has_none() -> None:
     tank = obsynth.DAEModel(
         {"balance": "2.0 * der(level) = inflow - 0.5 * sqrt(level) - leak"}, {"gauge": "level"},

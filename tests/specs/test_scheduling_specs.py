@@ -56,6 +56,7 @@ def test_a_spec_is_the_plant_of_its_expressions(tmp_path: Path) -> None:
     assert plant.scheduling.units == {"a": "m"}
 
 
+@pytest.mark.long
 def test_the_commands_go_from_a_spec_to_estimates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec, gains = str(_written(tmp_path)), str(tmp_path / "region.gains.json")
     assert main(["check", "--system", spec]) == 0
@@ -100,6 +101,7 @@ def test_what_is_no_region_is_refused_with_its_place(tmp_path: Path, old: str, n
     assert told in f"{refused.value.path}: {refused.value} {refused.value.problems}"
 
 
+@pytest.mark.long
 def test_a_range_alone_and_a_scenario_in_a_spec(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scenario = (
         "scenario:\n  horizon: 100\n  faults: {f2: {kind: step, size: 1, start: 60}}\n"

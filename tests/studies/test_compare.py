@@ -24,6 +24,7 @@ def bicycle() -> obsynth.Comparison:
     return obsynth.compare(spec.plant, scenario=scenario, options={spec.method: spec.options}, runs=5)
 
 
+@pytest.mark.long
 def test_one_recommendation_with_its_reason(bicycle: obsynth.Comparison) -> None:
     assert bicycle.recommended == "functional-filter"
     assert "rms error" in bicycle.reason
@@ -122,6 +123,7 @@ def test_texts_and_picture(bicycle: obsynth.Comparison) -> None:
     json.dumps(bicycle.to_dict())
 
 
+@pytest.mark.long
 def test_options_are_those_of_the_plant_as_it_is_given() -> None:
     """The paper's poles -2 .. -6 and its decoupling are of its plant: for the samples, the method was refused."""
     spec = load_spec(DESIGNS / "sharepasand" / "spec.yaml")
@@ -230,6 +232,7 @@ def test_bad_arguments(tmp_path: Path) -> None:
         obsynth.compare(plant.replace(Bf=None, Df=None, fault_names=None, units={}))
 
 
+@pytest.mark.long
 def test_the_page_lists_meanings_and_refusals_and_names_units(bicycle: obsynth.Comparison) -> None:
     page = bicycle.page()
     assert "<td>steering (rad)</td>" in page

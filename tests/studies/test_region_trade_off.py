@@ -15,6 +15,7 @@ _TANK = obsynth.DAEModel(
 )  # fmt: skip
 
 
+@pytest.mark.long
 def test_a_larger_region_costs_and_no_course_passes_the_claim() -> None:
     found = obsynth.region_trade_off(wang(0.3), sizes=[0.1, 0.5, 1.0])
     assert found.claim == "gamma"
@@ -46,6 +47,7 @@ def test_a_region_that_is_too_large_is_a_row_with_its_reason() -> None:
     found.plot()
 
 
+@pytest.mark.long
 def test_regions_of_nonlinear_plants_and_of_vertices_shrink_about_their_middle() -> None:
     options = {"region": {"level": [0.2, 2.0]}, "sample_time": 1.0, "noise": {"gauge": 1e-3, "leak": 1e-4}}
     found = obsynth.region_trade_off(_TANK, sizes=[0.5, 1.0], **options)

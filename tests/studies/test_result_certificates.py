@@ -253,6 +253,7 @@ def test_what_fails_or_says_nothing_is_not_certified(files: dict[str, Path], tmp
     assert not (tmp_path / "bad.json").exists()
 
 
+@pytest.mark.long
 def test_verification_needs_no_solver(files: dict[str, Path]) -> None:
     names = [str(files[kind]) for kind in KINDS]
     code = (

@@ -12,6 +12,7 @@ from obsynth.plants.transformations.uncertain_plant import affine_plant
 from obsynth.verification.over_tolerances.subdivision import index_one_on_box
 
 
+@pytest.mark.long
 def test_largest_tolerances_are_those_of_the_audit() -> None:
     found = obsynth.robustness(obsynth.fault_estimation_filter(drive()))
     assert found.loop_radius == pytest.approx(0.136, abs=1e-3)

@@ -110,6 +110,7 @@ def test_rank_answers_agree_with_the_decoupled_plant() -> None:
         assert asked.visible == (strength > 0.0)
 
 
+@pytest.mark.long
 def test_rank_answers_on_a_network_agree_with_the_decoupled_plant(share: Callable[..., Any]) -> None:
     # Kundur's 196 variables: 80 random pairs of all 19,110, or a share of them. The count is that of exact arithmetic
     # modulo 2**31 - 1.

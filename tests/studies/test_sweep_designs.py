@@ -98,6 +98,7 @@ def without_status(body):
     del body["status"]
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("sealed", [False, True], ids=["as edited", "with the digest made anew"])
 @pytest.mark.parametrize(
     ("change", "is_taken"),

@@ -72,6 +72,7 @@ def test_a_dask_worker_of_another_process_gives_the_same_numbers(linear, here) -
     assert there == here[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["threads", "processes"])
 def test_threads_and_processes_give_the_same_numbers(kind: str, recursive, here) -> None:
     make = ThreadPoolExecutor(2) if kind == "threads" else ProcessPoolExecutor(1, mp_context=get_context("spawn"))

@@ -22,6 +22,7 @@ def drive():
     return obsynth.design(spec.plant, spec.method, **dict(spec.options)), spec.scenario
 
 
+@pytest.mark.long
 def test_the_fixed_bound_alarms_and_the_adaptive_one_grows(drive) -> None:
     found = obsynth.tolerance_study(*drive, tolerances=[0, "5 %", "10 %"], runs=8, noise_bound=4.0)
     assert found.tolerances.tolist() == [0.0, 0.05, 0.1]
@@ -53,6 +54,7 @@ def test_refused_studies(drive, options: dict, words: str) -> None:
         obsynth.tolerance_study(bare, drive[1])
 
 
+@pytest.mark.long
 def test_the_command_writes_the_picture(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     picture = tmp_path / "t.svg"
     asked = ["evaluate", "--system", str(DRIVE), "--tolerances", "0,5%", "--runs", "3", "--noise-bound", "4",

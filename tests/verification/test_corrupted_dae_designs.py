@@ -139,6 +139,7 @@ TABLE: dict[str, tuple[Corruption, set[str]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 def test_the_good_design_passes() -> None:
     assert failed(good()) == set()
     names = [check.name for check in good().report.checks]
@@ -212,6 +213,7 @@ def test_every_row_that_decides_has_a_corruption() -> None:
     assert {check.name for check in good().report.checks if check.kind != "information"} <= broken
 
 
+@pytest.mark.long
 def test_saved_and_loaded_it_is_the_same(tmp_path) -> None:
     loaded = obsynth.load(good().save(tmp_path / "gains.json"))
     assert isinstance(loaded.observer, DAEObserver)
@@ -220,6 +222,7 @@ def test_saved_and_loaded_it_is_the_same(tmp_path) -> None:
     assert repr(loaded.report) == repr(good().report)
 
 
+@pytest.mark.long
 def test_python_functions_are_designed_for_and_not_saved(tmp_path) -> None:
     design = dae_adaptive_observer(
         linear(matrices()), dt=0.25, Q=0.01, R=0.04, initial_parameter_covariance=1.0, initial_covariance=1.0
@@ -235,6 +238,7 @@ def test_a_higher_index_is_refused_with_the_equations(index) -> None:
         dae_adaptive_observer(pendulum(ROD[index]), dt=0.01, Q=1e-6, R=1e-4)
 
 
+@pytest.mark.long
 def test_the_designs_are_made_from_their_specs() -> None:
     from obsynth.specs.loader import load_spec
 

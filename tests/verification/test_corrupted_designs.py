@@ -649,6 +649,7 @@ def test_every_single_entry_of_the_observer_counts(name: str, matrix: str, share
             assert found & causes, (row, column, found)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("matrix", ["E", "A", "B", "C", "D", "Bf", "Df"])
 @pytest.mark.parametrize("name", PLANTS)
 def test_every_single_entry_of_the_plant_counts(name: str, matrix: str, share: Callable[..., Any]) -> None:
@@ -657,6 +658,7 @@ def test_every_single_entry_of_the_plant_counts(name: str, matrix: str, share: C
         assert failed(plant_entry(matrix, row, column, 1e-6)(design)), (row, column)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", PLANTS)
 def test_not_a_number_anywhere_is_refused_or_fails(name: str, share: Callable[..., Any]) -> None:
     design = good(name)
@@ -779,6 +781,7 @@ class TestPrintedDigits:
         for name in PLANTS:
             assert failed(good(name), printed_digits=4) == set()
 
+    @pytest.mark.one_in(4)
     @pytest.mark.parametrize("letter", ["T", "N", "L", "W"])
     def test_any_wrong_digit_still_fails(self, letter: str, share: Callable[..., Any]) -> None:
         gain = np.round(good("paper").gains[letter], 4)
@@ -803,6 +806,7 @@ class TestPrintedDigits:
         places = share(scattered(good("paper").gains[letter].shape), 5)
         assert self.unnoticed(letter, 10, places) == set()
 
+    @pytest.mark.long
     def test_in_L_ten_units_fail_in_most_entries_and_twenty_in_all(self, share: Callable[..., Any]) -> None:
         """In the rows of large gains, roundings of T at their worst would do as much as ten units of one entry of L."""
         places = share(scattered(good("paper").gains["L"].shape), 3)

@@ -53,6 +53,7 @@ def test_conditions_of_the_paper_at_four_vertices() -> None:
     assert found.existence.passed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["design", "scaled"])
 def test_faults_are_decoupled_for_wild_courses(name: str, request: pytest.FixtureRequest) -> None:
     made: ObserverDesign = request.getfixturevalue(name)
@@ -69,6 +70,7 @@ def test_faults_are_decoupled_for_wild_courses(name: str, request: pytest.Fixtur
     assert np.array(by_step) == pytest.approx(found.faults[:20], abs=1e-14)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["design", "scaled"])
 def test_disturbances_pass_by_less_than_is_proved(name: str, request: pytest.FixtureRequest) -> None:
     made: ObserverDesign = request.getfixturevalue(name)
@@ -265,6 +267,7 @@ def test_units_do_not_matter() -> None:
     assert moved.certificate.claims["gamma_min"] < 1e-3 * plain
 
 
+@pytest.mark.long
 def test_feedthrough_and_a_sensor_fault_are_exact_too() -> None:
     A = WANG_A.tolist()
     A[0][0] = "0.9 + 0.05 * a"
