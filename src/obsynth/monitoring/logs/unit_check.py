@@ -122,6 +122,8 @@ class UnitCheck:
         if not np.isfinite(rows[:, :nu]).all() or not _mean_square(observer, rows, nu) > UNEXPLAINED:
             return None
         found = [(_mean_square(observer, new, nu), i, change) for i, change, new in self._changed(rows)]
+        if not found:
+            return None
         value, i, change = min(found, key=lambda one: one[0])
         # What would be explained without the signal, too, shows no unit: a small factor makes anything as good as zero.
         if not value < EXPLAINED or not _mean_square(observer, self._after(rows, i, NOTHING), nu) > EXPLAINED:
