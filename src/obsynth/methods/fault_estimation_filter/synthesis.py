@@ -87,21 +87,11 @@ def synthesise(
         made = _synthesised(plant, held, prepared, asked, progress)
         return made if near is None else _less_noisy(plant, near, made, asked, progress)
     if asked.S is not None:
-        raise PreconditionError(
-            f"S is for independent outputs (Wang 2015, below eq. (1), assumes rank C = {plant.ny}), but "
-            f"{plant.ny - merged.plant.ny} of the outputs depend on others. Leave S out: a filter exists, and such "
-            "outputs are merged by their noise then.",
-            condition="rank C",
-        )
+        raise _for_independent_outputs("S", "S", plant, merged)
     made = _of_merged(plant, merged, _synthesised(merged.plant, held, prepared, asked, progress))
     if not _is_as_labelled(made):
         if paper:
-            raise PreconditionError(
-                "The paper's W is for independent outputs (Wang 2015, below eq. (1), assumes "
-                f"rank C = {plant.ny}), but {plant.ny - merged.plant.ny} of the outputs "
-                "depend on others. Leave weight out: a filter exists, and such outputs are merged by their noise then.",
-                condition="rank C",
-            )
+            raise _for_independent_outputs("The paper's W", "weight", plant, merged)
         free = replace(asked, weight="free")
         made = _of_merged(plant, merged, _synthesised(merged.plant, held, prepared, free, progress))
     return made if near is None else _less_noisy(plant, near, made, asked, progress)
@@ -128,6 +118,18 @@ def _less_noisy(
     assert isinstance(other.observer, LinearObserver)
     assert isinstance(made.observer, LinearObserver)
     return other if fault_deviation(plant, other.observer) < fault_deviation(plant, made.observer) else made
+
+
+def _for_independent_outputs(
+    given: str, option: str, plant: DescriptorSystem, merged: MergedOutputs
+) -> PreconditionError:
+    """Return the refusal of what is for independent outputs alone, with the option to leave out."""
+    return PreconditionError(
+        f"{given} is for independent outputs (Wang 2015, below eq. (1), assumes rank C = {plant.ny}), but "
+        f"{plant.ny - merged.plant.ny} of the outputs depend on others. Leave {option} out: a filter exists, and such "
+        "outputs are merged by their noise then.",
+        condition="rank C",
+    )
 
 
 def _is_as_labelled(made: Synthesis) -> bool:
