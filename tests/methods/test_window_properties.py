@@ -18,8 +18,6 @@ from obsynth.methods.guaranteed_test.exact import Programmes, known_rows
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
 from obsynth.methods.guaranteed_test.proofs import (
-    Repaired,
-    _rational_step,
     columns_of,
     exact_multipliers,
     proved_least,
@@ -30,6 +28,7 @@ from obsynth.methods.guaranteed_test.proofs import (
 )
 from obsynth.monitoring.thresholds.guaranteed import GuaranteedRule
 from obsynth.monitoring.thresholds.monitor import LinearSample, Sample
+from obsynth.proofs.nearby_solutions import NearbySolution, rational_correction
 
 BASIC: dict[str, Any] = {"course": "constant", "samples": 5, "fault": "f1", "free": "none"}
 
@@ -143,7 +142,7 @@ def test_a_witness_is_as_large_as_its_farthest_exact_point_allows(seed: int, nor
     )
     values[0] = 0.7
     radius = np.where(bounded, rng.uniform(0.0, 2.0, len(bar)) * np.where(bounded, bar, 0.0), 0.1)
-    found = proved_least(window, Repaired(values, radius))
+    found = proved_least(window, NearbySolution(values, radius))
     shares = (np.abs(values) + radius)[bounded] / bar[bounded]
     groups = window.group[bounded] if norm == "ellipsoid" else np.full(bounded.sum(), -1)
     worst = max(
@@ -151,7 +150,7 @@ def test_a_witness_is_as_large_as_its_farthest_exact_point_allows(seed: int, nor
     )
     near = np.where(bounded, 0.1 * np.where(bounded, bar, 0.0), 1.0)
     near[0] = 0.7
-    assert proved_least(window, Repaired(near, np.zeros(len(bar)))) <= 0.7
+    assert proved_least(window, NearbySolution(near, np.zeros(len(bar)))) <= 0.7
     assert found <= 0.7 / worst * (1.0 + 1e-12)
     assert found >= 0.7 / worst * (1.0 - 1e-9)
 
@@ -161,7 +160,7 @@ def test_a_threshold_counts_how_far_multipliers_are_from_exact_ones(seed: int) -
     window, rng = window_of(design_of(seed)), np.random.default_rng(seed)
     values = np.array(design_of(seed).certificate.matrices["multipliers"]).ravel()
     radius = rng.uniform(0.0, 0.1, len(values)) * np.abs(values)
-    found, bar = proved_threshold(window, Repaired(values, radius)), np.where(window.bounded, window.bar, 0.0)
+    found, bar = proved_threshold(window, NearbySolution(values, radius)), np.where(window.bounded, window.bar, 0.0)
     matrix = window.matrix.toarray()
     for _ in range(20):
         other = values + radius * np.sign(rng.standard_normal(len(values)))
@@ -173,8 +172,8 @@ def test_equations_that_contradict_each_other_have_no_step() -> None:
     matrix = np.array([[1.0, 2.0, 0.0], [2.0, 4.0, 0.0], [0.0, 1.0, 1.0]])
     weight = np.ones(3)
     third = Fraction(1, 3)
-    assert _rational_step(matrix, weight, [third, third, Fraction(1)]) is None
-    found = _rational_step(matrix, weight, [third, 2 * third, Fraction(1)])
+    assert rational_correction(matrix, weight, [third, third, Fraction(1)]) is None
+    found = rational_correction(matrix, weight, [third, 2 * third, Fraction(1)])
     assert found is not None
     step = dict(zip(*found, strict=True))
     for row, wanted in zip(matrix, (third, 2 * third, Fraction(1)), strict=True):

@@ -35,6 +35,9 @@ LOSSLESS_DIGITS = 15
 #: Odd parts of fewer bits are data that were multiplied by a power of two.
 SHORT_BITS = 34
 
+#: Integers of Python, and the exponent of the power of two by which they are multiplied.
+ScaledIntegers: TypeAlias = tuple[np.ndarray, int]
+
 #: Rows of rational numbers.
 FractionRows: TypeAlias = Sequence[Sequence[Fraction]]
 
@@ -202,6 +205,17 @@ def stored_matrix(matrix: FloatArray) -> fmpq_mat:
     (whole,), unit = whole_matrices([matrix])
     found: fmpq_mat = fmpq_mat(whole) / unit
     return found
+
+
+def scaled_integers(doubles: FloatArray) -> ScaledIntegers:
+    """Return doubles exactly: integers ``(n,)``, and the exponent of the power of two by which all are multiplied."""
+    parts, exponents = np.frexp(doubles)
+    least = int(np.min(exponents, initial=0, where=doubles != 0.0)) - MANTISSA_BITS
+    mantissas = np.ldexp(parts, MANTISSA_BITS).astype(np.int64).tolist()
+    shifts = np.where(doubles != 0.0, exponents - MANTISSA_BITS - least, 0).tolist()
+    integers = np.empty(len(mantissas), dtype=object)
+    integers[:] = [value << shift for value, shift in zip(mantissas, shifts, strict=True)]
+    return integers, least
 
 
 def whole_matrices(matrices: Sequence[FloatArray]) -> tuple[list[fmpz_mat], fmpz]:

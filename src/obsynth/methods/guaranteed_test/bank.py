@@ -16,11 +16,12 @@ from obsynth.methods.guaranteed_test.checks import checks
 from obsynth.methods.guaranteed_test.existence import samples_decided_on
 from obsynth.methods.guaranteed_test.options import TestOptions
 from obsynth.methods.guaranteed_test.problem import problem_of, window_as_designed
-from obsynth.methods.guaranteed_test.proofs import Repaired, proved_ray, proved_threshold, repaired_multipliers
+from obsynth.methods.guaranteed_test.proofs import proved_ray, proved_threshold, repaired_multipliers
 from obsynth.methods.guaranteed_test.windows import courses_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.nearby_solutions import NearbySolution
 from obsynth.results.checks import Check, lower_bound_check, upper_bound_check
 from obsynth.results.design import Certificate, ObserverDesign
 
@@ -231,7 +232,7 @@ def _pairs(design: ObserverDesign, asked: TestOptions) -> Iterator[Check]:
             holds = proved_hidden(plant, own)
         else:
             window = window_as_designed(plant, own)
-            test = Repaired(shipped[PAIR_MULTIPLIERS][place], shipped[PAIR_RADIUS][place])
+            test = NearbySolution(shipped[PAIR_MULTIPLIERS][place], shipped[PAIR_RADIUS][place])
             zero, promised = size == 0.0, window.outer
             exact = repaired_multipliers(
                 promised if zero else window, test.values, refine=False, exact_zero=zero, among=test.radius

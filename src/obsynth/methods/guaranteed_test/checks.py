@@ -17,7 +17,6 @@ from obsynth.methods.guaranteed_test.problem import (
     require_linear_options,
 )
 from obsynth.methods.guaranteed_test.proofs import (
-    Repaired,
     proved_least,
     proved_threshold,
     repaired_multipliers,
@@ -37,6 +36,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.window.observer import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
+from obsynth.proofs.nearby_solutions import NearbySolution
 from obsynth.results.checks import Check, information, lower_bound_check, nothing_wrong, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import listed_gains
@@ -102,7 +102,7 @@ def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], TestOptio
     tests = {}
     for k in used:
         rows = programmes.windows[k].rows
-        tests[k] = Repaired(shipped["multipliers"][k][:rows], shipped["multiplier_radius"][k][:rows])
+        tests[k] = NearbySolution(shipped["multipliers"][k][:rows], shipped["multiplier_radius"][k][:rows])
     yield from _of_the_tests(design, shipped, programmes, tests, constant=constant)
     yield from _of_what_runs(design, shipped, problem, programmes, tests)
     yield from _of_the_least(design, shipped, problem, programmes, used, constant=constant)
@@ -166,7 +166,7 @@ def _what_does_not_fit(
     return wrong if len(names) in (0, nx) else [*wrong, "states"]
 
 
-def excess(found: Repaired | None, radius: FloatArray) -> float:
+def excess(found: NearbySolution | None, radius: FloatArray) -> float:
     """Return the largest ratio of what is proved to what is shipped; NaN where nothing is proved."""
     if found is None:
         return np.nan
@@ -180,7 +180,7 @@ def _worst(value: float) -> float:
 
 
 def _judged(
-    window: Window, test: Repaired, shipped: Mapping[str, FloatArray], k: int, *, constant: bool
+    window: Window, test: NearbySolution, shipped: Mapping[str, FloatArray], k: int, *, constant: bool
 ) -> tuple[float, float, float, float]:
     """Return of one test how far exact multipliers are away beside what is shipped, by what the threshold that is
     proved passes its own, the threshold itself, and the rounding error beside the shipped one."""
@@ -199,7 +199,7 @@ def _of_the_tests(
     design: ObserverDesign,
     shipped: Mapping[str, FloatArray],
     programmes: WindowProgrammes,
-    tests: Mapping[int, Repaired],
+    tests: Mapping[int, NearbySolution],
     *,
     constant: bool,
 ) -> Iterator[Check]:
@@ -267,7 +267,7 @@ def _of_what_runs(
     shipped: Mapping[str, FloatArray],
     problem: WindowProblem,
     programmes: WindowProgrammes,
-    tests: Mapping[int, Repaired],
+    tests: Mapping[int, NearbySolution],
 ) -> Iterator[Check]:
     windows, rooms = programmes.windows, {}
     implied: LinearObserver | WindowObserver | None = None
@@ -298,7 +298,7 @@ def _of_what_runs(
     yield listed_gains(design, gains)
 
 
-def _over_tolerances(design: ObserverDesign, window: Window, test: Repaired) -> Check:
+def _over_tolerances(design: ObserverDesign, window: Window, test: NearbySolution) -> Check:
     shipped, found, reason = design.certificate.matrices, np.nan, ""
     try:
         T, T0, record = (shipped[name] for name in ("state_tracking", "state_rows", "record"))
@@ -353,7 +353,7 @@ def _proved_witness(
     columns, size = len(window.bar), float(shipped["leasts"][k, 0])
     if "witness" not in shipped or shipped["witness"].shape[1] < columns:
         return np.nan, np.nan
-    witness = Repaired(shipped["witness"][k][:columns], shipped["witness_radius"][k][:columns])
+    witness = NearbySolution(shipped["witness"][k][:columns], shipped["witness_radius"][k][:columns])
     exact = repaired_point(window, witness.values, refine=False, among=witness.radius)
     found = proved_least(window, witness)
     return excess(exact, witness.radius), found if constant or found >= size else np.nan

@@ -16,12 +16,13 @@ import numpy as np
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
 from obsynth.methods.guaranteed_test.programs import TOLERANCE
-from obsynth.methods.guaranteed_test.proofs import Repaired, Square, proved_threshold, repaired_multipliers
+from obsynth.methods.guaranteed_test.proofs import proved_threshold, repaired_multipliers
 from obsynth.methods.guaranteed_test.tolerant import rows_before
 from obsynth.methods.guaranteed_test.window_observers import rounding_of
 from obsynth.methods.guaranteed_test.windows import Window, window_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import UNIT_ROUNDOFF, gamma, rounded_up
+from obsynth.proofs.nearby_solutions import NearbySolution, SquarePart
 from obsynth.results.design import ObserverDesign
 
 #: Patterns of missing rows whose programmes are kept: those of a gap that moves through a window.
@@ -123,9 +124,9 @@ class _Programme:
         # Entries that are products with a whole number have been rounded once.
         self.share = gamma(window.rows + 8) + 2.0 * UNIT_ROUNDOFF
         dense = self.prescribed.toarray()
-        self.square = Square.of(dense, 2.0 * UNIT_ROUNDOFF * np.abs(dense), np.ldexp(1.0, rows), rows)
+        self.square = SquarePart.of(dense, 2.0 * UNIT_ROUNDOFF * np.abs(dense), np.ldexp(1.0, rows), rows)
         self.highs, self.bases, self.known = _highs(window), {}, np.zeros(window.rows)
-        self.test: tuple[Repaired, float] | None = None
+        self.test: tuple[NearbySolution, float] | None = None
         at_rest = np.zeros(window.rows)
         for sign in (1.0, -1.0):
             found = [self.proved(multipliers) for multipliers in self.answers(at_rest, sign)]
@@ -166,7 +167,7 @@ class _Programme:
                     direction *= TIMES_OF_A_RAY * float(np.max(np.abs(self.test[0].values))) / size
                     yield self.test[0].values - sign * np.copysign(1.0, float(direction @ right)) * direction
 
-    def proved(self, multipliers: FloatArray) -> tuple[Repaired, float] | None:
+    def proved(self, multipliers: FloatArray) -> tuple[NearbySolution, float] | None:
         """Return multipliers with the distance to exact ones, and what bounds can do to these."""
         if self.square is None or not self.square.contraction < 1.0:
             found = repaired_multipliers(self.window, multipliers, refine=True)
@@ -180,7 +181,7 @@ class _Programme:
         sizes = self.bounded_sizes @ rounded_up(self.share * np.abs(values) + radius, 2)
         seen = np.abs(self.bounded @ values) + rounded_up(sizes, self.window.rows)
         total = float(rounded_up(self.bars @ seen, len(seen) + 4))
-        return (Repaired(values, radius), total) if np.isfinite(total) else None
+        return (NearbySolution(values, radius), total) if np.isfinite(total) else None
 
     def end(self, right: FloatArray, largest: FloatArray, sign: float) -> float:
         """Return the upper (``sign`` 1) or lower end of the fault for these right sides; infinite without a proof."""

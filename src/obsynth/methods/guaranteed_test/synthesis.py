@@ -24,7 +24,6 @@ from obsynth.methods.guaranteed_test.problem import (
 )
 from obsynth.methods.guaranteed_test.programs import Optimum, largest_hidden_fault
 from obsynth.methods.guaranteed_test.proofs import (
-    Repaired,
     proved_least,
     proved_threshold,
     repaired_multipliers,
@@ -51,6 +50,7 @@ from obsynth.methods.tracking import tracking_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.proofs.nearby_solutions import NearbySolution
 from obsynth.results.design import Certificate
 from obsynth.simulation.linear import scenario_runs, scenario_stepper
 from obsynth.simulation.scenario import Scenario
@@ -217,7 +217,7 @@ def in_time(states: int, samples: int) -> str:
 class Shipped:
     """What is proved of a window: multipliers, a witness, and both claims."""
 
-    def __init__(self, test: Repaired, threshold: float, witness: Repaired | None, least: float) -> None:
+    def __init__(self, test: NearbySolution, threshold: float, witness: NearbySolution | None, least: float) -> None:
         self.test, self.threshold, self.witness, self.least = test, threshold, witness, least
 
 
@@ -301,7 +301,7 @@ def _by_programme(
     problem: WindowProblem, programmes: WindowProgrammes, shipped: list[Shipped | None]
 ) -> dict[str, FloatArray]:
     """Return what is proved of each different window, a row for each, and which of them each row of a record has."""
-    windows, empty = programmes.windows, Repaired(np.zeros(1), np.zeros(1))
+    windows, empty = programmes.windows, NearbySolution(np.zeros(1), np.zeros(1))
     tests = [empty if one is None else one.test for one in shipped]
     continued = [
         one if one is not None and _is_lasting(problem, window, row, one.witness) else None
@@ -333,7 +333,7 @@ def padded(rows: Sequence[FloatArray], width: int = 1) -> FloatArray:
     return np.array([np.pad(row, (0, width - len(row))) for row in rows])
 
 
-def _is_lasting(problem: WindowProblem, window: Window, row: int, witness: Repaired | None) -> bool:
+def _is_lasting(problem: WindowProblem, window: Window, row: int, witness: NearbySolution | None) -> bool:
     """Whether a witness, where there is one to show, is a course of a plant that runs before and after the window."""
     if witness is None:
         return problem.continues(window, row)
