@@ -278,6 +278,7 @@ def check(
             "plant",
             str(error),
             signals=error.signals,
+            of_the_method=error.condition == "index",
         )
         return {method: VerificationReport.of(condition_rows((row,))) for method in REGISTRY}
 

@@ -102,5 +102,6 @@ def kind_conditions(plant: Plant, method: type[Method]) -> tuple[Condition, ...]
             1.0,
             method.id,
             f"{_PLANT_KINDS[kind][1]}; methods for such plants are: {', '.join(methods_for(kind))}.",
+            of_the_method=True,
         ),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from obsynth.analysis.existence.witnesses import Unclear
 from obsynth.errors import PreconditionError
@@ -18,16 +18,6 @@ OPTIONS_PATH = "method.options"
 NONE_OF_THIS_KIND = "No observer of this kind exists: "
 NOT_TAKEN = "This method does not take the plant as it is: "
 
-#: Conditions of the second kind.
-OF_THE_METHOD = frozenset(
-    (
-        *("kind of plant", "plant of this kind", "discrete time", "continuous time", "index", "constant E"),
-        *("faults", "fault named", "parameters", "known parameters", "bounds stated", "region stated"),
-        *("constant outputs", "directions of the faults", "effectiveness", "one sample to the outputs"),
-        *("bounded slopes", "residual directions"),
-    )
-)
-
 
 def without_opening(text: str) -> str | None:
     """Return a refusal by a condition that fails without its opening; `None` for other texts."""
@@ -37,7 +27,10 @@ def without_opening(text: str) -> str | None:
 @dataclass(frozen=True)
 class Condition:
     """One existence condition: ``value`` against ``bound``, the evidence, the ``mode`` where it fails, a doubt (or that
-    its numbers cannot be computed, ``True``)."""
+    its numbers cannot be computed, ``True``).
+
+    ``of_the_method``: where it fails the method does not take the plant as it is, or as it is stated; nothing is
+    decided about other observers."""
 
     name: str
     claim: str
@@ -49,6 +42,7 @@ class Condition:
     mode: complex | None = None
     signals: tuple[str, ...] = ()
     unclear: Unclear | bool | None = None
+    of_the_method: bool = field(default=False, kw_only=True)
 
     def require(self) -> None:
         """Raise `PreconditionError` when the condition fails."""
@@ -71,7 +65,7 @@ class Condition:
 
     @property
     def _opening(self) -> str:
-        return NOT_TAKEN if self.name.partition(" at ")[0] in OF_THE_METHOD else NONE_OF_THIS_KIND
+        return NOT_TAKEN if self.of_the_method else NONE_OF_THIS_KIND
 
     def in_doubt(self, found: Unclear, plant: DescriptorSystem) -> Condition:
         """Return the condition as one that rounding of the data could change, with what tells so in its detail."""

@@ -39,6 +39,7 @@ def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
             0.0,
             _SOURCE,
             "continuous" if plant.dt == 0.0 else "sampled: give a continuous plant, or see functional_filter.",
+            of_the_method=True,
         ),
         Condition(
             "faults",
@@ -48,6 +49,7 @@ def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
             1.0,
             _SOURCE,
             f"{plant.nf} faults" if plant.nf else "none: name one by Bf or Df.",
+            of_the_method=True,
         ),
     )
     if not all(condition.holds for condition in first):
@@ -66,6 +68,7 @@ def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
                 _SOURCE,
                 str(error),
                 signals=error.signals,
+                of_the_method=error.condition == "index",
             ),
         )
     _, direct = unknown_inputs(smooth)

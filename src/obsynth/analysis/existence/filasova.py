@@ -63,6 +63,7 @@ def _form_conditions(judge: Evaluator) -> Iterator[Condition]:
         _SOURCE,
         f"a plant sampled every {plant.dt:g} s. Give the continuous one (no sample_time in its transform): the "
         "observer is sampled afterwards, by obsynth.sample_observer.",
+        of_the_method=True,
     )
     yield _condition(
         "faults",
@@ -72,6 +73,7 @@ def _form_conditions(judge: Evaluator) -> Iterator[Condition]:
         1.0,
         _SOURCE,
         "none. Name the fault to estimate in Bf or Df.",
+        of_the_method=True,
     )
     (normal_rank, index, dynamic), floating = _form(judge)
     yield _condition(
@@ -94,6 +96,7 @@ def _form_conditions(judge: Evaluator) -> Iterator[Condition]:
         f"index {index}: the algebraic equations cannot be solved for the algebraic states without differentiating. "
         "Differentiate the constraints first.",
         unclear=floating,
+        of_the_method=True,
     )
     yield _condition(
         "dynamic states",
@@ -166,11 +169,20 @@ def _condition(
     *,
     signals: tuple[str, ...] = (),
     unclear: bool = False,
+    of_the_method: bool = False,
 ) -> Condition:
-    found = Condition(
-        name, claim, holds, value, bound, source, "" if holds else failure, signals=() if holds else signals
+    return Condition(
+        name,
+        claim,
+        holds,
+        value,
+        bound,
+        source,
+        "" if holds else failure,
+        signals=() if holds else signals,
+        unclear=True if unclear and not holds else None,
+        of_the_method=of_the_method,
     )
-    return replace(found, unclear=True) if unclear and not holds else found
 
 
 def _detectable(facts: SystemFacts) -> Condition:

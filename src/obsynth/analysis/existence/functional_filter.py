@@ -39,7 +39,16 @@ def conditions(
     sets = residual_sets(residuals, plant)
     if plant.nf == 0:
         return (
-            Condition("faults", "the plant has a fault", False, 0.0, 1.0, _SOURCE, "there is none: give Bf or Df."),
+            Condition(
+                "faults",
+                "the plant has a fault",
+                False,
+                0.0,
+                1.0,
+                _SOURCE,
+                "there is none: give Bf or Df.",
+                of_the_method=True,
+            ),
         )
     if sets is not None:
         return tuple(condition for seen in sets for condition in _residual_conditions(plant, seen, exactly))

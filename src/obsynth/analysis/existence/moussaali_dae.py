@@ -29,6 +29,7 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
             1.0,
             f"{SOURCE}, (3)",
             f"the plant is {a_kind(model)}",
+            of_the_method=True,
         )
         return
     found = index_report(model, dt)
@@ -52,6 +53,7 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
         f"{SOURCE}, (7)",
         detail,
         signals=found.states,
+        of_the_method=True,
     )
     if found.index == 1 and model.nq:
         told = _unidentified(model, dt)
@@ -63,6 +65,7 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
             1.0,
             f"{SOURCE}, (3)",
             f"{model.nq} parameter(s){told}",
+            of_the_method=True,
         )
 
 
@@ -79,6 +82,7 @@ def known_parameters(plant: DAEModel) -> Condition:
         "this method",
         told,
         signals=plant.parameter_names,
+        of_the_method=True,
     )
 
 

@@ -36,6 +36,7 @@ def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequenc
         yield Condition(
             error.condition or "form", "E is constant, its derivatives are independent, and no formula jumps", False,
             0.0, 1.0, _SOURCE, str(error), signals=error.signals,
+            of_the_method=True,
         )  # fmt: skip
         return
     count = len(terms.nonlinearities)
@@ -43,11 +44,13 @@ def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequenc
         "constant E", "E is constant, its derivatives are independent, and no formula jumps", True, 1.0, 1.0, _SOURCE,
         f"{terms.differential} differential state(s) and fault(s), "
         f"{len(terms.names) - terms.differential} algebraic one(s), {count} nonlinearit{'y' if count == 1 else 'ies'}",
+        of_the_method=True,
     )  # fmt: skip
     if region is None:
         yield Condition(
             "region stated", "the region is stated", False, 0.0, 1.0, _SOURCE,
             "there is none: give ranges of the signals (option region)",
+            of_the_method=True,
         )  # fmt: skip
         return
     try:
@@ -56,11 +59,13 @@ def _in_order(model: DAEModel, region: Mapping[str, Any] | None, faults: Sequenc
         yield Condition(
             "bounded slopes", "every nonlinearity has a bounded slope over the region", False, 0.0, 1.0, _SOURCE,
             str(error), signals=error.signals,
+            of_the_method=True,
         )  # fmt: skip
         return
     yield Condition(
         "bounded slopes", "every nonlinearity has a bounded slope over the region", True, float(len(slopes)),
         float(len(slopes)), _SOURCE, f"{len(slopes)} slope(s)",
+        of_the_method=True,
     )  # fmt: skip
     yield Condition(
         "corners", "the slopes have no more corners than can be proved one by one", len(slopes) <= MOST_SLOPES,

@@ -77,6 +77,7 @@ def constant_outputs(plant: PolytopicSystem, product: str, source: str) -> Condi
         0.0,
         source,
         f"changing: {', '.join(changing)}" if changing else "",
+        of_the_method=True,
     )
 
 
@@ -126,6 +127,7 @@ def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion
         np.inf,
         _SOURCE,
         "" if reach is not None else "between the vertices some fault may have no effect",
+        of_the_method=True,
     )
     if reach is None:
         return
@@ -140,6 +142,7 @@ def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion
         _SOURCE,
         f"later: {', '.join(late)}; a filter for these over a region is not known here" if late else "",
         signals=tuple(late),
+        of_the_method=True,
     )
     if not late:
         made.append(found[0])
@@ -178,6 +181,7 @@ def _direction_condition(plant: PolytopicSystem, found: object) -> Condition:
         if found is not None
         else "a fault turns with the scheduling; a filter with exact decoupling for that is not known here",
         signals=() if found is not None else plant.fault_names,
+        of_the_method=True,
     )
 
 

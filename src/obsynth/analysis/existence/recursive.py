@@ -62,6 +62,7 @@ def recursive_conditions(
             1.0,
             f"{SOURCE}, eq. (4)",
             str(error),
+            of_the_method=True,
         )
         return
     ranks = horizon_ranks(varying, early=early)
@@ -85,6 +86,7 @@ def recursive_conditions(
         1.0,
         f"{SOURCE}, eq. (4)",
         f"{varying.nq} parameter(s)",
+        of_the_method=True,
     )
     if not varying.nq:
         return
@@ -202,6 +204,7 @@ def residual_condition(ranks: HorizonRanks) -> Condition:
             else ": y - C xhat is zero whatever the parameters are, so the parameters are never corrected. Use form "
             "'innovation', which uses all parity directions."
         ),
+        of_the_method=True,
     )
 
 

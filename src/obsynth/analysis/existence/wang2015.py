@@ -211,6 +211,7 @@ def _form_conditions(judge: Evaluator) -> list[Condition]:
             if plant.is_discrete
             else "a continuous plant. Sample it first (transform: {sample_time: ...} in "
             "a spec, obsynth.discretise in Python).",
+            of_the_method=True,
         ),
         Condition(
             "faults",
@@ -220,6 +221,7 @@ def _form_conditions(judge: Evaluator) -> list[Condition]:
             1.0,
             "Wang 2015, eq. (1)",
             "" if plant.nf else "none. Name the fault to estimate in Bf or Df.",
+            of_the_method=True,
         ),
         Condition(
             "regularity",

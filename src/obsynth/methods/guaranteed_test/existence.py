@@ -44,7 +44,11 @@ def conditions(
     if isinstance(plant, DescriptorSystem):
         detail = "the plant is continuous: sample it (transform: sample_time, obsynth.discretise)."
         sampled = plant.dt > 0.0
-        first = (Condition("discrete time", "dt > 0", sampled, plant.dt, 0.0, SOURCE, "" if sampled else detail),)
+        first = (
+            Condition(
+                "discrete time", "dt > 0", sampled, plant.dt, 0.0, SOURCE, "" if sampled else detail, of_the_method=True
+            ),
+        )
         named, none = named if not asked.isolate else plant.nf > 0, "the plant has no fault (Bf, Df)."
     advice = f"name one of {', '.join(names)} (fault)." if names else none
     lacking = list(missing_bounds(plant, asked))
@@ -58,6 +62,7 @@ def conditions(
             1.0,
             SOURCE,
             "" if named else advice,
+            of_the_method=True,
         ),
         Condition(
             "bounds stated",
@@ -67,6 +72,7 @@ def conditions(
             0.0,
             SOURCE,
             " ".join(lacking),
+            of_the_method=True,
         ),
     )
     if not all(condition.holds for condition in first) or not with_windows:

@@ -33,6 +33,7 @@ def nonlinear_conditions(model: DAEModel, asked: Any) -> tuple[Condition, ...]:
         0.0,
         SOURCE,
         "" if not lacking else f"give {' and '.join(lacking)}: the remainder of the linear model is bounded there.",
+        of_the_method=True,
     )
     if lacking:
         return (stated,)

@@ -100,7 +100,9 @@ def conditions(plant: DescriptorSystem, asked: Options) -> tuple[Condition, ...]
     if not regular:
         return (first,)
     if not plant.nf:
-        return first, Condition("faults", "the plant has a fault to be estimated", False, 0.0, 1.0, _SOURCE)
+        return first, Condition(
+            "faults", "the plant has a fault to be estimated", False, 0.0, 1.0, _SOURCE, of_the_method=True
+        )
     claim = "a stable causal filter has this fault map, whatever known and decoupled inputs do"
     try:
         first_problem(plant, asked)
