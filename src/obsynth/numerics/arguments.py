@@ -21,7 +21,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from obsynth.errors import SpecError, a_kind
 from obsynth.numerics.arrays import FloatArray, Given, as_given, holds_truth
 
-#: Whole numbers beyond this are told by their length.
+#: Messages give the number of digits of whole numbers beyond this.
 LONGEST_SHOWN = 10**30
 
 #: A larger count of samples, rows or runs is a mistake that would fill the memory.
@@ -127,19 +127,19 @@ def whole_number(value: Any, name: str, what: str = "a whole number", *, least: 
     return int(value)
 
 
-def shape_problem(found: tuple[int, ...], wanted: tuple[int, ...], name: str) -> str | None:
+def shape_problem(actual: tuple[int, ...], needed: tuple[int, ...], name: str) -> str | None:
     """Return what is wrong with the shape of an array, as a sentence; ``None`` where nothing is."""
-    if found == wanted:
+    if actual == needed:
         return None
-    turned = len(found) == len(wanted) == 2 and found[1] == wanted[0] != found[0]
-    hint = " Is it transposed?" if turned or found == wanted[::-1] else ""
-    sides = [" by ".join(map(str, shape)) or "a single number" for shape in (found, wanted)]
+    transposed = len(actual) == len(needed) == 2 and actual[1] == needed[0] != actual[0]
+    hint = " Is it transposed?" if transposed or actual == needed[::-1] else ""
+    sides = [" by ".join(map(str, shape)) or "a single number" for shape in (actual, needed)]
     return f"{name} is {sides[0]}, but {sides[1]} is needed.{hint}"
 
 
-def require_shape(found: tuple[int, ...], wanted: tuple[int, ...], name: str) -> None:
+def require_shape(actual: tuple[int, ...], needed: tuple[int, ...], name: str) -> None:
     """Raise `SpecError` naming the argument where an array has another shape than is needed."""
-    problem = shape_problem(found, wanted, name)
+    problem = shape_problem(actual, needed, name)
     if problem:
         raise SpecError(problem, path=name)
 
@@ -153,13 +153,13 @@ def truth(value: Any, name: str) -> bool:
 
 def real_vector(value: Any, size: int, name: str) -> FloatArray:
     """Return ``(size,)`` finite real numbers; a single one may be given as such."""
-    wanted = SpecError(f"{name} must be {size} finite number(s).", path=name)
+    refusal = SpecError(f"{name} must be {size} finite number(s).", path=name)
     try:
         vector = np.atleast_1d(real_array(value, name))
     except SpecError:
-        raise wanted from None
+        raise refusal from None
     if vector.shape != (size,) or not np.isfinite(vector).all():
-        raise wanted
+        raise refusal
     return vector
 
 
@@ -196,11 +196,11 @@ def is_whole(value: Any) -> bool:
 
 
 def require_kind(
-    value: Any, kinds: type | tuple[type, ...], name: str, wanted: str, *, path: str | None = None
+    value: Any, kinds: type | tuple[type, ...], name: str, expected: str, *, path: str | None = None
 ) -> None:
     """Raise `SpecError` unless an argument is of some kind."""
     if not isinstance(value, kinds):
-        raise SpecError(f"{name} is {a_kind(value)}: give {wanted}.", path=path or name)
+        raise SpecError(f"{name} is {a_kind(value)}: give {expected}.", path=path or name)
 
 
 def require_mapping(value: Any, name: str) -> None:
@@ -283,14 +283,14 @@ def _problem_with_kind(value: Any, name: str, kind: Any) -> str | None:
     if _is_one_of(value, kind):
         return None
     options = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
-    asked = []
+    expected = []
     for option in options:
         plain = (get_origin(option) or option).__name__
         if plain in ("Sequence", "Iterable") and get_args(option)[0] is str:
-            asked.append("a list of names")
+            expected.append("a list of names")
         elif plain != "NoneType" and not (option is str and Path in options):
-            asked.append(_WORDS.get(plain, f"an obsynth.{plain}"))
-    return f"{name} is {a_kind(value)}: give {' or '.join(dict.fromkeys(asked))}."
+            expected.append(_WORDS.get(plain, f"an obsynth.{plain}"))
+    return f"{name} is {a_kind(value)}: give {' or '.join(dict.fromkeys(expected))}."
 
 
 def problem_with(value: Any, name: str, kind: Any) -> str | None:
@@ -314,21 +314,21 @@ def problem_with(value: Any, name: str, kind: Any) -> str | None:
         return None if fits else f"{name} is {shown(value)}: use one of {', '.join(map(str, allowed))}."
     if plain is bool:
         return None if isinstance(value, (bool, np.bool_)) else f"{name} is {shown(value)}: give True or False."
-    whole = plain is int
-    fits = is_finite_number(value) and (not whole or is_whole(value))
+    is_integer = plain is int
+    fits = is_finite_number(value) and (not is_integer or is_whole(value))
     limits = [(*_BOUNDS[type(mark)][1:], getattr(mark, _BOUNDS[type(mark)][0])) for mark in marks]
     if fits and all(holds(value, limit) for holds, _, limit in limits):
         return None
     bounds = " and ".join(f"{word} {limit:g}" for _, word, limit in limits)
-    return f"{name} is {shown(value)}: give a {'whole ' if whole else ''}number{f' {bounds}' if bounds else ''}."
+    return f"{name} is {shown(value)}: give a {'whole ' if is_integer else ''}number{f' {bounds}' if bounds else ''}."
 
 
 def _problem_with_written(value: Any, name: str, kind: str) -> str | None:
-    wanted, kinds = _LISTS.get(kind, ("numbers", ()))
+    expected, kinds = _LISTS.get(kind, ("numbers", ()))
     if kind == "samples":
         fits = (isinstance(value, str) and value == "auto") or (is_whole(value) and 1 <= value <= MOST_COUNTED)
-        wanted = f"a whole number of samples, 1 to {MOST_COUNTED}, or 'auto'"
-        return None if fits else f"{name} is {shown(value)}: give {wanted}."
+        expected = f"a whole number of samples, 1 to {MOST_COUNTED}, or 'auto'"
+        return None if fits else f"{name} is {shown(value)}: give {expected}."
     if kind == "named bounds" and isinstance(value, Mapping):
         return next(
             filter(None, (_problem_with_bound(bound, f"{name} of {key}") for key, bound in value.items())), None
@@ -341,12 +341,12 @@ def _problem_with_written(value: Any, name: str, kind: str) -> str | None:
     if kind == "reference model":
         fits = value is None or isinstance(value, Mapping) or hasattr(value, "dt")
         fits = fits or (isinstance(value, (list, tuple)) and len(value) == 4)
-        wanted = "{'bandwidth': 10}, matrices {'A': ..., 'B': ..., 'C': ..., 'D': ...} or a system of python-control"
-        return None if fits else f"{name} is {shown(value)}: give {wanted}."
+        expected = "{'bandwidth': 10}, matrices {'A': ..., 'B': ..., 'C': ..., 'D': ...} or a system of python-control"
+        return None if fits else f"{name} is {shown(value)}: give {expected}."
     fits = not isinstance(value, (bool, np.bool_)) and (not kinds or value is None or isinstance(value, kinds))
     if fits and kind == "fault sets" and not isinstance(value, (str, type(None))):
         fits = all(isinstance(entry, (str, list, tuple)) for entry in value)
-    return None if fits else f"{name} is {shown(value)}: give {wanted}."
+    return None if fits else f"{name} is {shown(value)}: give {expected}."
 
 
 def _problem_with_bound(bound: Any, name: str) -> str | None:
@@ -388,10 +388,10 @@ def argument_kinds(function: Callable[..., Any]) -> dict[str, Any]:
     known: dict[str, Any] = {"ArrayLike": _Numbers}
     kinds = {}
     for name, parameter in signature(function).parameters.items():
-        said = parameter.annotation
-        while isinstance(said, str) and parameter.kind is not parameter.VAR_KEYWORD and name not in kinds:
+        annotation = parameter.annotation
+        while isinstance(annotation, str) and parameter.kind is not parameter.VAR_KEYWORD and name not in kinds:
             try:
-                kinds[name] = eval(said, unwrap(function).__globals__, known)
+                kinds[name] = eval(annotation, unwrap(function).__globals__, known)
             except NameError as missing:
                 known[str(missing.name)] = type(str(missing.name), (_ByName,), {})
     return kinds
@@ -411,10 +411,10 @@ def arguments_worded(**words: str) -> Callable[[Callable[Given, Returned]], Call
         @wraps(function)
         def called(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
             kinds = argument_kinds(function)
-            given = dict(zip(stated.parameters, args, strict=False)) | kwargs
+            arguments = dict(zip(stated.parameters, args, strict=False)) | kwargs
             wrong = {
                 name: f"{name} is {a_kind(value)}: give {words[name]}." if name in words else text
-                for name, value in given.items()
+                for name, value in arguments.items()
                 if name in kinds and (text := problem_with(value, name, kinds[name]))
             }
             if wrong:

@@ -40,17 +40,18 @@ MAXIMUM_ENTRIES = 50_000_000
 
 
 def remembered(make: Callable[Concatenate[Any, Given], Made]) -> Callable[Concatenate[Any, Given], Made]:
-    """Make something of an object that never changes once, for as long as it lives; it must not hold the object.
-    What else is given says what is made, and can be hashed."""
+    """Return a function that makes something of an object once and keeps it for as long as the object lives.
+
+    The object never changes, and what is made must not hold it; the other arguments are part of the key: hashable."""
     known: WeakKeyDictionary[Any, dict[object, Made]] = WeakKeyDictionary()
     usual = {name: option.default for name, option in signature(make).parameters.items() if option.kind == KEYWORD}
 
     @wraps(make)
     def once(item: Any, /, *given: Given.args, **named: Given.kwargs) -> Made:
-        kept, key = known.setdefault(item, {}), (given, frozenset((usual | named).items()))
-        if key not in kept:
-            kept[key] = make(item, *given, **named)
-        return kept[key]
+        cache, key = known.setdefault(item, {}), (given, frozenset((usual | named).items()))
+        if key not in cache:
+            cache[key] = make(item, *given, **named)
+        return cache[key]
 
     return once
 
@@ -63,10 +64,10 @@ def read_only(array: NDArray[Any], dtype: Any = np.float64) -> NDArray[Any]:
 
 
 def freeze(record: Any, *names: str, **values: Any) -> None:
-    """Make arrays and mappings of a frozen record private and read-only: its own ones by name, or others given."""
+    """Make fields of a frozen record private and read-only: its own arrays and mappings by name, or new values."""
     for name, value in ({name: getattr(record, name) for name in names} | values).items():
-        kept = MappingProxyType(dict(value)) if isinstance(value, Mapping) else read_only(value)
-        object.__setattr__(record, name, kept)
+        frozen = MappingProxyType(dict(value)) if isinstance(value, Mapping) else read_only(value)
+        object.__setattr__(record, name, frozen)
 
 
 def largest_singular_value(matrix: NDArray[Any]) -> float:
@@ -100,10 +101,10 @@ def kind_of_entries(dtype: np.dtype[Any]) -> str:
 
 def require_no_overflow(numbers: Any, what: str, path: str) -> None:
     """Raise `SpecError` where one of some finite numbers is beyond `LARGEST`; ``what`` has it, as a message says."""
-    given = np.ravel(np.asarray(numbers, dtype=np.float64))
-    if given.size and np.abs(given).max() > LARGEST:
+    entries = np.ravel(np.asarray(numbers, dtype=np.float64))
+    if entries.size and np.abs(entries).max() > LARGEST:
         raise SpecError(
-            f"{what} {'has' if np.ndim(numbers) else 'is'} {given[int(np.argmax(np.abs(given)))]:.3g}, but numbers "
+            f"{what} {'has' if np.ndim(numbers) else 'is'} {entries[int(np.argmax(np.abs(entries)))]:.3g}, but numbers "
             f"beyond {LARGEST:g} overflow where they are multiplied: give it in other units.",
             path=path,
         )
@@ -153,11 +154,11 @@ def as_matrix(value: Any, name: str) -> FloatArray:
 
 def reachable(matrix: FloatArray) -> NDArray[np.bool_]:
     """Return which entries some power of a matrix ``(n, n)`` may have, by its pattern alone; the power zero counts."""
-    found: NDArray[np.bool_] = np.eye(len(matrix), dtype=bool) | (matrix != 0.0)
-    while not found.all():
+    reached: NDArray[np.bool_] = np.eye(len(matrix), dtype=bool) | (matrix != 0.0)
+    while not reached.all():
         # Paths of twice the length.
-        further = found.astype(np.float64) @ found > 0.0
-        if np.array_equal(further, found):
+        further = reached.astype(np.float64) @ reached > 0.0
+        if np.array_equal(further, reached):
             break
-        found = further
-    return found
+        reached = further
+    return reached

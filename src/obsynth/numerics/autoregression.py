@@ -68,11 +68,11 @@ class Autoregression:
 
     def whitened(self, x: FloatArray) -> FloatArray:
         """Return e of rows ``(..., n, m)``: zero in the first p of them, NaN where a row that is needed is NaN."""
-        left = x - self.offset
+        residuals = x - self.offset
         for i, a in enumerate(self.A, 1):
-            left[..., i:, :] -= x[..., :-i, :] @ a.T
-        left[..., : self.order, :] = 0.0
-        return np.asarray(left @ self.whitener.T)
+            residuals[..., i:, :] -= x[..., :-i, :] @ a.T
+        residuals[..., : self.order, :] = 0.0
+        return np.asarray(residuals @ self.whitener.T)
 
     def simulated(self, e: FloatArray) -> FloatArray:
         """Return the streams ``(runs, n, m)`` that white ones drive, from their mean."""
@@ -84,12 +84,12 @@ class Autoregression:
 
             return np.asarray(lfilter([1.0], np.concatenate([[1.0], -self.A[:, 0, 0]]), driven, axis=1) + self.mean)
         stacked = np.vstack([a.T for a in self.A])
-        past, found = np.zeros((len(e), len(stacked))), np.empty_like(driven)
+        past, streams = np.zeros((len(e), len(stacked))), np.empty_like(driven)
         for t in range(driven.shape[1]):
-            found[:, t] = past @ stacked + driven[:, t]
+            streams[:, t] = past @ stacked + driven[:, t]
             past[:, self.channels :] = past[:, : -self.channels].copy()
-            past[:, : self.channels] = found[:, t]
-        return np.asarray(found + self.mean)
+            past[:, : self.channels] = streams[:, t]
+        return np.asarray(streams + self.mean)
 
 
 def fitted_autoregression(x: FloatArray, order: int | None = None) -> Autoregression:
@@ -106,8 +106,8 @@ def fitted_autoregression(x: FloatArray, order: int | None = None) -> Autoregres
     z = (x - mean) / units
     turned = independent_directions(z)
     r = turned.shape[1]
-    seen = z @ turned
-    lags = np.hstack([np.ones((n - most, 1)), *(seen[most - i : n - i] for i in range(1, most + 1))])
+    projected = z @ turned
+    lags = np.hstack([np.ones((n - most, 1)), *(projected[most - i : n - i] for i in range(1, most + 1))])
     aims = z[most:]
     known = np.isfinite(lags).all(axis=1) & np.isfinite(aims).all(axis=1)
     lags, aims = lags[known], aims[known]
@@ -117,12 +117,12 @@ def fitted_autoregression(x: FloatArray, order: int | None = None) -> Autoregres
     best: tuple[float, FloatArray, FloatArray] | None = None
     for p in range(most + 1) if order is None else [order]:
         k = 1 + p * r
-        found = np.linalg.solve(gram[:k, :k] + ridge * np.eye(k), cross[:k])
+        fit = np.linalg.solve(gram[:k, :k] + ridge * np.eye(k), cross[:k])
         # What is new along the independent directions decides on the order.
-        left = turned.T @ (power - found.T @ cross[:k]) @ turned
-        criterion = np.linalg.slogdet(left / count)[1] + 2.0 * p * r * r / count
+        innovation_covariance = turned.T @ (power - fit.T @ cross[:k]) @ turned
+        criterion = np.linalg.slogdet(innovation_covariance / count)[1] + 2.0 * p * r * r / count
         if best is None or criterion < best[0]:
-            best = float(criterion), found, aims - lags[:, :k] @ found
+            best = float(criterion), fit, aims - lags[:, :k] @ fit
     if best is None:
         raise ValueError("no order was tried")
     coefficients, new = best[1:]
@@ -135,13 +135,13 @@ def fitted_autoregression(x: FloatArray, order: int | None = None) -> Autoregres
 
 def _most_order(known: NDArray[np.bool_], channels: int) -> int:
     """Return the longest memory that rows determine of which some are ``known (n,)``: none where none follow others."""
-    after, found = known, 0
+    after, longest = known, 0
     for order in range(1, MOST_ORDER + 1):
         after = after[1:] & known[:-order]
         if len(known) < ROWS_PER_COEFFICIENT * channels * order or after.sum() < 1 + channels * order:
             break
-        found = order
-    return found
+        longest = order
+    return longest
 
 
 def _stable(a: FloatArray) -> FloatArray:

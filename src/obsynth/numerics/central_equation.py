@@ -83,15 +83,15 @@ class CentralEquation:
 
     @classmethod
     def _of_all_states(cls, problem: GainProblem, noise: float, size: float) -> CentralEquation:
-        seen = max(largest_singular_value(part) for part in (problem.D, problem.C * size))
-        white = Whitened.of(problem.D, noise * (seen or 1.0), problem.B, problem.Zd)
-        shown = np.linalg.solve(white.factor, problem.C)
+        output_size = max(largest_singular_value(part) for part in (problem.D, problem.C * size))
+        white = Whitened.of(problem.D, noise * (output_size or 1.0), problem.B, problem.Zd)
+        white_c = np.linalg.solve(white.factor, problem.C)
         return cls(
             problem,
-            problem.A - white.known @ shown,
-            np.vstack([shown, problem.Z - white.direct @ shown]),
+            problem.A - white.known @ white_c,
+            np.vstack([white_c, problem.Z - white.direct @ white_c]),
             *white.blocks((noise * size) ** 2),
-            np.vstack([shown, problem.Z]),
+            np.vstack([white_c, problem.Z]),
             _bordered(white.direct, problem.Zd @ problem.Zd.T),
             np.hstack([white.known, problem.B @ problem.Zd.T]),
             white.factor,
@@ -105,18 +105,18 @@ class CentralEquation:
         known, hidden = basis[:, :m], basis[:, m:]
         lift = a @ hidden
         white = Whitened.of(known.T @ b, noise, hidden.T @ b, problem.Zd)
-        shown = np.linalg.solve(white.factor, known.T @ lift)
+        white_c = np.linalg.solve(white.factor, known.T @ lift)
         # What the measurements of a sample say of the noise before it, and all that this does.
-        told = known @ white.factor + hidden @ white.known
+        measured_noise = known @ white.factor + hidden @ white.known
         done = b @ (z @ b).T + noise**2 * z.T
         return cls(
             problem,
-            hidden.T @ lift - white.known @ shown,
-            np.vstack([shown, z @ hidden]),
+            hidden.T @ lift - white.known @ white_c,
+            np.vstack([white_c, z @ hidden]),
             *white.blocks(noise**2),
             np.vstack([np.linalg.solve(white.factor, known.T), z]),
-            _bordered(z @ told, z @ done),
-            np.hstack([a @ told, a @ done]),
+            _bordered(z @ measured_noise, z @ done),
+            np.hstack([a @ measured_noise, a @ done]),
             triangle[:m].T @ white.factor,
             lift,
         )
@@ -134,12 +134,12 @@ class CentralEquation:
             y = self.solution(level)
             if y is None:
                 return None, 0.0
-            found, left = self._gains(*self._sums(y, level))
+            gains, remainder = self._gains(*self._sums(y, level))
         except np.linalg.LinAlgError:
             return None, 0.0
-        if found is None or not (np.isfinite(found.R).all() and np.isfinite(found.V).all()):
+        if gains is None or not (np.isfinite(gains.R).all() and np.isfinite(gains.V).all()):
             return None, 0.0
-        return found, float(np.linalg.eigvalsh(left)[0]) / level**2
+        return gains, float(np.linalg.eigvalsh(remainder)[0]) / level**2
 
     def solution(self, level: float) -> FloatArray | None:
         """Return Y ``(n, n)`` at ``level``, or ``None``, of hidden states ``F K F'``; its signs are not looked at."""
@@ -155,16 +155,16 @@ class CentralEquation:
         )
         if s is None or self.lift is None:
             return s
-        shown = self.h[self.problem.measured :]
-        through = s @ shown.T
-        k = s - through @ np.linalg.solve(shown @ through - level**2 * np.eye(len(shown)), through.T)
+        error_rows = self.h[self.problem.measured :]
+        through = s @ error_rows.T
+        k = s - through @ np.linalg.solve(error_rows @ through - level**2 * np.eye(len(error_rows)), through.T)
         return np.asarray(self.lift @ k @ self.lift.T)
 
     def _sums(self, y: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:
         """Return ``k k' - diag(0, g^2 I) + h Y h'`` and ``A Y h' + B k'`` in all states; white measurements."""
-        seen = y @ self.outputs.T
-        total = self._lowered(self.full_weight + self.outputs @ seen, level)
-        return total, self.problem.A @ seen + self.full_cross
+        covariance = y @ self.outputs.T
+        total = self._lowered(self.full_weight + self.outputs @ covariance, level)
+        return total, self.problem.A @ covariance + self.full_cross
 
     def _lowered(self, weight: FloatArray, level: float) -> FloatArray:
         lowered = weight.copy()
@@ -176,13 +176,13 @@ class CentralEquation:
         m = self.problem.measured
         if self.problem.weight_is_free and self.lift is None:
             total = self.weight + self.h @ y @ self.h.T
-            left = total[m:, :m] @ np.linalg.solve(total[:m, :m], total[:m, m:]) - total[m:, m:]
+            remainder = total[m:, :m] @ np.linalg.solve(total[:m, :m], total[:m, m:]) - total[m:, m:]
         else:
             # Without a free weight xi knows nothing of the current measurement.
             h, weight = (self.outputs, self.full_weight) if self.lift is None else (self.h, self.weight)
-            left = -weight[m:, m:] - h[m:].dot(y).dot(h[m:].T)
-        left.reshape(-1)[:: len(left) + 1] += level**2
-        return is_positive(0.5 * (left + left.T))
+            remainder = -weight[m:, m:] - h[m:].dot(y).dot(h[m:].T)
+        remainder.reshape(-1)[:: len(remainder) + 1] += level**2
+        return is_positive(0.5 * (remainder + remainder.T))
 
     def _gains(self, total: FloatArray, through: FloatArray) -> tuple[Injection | None, FloatArray]:
         """Return the gains when the signs are right: m positive, q negative, and what must be positive of the q."""
@@ -190,26 +190,26 @@ class CentralEquation:
         if self.problem.weight_is_free:
             # The estimate may use the measurement of the same sample.
             solved = np.linalg.solve(total[:m, :m], np.vstack([through[:, :m], total[m:, :m]]).T).T
-            left = solved[n:] @ total[:m, m:] - total[m:, m:]
-            left = 0.5 * (left + left.T)
+            remainder = solved[n:] @ total[:m, m:] - total[m:, m:]
+            remainder = 0.5 * (remainder + remainder.T)
             solved = np.linalg.solve(self.factor.T, solved.T).T
-            found = Injection(np.asarray(solved[:n]), np.asarray(-solved[n:]))
-            return (found if is_positive(total[:m, :m]) and is_positive(left) else None), left
-        left = -0.5 * (total[m:, m:] + total[m:, m:].T)
+            injection = Injection(np.asarray(solved[:n]), np.asarray(-solved[n:]))
+            return (injection if is_positive(total[:m, :m]) and is_positive(remainder) else None), remainder
+        remainder = -0.5 * (total[m:, m:] + total[m:, m:].T)
         change = np.linalg.solve(total[m:, m:], total[m:, :m])
         reduced = total[:m, :m] - total[:m, m:] @ change
-        if not (is_positive(left) and is_positive(0.5 * (reduced + reduced.T))):
-            return None, left
+        if not (is_positive(remainder) and is_positive(0.5 * (reduced + reduced.T))):
+            return None, remainder
         gain = np.linalg.solve(self.factor.T, np.linalg.solve(reduced.T, (through[:, :m] - through[:, m:] @ change).T))
-        return Injection(np.asarray(gain.T), np.zeros((q, m))), left
+        return Injection(np.asarray(gain.T), np.zeros((q, m))), remainder
 
 
 def _bordered(border: FloatArray, corner: FloatArray) -> FloatArray:
     """Return ``[I, border'; border, corner]``."""
     m = border.shape[1]
-    found = np.eye(m + len(border))
-    found[m:, :m], found[:m, m:], found[m:, m:] = border, border.T, corner
-    return found
+    matrix = np.eye(m + len(border))
+    matrix[m:, :m], matrix[:m, m:], matrix[m:, m:] = border, border.T, corner
+    return matrix
 
 
 def central_injection(problem: GainProblem, level: float, *, noise: float) -> Injection | None:

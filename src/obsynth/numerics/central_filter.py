@@ -105,9 +105,9 @@ def central_filter_at(problem: GainProblem, level: float) -> Injection | None:
         return None
     work = with_least_weight(problem)
     for noise in NOISES:
-        found = central_injection(work, level, noise=noise)
-        if found is not None and problem.reaches(found, level):
-            return found
+        injection = central_injection(work, level, noise=noise)
+        if injection is not None and problem.reaches(injection, level):
+            return injection
     return None
 
 
@@ -142,18 +142,18 @@ def search_central_filter(
         descent = GammaIteration(equation, low, gain, tolerance, expects_rounding=close)
         share = FIRST_LEVEL if problem.order <= FEW_STATES else COARSE_START_SHARE
         descent.run(max(low, gain * (1.0 - PROBE * tolerance if close else share)))
-        found = descent.best()
-        if found is None and descent.reached and descent.reached[0].level < gain * (1.0 - NEXT_TO):
+        candidate = descent.best()
+        if candidate is None and descent.reached and descent.reached[0].level < gain * (1.0 - NEXT_TO):
             descent = descent.judged_again(gain)
-            found = descent.best()
+            candidate = descent.best()
         # The level that is reached last may be made up by rounding, or noise may raise it: of all that were judged.
-        seen = [found, *(item for item in descent.seen if math.isfinite(item[1]))]
-        found = min(filter(None, seen), key=lambda item: item[1], default=None)
-        if noise < most_noise < np.inf and (found is None or found[1] >= gain):
+        candidates = [candidate, *(item for item in descent.evaluated if math.isfinite(item[1]))]
+        candidate = min(filter(None, candidates), key=lambda item: item[1], default=None)
+        if noise < most_noise < np.inf and (candidate is None or candidate[1] >= gain):
             least_noise = noise  # nor is less of it worth a try
-        if found is None:
+        if candidate is None:
             continue
-        injection, reached = found
+        injection, reached = candidate
         if descent.settled and reached <= descent.high * (1.0 + PROBE * tolerance):
             most_noise = noise  # more of it cannot cost less
         if reached < gain:
@@ -169,13 +169,13 @@ def _decoupling_filter(problem: GainProblem, gain: float) -> tuple[Injection, fl
     # the unit circle only little of it leaves the equation a solution.
     best = None
     for share, noise in DECOUPLING_ATTEMPTS:
-        found = central_injection(problem, share * gain, noise=noise)
-        if found is None:
+        injection = central_injection(problem, share * gain, noise=noise)
+        if injection is None:
             continue
-        reached = problem.achieved_gain(found)
+        reached = problem.achieved_gain(injection)
         if reached <= DECOUPLED_GAIN * gain:
-            return found, reached
-        best = (found, reached) if best is None or reached < best[1] else best
+            return injection, reached
+        best = (injection, reached) if best is None or reached < best[1] else best
     coarsely = best is not None and problem.order > FEW_STATES and best[1] <= COARSELY_DECOUPLED * gain
     return best if coarsely else None
 
@@ -194,10 +194,10 @@ def _combined(problem: GainProblem, point: float) -> tuple[float, float]:
     """Return the size of the combination at a point of the z-plane, and what it leaves, as a share of xi."""
     shifted = problem.A - point * np.eye(problem.order)
     known = np.vstack([np.hstack([shifted, problem.B]), np.hstack([problem.C, problem.D])])
-    wanted = np.hstack([problem.Z, problem.Zd])
-    solved = least_squares(known.T, wanted.T)
-    left = float(np.linalg.norm(known.T @ solved - wanted.T))
-    return float(np.linalg.norm(solved)), left / max(float(np.linalg.norm(wanted)), SMALLEST)
+    target = np.hstack([problem.Z, problem.Zd])
+    solved = least_squares(known.T, target.T)
+    residual = float(np.linalg.norm(known.T @ solved - target.T))
+    return float(np.linalg.norm(solved)), residual / max(float(np.linalg.norm(target)), SMALLEST)
 
 
 def least_level(problem: GainProblem) -> float:
@@ -213,8 +213,8 @@ def least_noise_filter(problem: GainProblem) -> Injection | None:
     noise = with_least_weight(problem).noise_as_disturbance()
     if noise.order == 0 or noise.measured == 0:
         return None
-    found = central_injection(noise, WITHOUT_LIMIT * max(noise.disturbance_size, 1.0), noise=NOISES[0])
-    return found if found is not None and np.isfinite(problem.noise_variance(found)) else None
+    injection = central_injection(noise, WITHOUT_LIMIT * max(noise.disturbance_size, 1.0), noise=NOISES[0])
+    return injection if injection is not None and np.isfinite(problem.noise_variance(injection)) else None
 
 
 def noise_weighted_filters(
@@ -232,16 +232,16 @@ def noise_weighted_filters(
     weights, begin, last = (NOISE_WEIGHTS * sizes[0] / sizes[1])[::coarse], USUAL_WEIGHT // coarse, 0
 
     def tried(place: int, factor: float) -> Injection | None:
-        found = central_injection(_with_noise(work, weights[place]), factor * gain, noise=artificial)
-        return found if found is not None and (factor == 1.0 or reaches(found)) else None
+        injection = central_injection(_with_noise(work, weights[place]), factor * gain, noise=artificial)
+        return injection if injection is not None and (factor == 1.0 or reaches(injection)) else None
 
     for factor in LEVEL_FACTORS if coarse == 1 else LEVEL_FACTORS[:1]:
         # More weight than at a lower level, and not more than can be hoped for.
         places = range(last, len(weights) if factor == 1.0 else min(last + WEIGHT_STEPS, len(weights)))
-        found = last_found(partial(tried, factor=factor), places, begin)
-        if found is not None:
-            begin = last = found[0]
-            yield found[1]
+        heaviest = last_found(partial(tried, factor=factor), places, begin)
+        if heaviest is not None:
+            begin = last = heaviest[0]
+            yield heaviest[1]
 
 
 def last_found(tried: Callable[[int], Found | None], places: range, begin: int) -> tuple[int, Found] | None:
@@ -250,11 +250,11 @@ def last_found(tried: Callable[[int], Found | None], places: range, begin: int) 
     best: tuple[int, Found] | None = None
     place = min(max(begin, low), high - 1)
     while low < high:
-        found = tried(place)
-        if found is None:
+        result = tried(place)
+        if result is None:
             high = place
         else:
-            best, low = (place, found), place + 1
+            best, low = (place, result), place + 1
         if best is not None and high < places.stop:
             place = (low + high) // 2
         else:
@@ -269,12 +269,12 @@ def noise_weighted_filters_within(
 
     Far below the gain of the starting filter the artificial noise would in others be all that counts."""
 
-    def reached(found: Injection) -> bool:
-        return reaches(normalised.restore(found))
+    def reached(injection: Injection) -> bool:
+        return reaches(normalised.restore(injection))
 
     level = gain / normalised.gain
-    for found in noise_weighted_filters(normalised.problem, level, reaches=reached, artificial=min(NOISES)):
-        yield normalised.restore(found)
+    for central in noise_weighted_filters(normalised.problem, level, reaches=reached, artificial=min(NOISES)):
+        yield normalised.restore(central)
 
 
 def _with_noise(problem: GainProblem, weight: float) -> GainProblem:
@@ -322,12 +322,12 @@ def search_least_gain(problem: GainProblem) -> LeastGain:
         known: float | None = gain / normalised.gain
         if not work.weight_is_free and np.any(start.V):
             start, known = Injection(start.R, np.zeros_like(start.V)), None
-        found, level = search_central_filter(work, start, known, start_is_good=number > 0)
+        injection, level = search_central_filter(work, start, known, start_is_good=number > 0)
         records.append({"what": "least gain", "solver": "central filter", "status": "optimal", "gain": level})
         if level * normalised.gain < gain:
-            best, gain = normalised.restore(found), level * normalised.gain
+            best, gain = normalised.restore(injection), level * normalised.gain
             # Found once, in one of the two coordinates, among many states.
-            modes = normalised.restored_modes(work.modes(found)) if problem.order > HIGHER_LEVEL_UP_TO else None
+            modes = normalised.restored_modes(work.modes(injection)) if problem.order > HIGHER_LEVEL_UP_TO else None
         if gain >= GOOD_COORDINATES * before or gain <= NEGLIGIBLE_GAIN * starting:
             break
     exact = replace(problem, judged_exactly=True)

@@ -47,14 +47,14 @@ class ContinuousNorms:
     @cached_property
     def _turned(self) -> tuple[float, FloatArray, FloatArray, Modes] | None:
         """w, ``(w I - A)^-1``, the matrix in discrete time and its modes; ``None`` where A is not stable."""
-        a, one = self.a, np.eye(len(self.a))
+        a, identity = self.a, np.eye(len(self.a))
         own = Modes.of(a)
         values = own.values
         if np.max(values.real) >= 0.0:
             return None
         w = float(np.exp(np.mean(np.log(np.abs(values)))))
-        resolvent: FloatArray = np.asarray(np.linalg.inv(w * one - a), dtype=np.float64)
-        turned = resolvent @ (w * one + a)
+        resolvent: FloatArray = np.asarray(np.linalg.inv(w * identity - a), dtype=np.float64)
+        turned = resolvent @ (w * identity + a)
         return w, resolvent, turned, Modes((w + values) / (w - values), own.vectors)
 
     def between(self, b: FloatArray, c: FloatArray, d: FloatArray) -> HinfNorm:
@@ -69,9 +69,9 @@ class ContinuousNorms:
         # What drives nothing adds nothing; and systems that differ in that alone have one norm.
         acting = np.any(b, axis=0) | np.any(d, axis=0)
         system = (b, c, d) if acting.all() or not acting.any() else (b[:, acting], c, d[:, acting])
-        for known, found in self._known:
+        for known, norm in self._known:
             if all(map(np.array_equal, known, system)):
-                return found
+                return norm
         self._known.append((system, self._between(*system)))
         return self._known[-1][1]
 
@@ -80,11 +80,11 @@ class ContinuousNorms:
             return HinfNorm(np.inf, np.inf, np.nan)
         w, resolvent, turned, modes = self._turned
         through = resolvent @ b
-        found = hinf_norm(
+        norm = hinf_norm(
             turned, np.sqrt(2.0 * w) * through, np.sqrt(2.0 * w) * c @ resolvent, d + c @ through, modes=modes
         )
-        frequency = np.inf if found.frequency >= np.pi else w * float(np.tan(0.5 * found.frequency))
-        return HinfNorm(found.value, found.upper, float(frequency))
+        frequency = np.inf if norm.frequency >= np.pi else w * float(np.tan(0.5 * norm.frequency))
+        return HinfNorm(norm.value, norm.upper, float(frequency))
 
 
 def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
@@ -112,9 +112,9 @@ def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
         if contraction < 1.0:
             # Each further stretch as long as all so far: the response of what is left of the columns of b.
             per_state = float(np.linalg.norm(total[inputs:]))
-            left = per_state * np.linalg.norm(columns[:, :inputs], axis=0) / (1.0 - contraction)
-            if np.all(left <= RESPONSE_LEFT_SHARE * total[:inputs]):
-                return np.asarray(total[:inputs] + left)
+            tail = per_state * np.linalg.norm(columns[:, :inputs], axis=0) / (1.0 - contraction)
+            if np.all(tail <= RESPONSE_LEFT_SHARE * total[:inputs]):
+                return np.asarray(total[:inputs] + tail)
         step, transition = 2.0 * step, transition @ transition
     raise SpecError("Errors of the observer decay too slowly for a bound on its residual.", path="observer")
 
@@ -144,8 +144,8 @@ def zero_order_hold(
     balanced, scale, scaled, sizes = _in_like_sizes(a, inputs)
     block = np.zeros((n + m, n + m))
     block[:n, :n], block[:n, n:] = balanced, scaled
-    whole = None if exponential is None else exponential(block, step)
-    row = (_exponential(block, step) if whole is None else whole)[:n]
+    transition = None if exponential is None else exponential(block, step)
+    row = (_exponential(block, step) if transition is None else transition)[:n]
     return scale[:, None] * row[:, :n] / scale, scale[:, None] * row[:, n:] * sizes
 
 

@@ -147,28 +147,28 @@ def _without_dead_samples(model: Model, *, longest: int) -> tuple[NDArray[np.int
     Faults that are known so many samples late drive the rest: ``C A^(L-1) B`` is then what passes at once.
     """
     a, b, c, d = model
-    lags, entering, direct = np.zeros(d.shape[1], dtype=np.int64), b.copy(), d.copy()
+    lags, delayed_b, direct = np.zeros(d.shape[1], dtype=np.int64), b.copy(), d.copy()
     nothing = DEAD_SHARE * (np.linalg.norm(c) * np.linalg.norm(b, axis=0) + np.linalg.norm(d, axis=0))
     for i in range(d.shape[1]):
         while lags[i] < longest and np.linalg.norm(direct[:, i]) <= nothing[i]:
-            direct[:, i], entering[:, i] = c @ entering[:, i], a @ entering[:, i]
+            direct[:, i], delayed_b[:, i] = c @ delayed_b[:, i], a @ delayed_b[:, i]
             lags[i] += 1
         if lags[i] == longest:  # the input does nothing at all
-            lags[i], direct[:, i], entering[:, i] = 0, 0.0, 0.0
-    return lags, (a, entering, c, direct)
+            lags[i], direct[:, i], delayed_b[:, i] = 0, 0.0, 0.0
+    return lags, (a, delayed_b, c, direct)
 
 
 def _stacked(a: FloatArray, c: FloatArray, b: FloatArray, d: FloatArray, length: int) -> FloatArray:
     """Return the block Toeplitz matrix of a window from inputs to outputs."""
     rows, width = c.shape[0], b.shape[1]
-    found, moved, blocks = np.zeros((rows * (length + 1), width * (length + 1))), b, [d]
+    toeplitz, moved, blocks = np.zeros((rows * (length + 1), width * (length + 1))), b, [d]
     for _ in range(length):
         blocks.append(c @ moved)
         moved = a @ moved
     for i in range(length + 1):
         for j in range(i + 1):
-            found[i * rows : (i + 1) * rows, j * width : (j + 1) * width] = blocks[i - j]
-    return found
+            toeplitz[i * rows : (i + 1) * rows, j * width : (j + 1) * width] = blocks[i - j]
+    return toeplitz
 
 
 def _decoupling_window(
@@ -197,13 +197,13 @@ def _decoupling_window(
         shortest,
         shortest if dt == 0.0 else longest,
     )
-    if not window.moved:
+    if not window.decouples:
         raise PreconditionError(
             "The unknown inputs and faults cannot be reconstructed from the outputs by a window of any length: no "
             "filter of this form decouples them. Let a disturbance count as noise (leave it out of decoupled).",
             condition="decoupling",
         )
-    if not window.told:
+    if not window.estimates_faults:
         raise PreconditionError(
             f"No causal filter has the exact fault map with a delay of {_listed(lags)} samples: allow a longer delay.",
             condition="delay",
@@ -225,12 +225,12 @@ class _TriedWindow(NamedTuple):
     G: FloatArray
     Mf: FloatArray
     length: int
-    moved: bool
-    told: bool
+    decouples: bool
+    estimates_faults: bool
 
     @property
     def suffices(self) -> bool:
-        return self.moved and self.told
+        return self.decouples and self.estimates_faults
 
 
 def _first_window(tried: Callable[[int], _TriedWindow], shortest: int, longest: int) -> _TriedWindow:
@@ -279,9 +279,9 @@ def _tried_window(
         faults = np.arange(nf)
         chosen[faults, (length - lags) * nh + faults] = 1.0
     G, Mf = (first @ inverse, chosen @ inverse) if nh else (np.zeros((n, len(th))), np.zeros((nf, len(th))))
-    moved = not nh or bool(np.linalg.norm(G @ th - first) <= WINDOW_IDENTITY * (1.0 + np.linalg.norm(bh)))
-    told = not estimated or bool(np.linalg.norm(Mf @ th - chosen) <= WINDOW_IDENTITY)
-    return _TriedWindow(np.vstack(rows), th, np.asarray(G), np.asarray(Mf), length, moved, told)
+    decouples = not nh or bool(np.linalg.norm(G @ th - first) <= WINDOW_IDENTITY * (1.0 + np.linalg.norm(bh)))
+    estimates_faults = not estimated or bool(np.linalg.norm(Mf @ th - chosen) <= WINDOW_IDENTITY)
+    return _TriedWindow(np.vstack(rows), th, np.asarray(G), np.asarray(Mf), length, decouples, estimates_faults)
 
 
 def _normal_rank(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> int:
@@ -299,8 +299,8 @@ def _core(a: FloatArray, noise: tuple[FloatArray, FloatArray], window: _Window, 
         scipy.linalg.null_space(window.Th.T, rcond=WINDOW_RANK_TOLERANCE).T if hidden else np.eye(len(window.observed))
     )
     # Combinations without the newest sample are repeated by those of the sample before.
-    left, values, _ = np.linalg.svd(parity[:, -ny:], full_matrices=False)
-    parity = left[:, values > WINDOW_RANK_TOLERANCE].T @ parity
+    directions, values, _ = np.linalg.svd(parity[:, -ny:], full_matrices=False)
+    parity = directions[:, values > WINDOW_RANK_TOLERANCE].T @ parity
     first = np.hstack([np.eye(nw), np.zeros((nw, nw * length))])
     return (
         a - window.G @ window.observed,
@@ -352,10 +352,10 @@ def _seen_basis(a: FloatArray, outputs: FloatArray) -> FloatArray:
     if not count:
         return np.eye(len(a))
     own = vectors[:, :count]
-    shown = reachable_basis(
+    observable = reachable_basis(
         schur[:count, :count].T, (outputs @ own).T, share=SEEN_SHARE, scale=float(np.linalg.norm(outputs))
     )
-    unseen = own @ scipy.linalg.null_space(shown.T) if shown.shape[1] else own
+    unseen = own @ scipy.linalg.null_space(observable.T) if observable.shape[1] else own
     return np.asarray(scipy.linalg.null_space(unseen.T)) if unseen.shape[1] else np.eye(len(a))
 
 

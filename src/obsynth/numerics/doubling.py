@@ -96,15 +96,15 @@ class RankWatch:
         if self.wait:
             self.wait -= 1
             return None
-        kept = int(SHARE * n)
-        directions = np.random.default_rng(0).normal(size=(n, kept + PROBES))
+        rank = int(SHARE * n)
+        directions = np.random.default_rng(0).normal(size=(n, rank + PROBES))
         images = power @ directions
         if not np.all(np.isfinite(images)):
             return None
-        basis = np.linalg.qr(images[:, :kept])[0]
-        probes = images[:, kept:]
-        left = float(np.linalg.norm(probes - basis @ (basis.T @ probes)))
-        share = left / max(float(np.linalg.norm(probes)), float(np.finfo(np.float64).tiny))
+        basis = np.linalg.qr(images[:, :rank])[0]
+        probes = images[:, rank:]
+        missed = float(np.linalg.norm(probes - basis @ (basis.T @ probes)))
+        share = missed / max(float(np.linalg.norm(probes)), float(np.finfo(np.float64).tiny))
         if share <= POWER_ROUNDING:
             return np.asarray(basis), basis.T @ power
         self.wait = max(0, math.ceil(math.log2(math.log(POWER_ROUNDING) / math.log(share))) - 1) if share < 1.0 else 1
@@ -136,8 +136,8 @@ class ThinBack(NamedTuple):
 
         ``M^-1 = I - X rows' N^-1 rows`` and ``G M^-1 = rows' N^-1 rows``.
         """
-        seen = solution.dot(self.rows.T)
-        weight = self.weight + self.rows.dot(seen)
+        image = solution.dot(self.rows.T)
+        weight = self.weight + self.rows.dot(image)
         weight = 0.5 * (weight + weight.T)
         moved = left.dot(solution)
         _, _, solved, failed = lapack.dgesv(weight, moved.dot(self.rows.T).T, overwrite_b=1)
@@ -151,11 +151,11 @@ def symmetric_product(a: FloatArray, b: FloatArray) -> FloatArray:
     n = len(a)
     if n < FEWEST_STATES:
         return np.asarray(a.dot(b))
-    found, ends = np.empty((n, n)), [n * i // BLOCK_ROWS for i in range(BLOCK_ROWS + 1)]
+    product, ends = np.empty((n, n)), [n * i // BLOCK_ROWS for i in range(BLOCK_ROWS + 1)]
     for start, end in pairwise(ends):
-        np.matmul(a[start:end], b[:, :end], out=found[start:end, :end])
-        found[:start, start:end] = found[start:end, :start].T
-    return found
+        np.matmul(a[start:end], b[:, :end], out=product[start:end, :end])
+        product[:start, start:end] = product[start:end, :start].T
+    return product
 
 
 def slow_equation(
@@ -171,10 +171,10 @@ def slow_equation(
         return through.dot(u), ThinBack(back.rows.dot(u), weight), moved.dot(through.T)
     matrix = solution.dot(back)
     matrix.reshape(-1)[:: len(power) + 1] += 1.0
-    _, _, found, failed = lapack.dgesv(matrix.T, np.concatenate([rows, u.T.dot(back)]).T, overwrite_a=1)
+    _, _, solved, failed = lapack.dgesv(matrix.T, np.concatenate([rows, u.T.dot(back)]).T, overwrite_a=1)
     if failed:
         return None
-    through, returned = found.T[: len(rows)], found.T[len(rows) :]
+    through, returned = solved.T[: len(rows)], solved.T[len(rows) :]
     return np.ascontiguousarray(through.dot(u)), returned.dot(u), through.dot(solution.dot(rows.T))
 
 
@@ -241,21 +241,21 @@ def continuous_riccati_solution(
 
     A Cayley transform makes it an equation in discrete time with the same solution (Chu, Fan and Lin 2005).
     """
-    n, one = a.shape[0], np.eye(a.shape[0])
+    n, identity = a.shape[0], np.eye(a.shape[0])
     if n == 0:
         return np.zeros((0, 0))
     sizes = np.abs(np.linalg.eigvals(a))
     # In the middle of the eigenvalues, on a logarithmic scale: both ends are as slow.
     largest = max(float(sizes.max()), LEAST_POSITIVE)
     rate = RATE_OFFSET * math.sqrt(largest * max(float(sizes.min()), WIDEST_SPECTRUM * largest))
-    shown = c.T @ np.linalg.solve(measured, c)
+    information = c.T @ np.linalg.solve(measured, c)
     try:
-        inverse = np.linalg.inv(a.T - rate * one)
-        outer = np.linalg.inv((a - rate * one) + process @ inverse @ shown)
+        inverse = np.linalg.inv(a.T - rate * identity)
+        outer = np.linalg.inv((a - rate * identity) + process @ inverse @ information)
     except np.linalg.LinAlgError:
         return None
-    power = np.ascontiguousarray(one + 2.0 * rate * outer)
-    back, solution = inverse @ shown @ outer, outer @ process @ inverse
+    power = np.ascontiguousarray(identity + 2.0 * rate * outer)
+    back, solution = inverse @ information @ outer, outer @ process @ inverse
     return _doubled(power, np.asarray(2.0 * rate * back), np.asarray(2.0 * rate * solution))
 
 
@@ -283,11 +283,13 @@ def _doubled(
             part = watch.slow_part(power)
             if part is not None:
                 lifts.add(solution, part[0])
-            found = _doubled_once(power, back, solution) if part is None else slow_equation(part, power, back, solution)
-            if found is None:
+            stepped = (
+                _doubled_once(power, back, solution) if part is None else slow_equation(part, power, back, solution)
+            )
+            if stepped is None:
                 return None
             # A step adds to the last equation; the first of a lower order stands alone.
-            power, back, change = found[0], _added(None if part else back, found[1]), symmetric(found[2])
+            power, back, change = stepped[0], _added(None if part else back, stepped[1]), symmetric(stepped[2])
             solution = solution + change if part is None else change
             full, before = lifts.full(solution), full
             # The change itself is known far below rounding of the solution, where nothing was lifted.
@@ -322,9 +324,9 @@ def _added(back: FloatArray | ThinBack | None, added: FloatArray | ThinBack) -> 
 
 def symmetric(matrix: FloatArray) -> FloatArray:
     """Return the symmetric part ``(n, n)``."""
-    found = matrix + matrix.T
-    found *= 0.5
-    return np.asarray(found)
+    average = matrix + matrix.T
+    average *= 0.5
+    return np.asarray(average)
 
 
 def _doubled_once(
@@ -349,9 +351,9 @@ def _doubled_once(
 
 def _solved_in_place(matrix: FloatArray, rows: FloatArray) -> bool:
     """Replace ``rows (k, n)`` by ``rows @ inv(matrix)``, both in C order, uncopied; false where singular."""
-    _, _, found, failed = lapack.dgesv(matrix.T, rows.T, overwrite_a=1, overwrite_b=1)
-    if not np.may_share_memory(found, rows):
-        rows[...] = found.T
+    _, _, solution, failed = lapack.dgesv(matrix.T, rows.T, overwrite_a=1, overwrite_b=1)
+    if not np.may_share_memory(solution, rows):
+        rows[...] = solution.T
     return not failed
 
 
@@ -363,9 +365,9 @@ def compared_gain(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, le
     many states with few outputs a solution that takes less time and loses fewer digits.
     """
     if len(a) >= FEWEST_STATES and 0 < len(c) <= b.shape[1]:
-        found = _compared(a.T, c.T, b.T, d.T, level)
-        if found is not None:
-            return found
+        verdict = _compared(a.T, c.T, b.T, d.T, level)
+        if verdict is not None:
+            return verdict
     return _compared(a, b, c, d, level)
 
 
@@ -386,10 +388,10 @@ def _compared(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level:
                 # Far from normal, rounding in the doubling outgrows any margin.
                 return False if refuted and largest_singular_value(a) <= LARGEST_TRUSTED_NORM else None
             through = a.T @ p @ b + cross
-            left = -(gap + b.T @ p @ b)
-            if not is_positive(left):
+            weight = -(gap + b.T @ p @ b)
+            if not is_positive(weight):
                 return None
-            added = through @ np.linalg.solve(left, through.T)
+            added = through @ np.linalg.solve(weight, through.T)
         except np.linalg.LinAlgError:
             return None
         moved = a.T @ p @ a
@@ -397,12 +399,12 @@ def _compared(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level:
         return True if float(np.linalg.norm(p - moved - process - added)) <= EQUATION_TOLERANCE * sizes else None
 
 
-def is_clearly_negative(left: FloatArray, b: FloatArray, p: FloatArray) -> bool:
-    """Return whether ``left``, which holds ``-B'PB``, is below zero by more than what rounding may have done to P."""
-    if not np.isfinite(left).all() or is_positive(left):
+def is_clearly_negative(weight: FloatArray, b: FloatArray, p: FloatArray) -> bool:
+    """Return whether ``weight``, which holds ``-B'PB``, is below zero by more than what rounding may have done to P."""
+    if not np.isfinite(weight).all() or is_positive(weight):
         return False
     margin = REFUTED * float(np.linalg.norm(b)) ** 2 * float(np.linalg.norm(p))
-    return bool(np.linalg.eigvalsh(left)[0] < -margin)
+    return bool(np.linalg.eigvalsh(weight)[0] < -margin)
 
 
 def is_positive(matrix: FloatArray) -> bool:

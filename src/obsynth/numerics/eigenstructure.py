@@ -101,12 +101,12 @@ def place(
     if objective == "conditioning":
         # All go a short way, and the best of them to the end.  Small gains are not predicted as early.
         tried = [problem.minimised(start, steps=FIRST_SEARCH_STEPS, restarts=1) for start in starts]
-        ahead = sorted((found for found in tried if found is not None), key=lambda found: found[0])
+        ahead = sorted((candidate for candidate in tried if candidate is not None), key=lambda candidate: candidate[0])
         starts = [start for _, start in ahead[:FINALISTS]]
     for start in starts:
-        found = problem.minimised(start)
-        if found is not None and (best is None or found[0] < best[0]):
-            best = found
+        candidate = problem.minimised(start)
+        if candidate is not None and (best is None or candidate[0] < best[0]):
+            best = candidate
     if best is None:
         raise SolverError("No gain for these poles was found: the Sylvester equation stayed singular.")
     x, gain = problem.solution(best[1])
@@ -223,14 +223,14 @@ class _Sylvester:
 
 
 def checked_poles(
-    given: Any, count: int, fixed: ComplexArray, dt: float, *, of: str = "ui-pi-observer"
+    requested: Any, count: int, fixed: ComplexArray, dt: float, *, of: str = "ui-pi-observer"
 ) -> list[complex]:
     """Return the wanted poles, in exact conjugate pairs; ``of``: what they are for, in messages."""
-    listed = [as_pole(pole) for pole in given]
+    listed = [as_pole(pole) for pole in requested]
     problems = []
     if len(listed) != count:
-        kept = ", ".join(f"{complex(value):.6g}" for value in fixed)
-        besides = f" (fixed, not to be listed: {kept})" if kept else ""
+        fixed_text = ", ".join(f"{complex(value):.6g}" for value in fixed)
+        besides = f" (fixed, not to be listed: {fixed_text})" if fixed_text else ""
         problems.append(f"{len(listed)} are given, but {count} can be placed{besides}.")
     rates = decay_rates(listed, dt)
     unstable = [pole for pole, rate in zip(listed, rates, strict=True) if not rate > 0.0]

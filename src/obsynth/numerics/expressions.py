@@ -154,13 +154,13 @@ class _Reader:
 
     def error(self, reason: str) -> SpecError:
         decides = " To decide, write where(a > b, c, d): c where a > b, d elsewhere."
-        asked = DECIDING_WORDS.intersection(_NAME_IN_TEXT.findall(self.text)) or re.search("[<>]", self.text)
+        is_conditional = DECIDING_WORDS.intersection(_NAME_IN_TEXT.findall(self.text)) or re.search("[<>]", self.text)
         power = " A power is written **." if "^" in self.text else ""
         power += " An equation has a single =." if "==" in self.text else ""
         power += " A derivative in an equation is written der(x)." if _DERIVATIVES.search(self.text) else ""
         return SpecError(
             f"{self.text!r} is not a valid expression: {reason}. Allowed are numbers, names, + - * / **, parentheses "
-            f"and the functions {', '.join([*FUNCTIONS, *FUNCTIONS_OF_TWO, 'where'])}.{power}{decides if asked else ''}"
+            f"and the functions {', '.join([*FUNCTIONS, *FUNCTIONS_OF_TWO, 'where'])}.{power}{decides if is_conditional else ''}"
         )
 
     def misread(self, error: SyntaxError) -> SpecError:
@@ -200,19 +200,19 @@ class _Reader:
 
     def chain(self, node: ast.expr, depth: int) -> Evaluator:
         """Return what evaluates operations from left to right, in a loop: a long sum is no deep one."""
-        rest: list[tuple[Callable[[Any, Any], Any], Evaluator]] = []
+        operations: list[tuple[Callable[[Any, Any], Any], Evaluator]] = []
         while isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC:
-            rest.insert(0, (ARITHMETIC[type(node.op)], self.read(node.right, depth)))
+            operations.insert(0, (ARITHMETIC[type(node.op)], self.read(node.right, depth)))
             node = node.left
         if isinstance(node, ast.BinOp):
             raise self.error(f"{self.written(node)!r} is not allowed")
         first = self.read(node, depth)
 
         def evaluated(values: Mapping[str, Any], translate: Translation) -> Any:
-            found = first(values, translate)
-            for operation, operand in rest:
-                found = translate(operation)(found, operand(values, translate))
-            return found
+            value = first(values, translate)
+            for operation, operand in operations:
+                value = translate(operation)(value, operand(values, translate))
+            return value
 
         return evaluated
 
@@ -241,10 +241,10 @@ class _Reader:
         """Read what a derivative is taken of; it stands for a value of its own, found under its text."""
         outside, self.names, self.rates_allowed = self.names, set[str](), False
         text, evaluator = self.written(inner), self.read(inner, depth)
-        found = Expression(text, frozenset(self.names), evaluator)
+        expression = Expression(text, frozenset(self.names), evaluator)
         self.names, self.rates_allowed = outside, True
         key = f"der({text})"
-        self.rates[key] = found
+        self.rates[key] = expression
         return lambda values, _: values[key]
 
 

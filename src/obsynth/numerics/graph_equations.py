@@ -43,10 +43,10 @@ def equilibrated(matrix: Any, columns: FloatArray) -> tuple[Any, Any]:
 def largest_entries(matrix: Any) -> Any:
     """Return the largest absolute value of each row ``(rows,)``, which is not NaN where others are not."""
     sizes = ca.fabs(matrix)
-    found = sizes[:, 0]
+    largest = sizes[:, 0]
     for j in range(1, matrix.shape[1]):
-        found = ca.fmax(found, sizes[:, j])
-    return found
+        largest = ca.fmax(largest, sizes[:, j])
+    return largest
 
 
 def _solution(matrix: Any, right: Any, *, pivots: bool = False) -> Any:
@@ -56,8 +56,8 @@ def _solution(matrix: Any, right: Any, *, pivots: bool = False) -> Any:
     if n > SMALL:
         return ca.solve(ca.densify(matrix), ca.densify(right), "qr", {"eps": SINGULAR})
     A, B = ca.SX.sym("A", n, n), ca.SX.sym("B", n, m)
-    whole = ca.horzcat(A, B)
-    function = ca.Function("solve", [A, B], [_eliminated([whole[i, :] for i in range(n)], pivots=pivots)])
+    augmented = ca.horzcat(A, B)
+    function = ca.Function("solve", [A, B], [_eliminated([augmented[i, :] for i in range(n)], pivots=pivots)])
     return function(matrix, right)
 
 
@@ -72,10 +72,10 @@ def _eliminated(rows: list[Any], *, pivots: bool) -> Any:
                 rows[j], rows[i] = choose(rows[i], rows[j]), choose(rows[j], rows[i])
         for i in range(j + 1, n):
             rows[i] = rows[i] - (rows[i][j] / rows[j][j]) * rows[j]
-    found: list[Any] = [None] * n
+    solution: list[Any] = [None] * n
     for j in reversed(range(n)):
-        rest = rows[j][n:]
+        right = rows[j][n:]
         for i in range(j + 1, n):
-            rest = rest - rows[j][i] * found[i]
-        found[j] = rest / rows[j][j]
-    return ca.vertcat(*found)
+            right = right - rows[j][i] * solution[i]
+        solution[j] = right / rows[j][j]
+    return ca.vertcat(*solution)

@@ -50,12 +50,12 @@ class WeightLimit:
         """Return the norm of the weight."""
         return largest_singular_value(self.fixed + v @ self.free)
 
-    def kept(self, v: FloatArray) -> FloatArray:
+    def within_bound(self, v: FloatArray) -> FloatArray:
         """Return V, drawn towards zero by as much as a solver's rounding has let the weight out of the bound."""
-        least, found = largest_singular_value(self.fixed), self.norm(v)
-        if found <= self.bound or least >= self.bound:
+        least, size = largest_singular_value(self.fixed), self.norm(v)
+        if size <= self.bound or least >= self.bound:
             return v
-        return np.asarray((1.0 - NORM_ROUNDING) * (self.bound - least) / (found - least) * v)
+        return np.asarray((1.0 - NORM_ROUNDING) * (self.bound - least) / (size - least) * v)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,10 +161,10 @@ class GainProblem:
         """Return whether the norm d -> xi is at most ``level``."""
         if not self.judged_exactly:
             if solution not in self._gains:
-                found = largest_peak(*self.closed_loop(solution), modes=self.modes(solution), enough=level)
-                if found > level:
+                peak = largest_peak(*self.closed_loop(solution), modes=self.modes(solution), enough=level)
+                if peak > level:
                     return False  # some gain that is attained: which is the largest is not known
-                self._gains[solution] = found
+                self._gains[solution] = peak
             return self._gains[solution] <= level
         return norm_is_at_most(*self.closed_loop(solution), level, modes=self.modes(solution))
 

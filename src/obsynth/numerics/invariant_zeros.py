@@ -32,13 +32,13 @@ def system_zeros(E: FloatArray, A: FloatArray, *, nx: int) -> FiniteZeros:
     """Return the finite zeros of a system pencil ``(nx + ny, nx + nu)`` without those that are only nearly infinite.
     Far out a pencil with zeros at infinity is nearly singular beside ``z E`` (a chain of k states shows with ``z^-k``):
     there a candidate counts only when the pencil is singular to rounding in units that suit its size."""
-    found = finite_zeros(E, A, to_the_end=False)
-    if not found.values.size:
-        return found
+    zeros = finite_zeros(E, A, to_the_end=False)
+    if not zeros.values.size:
+        return zeros
     # Both of a pair are judged by the upper one.
-    upper = [complex(z.real, abs(z.imag)) for z in found.values]
-    kept = np.array([abs(z) <= 1.0 or _is_singular(E, A, z, found.normal_rank, nx=nx) for z in upper], dtype=bool)
-    return replace(found, values=read_only(found.values[kept], np.complex128))
+    upper = [complex(z.real, abs(z.imag)) for z in zeros.values]
+    confirmed = np.array([abs(z) <= 1.0 or _is_singular(E, A, z, zeros.normal_rank, nx=nx) for z in upper], dtype=bool)
+    return replace(zeros, values=read_only(zeros.values[confirmed], np.complex128))
 
 
 def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int, *, nx: int) -> bool:
@@ -112,22 +112,22 @@ def are_outside(E: FloatArray, A: FloatArray, zeros: FiniteZeros, dt: float) -> 
     One of multiplicity k moves by ``eps^(1/k)``: near the boundary it also counts as outside when the pencil is
     singular to working precision all the way to the nearest boundary point."""
     judged: PencilPoints | EquilibratedPencil | None = None
-    found: dict[complex, bool] = {}
+    outside: dict[complex, bool] = {}
     for value in map(complex, zeros.values):
         distance = abs(abs(value) - 1.0) if dt > 0.0 else abs(value.real)
         # Of a pair both are where the one before was found to be: the pencil is real.
-        if (other := value.conjugate()) in found:
-            found[value] = found[other]
+        if (other := value.conjugate()) in outside:
+            outside[value] = outside[other]
         elif is_outside(value, dt) or distance > BOUNDARY_NEIGHBOURHOOD * max(1.0, abs(value)):
-            found[value] = is_outside(value, dt)
+            outside[value] = is_outside(value, dt)
         else:
             if judged is None:
                 judged = pencil = equilibrate_pencil(E, A)
                 # A large one of full column rank is made ready for many points.
                 if min(E.shape[0], zeros.normal_rank) >= E.shape[1] >= FEW_COLUMNS:
                     judged = PencilPoints(pencil.E, pencil.A, (1.0, 1.0))
-            found[value] = _reaches_boundary(judged, value, dt, zeros.normal_rank)
-    return tuple(found[value] for value in map(complex, zeros.values))
+            outside[value] = _reaches_boundary(judged, value, dt, zeros.normal_rank)
+    return tuple(outside[value] for value in map(complex, zeros.values))
 
 
 def zero_at(E: FloatArray, A: FloatArray, value: complex, B: FloatArray, C: FloatArray, D: FloatArray) -> Zero:
@@ -144,10 +144,10 @@ def zeros_of_system(
 ) -> tuple[FiniteZeros, tuple[Zero, ...], tuple[Zero, ...]]:
     """Return what `finite_zeros` says of ``[A - z E, B; C, D]``, the zeros, and those not strictly stable."""
     e, a = system_pencil(E, A, B, C, D)
-    found = system_zeros(e, a, nx=E.shape[0])
-    zeros = zeros_with_directions(e, a, found, nx=E.shape[0])
-    outside = tuple(zero for zero, out in zip(zeros, are_outside(e, a, found, dt), strict=True) if out)
-    return found, zeros, outside
+    finite = system_zeros(e, a, nx=E.shape[0])
+    zeros = zeros_with_directions(e, a, finite, nx=E.shape[0])
+    outside = tuple(zero for zero, out in zip(zeros, are_outside(e, a, finite, dt), strict=True) if out)
+    return finite, zeros, outside
 
 
 def system_pencil(
@@ -177,13 +177,13 @@ def _reaches_boundary(pencil: PencilPoints | EquilibratedPencil, value: complex,
 
 
 def zeros_with_directions(
-    E: FloatArray, A: FloatArray, found: FiniteZeros, *, nx: int, wanted: Callable[[complex], bool] = lambda _: True
+    E: FloatArray, A: FloatArray, finite: FiniteZeros, *, nx: int, selected: Callable[[complex], bool] = lambda _: True
 ) -> tuple[Zero, ...]:
     """Return zeros of the system pencil ``A - z E`` with their directions: all, or the wanted ones; of a pair both."""
-    values = [complex(value) for value in found.values]
+    values = [complex(value) for value in finite.values]
     zeros: list[Zero] = []
     for i, value in enumerate(values):
-        if not wanted(value):
+        if not selected(value):
             continue
         if value.imag < 0.0:
             # Pairs follow each other and are exact.
@@ -193,7 +193,7 @@ def zeros_with_directions(
             zeros.append(Zero(value, state, driving, zeros[-1].input_share))
             continue
         pencil = equilibrated_at(E, A, value, nx=nx)
-        kernel = _kernel(pencil, value, least=pencil.A.shape[1] - found.normal_rank + 1)
+        kernel = _kernel(pencil, value, least=pencil.A.shape[1] - finite.normal_rank + 1)
         basis = smallest_part_first(kernel, slice(nx, None))
         twins = sum(abs(value - other) <= CLUSTER_TOLERANCE * max(1.0, abs(value)) for other in values[:i])
         zeros.append(_zero_along(basis[:, min(twins, basis.shape[1] - 1)], value, pencil.columns, nx=nx))

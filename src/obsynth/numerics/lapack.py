@@ -36,11 +36,11 @@ def library() -> ModuleType:
         spec = PathFinder.find_spec(_EXTENSION, [str(Path(folder) / "linalg") for folder in folders])
         if spec is not None and spec.loader is not None:
             try:
-                found = module_from_spec(spec)
-                spec.loader.exec_module(found)
+                module = module_from_spec(spec)
+                spec.loader.exec_module(module)
             except ImportError:  # an installation whose extensions need their package first
                 return import_module("scipy.linalg.lapack")
-            return found
+            return module
     return import_module("scipy.linalg.lapack")
 
 

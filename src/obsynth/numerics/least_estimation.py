@@ -99,10 +99,10 @@ class Whitened(NamedTuple):
     basis: FloatArray
     noise: float
 
-    def restored(self, given: EstimationProblem, K: FloatArray, Z0: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def restored(self, original: EstimationProblem, K: FloatArray, Z0: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return gains on the given problem's r of gains on the innovation."""
         if self.factor is None:
-            return np.zeros((len(given.A), len(given.C))), np.zeros((len(given.L), len(given.C)))
+            return np.zeros((len(original.A), len(original.C))), np.zeros((len(original.L), len(original.C)))
         return self.K + self.basis @ K @ self.factor, Z0 @ self.factor
 
 
@@ -124,9 +124,9 @@ def least_estimation(
         least = _invisible_at(white.plain, angle) if white.noise else limit
         least = max(least, _invisible_from_rest(white.plain))
         level = _norm(_closed(core, K, Z0))
-        found = _search(core, (K, Z0), least, level)
-        if found is not None:
-            K, Z0, level = found
+        better = _search(core, (K, Z0), least, level)
+        if better is not None:
+            K, Z0, level = better
         decays = tuple(_decays(core, share * level) for share in WORST_LEVELS)
     closed = _closed(white.plain, K, Z0)
     gain = _norm(closed) if norm == "hinf" else _deviation(closed)
@@ -160,14 +160,14 @@ def least_mean_square(problem: EstimationProblem) -> ContinuousFilter:
     Raise `PreconditionError` where white noise passes to the error whatever the filter, or no filter is stable.
     """
     rows = len(problem.C)
-    a, b, both, direct = uncayley(
+    a, b, outputs, direct = uncayley(
         problem.A,
         problem.B,
         np.vstack([problem.C, problem.L]),
         np.vstack([problem.D, problem.D1]),
         problem.alpha,
     )
-    c, wanted, d, d1 = both[:rows], both[rows:], direct[:rows], direct[rows:]
+    c, error_rows, d, d1 = outputs[:rows], outputs[rows:], direct[:rows], direct[rows:]
     Z0 = d1 @ np.linalg.pinv(d)
     if np.linalg.norm(d1 - Z0 @ d) > WHITE_SHARE * (1.0 + np.linalg.norm(d1)):
         raise PreconditionError(
@@ -183,13 +183,15 @@ def least_mean_square(problem: EstimationProblem) -> ContinuousFilter:
     else:
         covariance = _continuous_covariance(a, b, c, d)
     K = np.asarray(np.linalg.solve(d @ d.T, c @ covariance + d @ b.T).T)
-    closed, entering, shown = a - K @ c, b - K @ d, wanted - Z0 @ c
-    spread = continuous_lyapunov(closed, -entering @ entering.T) if len(a) else np.zeros((0, 0))
-    deviation = float(np.sqrt(max(np.trace(shown @ spread @ shown.T), 0.0)))
+    closed, closed_b, closed_l = a - K @ c, b - K @ d, error_rows - Z0 @ c
+    spread = continuous_lyapunov(closed, -closed_b @ closed_b.T) if len(a) else np.zeros((0, 0))
+    deviation = float(np.sqrt(max(np.trace(closed_l @ spread @ closed_l.T), 0.0)))
     half = np.linalg.solve(np.eye(len(problem.A)) + problem.A, problem.G)
     moved, through = np.sqrt(2.0 * problem.alpha) * half, np.vstack([problem.C, problem.L]) @ half
-    seen, direct_estimate = problem.V + through[:rows], problem.F + through[rows:]
-    return ContinuousFilter(closed, moved + K @ seen, -shown, direct_estimate - Z0 @ seen, deviation)
+    residual_input, direct_estimate = problem.V + through[:rows], problem.F + through[rows:]
+    return ContinuousFilter(
+        closed, moved + K @ residual_input, -closed_l, direct_estimate - Z0 @ residual_input, deviation
+    )
 
 
 def _continuous_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
@@ -205,8 +207,8 @@ def _continuous_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: Float
 
 def _riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> FloatArray:
     with warnings.catch_warnings(action="ignore"):
-        found = discrete_riccati(a, b, q, r, s=s) if len(a) else np.zeros((0, 0))
-    return np.asarray(0.5 * (found + found.T))
+        solution = discrete_riccati(a, b, q, r, s=s) if len(a) else np.zeros((0, 0))
+    return np.asarray(0.5 * (solution + solution.T))
 
 
 def _kalman(problem: EstimationProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -224,9 +226,9 @@ def _size(problem: EstimationProblem) -> float:
     def size(part: FloatArray) -> float:
         return float(np.linalg.norm(part))
 
-    shown = size(problem.C) * size(problem.B) + size(problem.D)
-    wanted = size(problem.L) * size(problem.B) + size(problem.D1)
-    return max(shown, WANTED_SHARE * wanted, SMALLEST)
+    measured_size = size(problem.C) * size(problem.B) + size(problem.D)
+    estimated_size = size(problem.L) * size(problem.B) + size(problem.D1)
+    return max(measured_size, WANTED_SHARE * estimated_size, SMALLEST)
 
 
 def whitened(problem: EstimationProblem, noises: Sequence[float] = ADDED_NOISES) -> Whitened:
@@ -282,9 +284,9 @@ def _central(problem: EstimationProblem, P: FloatArray) -> tuple[FloatArray, Flo
     if not len(C):
         return np.zeros((len(A), 0)), np.zeros((len(L), 0))
     R = C @ P @ C.T + D @ D.T
-    wanted = np.hstack([C @ P @ A.T + D @ B.T, C @ P @ L.T + D @ D1.T])
-    both = np.asarray(np.linalg.solve(R, wanted).T, dtype=np.float64)
-    return both[: len(A)], both[len(A) :]
+    cross = np.hstack([C @ P @ A.T + D @ B.T, C @ P @ L.T + D @ D1.T])
+    gains = np.asarray(np.linalg.solve(R, cross).T, dtype=np.float64)
+    return gains[: len(A)], gains[len(A) :]
 
 
 def _closed(
@@ -321,10 +323,10 @@ def _at_level(problem: EstimationProblem, level: float) -> FloatArray | None:
     R = CL @ P @ CL.T + weight
     if len(P) and np.linalg.eigvalsh(P)[0] < -NEGATIVE_SHARE * (np.max(np.abs(P)) + 1.0):
         return None
-    seen, mixed, error = R[:rows, :rows], R[:rows, rows:], R[rows:, rows:]
-    if rows and np.linalg.eigvalsh(seen)[0] <= 0.0:
+    innovation, mixed, error = R[:rows, :rows], R[:rows, rows:], R[rows:, rows:]
+    if rows and np.linalg.eigvalsh(innovation)[0] <= 0.0:
         return None
-    schur = error - (mixed.T @ np.linalg.solve(seen, mixed) if rows else 0.0)
+    schur = error - (mixed.T @ np.linalg.solve(innovation, mixed) if rows else 0.0)
     if np.linalg.eigvalsh(0.5 * (schur + schur.T))[-1] >= 0.0:
         return None
     closed = problem.A - _central(problem, P)[0] @ problem.C
@@ -338,7 +340,7 @@ def _search(
     nothing = ZERO_SHARE * max(float(np.linalg.norm(problem.D1)), float(np.linalg.norm(problem.L @ problem.B)), high)
     if high <= max(least * (1.0 + LEVEL_SHARE), nothing):
         return None
-    low, found = least * (1.0 - BOUND_ROUNDING), None
+    low, best = least * (1.0 - BOUND_ROUNDING), None
     for tried in range(MOST_LEVELS):
         level = 0.5 * (low + high) if tried else least * (1.0 + 3.0 * LEVEL_SHARE)
         level = level if low < level < high else 0.5 * (low + high)
@@ -348,28 +350,28 @@ def _search(
         else:
             gains = _central(problem, P)
             if _norm(_closed(problem, *gains)) <= level * (1.0 + NORM_ABOVE_LEVEL):
-                high, found = level, gains
+                high, best = level, gains
             else:
                 low = level
         if high - low <= LEVEL_SHARE * high or high <= nothing:
             break
-    return None if found is None else (*found, high)
+    return None if best is None else (*best, high)
 
 
 def _responses(problem: EstimationProblem, angles: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the responses of e0 and of r at angles on the circle."""
     points = np.exp(1j * np.atleast_1d(angles))[:, None, None]
-    entering = np.broadcast_to(problem.B.astype(complex), (len(points), *problem.B.shape))
-    states = np.linalg.solve(points * np.eye(len(problem.A)) - problem.A, entering)
+    inputs = np.broadcast_to(problem.B.astype(complex), (len(points), *problem.B.shape))
+    states = np.linalg.solve(points * np.eye(len(problem.A)) - problem.A, inputs)
     return problem.L @ states + problem.D1, problem.C @ states + problem.D
 
 
 def _hidden_gain(problem: EstimationProblem, angles: FloatArray) -> FloatArray:
     """Return the gain of what r does not show, at angles: no filter, causal or not, has less."""
-    error, shown = _responses(problem, angles)
+    error, residual = _responses(problem, angles)
     if len(problem.C):
-        turned = np.conj(np.swapaxes(shown, 1, 2))
-        error = error - error @ turned @ np.linalg.solve(shown @ turned, shown)
+        turned = np.conj(np.swapaxes(residual, 1, 2))
+        error = error - error @ turned @ np.linalg.solve(residual @ turned, residual)
     return np.asarray(np.linalg.norm(error, 2, axis=(1, 2))) if error.size else np.zeros(len(error))
 
 
@@ -393,17 +395,17 @@ def _non_causal_limit(problem: EstimationProblem) -> tuple[float, float]:
             low, high = angles[max(i - 1, 0)], angles[min(i + 1, len(angles) - 1)]
             for _ in range(8):
                 inner = np.linspace(low, high, 9)
-                found = np.nan_to_num(_hidden_gain(problem, inner))
-                j = int(found.argmax())
-                best = max(best, (float(found[j]), float(inner[j])))
+                refined = np.nan_to_num(_hidden_gain(problem, inner))
+                j = int(refined.argmax())
+                best = max(best, (float(refined[j]), float(inner[j])))
                 low, high = inner[max(j - 1, 0)], inner[min(j + 1, 8)]
     return best[0] * (1.0 - BOUND_ROUNDING), best[1]
 
 
 def _invisible_at(problem: EstimationProblem, angle: float) -> float:
     """Return the gain of inputs that r does not show at one angle."""
-    error, shown = (part[0] for part in _responses(problem, np.array([angle])))
-    hidden = scipy.linalg.null_space(shown, rcond=WINDOW_RANK_TOLERANCE) if len(shown) else np.eye(error.shape[1])
+    error, residual = (part[0] for part in _responses(problem, np.array([angle])))
+    hidden = scipy.linalg.null_space(residual, rcond=WINDOW_RANK_TOLERANCE) if len(residual) else np.eye(error.shape[1])
     return float(np.linalg.norm(error @ hidden, 2)) * (1.0 - BOUND_ROUNDING) if hidden.shape[1] else 0.0
 
 
@@ -415,24 +417,26 @@ def _invisible_from_rest(problem: EstimationProblem) -> float:
     rows, errors, width = len(problem.C), len(problem.L), problem.B.shape[1]
     if not width or not errors:
         return 0.0
-    both, moved = np.vstack([problem.C, problem.L]), problem.B
+    outputs, moved = np.vstack([problem.C, problem.L]), problem.B
     length = max(4, min(LONGEST_FROM_REST, MOST_INPUTS_FROM_REST // width))
     blocks = [np.vstack([problem.D, problem.D1])]
     for _ in range(length):
-        blocks.append(both @ moved)
+        blocks.append(outputs @ moved)
         moved = problem.A @ moved
     while length >= 0:
-        whole = np.zeros((length + 1, rows + errors, length + 1, width))
+        toeplitz = np.zeros((length + 1, rows + errors, length + 1, width))
         for i in range(length + 1):
             for j in range(i + 1):
-                whole[i, :, j, :] = blocks[i - j]
-        shown, wanted = (whole[:, part].reshape(-1, (length + 1) * width) for part in (slice(rows), slice(rows, None)))
-        _, values, right = np.linalg.svd(shown) if rows else (None, np.zeros(0), np.eye(shown.shape[1]))
+                toeplitz[i, :, j, :] = blocks[i - j]
+        residual, error = (
+            toeplitz[:, part].reshape(-1, (length + 1) * width) for part in (slice(rows), slice(rows, None))
+        )
+        _, values, right = np.linalg.svd(residual) if rows else (None, np.zeros(0), np.eye(residual.shape[1]))
         clear = values > BOUNDARY_RANK_TOLERANCE * max(float(np.max(values, initial=0.0)), SMALLEST)
         if not clear.any() or values[clear].min() >= CLEAR_KERNEL * values[0]:
             hidden = right[int(clear.sum()) :].T
-            found = float(np.linalg.norm(wanted @ hidden, 2)) if hidden.shape[1] else 0.0
-            return found * (1.0 - BOUND_ROUNDING)
+            gain = float(np.linalg.norm(error @ hidden, 2)) if hidden.shape[1] else 0.0
+            return gain * (1.0 - BOUND_ROUNDING)
         length = length // 2 if length else -1
     return 0.0
 

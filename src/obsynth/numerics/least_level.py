@@ -58,7 +58,7 @@ class GammaIteration:
 
     ``settled``: the margin tells that nothing is below; ``expects_rounding``: the first filter is judged and a few
     failures in a narrow bracket end it; ``judged``: a level counts only when the true gain of its filter is within it;
-    ``seen``: the filters whose true gain was asked for.
+    ``evaluated``: the filters whose true gain was asked for.
     """
 
     equation: CentralEquation
@@ -69,7 +69,7 @@ class GammaIteration:
     settled: bool = False
     expects_rounding: bool = False
     judged: bool = False
-    seen: list[tuple[Injection, float]] = field(default_factory=list)
+    evaluated: list[tuple[Injection, float]] = field(default_factory=list)
 
     def run(self, first: float) -> None:
         """Go down from ``first``; where that is not reached and close to ``high``, nothing below is looked for."""
@@ -77,9 +77,9 @@ class GammaIteration:
         for _ in range(MOST_LEVELS):
             if level >= self.high * (1.0 - 0.5 * self.tolerance):
                 return
-            found, margin = self.equation.filter_and_margin(level)
-            if found is not None and self._is_credible(level, margin, found):
-                self.reached.append(Reached(level, margin, found))
+            injection, margin = self.equation.filter_and_margin(level)
+            if injection is not None and self._is_credible(level, margin, injection):
+                self.reached.append(Reached(level, margin, injection))
                 self.high, caution = level, 1.0
                 if margin <= 4.0 * self.tolerance:
                     self.settled = True
@@ -92,14 +92,14 @@ class GammaIteration:
                     return
             level = self._next_level(caution)
 
-    def _is_credible(self, level: float, margin: float, found: Injection) -> bool:
+    def _is_credible(self, level: float, margin: float, injection: Injection) -> bool:
         """Whether the margin has shrunk with the level, without which the solution is not the one looked for."""
         if margin > MOST_MARGIN:
             return False
         if self.reached and margin * level**2 >= self.reached[-1].margin * self.reached[-1].level ** 2:
             return False
         believed = not self.judged and (not self.expects_rounding or bool(self.reached))
-        return believed or self._gain_within(found, level) is not None
+        return believed or self._gain_within(injection, level) is not None
 
     def _next_level(self, caution: float) -> float:
         """Return the level to try: a little above where the margin should vanish."""
@@ -133,17 +133,17 @@ class GammaIteration:
         gain = self.equation.problem.achieved_gain(last.injection)
         if gain <= last.level * (1.0 + NORM_EXCESS):
             return last.injection, gain
-        least, step, found = last.level, RETREAT * self.tolerance, None
-        while found is None and step <= NEXT_TO and least * (1.0 + step) < self.reached[0].level:
-            found, step = self._kept(least * (1.0 + step)), RETREAT * step
-        if found is None:
+        least, step, within = last.level, RETREAT * self.tolerance, None
+        while within is None and step <= NEXT_TO and least * (1.0 + step) < self.reached[0].level:
+            within, step = self._filter_within(least * (1.0 + step)), RETREAT * step
+        if within is None:
             return None
         step, ratio = step / RETREAT, RETREAT
         for _ in range(HALVINGS):
             ratio = math.sqrt(ratio)
-            lower = self._kept(least * (1.0 + step / ratio))
-            found, step = (found, step) if lower is None else (lower, step / ratio)
-        return found
+            lower = self._filter_within(least * (1.0 + step / ratio))
+            within, step = (within, step) if lower is None else (lower, step / ratio)
+        return within
 
     def judged_again(self, high: float) -> GammaIteration:
         """Return a descent in which each filter is judged by itself, down to the lowest level that failed."""
@@ -153,15 +153,15 @@ class GammaIteration:
         again.run(0.5 * (top + high) if first_fails else top)
         return again
 
-    def _kept(self, level: float) -> tuple[Injection, float] | None:
+    def _filter_within(self, level: float) -> tuple[Injection, float] | None:
         """Return the filter of a level and its true gain where the level is not exceeded."""
-        found = self.equation.filter_at(level)
-        gain = None if found is None else self._gain_within(found, level)
-        return None if found is None or gain is None else (found, gain)
+        injection = self.equation.filter_at(level)
+        gain = None if injection is None else self._gain_within(injection, level)
+        return None if injection is None or gain is None else (injection, gain)
 
-    def _gain_within(self, found: Injection, level: float) -> float | None:
-        gain = self.equation.problem.achieved_gain(found)
-        self.seen.append((found, gain))
+    def _gain_within(self, injection: Injection, level: float) -> float | None:
+        gain = self.equation.problem.achieved_gain(injection)
+        self.evaluated.append((injection, gain))
         return gain if gain <= level * (1.0 + self.tolerance) else None
 
 
@@ -169,6 +169,6 @@ def _vanishing(points: list[tuple[float, float]]) -> float:
     """Return where u is for a margin of zero, by the polynomial in the margin through points (u, margin)."""
     total = 0.0
     for i, (u, margin) in enumerate(points):
-        others = [m for j, (_, m) in enumerate(points) if j != i]
-        total += u * math.prod(m / (m - margin) for m in others)
+        other_margins = [m for j, (_, m) in enumerate(points) if j != i]
+        total += u * math.prod(m / (m - margin) for m in other_margins)
     return total

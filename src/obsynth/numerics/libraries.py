@@ -37,11 +37,11 @@ _SETTING = threading.Lock()
 
 
 def failure_of(error: Exception) -> SolverError | None:
-    """Return what the error of a library says of the numbers; `None` if it says nothing of them."""
+    """Return the `SolverError` for an error of a library that is due to the numbers; `None` for any other error."""
     if isinstance(error, MemoryError):
-        told = str(error).rstrip(".")
+        reason = str(error).rstrip(".")
         return SolverError(
-            f"This does not fit into the memory{f' ({told})' if told else ''}. The result is inconclusive."
+            f"This does not fit into the memory{f' ({reason})' if reason else ''}. The result is inconclusive."
         )
     is_numerical = isinstance(error, (np.linalg.LinAlgError, ArithmeticError))
     if isinstance(error, ValueError):
@@ -60,10 +60,10 @@ def failed_computations() -> Iterator[None]:
     try:
         yield
     except (np.linalg.LinAlgError, ArithmeticError, ValueError) as error:
-        told = failure_of(error)
-        if told is None:
+        failure = failure_of(error)
+        if failure is None:
             raise
-        raise told from error
+        raise failure from error
 
 
 def imported(module: str, *, extra: str | None, what: str = "This") -> Any:
@@ -72,9 +72,9 @@ def imported(module: str, *, extra: str | None, what: str = "This") -> Any:
         return import_module(module)
     except ImportError as error:
         package = module.partition(".")[0]
-        wanted = package if extra is None else f"'obsynth[{extra}]'"
+        requirement = package if extra is None else f"'obsynth[{extra}]'"
         raise SpecError(
-            f"{what} needs {package}, which is not installed: pip install {wanted}", path=package
+            f"{what} needs {package}, which is not installed: pip install {requirement}", path=package
         ) from error
 
 

@@ -58,13 +58,13 @@ def balance_by_least_squares(
     ne, nx = E.shape
     b, c = np.hstack([np.zeros((ne, 0)), *inputs]), np.vstack([np.zeros((0, nx)), *outputs])
     ends = [0, ne, ne + nx, ne + nx + len(c), ne + nx + len(c) + b.shape[1]]
-    equations, states, shown, entering = map(range, ends[:-1], ends[1:])
+    equations, states, output_rows, input_columns = map(range, ends[:-1], ends[1:])
     problem = LogBalance(ends[-1])
-    for matrix, rows, columns in ((E, equations, states), (A, equations, states), (c, shown, states)):
+    for matrix, rows, columns in ((E, equations, states), (A, equations, states), (c, output_rows, states)):
         problem.add(matrix, rows, columns)
-    problem.add(b, equations, entering)
+    problem.add(b, equations, input_columns)
     exponents = problem.solve(passes=0, ridge=SMALL_RIDGE, whole=True).astype(np.int64)
-    return Scaling(*(read_only(np.ldexp(1.0, exponents[part])) for part in (equations, states, shown)))
+    return Scaling(*(read_only(np.ldexp(1.0, exponents[part])) for part in (equations, states, output_rows)))
 
 
 @dataclass(eq=False)
@@ -109,26 +109,26 @@ class LogBalance:
         # Of hundreds of states with a dense E the weights are so large that their rounding would be the ridge.
         largest = float(entries.diagonal(weights).max(initial=0.0))
         ridge = max(ridge, largest * float(np.finfo(np.float64).eps) / ROUNDED_RIDGE)
-        solved, found = self._solved(entries, weights, ridge)
+        solved, exponents = self._solved(entries, weights, ridge)
         for _ in range(passes):
-            weights = entries.weights * entries.say(found)
-            solved, found = self._solved(entries, weights, ridge)
+            weights = entries.weights * entries.say(exponents)
+            solved, exponents = self._solved(entries, weights, ridge)
         # What the entries leave open would be rounding over the ridge: of exact residuals nothing is left of it.
         for _ in range(RESIDUAL_CORRECTIONS):
-            before, found = found, found + solved(self._missed(entries, weights, found, ridge))
-            if np.array_equal(before, found):
+            before, exponents = exponents, exponents + solved(self._missed(entries, weights, exponents, ridge))
+            if np.array_equal(before, exponents):
                 break
-            to_a_half = np.abs(np.abs(found - np.round(found)) - 0.5)
-            if whole and np.all(np.abs(found - before) <= SETTLED_SHARE * np.min(to_a_half, initial=1.0)):
+            to_a_half = np.abs(np.abs(exponents - np.round(exponents)) - 0.5)
+            if whole and np.all(np.abs(exponents - before) <= SETTLED_SHARE * np.min(to_a_half, initial=1.0)):
                 break
-        return np.asarray(np.round(found) if whole else found, dtype=np.float64)
+        return np.asarray(np.round(exponents) if whole else exponents, dtype=np.float64)
 
-    def _missed(self, entries: _Entries, weights: FloatArray, found: FloatArray, ridge: float) -> FloatArray:
+    def _missed(self, entries: _Entries, weights: FloatArray, exponents: FloatArray, ridge: float) -> FloatArray:
         """Return what is left of the normal equations."""
-        parts = _whole_parts(weights * entries.logarithms(found))
-        missed = -ridge * found - sum(map(entries.sums, parts[::-1]))
+        parts = _whole_parts(weights * entries.logarithms(exponents))
+        missed = -ridge * exponents - sum(map(entries.sums, parts[::-1]))
         for unknown, exponent in self._wishes:
-            missed[unknown] += WISH_WEIGHT * ridge * (exponent - found[unknown])
+            missed[unknown] += WISH_WEIGHT * ridge * (exponent - exponents[unknown])
         return missed
 
     def _solved(
@@ -169,11 +169,11 @@ def _whole_parts(parts: FloatArray) -> list[FloatArray]:
     """Return multiples of smaller and smaller powers of two whose sum is given, but for the last bits of small ones.
 
     Sums of such multiples are exact: what enters two sums enters both with the same value."""
-    found = []
+    multiples = []
     for bits in PART_BITS:
-        found.append(np.ldexp(np.rint(np.ldexp(parts, bits)), -bits))
-        parts = parts - found[-1]
-    return found
+        multiples.append(np.ldexp(np.rint(np.ldexp(parts, bits)), -bits))
+        parts = parts - multiples[-1]
+    return multiples
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,10 +203,10 @@ class _Entries:
 
     def logarithms(self, exponents: FloatArray) -> FloatArray:
         """Return the logarithms of the scaled entries."""
-        found, known = self.sizes.copy(), np.append(exponents, 0.0)
+        totals, known = self.sizes.copy(), np.append(exponents, 0.0)
         for place, sign in zip(self.places, self.signs, strict=True):
-            found += sign * known[place]
-        return found
+            totals += sign * known[place]
+        return totals
 
     def say(self, exponents: FloatArray) -> FloatArray:
         """Return the say of each entry: all of it above one, less the further it is below."""
@@ -214,27 +214,27 @@ class _Entries:
 
     def sums(self, parts: FloatArray) -> FloatArray:
         """Return for each unknown the sum ``(count,)``, with signs, of what is given for the entries that it scales."""
-        found = np.zeros(self.count + 1)
+        totals = np.zeros(self.count + 1)
         for place, sign in zip(self.places, self.signs, strict=True):
-            found += np.bincount(place, sign * parts, len(found))
-        return found[:-1]
+            totals += np.bincount(place, sign * parts, len(totals))
+        return totals[:-1]
 
     def diagonal(self, weights: FloatArray) -> FloatArray:
         """Return for each unknown the weight ``(count,)`` of all entries that it scales."""
-        found = np.zeros(self.count + 1)
+        totals = np.zeros(self.count + 1)
         for place in self.places:
-            found += np.bincount(place, weights, len(found))
-        return found[:-1]
+            totals += np.bincount(place, weights, len(totals))
+        return totals[:-1]
 
     def normal(self, weights: FloatArray) -> FloatArray:
         """Return the matrix ``(count, count)`` of the normal equations."""
         count = self.count + 1
-        found = np.diag(np.append(self.diagonal(weights), 0.0))
+        matrix = np.diag(np.append(self.diagonal(weights), 0.0))
         scaled = list(zip(self.places, self.signs, strict=True))
         for number, (place, sign) in enumerate(scaled):
             for other, other_sign in scaled[:number]:
-                both = np.bincount(place * count + other, sign * other_sign * weights, count * count)
-                both = both.reshape(count, count)
-                found += both
-                found += both.T
-        return found[:-1, :-1]
+                products = np.bincount(place * count + other, sign * other_sign * weights, count * count)
+                products = products.reshape(count, count)
+                matrix += products
+                matrix += products.T
+        return matrix[:-1, :-1]

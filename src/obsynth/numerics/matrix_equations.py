@@ -52,8 +52,8 @@ def discrete_riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: FloatArray,
 
 
 def _by_rows(solve: Callable[..., Any], *matrices: FloatArray, **others: FloatArray | None) -> FloatArray:
-    given = {name: None if matrix is None else np.ascontiguousarray(matrix) for name, matrix in others.items()}
-    return np.asarray(solve(*map(np.ascontiguousarray, matrices), **given))
+    options = {name: None if matrix is None else np.ascontiguousarray(matrix) for name, matrix in others.items()}
+    return np.asarray(solve(*map(np.ascontiguousarray, matrices), **options))
 
 
 def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c: FloatArray) -> FloatArray | None:
@@ -100,14 +100,14 @@ def bounded_real_matrix(
     cross, gap = c.T @ d, d.T @ d - level**2 * np.eye(b.shape[1])
     exceeded, last = False, np.zeros(n)
 
-    def possible(found: FloatArray) -> bool:
+    def possible(solution: FloatArray) -> bool:
         """Whether the gain may still be below the level after the steps of a solution."""
         nonlocal exceeded, last
-        left, sizes = -(gap + b.T @ found @ b), found.diagonal().copy()
-        if np.isfinite(left).all():
+        reserve, sizes = -(gap + b.T @ solution @ b), solution.diagonal().copy()
+        if np.isfinite(reserve).all():
             # Over more steps the solution grows: one that does not is behind a level that was exceeded in between.
             shrunk = (sizes < last - REFUTED * last.max(initial=0.0)).any()
-            exceeded, last = bool(shrunk) or is_clearly_negative(left, b, found), sizes
+            exceeded, last = bool(shrunk) or is_clearly_negative(reserve, b, solution), sizes
         return not exceeded
 
     if b.shape[1]:
@@ -130,8 +130,8 @@ def riccati_solution(
     a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray
 ) -> FloatArray | None:
     """Return the stabilising solution by doubling, or where that breaks down by SciPy; ``None`` without one."""
-    found = doubled_solution(a, h, process, weight, cross)
-    return discrete_solution(a, h, process, weight, cross) if found is None else found
+    solution = doubled_solution(a, h, process, weight, cross)
+    return discrete_solution(a, h, process, weight, cross) if solution is None else solution
 
 
 def doubled_solution(

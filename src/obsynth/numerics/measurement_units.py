@@ -20,7 +20,7 @@ _TEMPERATURES = {
 _FACTOR_DIGITS = 12
 
 
-def conversion(found: str, wanted: str) -> tuple[float, float] | None:
+def conversion(source: str, target: str) -> tuple[float, float] | None:
     """Return factor and shift from numbers in one unit to those in another; `None` where one is no unit that is known.
 
     Raises
@@ -28,20 +28,22 @@ def conversion(found: str, wanted: str) -> tuple[float, float] | None:
     SpecError
         One cannot be converted to the other; or both are temperatures, and pint is not installed.
     """
-    found, wanted = _spelled(found, wanted), _spelled(wanted, found)
-    if found == wanted:
+    source, target = _spelled(source, target), _spelled(target, source)
+    if source == target:
         return 1.0, 0.0
     if find_spec("pint") is None:
-        if {found, wanted} <= set(_TEMPERATURES.values()):
-            raise SpecError(f"{found} is not {wanted}: pip install 'obsynth[units]' to have it converted", path="units")
+        if {source, target} <= set(_TEMPERATURES.values()):
+            raise SpecError(
+                f"{source} is not {target}: pip install 'obsynth[units]' to have it converted", path="units"
+            )
         return None
     units = _registry()
     try:
-        own, other = units.Unit(found), units.Unit(wanted)
+        own, other = units.Unit(source), units.Unit(target)
     except Exception:  # noqa: BLE001 - whatever pint makes of a text that is no unit
         return None
     if own.dimensionality != other.dimensionality:
-        raise SpecError(f"{found} cannot be converted to {wanted}", path="units")
+        raise SpecError(f"{source} cannot be converted to {target}", path="units")
     zero, one = (float(units.Quantity(value, own).to(other).magnitude) for value in (0.0, 1.0))
     factor = one - zero
     return (factor if zero == 0.0 else round(factor, _FACTOR_DIGITS)), zero

@@ -42,16 +42,16 @@ SAFE_RECIPROCAL_CONDITION = 1e-7
 
 def pencils_at(e: FloatArray | None, a: FloatArray, points: ComplexArray) -> ComplexArray:
     """Return ``s E - A`` at points, ``(count, n, m)``; E is the identity where it is not given."""
-    found = np.empty((len(points), *a.shape), dtype=np.complex128)
+    pencils = np.empty((len(points), *a.shape), dtype=np.complex128)
     if e is not None:
-        found[:] = np.ascontiguousarray(e)
-        found *= points[:, None, None]
-        found -= np.ascontiguousarray(a)
-        return found
-    found[:] = -a
+        pencils[:] = np.ascontiguousarray(e)
+        pencils *= points[:, None, None]
+        pencils -= np.ascontiguousarray(a)
+        return pencils
+    pencils[:] = -a
     diagonal = np.arange(len(a))
-    found[:, diagonal, diagonal] += points[:, None]
-    return found
+    pencils[:, diagonal, diagonal] += points[:, None]
+    return pencils
 
 
 def resolved(e: FloatArray | None, a: FloatArray, b: FloatArray, points: ComplexArray) -> Iterator[ComplexArray]:
@@ -84,23 +84,23 @@ class Modes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ModalResponse:
-    """``C (z I - A)^-1 B + D``, ``A = V diag(poles) V^-1``: ``shown`` is C V ``(p, n)``, ``driven`` V^-1 B."""
+    """``C (z I - A)^-1 B + D``, ``A = V diag(poles) V^-1``: ``c_modes`` is C V ``(p, n)``, ``b_modes`` V^-1 B."""
 
     poles: ComplexArray
-    shown: ComplexArray
-    driven: ComplexArray
+    c_modes: ComplexArray
+    b_modes: ComplexArray
     direct: FloatArray
 
     @classmethod
     def of(cls, modes: Modes, b: FloatArray, c: FloatArray, d: FloatArray) -> ModalResponse | None:
         """Return the response; ``None`` where the eigenvectors are no basis."""
         try:
-            driven = np.asarray(np.linalg.solve(modes.vectors, b.astype(np.complex128)), dtype=np.complex128)
+            b_modes = np.asarray(np.linalg.solve(modes.vectors, b.astype(np.complex128)), dtype=np.complex128)
         except np.linalg.LinAlgError:
             return None
         return (
-            cls(modes.values, np.asarray(c @ modes.vectors, dtype=np.complex128), driven, d)
-            if np.isfinite(driven).all()
+            cls(modes.values, np.asarray(c @ modes.vectors, dtype=np.complex128), b_modes, d)
+            if np.isfinite(b_modes).all()
             else None
         )
 
@@ -115,11 +115,11 @@ class ModalResponse:
             sizes = self._by_gram_matrices(factors, roughly=roughly)
         else:
             sizes = self._by_power_iteration(factors, roughly=roughly)
-        there = np.isfinite(sizes)
-        return sizes if there.all() else np.asarray(np.where(there, sizes, 0.0))
+        finite = np.isfinite(sizes)
+        return sizes if finite.all() else np.asarray(np.where(finite, sizes, 0.0))
 
     def _by_gram_matrices(self, factors: ComplexArray, *, roughly: bool) -> FloatArray:
-        inner, outer, direct = self.shown, self.driven, self.direct
+        inner, outer, direct = self.c_modes, self.b_modes, self.direct
         if direct.shape[0] > direct.shape[1]:
             inner, outer, direct = outer.T, inner.T, direct.T
         response = (inner * factors[:, None, :]).reshape(-1, factors.shape[1]) @ outer
@@ -140,23 +140,23 @@ class ModalResponse:
         return np.asarray(np.sqrt(middle + np.hypot(half, beside)))
 
     def _by_power_iteration(self, factors: ComplexArray, *, roughly: bool) -> FloatArray:
-        parts: tuple[NDArray[Any], ...] = (self.shown, self.driven, self.direct)
+        parts: tuple[NDArray[Any], ...] = (self.c_modes, self.b_modes, self.direct)
         unit = 1.0
         if roughly:
             # Where a peak may be single precision tells as well, in half of the time; in units in which it can.
             inner, outer, beside = (float(np.max(np.abs(part), initial=SMALLEST)) for part in parts)
             unit = max(inner * outer, beside)
-            scaled = (self.shown / inner, self.driven * (inner / unit), self.direct / unit)
+            scaled = (self.c_modes / inner, self.b_modes * (inner / unit), self.direct / unit)
             with np.errstate(under="ignore"):
                 parts = tuple(part.astype(np.complex64) for part in scaled)
         kind, steps = (np.complex64, ROUGH_STEPS) if roughly else (np.complex128, POWER_STEPS)
-        shown, driven, direct = parts
-        back, through, turned = shown.conj().T, driven.conj().T, factors.T.astype(kind)
+        c_modes, b_modes, direct = parts
+        back, through, turned = c_modes.conj().T, b_modes.conj().T, factors.T.astype(kind)
         start = np.random.default_rng(0).normal(size=(direct.shape[1], 1))
         u, size = np.repeat(start.astype(kind), len(factors), axis=1), np.zeros(len(factors))
         for _ in range(steps):
             u = u / np.maximum(np.linalg.norm(u, axis=0), np.finfo(kind).tiny)
-            y = shown @ (turned * (driven @ u)) + direct @ u
+            y = c_modes @ (turned * (b_modes @ u)) + direct @ u
             size = np.linalg.norm(y, axis=0)
             u = through @ (turned.conj() * (back @ y)) + direct.T @ y
         return np.asarray(unit * size.astype(np.float64))
@@ -185,10 +185,10 @@ class ModalResponse:
         steps = np.arange(-POINTS_BESIDE, POINTS_BESIDE + 1) / POINTS_BESIDE
         for _ in range(MODE_REFINEMENTS):
             tried = np.minimum(np.maximum(centres[:, None] + widths[:, None] * steps, 0.0), np.pi)
-            found: NDArray[Any] = self.gains(tried.ravel()).reshape(tried.shape)
+            gains: NDArray[Any] = self.gains(tried.ravel()).reshape(tried.shape)
             widths = widths / POINTS_BESIDE
             # Of a few peaks numbers are faster than arrays.
-            peaks = zip(tried.tolist(), found.tolist(), widths.tolist(), strict=True)
+            peaks = zip(tried.tolist(), gains.tolist(), widths.tolist(), strict=True)
             centres = np.array([_top(angles, sizes, step) for angles, sizes, step in peaks])
         return np.asarray(np.minimum(np.maximum(centres, 0.0), np.pi))
 
@@ -237,9 +237,9 @@ def _pencil_eigenvalues(right: FloatArray, left: FloatArray) -> tuple[ComplexArr
     from obsynth.numerics.lapack import dgecon, dgetrf, dgetrs, pencil_eigenvalues
 
     for sign in (1.0, -1.0):
-        both = np.asarray_chkfinite(right + sign * left)
-        factors, pivots, failed = dgetrf(both)
-        if not failed and dgecon(factors, np.max(np.sum(np.abs(both), axis=0)))[0] > SAFE_RECIPROCAL_CONDITION:
+        total = np.asarray_chkfinite(right + sign * left)
+        factors, pivots, failed = dgetrf(total)
+        if not failed and dgecon(factors, np.max(np.sum(np.abs(total), axis=0)))[0] > SAFE_RECIPROCAL_CONDITION:
             s = np.linalg.eigvals(dgetrs(factors, pivots, right - sign * left)[0])
             return np.asarray(sign * (1.0 + s), dtype=np.complex128), np.asarray(1.0 - s, dtype=np.complex128)
     alpha, size = pencil_eigenvalues(right, left)

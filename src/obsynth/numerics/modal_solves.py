@@ -74,21 +74,21 @@ class ModalSolves:
         numpy.linalg.LinAlgError
             The pencil is singular at a point.
         """
-        wanted = np.broadcast_to(right, (len(points), *right.shape[-2:])).astype(np.complex128)
-        found, missed, left = np.zeros_like(wanted), wanted, np.ones(len(points), dtype=bool)
+        targets = np.broadcast_to(right, (len(points), *right.shape[-2:])).astype(np.complex128)
+        solutions, missed, unsolved = np.zeros_like(targets), targets, np.ones(len(points), dtype=bool)
         with np.errstate(all="ignore"):
             for _ in range(MOST_CORRECTIONS):
-                found = found + self._roughly(points, missed)
-                missed = wanted - self._applied(points, found)
-                bound = self._rounding(points, found, wanted)
+                solutions = solutions + self._roughly(points, missed)
+                missed = targets - self._applied(points, solutions)
+                bound = self._rounding(points, solutions, targets)
                 # Where squares overflow nothing is known of either.
-                left = ~((np.linalg.norm(missed, axis=(1, 2)) <= bound) & np.isfinite(bound))
-                if not left.any():
-                    return found
-        for place in np.flatnonzero(left):
+                unsolved = ~((np.linalg.norm(missed, axis=(1, 2)) <= bound) & np.isfinite(bound))
+                if not unsolved.any():
+                    return solutions
+        for place in np.flatnonzero(unsolved):
             e = None if self.E is None else self.E.T
-            found[place] = next(resolved(e, self.A.T, wanted[place].T, points[[place]]))[0].T
-        return found
+            solutions[place] = next(resolved(e, self.A.T, targets[place].T, points[[place]]))[0].T
+        return solutions
 
     def _roughly(self, points: ComplexArray, rows: ComplexArray) -> ComplexArray:
         """Return rows times the inverse, as well as the eigenvectors have it."""
@@ -101,8 +101,8 @@ class ModalSolves:
         moved = rows if self.E is None else rows @ self.E
         return np.asarray(points[:, None, None] * moved - rows @ self.A)
 
-    def _rounding(self, points: ComplexArray, found: ComplexArray, wanted: ComplexArray) -> FloatArray:
+    def _rounding(self, points: ComplexArray, solutions: ComplexArray, targets: ComplexArray) -> FloatArray:
         size = np.sqrt(len(self.A)) if self.E is None else float(np.linalg.norm(self.E))
-        terms = (np.abs(points) * size + float(np.linalg.norm(self.A))) * np.linalg.norm(found, axis=(1, 2))
+        terms = (np.abs(points) * size + float(np.linalg.norm(self.A))) * np.linalg.norm(solutions, axis=(1, 2))
         unit = ROUNDINGS_LEFT * float(np.finfo(np.float64).eps)
-        return np.asarray(unit * (terms + np.linalg.norm(wanted, axis=(1, 2))))
+        return np.asarray(unit * (terms + np.linalg.norm(targets, axis=(1, 2))))

@@ -99,10 +99,10 @@ def newton(
             x = x + step
             last = scaled.rows * evaluate(x)[0]
             return NewtonResult(x, bool(np.abs(last).max() <= LARGEST_RESIDUAL), iteration, last)
-        found = _damped(evaluate, x, step, scaled.rows, float(np.abs(residuals).max()))
-        if found is None:
+        damped = _damped(evaluate, x, step, scaled.rows, float(np.abs(residuals).max()))
+        if damped is None:
             return NewtonResult(x, False, iteration, residuals)
-        x, value, jacobian = found
+        x, value, jacobian = damped
     return NewtonResult(x, False, MOST_ITERATIONS, residuals)
 
 

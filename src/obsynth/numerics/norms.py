@@ -83,9 +83,9 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, mod
         return HinfNorm(np.inf, np.inf, np.nan)
     a, b, c, modes = _balanced(a, b, c, modes)
     if a.shape[0] > STATES_OF_PENCIL:
-        found = _norm_of_many_states(a, b, c, d, modes)
-        if found is not None:
-            return found
+        norm = _norm_of_many_states(a, b, c, d, modes)
+        if norm is not None:
+            return norm
     best, angle = _highest_peak(a, b, c, d, modes)
     if best == 0.0 or not np.isfinite(best) or a.shape[0] == 0:
         return HinfNorm(best, best, angle)
@@ -234,10 +234,10 @@ def state_units(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
 
 def _peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, angles: FloatArray) -> tuple[float, float]:
     with np.errstate(over="ignore", invalid="ignore"):
-        found = frequency_response(a, b, c, d, angles)
-    if not np.isfinite(found).all():
+        responses = frequency_response(a, b, c, d, angles)
+    if not np.isfinite(responses).all():
         return np.inf, np.nan
-    gains = np.linalg.svd(found, compute_uv=False)[:, 0]
+    gains = np.linalg.svd(responses, compute_uv=False)[:, 0]
     top = int(np.argmax(gains))
     return float(gains[top]), float(angles[top])
 
@@ -259,5 +259,5 @@ def output_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray
                 break
         else:
             return infinite
-        found = np.asarray(c @ states @ c.T + d @ d.T)
-    return found if np.all(np.isfinite(found)) else infinite
+        covariance = np.asarray(c @ states @ c.T + d @ d.T)
+    return covariance if np.all(np.isfinite(covariance)) else infinite

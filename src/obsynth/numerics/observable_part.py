@@ -65,16 +65,16 @@ def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray, *,
             waiting.append(complex(mode.real, 0.0))
         elif mode.imag >= 0.0:
             waiting.append(mode)
-    seen = n
+    visible = n
     while waiting:
         value = waiting[0]
         cluster = [other for other in waiting if abs(other - value) <= SAME_MODE * max(1.0, abs(value))]
-        kernel = _hidden_directions(work_f[:seen, :seen], work_c[:, :seen], sum(cluster) / len(cluster), size)
-        found = kernel.shape[1] // (2 if value.imag > 0.0 else 1)
-        if found == 0 and not any(is_outside(other, dt) for other in cluster):
+        kernel = _hidden_directions(work_f[:visible, :visible], work_c[:, :visible], sum(cluster) / len(cluster), size)
+        count = kernel.shape[1] // (2 if value.imag > 0.0 else 1)
+        if count == 0 and not any(is_outside(other, dt) for other in cluster):
             waiting = [other for other in waiting if other not in cluster]
             continue
-        if found == 0 or (found > len(cluster) and is_outside(value, dt)):
+        if count == 0 or (count > len(cluster) and is_outside(value, dt)):
             raise PreconditionError(
                 f"By the zeros of plant and fault model {value:.6g} is a fixed mode, but it is observable in the pair "
                 "(U A, C): double precision cannot decide. Lower the order of the fault model, or rescale the plant.",
@@ -83,14 +83,14 @@ def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray, *,
             )
         turn = np.eye(n)
         # Observable directions first, the hidden ones behind them.
-        left = np.linalg.svd(kernel)[0]
-        turn[:seen, :seen] = np.hstack([left[:, kernel.shape[1] :], left[:, : kernel.shape[1]]])
+        directions = np.linalg.svd(kernel)[0]
+        turn[:visible, :visible] = np.hstack([directions[:, kernel.shape[1] :], directions[:, : kernel.shape[1]]])
         work_f, work_c, basis = turn.T @ work_f @ turn, work_c @ turn, basis @ turn
-        seen -= kernel.shape[1]
-        for other in cluster[:found]:
+        visible -= kernel.shape[1]
+        for other in cluster[:count]:
             waiting.remove(other)
-    hidden = eigenvalues(work_f[seen:, seen:])
-    return ObservableSplit(basis, units, work_f[:seen, :seen], work_c[:, :seen], hidden)
+    hidden = eigenvalues(work_f[visible:, visible:])
+    return ObservableSplit(basis, units, work_f[:visible, :visible], work_c[:, :visible], hidden)
 
 
 def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float) -> FloatArray:
@@ -100,11 +100,11 @@ def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float
     kernel = right[values <= HIDDEN_MODE_TOLERANCE * max(size, abs(value))].conj().T
     if value.imag == 0.0:
         return np.asarray(kernel.real)
-    both = np.hstack([kernel.real, kernel.imag])
-    if both.shape[1] == 0:
-        return both
-    left, lengths, _ = np.linalg.svd(both, full_matrices=False)
-    return np.asarray(left[:, lengths > RANK_TOLERANCE])
+    parts = np.hstack([kernel.real, kernel.imag])
+    if parts.shape[1] == 0:
+        return parts
+    directions, lengths, _ = np.linalg.svd(parts, full_matrices=False)
+    return np.asarray(directions[:, lengths > RANK_TOLERANCE])
 
 
 def _balancing(f: FloatArray, c: FloatArray) -> FloatArray:
@@ -114,10 +114,10 @@ def _balancing(f: FloatArray, c: FloatArray) -> FloatArray:
     states = range(n)
     links = np.where(np.eye(n, dtype=bool), 0.0, f)
     # All outputs together: which combinations of them are looked at must not matter.
-    shown = np.linalg.norm(c, axis=0, keepdims=True)
-    floor_f, floor_c = (CANCELLATION_TOLERANCE * float(np.max(np.abs(part), initial=0.0)) for part in (f, shown))
+    output_sizes = np.linalg.norm(c, axis=0, keepdims=True)
+    floor_f, floor_c = (CANCELLATION_TOLERANCE * float(np.max(np.abs(part), initial=0.0)) for part in (f, output_sizes))
     problem.add(np.where(np.abs(links) > floor_f, f, 0.0), states, states, signs=(-1, 1), common=n)
-    problem.add(np.where(shown > floor_c, shown, 0.0), range(n + 1, n + 2), states)
+    problem.add(np.where(output_sizes > floor_c, output_sizes, 0.0), range(n + 1, n + 2), states)
     for state in states:
         problem.wish(state, 0.0)
     return np.asarray(np.exp2(problem.solve()[:n]))

@@ -148,5 +148,5 @@ class PencilPoints:
         below = np.array(schur[2] if schur else self.E, dtype=np.complex128, order="F")
         if not below.shape[0]:
             return triangle
-        found, _, _, _ = ztpqrt(0, min(TPQRT_BLOCK, triangle.shape[0]), triangle, below, overwrite_a=1, overwrite_b=1)
-        return np.triu(found)
+        reduced, _, _, _ = ztpqrt(0, min(TPQRT_BLOCK, triangle.shape[0]), triangle, below, overwrite_a=1, overwrite_b=1)
+        return np.triu(reduced)

@@ -72,8 +72,8 @@ def reduced(E: FloatArray, A: FloatArray) -> tuple[Deflation, Deflation]:
 
 def with_nonsingular_e(E: FloatArray, A: FloatArray) -> tuple[Deflation, Deflation]:
     """Return the two passes over a square pencil whose E is known to be nonsingular: nothing is taken away."""
-    identity, whole = np.eye(len(E)), np.asarray(np.linalg.solve(E, A), dtype=np.float64)
-    return Deflation(identity, whole, (), (), ()), Deflation(identity, whole.T, (), (), ())
+    identity, dynamics = np.eye(len(E)), np.asarray(np.linalg.solve(E, A), dtype=np.float64)
+    return Deflation(identity, dynamics, (), (), ()), Deflation(identity, dynamics.T, (), (), ())
 
 
 def structure_of_reduced(shape: tuple[int, ...], passes: tuple[Deflation, Deflation]) -> PencilStructure:
@@ -110,31 +110,31 @@ def finite_zeros(E: FloatArray, A: FloatArray, *, to_the_end: bool = True) -> Fi
         # Full rank of the columns everywhere.
         return FiniteZeros(_in_pairs(np.zeros(0, dtype=np.complex128)), sum(right.ranks) + columns, right.decisions)
     left = without_left_singular_part(right, scales)
-    found, rank = _eigenvalues(left.E, left.A), normal_rank_of(right, left)
+    computed, rank = _eigenvalues(left.E, left.A), normal_rank_of(right, left)
     decisions = right.decisions + left.decisions
     if np.all(clear):
-        return FiniteZeros(_in_pairs(found[:0]), sum(right.ranks) + columns, decisions)
+        return FiniteZeros(_in_pairs(computed[:0]), sum(right.ranks) + columns, decisions)
     if rank < sum(right.ranks) + columns:
         # Singular everywhere: that the pencil is so at a point says nothing.
-        return FiniteZeros(found, rank, decisions)
+        return FiniteZeros(computed, rank, decisions)
     points = PencilPoints(right.E, right.A, scales)
     # A staircase on the verge of a rank invents zeros at which the pencil is not singular.
-    upper = [points.confirmed(complex(value)) for value in found if value.imag >= 0.0]
-    kept = _in_pairs(np.array([value for value in upper if value is not None], dtype=np.complex128))
-    zeros = _with_missed_zeros(kept, candidates[~clear], points)
-    if len(zeros) == len(kept) == len(found):
+    upper = [points.confirmed(complex(value)) for value in computed if value.imag >= 0.0]
+    confirmed = _in_pairs(np.array([value for value in upper if value is not None], dtype=np.complex128))
+    zeros = _with_missed_zeros(confirmed, candidates[~clear], points)
+    if len(zeros) == len(confirmed) == len(computed):
         # What a long staircase leaves of a zero is its rounding; the same zeros are found without it.
-        places = kept if len(kept) else candidates[~clear]
+        places = confirmed if len(confirmed) else candidates[~clear]
         decisions = right.decisions + tuple(points.rank(complex(place)) for place in places if place.imag >= 0.0)
     return FiniteZeros(zeros, rank, decisions)
 
 
-def _with_missed_zeros(found: ComplexArray, candidates: ComplexArray, points: PencilPoints) -> ComplexArray:
+def _with_missed_zeros(confirmed: ComplexArray, candidates: ComplexArray, points: PencilPoints) -> ComplexArray:
     """Add zeros of a tall pencil, E of full column rank, that a long staircase lost.
 
     All zeros are among the eigenvalues of the part on the range of E, and each can be tested by itself.
     """
-    zeros = list(found)
+    zeros = list(confirmed)
     nullities: dict[complex, int] = {}
     for candidate in map(complex, _in_pairs(candidates)):
         near = sum(abs(zero - candidate) <= CLUSTER_TOLERANCE * max(1.0, abs(candidate)) for zero in zeros)
@@ -172,8 +172,8 @@ def _clearly_no_zeros(parts: _SquarePart, scales: tuple[float, float]) -> tuple[
         np.fill_diagonal(apart, np.inf)
         # Closest to lambda_i means up to half way to the others.
         reach = 2.0 * (tolerances + residual * spread)[:, None] * (weights / apart)
-        away, shown = np.sum(reach, axis=1), np.linalg.norm(rest @ vectors, axis=0)
-        least = shown * (1.0 - away) - reach @ shown
+        away, rest_norms = np.sum(reach, axis=1), np.linalg.norm(rest @ vectors, axis=0)
+        least = rest_norms * (1.0 - away) - reach @ rest_norms
         clear = np.asarray((away < 1.0) & (least > 2.0 * tolerances))
     pairs = np.flatnonzero(values.imag > 0.0)
     clear[pairs] &= clear[pairs + 1]

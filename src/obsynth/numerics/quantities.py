@@ -78,5 +78,5 @@ def _may_carry(value: Any) -> bool:
 
 
 def _number(value: Any) -> Any:
-    found = next(getattr(value, name) for name in _NUMBER if hasattr(value, name))
-    return float(found) if np.ndim(found) == 0 else np.asarray(found)
+    number = next(getattr(value, name) for name in _NUMBER if hasattr(value, name))
+    return float(number) if np.ndim(number) == 0 else np.asarray(number)

@@ -132,13 +132,13 @@ def independent_directions(rows: FloatArray) -> FloatArray:
     follow from each other: the signals themselves where none does."""
     known = rows[np.isfinite(rows).all(axis=1)]
     sizes, vectors = np.linalg.eigh(known.T @ known / max(len(known), 1))
-    kept = sizes > DEPENDENT_SIGNAL_SHARE * sizes.mean()
-    return np.eye(len(sizes)) if kept.all() or not kept.any() else np.asarray(vectors[:, kept])
+    significant = sizes > DEPENDENT_SIGNAL_SHARE * sizes.mean()
+    return np.eye(len(sizes)) if significant.all() or not significant.any() else np.asarray(vectors[:, significant])
 
 
-def but_rounding(found: FloatArray, size_of_terms: FloatArray) -> FloatArray:
+def but_rounding(sums: FloatArray, size_of_terms: FloatArray) -> FloatArray:
     """Return sums without those that cancel down to the rounding of their terms."""
-    return np.where(np.abs(found) > CANCELLATION_TOLERANCE * size_of_terms, found, 0.0)
+    return np.where(np.abs(sums) > CANCELLATION_TOLERANCE * size_of_terms, sums, 0.0)
 
 
 def real_but_rounding(value: complex) -> float:
@@ -148,8 +148,8 @@ def real_but_rounding(value: complex) -> float:
 
 def product_but_rounding(matrix: Any, other: FloatArray, more: FloatArray | None = None) -> FloatArray:
     """Return ``more + matrix other``; where its terms cancel down to their rounding, there is nothing."""
-    found, terms = matrix @ other, abs(matrix) @ np.abs(other)
-    return but_rounding(found, terms) if more is None else but_rounding(more + found, np.abs(more) + terms)
+    product, terms = matrix @ other, abs(matrix) @ np.abs(other)
+    return but_rounding(product, terms) if more is None else but_rounding(more + product, np.abs(more) + terms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,11 +231,11 @@ def rank_in_any_units(first: FloatArray, second: FloatArray, *, expected: int) -
     Rounding of the entries is as small beside them in all units, so that no scaling makes a matrix look regular that
     is not; one whose units drift apart, as along a chain of parts that hardly touch, makes it look singular.
     """
-    found = decide_rank(first, expected=expected)
-    if found.full and found.clear:
-        return found
+    decided = decide_rank(first, expected=expected)
+    if decided.full and decided.clear:
+        return decided
     other = decide_rank(second, expected=expected)
-    return max(found, other, key=lambda decision: (decision.rank, decision.smallest_kept))
+    return max(decided, other, key=lambda decision: (decision.rank, decision.smallest_kept))
 
 
 def numerical_rank(values: FloatArray, *, scale: float | None = None, tolerance: float = RANK_TOLERANCE) -> int:

@@ -170,8 +170,8 @@ def checked_region(region: Any, name: str = "region") -> LMIRegion:
     if isinstance(region, Mapping):
         region = [region]
     if isinstance(region, (list, tuple)) and region and all(isinstance(part, Mapping) for part in region):
-        found = [_written(part, name) for part in region]
-        return reduce(operator.and_, found)
+        regions = [_written(part, name) for part in region]
+        return reduce(operator.and_, regions)
     if not isinstance(region, LMIRegion):
         raise SpecError(
             f"{name} is {shown(region)}: give conditions.disk(center, radius), conditions.half_plane(decay), "

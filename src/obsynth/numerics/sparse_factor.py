@@ -58,16 +58,16 @@ class SparseFactor:
     """
 
     def __init__(self, matrix: Any, *, by_all: bool = False) -> None:
-        given = csr(matrix)
-        self.rows: FloatArray = np.ones(given.shape[0])
-        self.columns: FloatArray = np.ones(given.shape[1])
+        original = csr(matrix)
+        self.rows: FloatArray = np.ones(original.shape[0])
+        self.columns: FloatArray = np.ones(original.shape[1])
         if by_all:
-            self.rows, self.columns = scales_by_all_entries(given)
+            self.rows, self.columns = scales_by_all_entries(original)
         for _ in range(SCALING_SWEEPS):
-            self.rows /= power_of_two_below(_peaks(_scaled(given, self.rows, self.columns), axis=1))
-            self.columns /= power_of_two_below(_peaks(_scaled(given, self.rows, self.columns), axis=0))
-        self.matrix = _scaled(given, self.rows, self.columns)
-        self.size = given.shape[0]
+            self.rows /= power_of_two_below(_peaks(_scaled(original, self.rows, self.columns), axis=1))
+            self.columns /= power_of_two_below(_peaks(_scaled(original, self.rows, self.columns), axis=0))
+        self.matrix = _scaled(original, self.rows, self.columns)
+        self.size = original.shape[0]
         try:
             self._lu = scipy.sparse.linalg.splu(scipy.sparse.csc_array(self.matrix))
             self.exactly_singular = False
@@ -124,9 +124,9 @@ class SparseFactor:
 
     def solve_with_error(self, right: FloatArray) -> tuple[FloatArray, float]:
         """Return the refined solution, and its largest componentwise backward error."""
-        found, worst = np.zeros((self.size, right.shape[1])), 0.0
+        solution, worst = np.zeros((self.size, right.shape[1])), 0.0
         if not self.size:
-            return found, worst
+            return solution, worst
         for part in _chunks(right.shape[1]):
             scaled = self.rows[:, None] * right[:, part]
             unknown = self._lu.solve(scaled)
@@ -134,8 +134,8 @@ class SparseFactor:
             residual = np.abs(residual_in_twice_the_digits(self.matrix, unknown, scaled))
             sizes = abs(self.matrix) @ np.abs(unknown) + np.abs(scaled)
             worst = max(worst, float(np.max(residual / np.where(sizes > 0.0, sizes, 1.0), initial=0.0)))
-            found[:, part] = self.columns[:, None] * unknown
-        return found, worst
+            solution[:, part] = self.columns[:, None] * unknown
+        return solution, worst
 
     def solve_transposed(self, right: FloatArray) -> FloatArray:
         """Return ``matrix^-T right``, refined once."""
@@ -149,14 +149,14 @@ class SparseFactor:
 
     def size_of_terms(self, solution: FloatArray, places: Any) -> FloatArray:
         """Return chosen rows of ``|matrix^-1| (|matrix| |solution|)``: rounding is judged beside it."""
-        wanted = np.asarray(places, dtype=np.int64)
+        rows = np.asarray(places, dtype=np.int64)
         terms = abs(self.matrix) @ (np.abs(solution) / self.columns[:, None])
-        found = np.zeros((len(wanted), solution.shape[1]))
-        for part in _chunks(len(wanted)):
-            units = np.zeros((self.size, len(wanted[part])))
-            units[wanted[part], np.arange(units.shape[1])] = 1.0
-            found[part] = np.abs(self._lu.solve(units, trans="T")).T @ terms
-        return self.columns[wanted][:, None] * found
+        sizes = np.zeros((len(rows), solution.shape[1]))
+        for part in _chunks(len(rows)):
+            units = np.zeros((self.size, len(rows[part])))
+            units[rows[part], np.arange(units.shape[1])] = 1.0
+            sizes[part] = np.abs(self._lu.solve(units, trans="T")).T @ terms
+        return self.columns[rows][:, None] * sizes
 
     def usual_size_of_terms(self, solution: FloatArray) -> FloatArray:
         """Return an estimate of `size_of_terms` of all rows, with sums of squares: terms of random signs.
@@ -171,8 +171,8 @@ class SparseFactor:
 
 def sparse_factor(matrix: Any) -> SparseFactor:
     """Return the factors of a matrix; scaled by all of its entries where it looks singular scaled by the largest."""
-    found = SparseFactor(matrix)
-    return SparseFactor(matrix, by_all=True) if found.singular else found
+    factor = SparseFactor(matrix)
+    return SparseFactor(matrix, by_all=True) if factor.singular else factor
 
 
 def scales_by_all_entries(matrix: Any) -> tuple[FloatArray, FloatArray]:
@@ -198,8 +198,8 @@ def scales_by_all_entries(matrix: Any) -> tuple[FloatArray, FloatArray]:
         )
     )
     weights = scipy.sparse.diags_array(1.0 / np.maximum(np.concatenate(numbers), 1.0))
-    found, _ = scipy.sparse.linalg.cg(system, -sums, rtol=SCALING_ACCURACY, maxiter=SCALING_STEPS, M=weights)
-    scales = np.exp2(np.round(found))
+    exponents, _ = scipy.sparse.linalg.cg(system, -sums, rtol=SCALING_ACCURACY, maxiter=SCALING_STEPS, M=weights)
+    scales = np.exp2(np.round(exponents))
     return scales[:count], scales[count:]
 
 
@@ -216,10 +216,10 @@ def _scaled(matrix: Any, rows: FloatArray, columns: FloatArray) -> Any:
 
 def _peaks(matrix: Any, *, axis: int) -> FloatArray:
     """Return the largest absolute entry of each row (``axis=1``) or column."""
-    found = np.zeros(matrix.shape[1 - axis])
+    peaks = np.zeros(matrix.shape[1 - axis])
     places = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr)) if axis else matrix.indices
-    np.maximum.at(found, places, np.abs(matrix.data))
-    return found
+    np.maximum.at(peaks, places, np.abs(matrix.data))
+    return peaks
 
 
 def _norm_estimate(matrix: Any) -> float:

@@ -56,9 +56,9 @@ def _maximum_matching(matrix: Any) -> Indices:
     Every row may have an entry of its own beside the matrix, at a price: the cheapest full matching uses as few as
     possible.  scipy's matching without weights took minutes with rows and columns in some orders.
     """
-    found = np.full(matrix.shape[1], -1, dtype=np.int64)
+    row_of_column = np.full(matrix.shape[1], -1, dtype=np.int64)
     if not matrix.nnz:
-        return found
+        return row_of_column
     # Most rows of E are empty.
     own_rows, own_columns = np.flatnonzero(np.diff(matrix.indptr)), np.unique(matrix.indices)
     part = csr(matrix[own_rows][:, own_columns])
@@ -67,13 +67,13 @@ def _maximum_matching(matrix: Any) -> Indices:
         csr(scipy.sparse.hstack([cheap, OWN_ENTRY * scipy.sparse.eye_array(len(own_rows))]))
     )
     inside = column < len(own_columns)
-    found[own_columns[column[inside]]] = own_rows[row[inside]]
-    return found
+    row_of_column[own_columns[column[inside]]] = own_rows[row[inside]]
+    return row_of_column
 
 
-def unmatched_instead(pattern: Any, found: CoarseStructure, rows: Indices) -> Indices | None:
+def unmatched_instead(pattern: Any, structure: CoarseStructure, rows: Indices) -> Indices | None:
     """Return as many of some rows, the first ones if possible, as a maximum matching leaves free; else ``None``."""
-    row_of_column = found.row_of_column.copy()
+    row_of_column = structure.row_of_column.copy()
     unmatched = np.setdiff1d(np.arange(pattern.shape[0]), row_of_column)
     chosen = list[int]()
     for start in map(int, unmatched):
@@ -127,6 +127,6 @@ def components_of(pattern: Any) -> tuple[Indices, Indices]:
     """Return the connected component of each row and each column; two that share an entry are in the same."""
     matrix = csr(pattern)
     rows = matrix.shape[0]
-    both = scipy.sparse.block_array([[None, abs(matrix)], [abs(matrix).T, None]], format="csr")
-    _, labels = scipy.sparse.csgraph.connected_components(both, directed=False)
+    bipartite = scipy.sparse.block_array([[None, abs(matrix)], [abs(matrix).T, None]], format="csr")
+    _, labels = scipy.sparse.csgraph.connected_components(bipartite, directed=False)
     return np.asarray(labels[:rows], dtype=np.int64), np.asarray(labels[rows:], dtype=np.int64)

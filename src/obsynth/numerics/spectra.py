@@ -75,9 +75,9 @@ def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray,
     return mean_miss(eigenvalues(matrix), goal, dt)
 
 
-def mean_miss(found: Sequence[complex] | ComplexArray, wanted: Sequence[complex] | ComplexArray, dt: float) -> float:
+def mean_miss(computed: Sequence[complex] | ComplexArray, wanted: Sequence[complex] | ComplexArray, dt: float) -> float:
     """Return `spectrum_error` of a matrix that has these eigenvalues."""
-    values, goal = (np.asarray(given, dtype=np.complex128) for given in (found, wanted))
+    values, goal = (np.asarray(poles, dtype=np.complex128) for poles in (computed, wanted))
     if values.size != goal.size:
         return float("inf")
     groups = _groups(values, goal, dt)
@@ -85,24 +85,24 @@ def mean_miss(found: Sequence[complex] | ComplexArray, wanted: Sequence[complex]
 
 
 def farthest_pole(
-    found: Sequence[complex] | ComplexArray, wanted: Sequence[complex] | ComplexArray, dt: float
+    computed: Sequence[complex] | ComplexArray, wanted: Sequence[complex] | ComplexArray, dt: float
 ) -> float:
     """Return how far the worst eigenvalue is from its wanted one, relative as `spectrum_error`; nothing is a mean."""
-    values, goal = (np.asarray(given, dtype=np.complex128) for given in (found, wanted))
+    values, goal = (np.asarray(poles, dtype=np.complex128) for poles in (computed, wanted))
     if values.size != goal.size or not np.all(np.isfinite(values)):
         return float("inf")
     return max((float(np.max(np.abs(misses))) for misses in _groups(values, goal, dt)), default=0.0)
 
 
-def _groups(found: ComplexArray, goal: ComplexArray, dt: float) -> list[ComplexArray]:
+def _groups(computed: ComplexArray, goal: ComplexArray, dt: float) -> list[ComplexArray]:
     """Return, for each group of wanted poles that are the same, by how much eigenvalues miss them, relatively."""
     from scipy.optimize import linear_sum_assignment
 
     if goal.size == 0:
         return []
-    rows, columns = linear_sum_assignment(np.abs(found[:, None] - goal[None, :]))
+    rows, columns = linear_sum_assignment(np.abs(computed[:, None] - goal[None, :]))
     assigned = np.empty_like(goal)
-    assigned[columns] = found[rows]
+    assigned[columns] = computed[rows]
     largest = float(np.max(np.abs(goal))) or 1.0
     groups, waiting = [], np.arange(goal.size)
     while waiting.size:
@@ -132,12 +132,12 @@ def abscissa_of(values: ComplexArray, dt: float) -> float:
 
 def as_printed(matrix: FloatArray, digits: int) -> FloatArray:
     """Return each entry as it is when printed with so many significant digits."""
-    form, found, there = f"%.{digits - 1}e", np.zeros(matrix.shape), matrix != 0.0
-    values = matrix[there]
+    form, rounded, nonzero = f"%.{digits - 1}e", np.zeros(matrix.shape), matrix != 0.0
+    values = matrix[nonzero]
     printed, sure = _printed(values, digits)
     printed[~sure] = [float(form % value) for value in values[~sure].tolist()]
-    found[there] = printed
-    return found
+    rounded[nonzero] = printed
+    return rounded
 
 
 def _printed(values: FloatArray, digits: int) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -190,22 +190,22 @@ def _digits_beyond_doubt(matrix: FloatArray, dt: float) -> int:
 
 def decay_rates(values: ComplexArray | Sequence[complex], dt: float) -> FloatArray:
     """Return the rate in 1/s at which each mode decays; negative for one that grows."""
-    given = np.asarray(values, dtype=np.complex128)
+    poles = np.asarray(values, dtype=np.complex128)
     if dt == 0.0:
-        return np.asarray(-given.real, dtype=np.float64)
+        return np.asarray(-poles.real, dtype=np.float64)
     with np.errstate(divide="ignore"):
-        return np.asarray(-np.log(np.abs(given)) / dt, dtype=np.float64)
+        return np.asarray(-np.log(np.abs(poles)) / dt, dtype=np.float64)
 
 
 def speeds(values: ComplexArray | Sequence[complex], dt: float) -> FloatArray:
     """Return the speed ``abs(s)`` of each mode in 1/s; infinite for a mode that dies in one sample."""
-    given = np.asarray(values, dtype=np.complex128)
+    poles = np.asarray(values, dtype=np.complex128)
     if dt == 0.0:
-        return np.asarray(np.abs(given), dtype=np.float64)
-    alive = np.abs(given) > DEAD_BEAT
-    found = np.full(given.shape, np.inf)
-    found[alive] = np.abs(np.log(given[alive])) / dt
-    return found
+        return np.asarray(np.abs(poles), dtype=np.float64)
+    alive = np.abs(poles) > DEAD_BEAT
+    sizes = np.full(poles.shape, np.inf)
+    sizes[alive] = np.abs(np.log(poles[alive])) / dt
+    return sizes
 
 
 def moving_speeds(values: ComplexArray | Sequence[complex], dt: float, rate: float) -> FloatArray:
@@ -213,9 +213,9 @@ def moving_speeds(values: ComplexArray | Sequence[complex], dt: float, rate: flo
 
     Beside nothing faster than ``rate`` (1/s), what rounding leaves of an integrator would be a mode of 1e16 samples.
     """
-    found = speeds(values, dt)
-    found = found[np.isfinite(found)]
-    return np.asarray(found[found > STANDING * np.max(found, initial=rate)])
+    finite = speeds(values, dt)
+    finite = finite[np.isfinite(finite)]
+    return np.asarray(finite[finite > STANDING * np.max(finite, initial=rate)])
 
 
 def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> FloatArray:

@@ -97,8 +97,8 @@ def projection_of(
     diagonal = np.abs(packed.diagonal())
     if (diagonal <= least * np.sqrt(np.einsum("ij,ij->j", H, H))).any():
         return None
-    given = np.eye(rows) if sizes is None else np.diag(1.0 / sizes)
-    transposed = lapack.dormqr("L", "T", packed, tau, given, 64 * rows)[0]
+    weights = np.eye(rows) if sizes is None else np.diag(1.0 / sizes)
+    transposed = lapack.dormqr("L", "T", packed, tau, weights, 64 * rows)[0]
     rotation = np.concatenate((transposed[n:], transposed[:n]))
     return Projection(rotation, np.asfortranarray(packed[:n]), np.tri(n))
 
@@ -167,16 +167,16 @@ def rank_revealing_step(
 ) -> LeastSquaresStep:
     """Solve one step in which x may be undetermined, noise missing, and earlier directions ``unknown (rows, r)``."""
     n = H.shape[1]
-    lengths, q1, q2, head, kept, null = _by_columns(H, unknown)
+    lengths, q1, q2, head, independent, null = _by_columns(H, unknown)
     rank = len(head)
-    innovation, carried, rest = _whitened(q1, q2, S, Y, mapped)
-    noise = _triangle(rest.T)[: min(rest.shape)].T if rest.size else np.zeros((rank, 0))
+    innovation, carried, noise_left = _whitened(q1, q2, S, Y, mapped)
+    noise = _triangle(noise_left.T)[: min(noise_left.shape)].T if noise_left.size else np.zeros((rank, 0))
     solved = _substituted(head, np.hstack([q1.T @ Y - carried, noise])) if rank else np.zeros((0, Y.shape[1]))
     back = np.zeros((len(lengths), solved.shape[1]))
-    back[kept] = solved
+    back[independent] = solved
     back = back / lengths[:, None]
-    found, factor = back[:n, Y.shape[1] :], np.zeros((n, n))
-    compact = _triangle(found.T)[:n].T if found.size else found
+    root, factor = back[:n, Y.shape[1] :], np.zeros((n, n))
+    compact = _triangle(root.T)[:n].T if root.size else root
     factor[:, : compact.shape[1]] = compact
     return LeastSquaresStep(back[:n, : Y.shape[1]], factor, innovation, _basis(null, lengths[:n]))
 
@@ -186,10 +186,10 @@ def _by_columns(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.intp], FloatArray]:
     """Return the lengths of the columns of ``[H -unknown]``, and of these columns at length one: bases of their range
     and of what is beside it, the triangle ``(rank, rank)`` with the columns that it is of, and the null space."""
-    whole = np.hstack([H, -unknown])
-    lengths = np.sqrt(np.einsum("ij,ij->j", whole, whole))
+    joined = np.hstack([H, -unknown])
+    lengths = np.sqrt(np.einsum("ij,ij->j", joined, joined))
     lengths[lengths == 0.0] = 1.0
-    q, r, order = _pivoted(whole / lengths)
+    q, r, order = _pivoted(joined / lengths)
     sizes = np.abs(np.diagonal(r))
     rank = int(np.sum(sizes > RANK_TOLERANCE * max(float(sizes[0]), 0.0))) if sizes.size else 0
     head = r[:rank, :rank]
@@ -216,9 +216,9 @@ def _pivoted(matrix: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.int
         return np.eye(rows), np.empty_like(matrix), np.arange(columns)
     packed, order, tau, _, _ = lapack.dgeqp3(_finite(matrix), lwork=WORK * (columns + 1))
     reflections = min(rows, columns)
-    whole = np.empty((rows, rows), order="F")
-    whole[:, :reflections] = packed[:, :reflections]
-    return lapack.dorgqr(whole, tau, lwork=WORK * rows, overwrite_a=1)[0], np.triu(packed), order - 1
+    q = np.empty((rows, rows), order="F")
+    q[:, :reflections] = packed[:, :reflections]
+    return lapack.dorgqr(q, tau, lwork=WORK * rows, overwrite_a=1)[0], np.triu(packed), order - 1
 
 
 def _triangle(matrix: FloatArray) -> FloatArray:
@@ -264,22 +264,22 @@ def _whitened(
     lower = t[:rank, :rank].T
     innovation = _substituted(lower, scaled[:rank], lower=True) if rank else np.zeros((0, Y.shape[1]))
     # What is left is free of noise: it must vanish, or the constraints contradict each other.
-    left = scaled[rank:] - (t[:rank, rank:].T @ innovation if rank else 0.0)
+    remainder = scaled[rank:] - (t[:rank, rank:].T @ innovation if rank else 0.0)
     terms = ((np.abs(q2.T) @ np.abs(Y)) / sizes)[order][rank:]
     if mapped:
         _require_consistent(
-            np.hstack([np.zeros((len(left), 1)), left[:, mapped:]]),
-            np.hstack([np.zeros((len(left), 1)), terms[:, mapped:]]),
+            np.hstack([np.zeros((len(remainder), 1)), remainder[:, mapped:]]),
+            np.hstack([np.zeros((len(remainder), 1)), terms[:, mapped:]]),
         )
     else:
-        _require_consistent(left, terms)
+        _require_consistent(remainder, terms)
     rotated = q1.T @ S @ z
     signs = np.sign(np.diagonal(lower))[:, None]
     return signs * innovation, rotated[:, :rank] @ innovation, rotated[:, rank:]
 
 
-def _require_consistent(left: FloatArray, terms: FloatArray) -> None:
-    bad = np.abs(left) > CONSISTENCY * terms
+def _require_consistent(remainder: FloatArray, terms: FloatArray) -> None:
+    bad = np.abs(remainder) > CONSISTENCY * terms
     if np.any(bad[:, :1]):
         raise PreconditionError(
             "Equations or outputs without noise contradict each other: no state fits them. Give the ones that are only "
@@ -332,8 +332,8 @@ def joint_step(
     if S.shape[1] < len(H):
         S = np.hstack((S, np.zeros((len(H), len(H) - S.shape[1]))))
     least = DEPENDENT_COLUMN if complete else SUSPECT_COLUMN
-    found = None if unknown.shape[1] else _regular(H, S, known.shape[1], right, least)
-    return _by_rank(H, S, known.shape[1], right, unknown) if found is None else found
+    step = None if unknown.shape[1] else _regular(H, S, known.shape[1], right, least)
+    return _by_rank(H, S, known.shape[1], right, unknown) if step is None else step
 
 
 def _regular(
@@ -376,21 +376,21 @@ def _by_rank(
     # The part of the solution that is free: x and the coordinates d, in scaled units.
     free = np.linalg.qr(free)[0] if free.shape[1] else free
     left, values, right_vectors = np.linalg.svd(free[:n], full_matrices=True)
-    kept = int(np.sum(values > RANK_TOLERANCE))
-    basis, weights = np.linalg.qr(left[:, :kept] / lengths[:n, None])
-    into = right_vectors[:kept].T @ (np.linalg.inv(weights) / values[:kept, None])
+    undetermined = int(np.sum(values > RANK_TOLERANCE))
+    basis, weights = np.linalg.qr(left[:, :undetermined] / lengths[:n, None])
+    into = right_vectors[:undetermined].T @ (np.linalg.inv(weights) / values[:undetermined, None])
     # What acts on x, in as few directions as it needs; the others only act on what came before.
     spread = solved[:n, columns:]
     compact, triangle = np.linalg.qr(spread.T, mode="complete")
     most = min(n, spread.shape[1])
     before, lost = turned[:width, count:], free[n:] / lengths[n:, None]
-    upper = np.hstack((before @ compact[:, :most], np.zeros((width, kept))))
+    upper = np.hstack((before @ compact[:, :most], np.zeros((width, undetermined))))
     lower = np.hstack((solved[n:, columns:] @ compact[:, :most], lost @ into))
     back = SmootherGain(
         np.vstack((turned[:width, :count] @ white, solved[n:, :columns])),
         np.vstack((upper, lower)),
         np.vstack((before @ compact[:, most:], solved[n:, columns:] @ compact[:, most:])),
-        np.vstack((np.zeros((width, free.shape[1] - kept)), lost @ right_vectors[kept:].T)),
+        np.vstack((np.zeros((width, free.shape[1] - undetermined)), lost @ right_vectors[undetermined:].T)),
     )
     return SquareRootGaussian(solved[:n, :columns], triangle[:most].T, basis), back
 
@@ -455,9 +455,9 @@ def update(
     """
     q, gap = len(state.theta), v - G @ state.theta
     if q == 1:
-        kept = _scalar(state, G, forgetting, regular, directional)
-        triangle = np.array([[np.sqrt(kept)]])
-        gain = G.T / kept
+        information = _scalar(state, G, forgetting, regular, directional)
+        triangle = np.array([[np.sqrt(information)]])
+        gain = G.T / information
         theta = state.theta + gain @ gap
     else:
         carried = _directional(state.triangle, G, forgetting) if directional else np.sqrt(forgetting) * state.triangle

@@ -64,8 +64,8 @@ def _deflate(
         left, values, _ = full_svd(A @ kernel)
         decision = rank_from(values, scale=scales[1], expected=columns - rank)
         decisions.append(decision)
-        rest = left[:, decision.rank :].T
-        E, A = rest @ E @ complement, rest @ A @ complement
+        left_null = left[:, decision.rank :].T
+        E, A = left_null @ E @ complement, left_null @ A @ complement
         nullities.append(columns - rank)
         ranks.append(decision.rank)
         most_nullity = decision.rank

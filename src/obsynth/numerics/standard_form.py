@@ -43,19 +43,19 @@ def reachable_basis(a: FloatArray, b: FloatArray, *, share: float = REACHED_SHAR
 
     A direction counts where it is larger than ``share`` of ``scale``; by default of the matrices themselves.
     """
-    n, found, x = len(a), np.zeros((len(a), 0)), np.asarray(b)
+    n, basis, x = len(a), np.zeros((len(a), 0)), np.asarray(b)
     size = max(float(np.linalg.norm(a)), SMALLEST)
-    while found.shape[1] < n and x.size:
+    while basis.shape[1] < n and x.size:
         for _ in range(2):
-            x = x - found @ (found.T @ x)
-        level = scale or (float(np.linalg.norm(b)) if not found.shape[1] else size)
+            x = x - basis @ (basis.T @ x)
+        level = scale or (float(np.linalg.norm(b)) if not basis.shape[1] else size)
         left, values, _ = np.linalg.svd(x, full_matrices=False)
         left = left[:, values > share * max(level, SMALLEST)]
         if not left.shape[1]:
             break
-        found = np.hstack([found, left])
+        basis = np.hstack([basis, left])
         x = a @ left
-    return found
+    return basis
 
 
 def cayley_point(*poles: Any) -> float:
@@ -82,23 +82,23 @@ def standard_form(
     """
     if dt == 0.0:
         point = cayley_point(scipy.linalg.eigvals(a, e)) if alpha is None else alpha
-        found, shift = _cayley(e, a, b, c, d, point), 0
+        system, shift = _cayley(e, a, b, c, d, point), 0
     else:
-        point, (found, shift) = 1.0, _without_infinite_modes(e, a, b, c, d)
-    A, B, C, D = found
+        point, (system, shift) = 1.0, _without_infinite_modes(e, a, b, c, d)
+    A, B, C, D = system
     reached = reachable_basis(A, B)
     A, B, C = reached.T @ A @ reached, reached.T @ B, C @ reached
-    seen = reachable_basis(A.T, C.T)
-    return StandardForm(seen.T @ A @ seen, seen.T @ B, C @ seen, D, shift, point)
+    observable = reachable_basis(A.T, C.T)
+    return StandardForm(observable.T @ A @ observable, observable.T @ B, C @ observable, D, shift, point)
 
 
 def _cayley(
     e: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, alpha: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     factor, root = scipy.linalg.lu_factor(alpha * e - a), np.sqrt(2.0 * alpha)
-    entering = scipy.linalg.lu_solve(factor, b)
+    moved_b = scipy.linalg.lu_solve(factor, b)
     moved = scipy.linalg.lu_solve(factor, alpha * e + a)
-    return moved, root * entering, root * (c @ scipy.linalg.lu_solve(factor, e)), d + c @ entering
+    return moved, root * moved_b, root * (c @ scipy.linalg.lu_solve(factor, e)), d + c @ moved_b
 
 
 def uncayley(
@@ -157,13 +157,13 @@ def _without_infinite_modes(
 
 def _polynomial_part(a2: FloatArray, e2: FloatArray, b2: FloatArray, c2: FloatArray) -> list[FloatArray]:
     """Return the matrices by which outputs depend on the inputs of this sample, the next, and so on."""
-    found: list[FloatArray] = []
+    coefficients: list[FloatArray] = []
     if not len(a2):
-        return found
+        return coefficients
     nilpotent, x = np.linalg.solve(a2, e2), -np.linalg.solve(a2, b2)
-    while len(found) < len(a2) and np.max(np.abs(x), initial=0.0) > NILPOTENT_LEFT:
-        found.append(c2 @ x)
+    while len(coefficients) < len(a2) and np.max(np.abs(x), initial=0.0) > NILPOTENT_LEFT:
+        coefficients.append(c2 @ x)
         x = nilpotent @ x
-    while found and np.max(np.abs(found[-1]), initial=0.0) < NILPOTENT_LEFT:
-        found.pop()
-    return found
+    while coefficients and np.max(np.abs(coefficients[-1]), initial=0.0) < NILPOTENT_LEFT:
+        coefficients.pop()
+    return coefficients

@@ -166,7 +166,7 @@ class PrintedInequality:
         if not self.free_weight:
             return Injection(r, np.zeros((len(parts.W0), parts.V.shape[1])))
         v = (gains["W"] / scaling.outputs - parts.W0) @ parts.V
-        return Injection(r, v if limit is None else limit.kept(v))
+        return Injection(r, v if limit is None else limit.within_bound(v))
 
 
 def gains_by_inequality(goal: Goal, printed: PrintedInequality, records: list[dict[str, Any]]) -> list[Injection]:

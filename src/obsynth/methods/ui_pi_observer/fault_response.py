@@ -174,7 +174,7 @@ def _limits(plant: DescriptorSystem, observer: LinearObserver, tracking: FloatAr
     def outside(value: complex) -> bool:
         return value.imag >= 0.0 and is_outside(value, plant.dt)
 
-    for zero in zeros_with_directions(padded, whole, found, nx=scaled.nx, wanted=outside):
+    for zero in zeros_with_directions(padded, whole, found, nx=scaled.nx, selected=outside):
         if float(np.linalg.norm(zero.input_direction[: plant.nf])) <= NEGLIGIBLE_INPUT:
             continue
         fault, place = units.faults * zero.input_direction[: plant.nf], units.eigenvalue(zero.value)
