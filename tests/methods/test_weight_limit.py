@@ -24,7 +24,7 @@ def test_what_rounding_let_out_is_drawn_back(excess: float) -> None:
     fixed, free, v = rng.standard_normal((2, 4)), rng.standard_normal((2, 4)), rng.standard_normal((2, 2))
     v *= 5.0
     bound = float(np.linalg.norm(fixed + v @ free, 2)) / (1.0 + excess)
-    kept = WeightLimit(fixed, free, bound).kept(v)
+    kept = WeightLimit(fixed, free, bound).within_bound(v)
     assert np.linalg.norm(fixed + kept @ free, 2) <= bound
     if excess < 1.0:
         np.testing.assert_allclose(kept, v, rtol=10.0 * excess + 1e-11)
@@ -33,7 +33,7 @@ def test_what_rounding_let_out_is_drawn_back(excess: float) -> None:
 def test_what_is_within_stays_as_it_is() -> None:
     fixed, v = np.eye(2, 3), np.full((2, 1), 0.1)
     limit = WeightLimit(fixed, np.array([[0.0, 0.0, 1.0]]), 2.0)
-    assert limit.kept(v) is v
+    assert limit.within_bound(v) is v
 
 
 def test_a_limit_that_costs_nothing_calls_no_solver() -> None:

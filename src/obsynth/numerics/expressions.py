@@ -158,9 +158,10 @@ class _Reader:
         power = " A power is written **." if "^" in self.text else ""
         power += " An equation has a single =." if "==" in self.text else ""
         power += " A derivative in an equation is written der(x)." if _DERIVATIVES.search(self.text) else ""
+        advice = power + (decides if is_conditional else "")
         return SpecError(
             f"{self.text!r} is not a valid expression: {reason}. Allowed are numbers, names, + - * / **, parentheses "
-            f"and the functions {', '.join([*FUNCTIONS, *FUNCTIONS_OF_TWO, 'where'])}.{power}{decides if is_conditional else ''}"
+            f"and the functions {', '.join([*FUNCTIONS, *FUNCTIONS_OF_TWO, 'where'])}.{advice}"
         )
 
     def misread(self, error: SyntaxError) -> SpecError:
