@@ -27,9 +27,9 @@ from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.noise import noise_words
+from obsynth.proofs.exact_arithmetic import rounded_outward
 from obsynth.proofs.witnesses import (
     Dyadic,
-    above,
     blocks,
     definite_witness,
     inverse,
@@ -551,7 +551,7 @@ class _Contraction:
         for i, height in enumerate(heights):
             for j, length in enumerate(lengths):
                 added = Fraction(root_above(height * length / self.slowness**2))
-                found[i, j] = above((own[i][j] + added) * Fraction(BOUND_ROOM))
+                found[i, j] = rounded_outward((own[i][j] + added) * Fraction(BOUND_ROOM))
         return found
 
 

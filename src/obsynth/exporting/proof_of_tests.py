@@ -19,7 +19,8 @@ from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
-from obsynth.proofs.witnesses import Dyadic, above, number_data, root_above, written
+from obsynth.proofs.exact_arithmetic import rounded_outward
+from obsynth.proofs.witnesses import Dyadic, number_data, root_above, written
 from obsynth.results.design import ObserverDesign
 
 #: Windows with more equations have no exact fractions in a file: their numerators have as many words.
@@ -56,7 +57,7 @@ def _threshold(whole: ObserverDesign, test: ObserverDesign, window: Window, row:
     parts = _transposed_product(window, exact)
     proved = _largest(window, parts)
     # The exact multipliers are next to the shipped ones: their own threshold may be larger by rounding.
-    stated = max(threshold, above(proved)) if threshold else 0.0
+    stated = max(threshold, rounded_outward(proved)) if threshold else 0.0
     rounding, constant = _rounding(whole, window, exact, row)
     return {
         "claim": "threshold",
@@ -76,7 +77,7 @@ def _least(test: ObserverDesign, window: Window) -> dict[str, Any] | None:
     if point is None:
         return None
     worst = max(Fraction(1), _excess(window, point))
-    least = -above(-(point[0] / worst))
+    least = -rounded_outward(-(point[0] / worst))
     if not least > 0.0:
         return None
     share = Fraction(least) / point[0]
@@ -277,8 +278,8 @@ def _rounding(whole: ObserverDesign, window: Window, multipliers: list[Fraction]
         missed = [m + abs(a - b) for m, a, b in zip(missed, exact.at(k), found, strict=True)]
         response, state = [state @ bu, state @ by], state @ az
     constant = -sum((m * side for m, side in zip(multipliers, window.standing or (), strict=False)), start=Fraction(0))
-    away = above(abs(Fraction(float(observer.added[row])) - constant))
-    return np.array([above(value) * ROUNDING_ROOM for value in missed]), away * ROUNDING_ROOM
+    away = rounded_outward(abs(Fraction(float(observer.added[row])) - constant))
+    return np.array([rounded_outward(value) * ROUNDING_ROOM for value in missed]), away * ROUNDING_ROOM
 
 
 class _Weights:

@@ -95,7 +95,7 @@ def interval_columns(
     widths = [length * 2.0 ** -int(level) for level in cuts]
     reached = _reached(a, b)
     nodes, second, fourth = (
-        [_within(one, reached) for one in ones] for ones in zip(*_motions(a, b, widths), strict=True)
+        [_within(matrix, reached) for matrix in ones] for ones in zip(*_motions(a, b, widths), strict=True)
     )
     blocks = [
         node.scaled(0.5 * (before + after) * ROUNDED)
@@ -109,9 +109,9 @@ def interval_columns(
         mass = width**3 / 12.0
         weights[last] += mass * float(middles.sum()) / count
         weights[first] += mass * float((count - middles).sum()) / count
-        left = mass * width**2 * float((middles * (count - middles)).sum()) / 2.0
+        fourth_order = mass * width**2 * float((middles * (count - middles)).sum()) / 2.0
         largest = modes.largest(fourth[first], width * count)
-        rest += rounded_up(left * largest, 12)
+        rest += rounded_up(fourth_order * largest, 12)
     blocks += [block.scaled(weight * ROUNDED) for block, weight in zip(second, weights, strict=True) if weight]
     rest = rounded_up(rest, len(widths) + 8)
     if np.array_equal(modes.T, np.diag(np.diag(modes.T))):
@@ -141,10 +141,10 @@ def halvings(
         widths = length * 2.0**-levels
         with np.errstate(over="ignore", invalid="ignore", under="ignore"):
             sizes = np.exp(np.clip(np.outer(places * widths, values.real), -700.0, 700.0))
-            whole = widths @ sizes
+            total = widths @ sizes
             turns = (widths[:, None] * np.abs(values)) ** 2
             lost = LOOSENESS * (shared * turns) ** 2 / 96.0
-            curved = (widths[:, None] * (turns / 12.0 + lost) * sizes / whole).max(axis=1)
+            curved = (widths[:, None] * (turns / 12.0 + lost) * sizes / total).max(axis=1)
         if not float(curved.sum()) > CURVATURE_SHARE:
             break
         worst = int(np.argmax(np.round(curved / np.max(curved), MODE_BITS)))
@@ -157,9 +157,9 @@ def _excited(a: FloatArray, b: FloatArray) -> np.ndarray:
     """Return the modes that the columns excite, to some bits; all of them where eigenvectors tell nothing."""
     balanced, scale = balanced_matrix(a)
     values, vectors = np.linalg.eig(balanced)
-    entering = b / scale[:, None]
+    balanced_b = b / scale[:, None]
     try:
-        sizes = np.abs(np.linalg.solve(vectors, entering.astype(complex))).max(axis=1, initial=0.0)
+        sizes = np.abs(np.linalg.solve(vectors, balanced_b.astype(complex))).max(axis=1, initial=0.0)
         values = values[sizes > UNMOVED_MODE * np.max(sizes, initial=0.0)]
     except np.linalg.LinAlgError:
         pass
@@ -173,24 +173,24 @@ def _excited(a: FloatArray, b: FloatArray) -> np.ndarray:
 
 def _groups(cuts: list[int], shared: int) -> list[tuple[int, int]]:
     """Return first and last node of neighbouring pieces of one length, at most ``shared`` of them."""
-    found, first = [], 0
+    groups, first = [], 0
     for k in range(1, len(cuts) + 1):
         if k == len(cuts) or cuts[k] != cuts[first] or k - first == shared:
-            found.append((first, k))
+            groups.append((first, k))
             first = k
-    return found
+    return groups
 
 
 def _reached(a: AffineMatrix, b: AffineMatrix) -> np.ndarray:
     """Return which states each column can reach at all ``(n, m)``."""
     moving = (a.magnitude > 0.0).astype(np.float64)
-    found = b.magnitude > 0.0
+    reached = b.magnitude > 0.0
     for _ in range(len(moving)):
-        more = found | (moving @ found > 0.0)
-        if np.array_equal(more, found):
+        more = reached | (moving @ reached > 0.0)
+        if np.array_equal(more, reached):
             break
-        found = more
-    return np.asarray(found)
+        reached = more
+    return np.asarray(reached)
 
 
 def _motions(
@@ -210,12 +210,12 @@ def _motions(
     with flint.ctx.workprec(BITS_OF_MOTIONS):
         matrix, vectors = arb_matrix(a.center), arb_matrix(b.center)
         exact = {width: (matrix * flint.arb(width)).exp() for width in set(widths)}
-        found = []
+        motions = []
         for width in [0.0, *widths]:
             vectors = exact[width] * vectors if width else vectors
             twice = matrix * (matrix * vectors)
-            found.append((vectors, twice, matrix * (matrix * twice)))
-        balls = [tuple(_as_affine(as_ball(part), a.count) for part in parts) for parts in found]
+            motions.append((vectors, twice, matrix * (matrix * twice)))
+        balls = [tuple(_as_affine(as_ball(part), a.count) for part in parts) for parts in motions]
     for node, second, last in balls:
         yield node, second, last
 
@@ -252,14 +252,14 @@ class _Modes(NamedTuple):
         norms = np.array([rounded_up(np.sqrt(np.sum(size[group] ** 2, axis=0)), 6) for group in self.groups])
         with np.errstate(over="ignore", invalid="ignore"):
             grown = exponential(self.M, width).magnitude @ norms
-        found = np.empty_like(size)
+        bounds = np.empty_like(size)
         for group, bound in zip(self.groups, rounded_up(np.nan_to_num(grown, nan=np.inf), len(norms) + 2), strict=True):
-            found[group] = bound
+            bounds[group] = bound
         if self.contraction is None:
-            return found
+            return bounds
         spread = rounded_up(columns.spread + columns.radius, 3)
-        whole = self.contraction.sizes(columns.center, spread) * np.exp(self.growth * width) * ROUNDED
-        return np.asarray(np.minimum(found, rounded_up(self.rows[:, None] * whole[None, :], 6)))
+        contracted = self.contraction.sizes(columns.center, spread) * np.exp(self.growth * width) * ROUNDED
+        return np.asarray(np.minimum(bounds, rounded_up(self.rows[:, None] * contracted[None, :], 6)))
 
 
 def _modes(a: AffineMatrix, length: float, *, apart: bool) -> _Modes:
@@ -281,12 +281,12 @@ def _modes(a: AffineMatrix, length: float, *, apart: bool) -> _Modes:
     values = np.linalg.eigvals(a.center)
     growth = max(float(np.max(values.real, initial=-np.inf)) + ADDED_DECAY / length, 0.0)
     shifted = Ball(a.center, rounded_up(a.spread + a.radius, 3)) - Ball.exact(growth * np.eye(len(a.center)))
-    found = prove_contraction(shifted, discrete=False)
-    if found is None:
+    contraction = prove_contraction(shifted, discrete=False)
+    if contraction is None:
         return _Modes(T, inverse, groups, M, None, growth, np.zeros(len(T)))
-    sizes = Ball(inverse.center, inverse.radius) @ Ball.exact(found.inverse)
-    rows = rounded_up(column_norms(sizes.T) / (1.0 - found.defect), 4)
-    return _Modes(T, inverse, groups, M, found, growth, rows)
+    sizes = Ball(inverse.center, inverse.radius) @ Ball.exact(contraction.inverse)
+    rows = rounded_up(column_norms(sizes.T) / (1.0 - contraction.defect), 4)
+    return _Modes(T, inverse, groups, M, contraction, growth, rows)
 
 
 def _coordinates(a: FloatArray) -> tuple[FloatArray, list[list[int]] | None]:
@@ -300,7 +300,7 @@ def _coordinates(a: FloatArray) -> tuple[FloatArray, list[list[int]] | None]:
             continue
         groups.append([len(columns)] if value.imag == 0.0 else [len(columns), len(columns) + 1])
         columns += [vector.real] if value.imag == 0.0 else [vector.real, vector.imag]
-    found = np.array(columns).T
-    if np.linalg.cond(found) > MOST_DEPENDENT:
+    basis = np.array(columns).T
+    if np.linalg.cond(basis) > MOST_DEPENDENT:
         return np.diag(scale), None
-    return scale[:, None] * found, groups
+    return scale[:, None] * basis, groups

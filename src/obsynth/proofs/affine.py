@@ -178,14 +178,14 @@ def affine_exponential(matrix: AffineMatrix) -> AffineMatrix:
     for k in range(TERMS, 0, -1):
         series = (small @ series).scaled(1.0 / k) + identity
     # With row sums of at most 1/2, the terms that are left out are less than twice the first of them.
-    bound, rest = small.magnitude, np.eye(size)
+    bound, remainder = small.magnitude, np.eye(size)
     for k in range(1, TERMS + 2):
-        rest = _up(bound @ rest / k, size + 3)
+        remainder = _up(bound @ remainder / k, size + 3)
     # Which entries of a power, the first or later, can be other than zero.
-    found = bound > 0.0
+    pattern = bound > 0.0
     for _ in range(len(bound).bit_length()):
-        found = found | (found.astype(np.float64) @ found.astype(np.float64) > 0.0)
-    series = series.enlarged(np.where(found, 2.0 * float(rest.sum(axis=1).max(initial=0.0)), 0.0))
+        pattern = pattern | (pattern.astype(np.float64) @ pattern.astype(np.float64) > 0.0)
+    series = series.enlarged(np.where(pattern, 2.0 * float(remainder.sum(axis=1).max(initial=0.0)), 0.0))
     for _ in range(doublings):
         series = series @ series
     return series
@@ -196,8 +196,8 @@ def affine_zero_order_hold(a: AffineMatrix, inputs: AffineMatrix, step: float) -
     nx, width = inputs.shape
     zero = AffineMatrix.exact(np.zeros((width, nx + width)), a.count)
     block = affine_block([[a, inputs]])
-    whole = affine_exponential(affine_block([[block], [zero]]).scaled(step))
-    return whole[:nx, :nx], whole[:nx, nx:]
+    transition = affine_exponential(affine_block([[block], [zero]]).scaled(step))
+    return transition[:nx, :nx], transition[:nx, nx:]
 
 
 def _up(value: FloatArray, operations: int) -> FloatArray:

@@ -71,15 +71,15 @@ class AffineNumber:
 
     def __add__(self, other: Any) -> AffineNumber:
         """Return the sum at the same q."""
-        given = self.lifted(other)
-        if given.center == 0.0 and not given.spread:
+        addend = self.lifted(other)
+        if addend.center == 0.0 and not addend.spread:
             return self
         if self.center == 0.0 and not self.spread:
-            return given
-        if self.is_whole and given.is_whole:
-            return self.lifted(self.center + given.center)
-        size = self.magnitude + given.magnitude
-        return self._rounded(self.center + given.center, self.parts + given.parts, self.radius + given.radius, size)
+            return addend
+        if self.is_whole and addend.is_whole:
+            return self.lifted(self.center + addend.center)
+        size = self.magnitude + addend.magnitude
+        return self._rounded(self.center + addend.center, self.parts + addend.parts, self.radius + addend.radius, size)
 
     def __neg__(self) -> AffineNumber:
         """Return the negative; exact."""
@@ -91,27 +91,31 @@ class AffineNumber:
 
     def __mul__(self, other: Any) -> AffineNumber:
         """Return the product at the same q."""
-        given = self.lifted(other)
-        for one, two in ((self, given), (given, self)):
-            if not two.spread and two.center in (0.0, 1.0, -1.0):
-                return AffineNumber(one.center * two.center, one.parts * two.center, one.radius * abs(two.center))
-        if self.is_whole and given.is_whole:
-            return self.lifted(self.center * given.center)
-        affine, theirs = float(np.abs(self.parts).sum()), float(np.abs(given.parts).sum())
-        radius = affine * theirs + self.radius * given.magnitude + self.magnitude * given.radius
+        factor = self.lifted(other)
+        for number, constant in ((self, factor), (factor, self)):
+            if not constant.spread and constant.center in (0.0, 1.0, -1.0):
+                return AffineNumber(
+                    number.center * constant.center,
+                    number.parts * constant.center,
+                    number.radius * abs(constant.center),
+                )
+        if self.is_whole and factor.is_whole:
+            return self.lifted(self.center * factor.center)
+        affine, theirs = float(np.abs(self.parts).sum()), float(np.abs(factor.parts).sum())
+        radius = affine * theirs + self.radius * factor.magnitude + self.magnitude * factor.radius
         return self._rounded(
-            self.center * given.center,
-            self.center * given.parts + given.center * self.parts,
+            self.center * factor.center,
+            self.center * factor.parts + factor.center * self.parts,
             radius,
-            self.magnitude * given.magnitude,
+            self.magnitude * factor.magnitude,
         )
 
     def __truediv__(self, other: Any) -> AffineNumber:
         """Return the quotient at the same q."""
-        given = self.lifted(other)
-        if not given.spread and given.center and math.frexp(given.center)[0] in (0.5, -0.5):
-            return self * (1.0 / given.center)
-        return self * given.reciprocal()
+        divisor = self.lifted(other)
+        if not divisor.spread and divisor.center and math.frexp(divisor.center)[0] in (0.5, -0.5):
+            return self * (1.0 / divisor.center)
+        return self * divisor.reciprocal()
 
     def reciprocal(self) -> AffineNumber:
         """Return one over this; refused where it can be zero."""
@@ -300,9 +304,9 @@ def affine_translation(count: int) -> Callable[[Callable[..., Any]], Callable[..
         if operation is np.where:
             return lambda condition, first, second: first if condition else second
         if operation in _OF_ONE:
-            one = _OF_ONE[operation]
-            return lambda x: one(zero.lifted(x))
-        two = _OF_TWO[operation]
-        return lambda x, y: two(zero.lifted(x), zero.lifted(y))
+            function = _OF_ONE[operation]
+            return lambda x: function(zero.lifted(x))
+        operator = _OF_TWO[operation]
+        return lambda x, y: operator(zero.lifted(x), zero.lifted(y))
 
     return translated

@@ -118,8 +118,8 @@ class Contraction:
         """Return ``(p, m)``: upper bounds on ``sum_j |c A^j b|`` of each row and column, from ``j = 0``."""
         sizes = self.sizes(columns, radius)
         product = Ball.exact(rows) @ Ball.exact(self.inverse)
-        shown = rounded_up(column_norms(product.T) / (1.0 - self.defect), 4)
-        return rounded_up(shown[:, None] * sizes[None, :] * self.factor, 4)
+        row_norms = rounded_up(column_norms(product.T) / (1.0 - self.defect), 4)
+        return rounded_up(row_norms[:, None] * sizes[None, :] * self.factor, 4)
 
 
 def column_norms(ball: Ball) -> FloatArray:
@@ -163,9 +163,9 @@ def proved_contractions(
     for share in TRIED_RATES:
         tried = 1.0 - (1.0 - share) * room if discrete else (1.0 - share) * room
         # Sums of squares lose no digits to the slowest mode; with many states they take too long.
-        found = _tried(ball, tried, discrete=discrete, sums_first=len(a) <= LYAPUNOV_SUMS_UP_TO)
-        if found is not None:
-            yield found
+        contraction = _tried(ball, tried, discrete=discrete, sums_first=len(a) <= LYAPUNOV_SUMS_UP_TO)
+        if contraction is not None:
+            yield contraction
 
 
 def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> float | None:
@@ -177,20 +177,20 @@ def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> 
         return None
     radius = float(np.max(np.abs(np.linalg.eigvals(ball.midpoint))))
     for share in TIGHT_RATES if radius < 1.0 else ():
-        found = prove_contraction(ball, discrete=True, rate=radius + share * (1.0 - radius))
-        if found is not None:
-            return found.rate
-    found = prove_contraction(ball, discrete=True) if known is None else known
-    return None if found is None else found.rate
+        contraction = prove_contraction(ball, discrete=True, rate=radius + share * (1.0 - radius))
+        if contraction is not None:
+            return contraction.rate
+    contraction = prove_contraction(ball, discrete=True) if known is None else known
+    return None if contraction is None else contraction.rate
 
 
 def _tried(ball: Ball, rate: float, *, discrete: bool, sums_first: bool) -> Contraction | None:
-    ways = (_summed_factor, _lyapunov_factor)
-    for way in (*(ways if sums_first else ways[::-1]), _precise_factor):
-        factor = way(ball.midpoint, rate, discrete=discrete)
-        found = None if factor is None else _proved(ball, factor, rate, discrete=discrete)
-        if found is not None:
-            return found
+    factors_of = (_summed_factor, _lyapunov_factor)
+    for factor_of in (*(factors_of if sums_first else factors_of[::-1]), _precise_factor):
+        factor = factor_of(ball.midpoint, rate, discrete=discrete)
+        contraction = None if factor is None else _proved(ball, factor, rate, discrete=discrete)
+        if contraction is not None:
+            return contraction
     return None
 
 
@@ -205,10 +205,10 @@ def _proved(ball: Ball, factor: FloatArray, rate: float, *, discrete: bool) -> C
 
     def formula(kind: type[Enclosed]) -> Enclosed:
         q, s = kind.exact(factor), kind.exact(inverse)
-        whole, moved = q @ s, q @ (kind.of(ball) @ s)
+        unit, moved = q @ s, q @ (kind.of(ball) @ s)
         if discrete:
-            return block([[(whole.T @ whole).scaled(rate), moved.T], [moved, kind.exact(np.eye(n)).scaled(rate)]])
-        half = whole.T @ (moved + whole.scaled(rate))
+            return block([[(unit.T @ unit).scaled(rate), moved.T], [moved, kind.exact(np.eye(n)).scaled(rate)]])
+        half = unit.T @ (moved + unit.scaled(rate))
         return -(half + half.T)
 
     if not prove_positive_definite(formula).proved:
@@ -226,23 +226,23 @@ def _summed_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray 
     W is I, or where I is lost beside such a sum, that sum with W = I: beside it this one is at most as large as the
     slowest mode is slow, however far the states are from each other.
     """
-    one = np.eye(len(a))
+    identity = np.eye(len(a))
     with np.errstate(all="ignore"):
         balanced, scale = balanced_matrix(a)
         if discrete:
-            power, start, size = balanced / rate if rate > 0.0 else np.full_like(balanced, np.nan), one, 1.0
+            power, start, size = balanced / rate if rate > 0.0 else np.full_like(balanced, np.nan), identity, 1.0
         else:
-            shifted = balanced + rate * one
+            shifted = balanced + rate * identity
             size = largest_singular_value(shifted) or 1.0
             try:
-                inverse = np.linalg.inv(size * one - shifted)
+                inverse = np.linalg.inv(size * identity - shifted)
             except np.linalg.LinAlgError:
                 return None
-            power, start = inverse @ (size * one + shifted), np.sqrt(2.0 * size) * inverse
-        found = _summed(power, start)
-        if found is not None and size * float(np.max(np.sum(found**2, axis=0))) > LARGEST_SUM:
-            found = _summed(power, found / np.max(np.abs(found)) @ start)
-        return None if found is None else np.asarray(np.triu(np.linalg.qr(found / scale[None, :], mode="r")))
+            power, start = inverse @ (size * identity + shifted), np.sqrt(2.0 * size) * inverse
+        root = _summed(power, start)
+        if root is not None and size * float(np.max(np.sum(root**2, axis=0))) > LARGEST_SUM:
+            root = _summed(power, root / np.max(np.abs(root)) @ start)
+        return None if root is None else np.asarray(np.triu(np.linalg.qr(root / scale[None, :], mode="r")))
 
 
 def _precise_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray | None:
@@ -253,14 +253,14 @@ def _precise_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray
         return None
     balanced, scale = balanced_matrix(a)
     with flint.ctx.workprec(PRECISE_BITS):
-        one, turned = arb_matrix(np.eye(n)), arb_matrix(balanced.T)
-        moving = turned * (1 / flint.arb(rate)) if discrete else turned + one * flint.arb(rate)
-        total = one
+        identity, turned = arb_matrix(np.eye(n)), arb_matrix(balanced.T)
+        moving = turned * (1 / flint.arb(rate)) if discrete else turned + identity * flint.arb(rate)
+        total = identity
         for _ in range(2):
-            found = enclosed_sum(moving, total, largest_singular_value(balanced) + rate, discrete=discrete)
-            if found is None:
+            enclosed = enclosed_sum(moving, total, largest_singular_value(balanced) + rate, discrete=discrete)
+            if enclosed is None:
                 return None
-            total = found.mid()
+            total = enclosed.mid()
         rows = total.tolist()
         for k in range(n):
             if not rows[k][k] > 0:
@@ -290,7 +290,7 @@ def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArra
     """Return an upper triangular Q with ``P = Q'Q`` near a solution; ``None`` where there is none."""
     from scipy.linalg import qr
 
-    one = np.eye(len(a))
+    identity = np.eye(len(a))
     with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
         # Scales of very different units are cast to positions of a permutation.
         balanced, scale = balanced_matrix(a)
@@ -300,11 +300,11 @@ def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArra
                 return np.asarray(root / scale)
         try:
             if discrete:
-                solution = discrete_lyapunov((balanced / rate).T, one) if rate > 0.0 else None
+                solution = discrete_lyapunov((balanced / rate).T, identity) if rate > 0.0 else None
             else:
-                shifted = balanced + rate * one
+                shifted = balanced + rate * identity
                 size = largest_singular_value(shifted) or 1.0
-                solution = continuous_lyapunov(shifted.T / size, -one)
+                solution = continuous_lyapunov(shifted.T / size, -identity)
         except (np.linalg.LinAlgError, ValueError):
             return None
     if solution is None or not np.all(np.isfinite(solution)):
@@ -320,14 +320,14 @@ def _root_of_sum(power: FloatArray) -> FloatArray | None:
     """Return an upper triangular Q with ``Q'Q`` near ``sum A^k' A^k``, in doubled steps; ``None`` where it has none.
 
     Of many states that is a third of the time of Schur vectors."""
-    found = np.eye(len(power))
+    total = np.eye(len(power))
     for _ in range(MOST_SUM_DOUBLINGS):
-        later = symmetric_product(power.T, found @ power)
-        found = found + later
-        if not np.all(np.isfinite(found)):
+        later = symmetric_product(power.T, total @ power)
+        total = total + later
+        if not np.all(np.isfinite(total)):
             return None
-        if np.all(np.diag(later) <= SUMS_SETTLED * np.diag(found)):
-            factor, failed = lapack.dpotrf(found, lower=0, clean=1)
+        if np.all(np.diag(later) <= SUMS_SETTLED * np.diag(total)):
+            factor, failed = lapack.dpotrf(total, lower=0, clean=1)
             return None if failed else np.asarray(factor)
         power = power @ power
     return None
@@ -379,5 +379,5 @@ def inverse_bound(matrix: FloatArray) -> FloatArray | None:
         return None
     # inverse = near (I - residual)^-1 = near (I + residual + ...); no entry of residual^k is larger than norm^k.
     more = norm / (1.0 - norm) * near.sum(axis=1, keepdims=True)
-    found = rounded_up(near + more, 2 * size + 8) * (1.0 + 8.0 * UNIT_ROUNDOFF)
-    return np.asarray(found * weights[:, None] / weights * (1.0 + 8.0 * UNIT_ROUNDOFF))
+    bound = rounded_up(near + more, 2 * size + 8) * (1.0 + 8.0 * UNIT_ROUNDOFF)
+    return np.asarray(bound * weights[:, None] / weights * (1.0 + 8.0 * UNIT_ROUNDOFF))

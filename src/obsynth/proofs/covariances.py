@@ -27,13 +27,14 @@ TRIED_BITS, MOST_COVARIANCE_DOUBLINGS, RADIUS = (160, 640), 100, 1e-9
 
 
 def certain_noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> FloatArray:
-    """Return `noise_covariance` where the trace by observability agrees, or the enclosed one; NaN where neither is had.
-    Infinite is that of a matrix with a pole on or outside the boundary, not of sums that rounding has blown up."""
-    found = noise_covariance(a, b, c, d, dt)
+    """Return `noise_covariance` where the trace by observability agrees, else the enclosed one; NaN without either.
+
+    It is infinite only where a pole lies on or outside the stability boundary, not where rounding blows sums up."""
+    covariance = noise_covariance(a, b, c, d, dt)
     # A variance below zero is rounding as well.
-    variance, again = float(np.trace(found)), float(np.trace(noise_covariance(a.T, c.T, b.T, d.T, dt)))
+    variance, again = float(np.trace(covariance)), float(np.trace(noise_covariance(a.T, c.T, b.T, d.T, dt)))
     if np.isfinite(variance) and abs(variance - again) <= SURE_DIFFERENCE * variance:
-        return found
+        return covariance
     exact = enclosed_noise_covariance(a, b, c, d, dt)
     if exact is not None:
         return exact
@@ -41,7 +42,7 @@ def certain_noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: Flo
         known = abs(variance - again) <= AGREEMENT * variance
     else:
         known = not np.isfinite(again) and not abscissa(a, dt) < (1.0 if dt > 0.0 else 0.0)
-    return found if known else np.full_like(found, np.nan)
+    return covariance if known else np.full_like(covariance, np.nan)
 
 
 def enclosed_noise_covariance(
@@ -58,15 +59,15 @@ def enclosed_noise_covariance(
             states = enclosed_sum(arb_matrix(a), driven, largest_singular_value(a) or 1.0, discrete=dt > 0.0)
             if states is None:
                 continue
-            shown = arb_matrix(c) * states * arb_matrix(c).transpose()
+            outputs = arb_matrix(c) * states * arb_matrix(c).transpose()
             if dt > 0.0:
-                shown = shown + arb_matrix(d) * arb_matrix(d).transpose()
-            values = np.reshape(shown.entries(), (len(c), len(c)))
-            found = np.array([[float(value.mid()) for value in row] for row in values]).reshape(values.shape)
+                outputs = outputs + arb_matrix(d) * arb_matrix(d).transpose()
+            values = np.reshape(outputs.entries(), (len(c), len(c)))
+            covariance = np.array([[float(value.mid()) for value in row] for row in values]).reshape(values.shape)
             radii = np.array([[float(value.rad()) for value in row] for row in values]).reshape(values.shape)
-        sizes = np.sqrt(np.maximum(np.diag(found), 0.0))
-        if np.all(np.isfinite(found)) and np.all(radii <= RADIUS * np.outer(sizes, sizes)):
-            return found
+        sizes = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        if np.all(np.isfinite(covariance)) and np.all(radii <= RADIUS * np.outer(sizes, sizes)):
+            return covariance
     return None
 
 
@@ -76,20 +77,20 @@ def enclosed_sum(a: Any, weight: Any, size: float, *, discrete: bool) -> Any | N
     n = a.nrows()
     states, power = weight, a
     if not discrete:
-        one = flint.arb_mat(n, n, [float(i == j) for i in range(n) for j in range(n)]) * flint.arb(size)
+        identity = flint.arb_mat(n, n, [float(i == j) for i in range(n) for j in range(n)]) * flint.arb(size)
         try:
-            inverse = (one - a).inv()
+            inverse = (identity - a).inv()
         except ZeroDivisionError:
             return None
-        states, power = inverse * states * inverse.transpose() * flint.arb(2.0 * size), inverse * (one + a)
+        states, power = inverse * states * inverse.transpose() * flint.arb(2.0 * size), inverse * (identity + a)
     for _ in range(MOST_COVARIANCE_DOUBLINGS):
         states, power = states + power * states * power.transpose(), power * power
-        left = squared_norm(power)
-        if not left.is_finite():
+        decay = squared_norm(power)
+        if not decay.is_finite():
             return None
-        if left < flint.arb(2) ** (-flint.ctx.prec):
-            rest = (left * squared_norm(states).sqrt() / (1 - left)).upper()
-            ball = flint.arb(0, rest)
+        if decay < flint.arb(2) ** (-flint.ctx.prec):
+            remainder = (decay * squared_norm(states).sqrt() / (1 - decay)).upper()
+            ball = flint.arb(0, remainder)
             return states + flint.arb_mat(n, n, [ball] * (n * n))
     return None
 

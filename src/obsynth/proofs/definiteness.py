@@ -127,11 +127,11 @@ def _symmetric(ball: Ball) -> Ball:
         for rows, columns in (
             (slice(i, i + PANEL_ROWS), slice(j, j + PANEL_ROWS)) for i in starts for j in starts[i // PANEL_ROWS :]
         ):
-            one, other = ball.midpoint[rows, columns], ball.midpoint[columns, rows].T
-            middle[rows, columns] = 0.5 * (one + other)
+            block, mirrored = ball.midpoint[rows, columns], ball.midpoint[columns, rows].T
+            middle[rows, columns] = 0.5 * (block + mirrored)
             middle[columns, rows] = middle[rows, columns].T
             # The difference of the midpoints more than covers the rounding of their average.
-            size = np.maximum(ball.radius[rows, columns], ball.radius[columns, rows].T) + np.abs(one - other)
+            size = np.maximum(ball.radius[rows, columns], ball.radius[columns, rows].T) + np.abs(block - mirrored)
             radius[rows, columns] = rounded_up(size, 4)
             radius[columns, rows] = radius[rows, columns].T
     return Ball(middle, radius)
@@ -158,9 +158,9 @@ def _by_cholesky(ball: Ball, means: Means = "Cholesky") -> DefinitenessProof:
         )
         return DefinitenessProof(False, min(estimate - error, 0.0), error, reason=reason)
     # That is a proof.  How much there is besides is estimated, and proved by another factorisation.
-    left = _smallest_eigenvalue(factor)
+    smallest = _smallest_eigenvalue(factor)
     for share in EIGENVALUE_SHARES:
-        larger = shift + share * left
+        larger = shift + share * smallest
         if larger > shift and _shifted_factor(ball.midpoint, larger) is not None:
             return DefinitenessProof(True, larger - error, error, means)
     return DefinitenessProof(True, shift - error, error, means)
@@ -207,18 +207,18 @@ def _in_more_digits(formula: Formula, exponents: NDArray[np.int64], first: Defin
     if first.lower_bound < -2.0 * first.error_bound:
         return first  # negative beyond all errors
     if len(exponents) > LARGEST_ORDER:
-        told = f"ball arithmetic is tried up to order {LARGEST_ORDER}, this is {len(exponents)}"
-        return replace(first, reason=f"{first.reason}; {told}")
+        reason = f"ball arithmetic is tried up to order {LARGEST_ORDER}, this is {len(exponents)}"
+        return replace(first, reason=f"{first.reason}; {reason}")
     units = np.diag(np.ldexp(1.0, exponents))
 
     def scaled(kind: type[Enclosed]) -> Enclosed:
         change = kind.exact(units)
         return change @ formula(kind) @ change
 
-    bound, told = prove_by_ball_arithmetic(scaled)
+    bound, reason = prove_by_ball_arithmetic(scaled)
     if bound is None:
-        return replace(first, reason=f"{first.reason}; {told}")
-    return DefinitenessProof(True, bound, first.error_bound, "ball arithmetic", told)
+        return replace(first, reason=f"{first.reason}; {reason}")
+    return DefinitenessProof(True, bound, first.error_bound, "ball arithmetic", reason)
 
 
 def _shifted_factor(matrix: FloatArray, shift: float) -> FloatArray | None:

@@ -89,13 +89,13 @@ class EnclosedPencil:
     def zero_coefficients(self) -> list[Any]:
         """Coefficients, lowest first, of a polynomial whose roots are the finite zeros; the columns must be full."""
         with flint.ctx.workprec(self.bits):
-            found = self._determinant(0)
+            divisor = self._determinant(0)
             rows, columns = self.shape
             for seed in (1, 2) if rows > columns else ():
-                if len(found) == 1:
+                if len(divisor) == 1:
                     break
-                found = greatest_common_divisor(found, self._determinant(seed))
-            return found
+                divisor = greatest_common_divisor(divisor, self._determinant(seed))
+            return divisor
 
     @property
     def zeros(self) -> tuple[complex, ...]:
@@ -127,15 +127,15 @@ class EnclosedPencil:
         rng = random.Random(POINTS_SEED + seed)
         e, a = arb_mat(self.E), arb_mat(self.A)
         if rows > columns:
-            left = arb_mat(columns, rows, [rng.randint(-4096, 4096) for _ in range(columns * rows)])
-            e, a = left * e, left * a
+            compression = arb_mat(columns, rows, [rng.randint(-4096, 4096) for _ in range(columns * rows)])
+            e, a = compression * e, compression * a
         shift = arb(flint.fmpq(rng.randrange(1 << 20), 1 << 19))
         # det(a - z e) = det(s0) det(I - t s0^-1 e), t = z - shift: the reversed characteristic polynomial.
         characteristic = (a - e * shift).solve(e).charpoly().coeffs()
         degree = int(self.E.rank())
-        found = characteristic[::-1][: degree + 1]
+        coefficients = characteristic[::-1][: degree + 1]
         # The coefficients of p(z - shift).
-        moved = list(found)
+        moved = list(coefficients)
         for start in range(len(moved)):
             for i in range(len(moved) - 2, start - 1, -1):
                 moved[i] = moved[i] + (-shift) * moved[i + 1]
@@ -166,7 +166,7 @@ def _normalised(coefficients: Sequence[Any]) -> list[Any]:
 
 
 def _trimmed(coefficients: Sequence[Any]) -> list[Any]:
-    found = list(coefficients)
-    while found and found[-1].contains(0):
-        found.pop()
-    return found
+    trimmed = list(coefficients)
+    while trimmed and trimmed[-1].contains(0):
+        trimmed.pop()
+    return trimmed

@@ -195,16 +195,16 @@ def written_matrix(matrix: FloatArray) -> fmpq_mat:
     powers = [0, *(power for _, power in decimals.values())]
     least = min(powers)
     tens = [10**power for power in range(max(powers) - least + 1)]
-    whole = {value: int(digits) * tens[power - least] for value, (digits, power) in decimals.items()}
-    found: fmpq_mat = fmpq_mat(fmpz_mat(rows, columns, [whole[value] for value in values])) / fmpz(10) ** -least
-    return found
+    integers = {value: int(digits) * tens[power - least] for value, (digits, power) in decimals.items()}
+    rational: fmpq_mat = fmpq_mat(fmpz_mat(rows, columns, [integers[value] for value in values])) / fmpz(10) ** -least
+    return rational
 
 
 def stored_matrix(matrix: FloatArray) -> fmpq_mat:
     """Return a matrix ``(m, n)`` of doubles as the rational numbers that are stored, whatever they stand for."""
-    (whole,), unit = whole_matrices([matrix])
-    found: fmpq_mat = fmpq_mat(whole) / unit
-    return found
+    (integers,), unit = whole_matrices([matrix])
+    rational: fmpq_mat = fmpq_mat(integers) / unit
+    return rational
 
 
 def scaled_integers(doubles: FloatArray) -> ScaledIntegers:
@@ -222,15 +222,17 @@ def whole_matrices(matrices: Sequence[FloatArray]) -> tuple[list[fmpz_mat], fmpz
     """Return matrices of doubles as they are stored, times a power of two that makes all entries whole, and that."""
     parts = [np.frexp(matrix) for matrix in matrices]
     least = min(int(np.min(powers, initial=0, where=half != 0.0)) for half, powers in parts) - MANTISSA_BITS
-    found = []
+    scaled = []
     for half, powers in parts:
-        whole, shifts = np.ldexp(half, MANTISSA_BITS).astype(np.int64), powers - MANTISSA_BITS - least
+        integers, shifts = np.ldexp(half, MANTISSA_BITS).astype(np.int64), powers - MANTISSA_BITS - least
         # What is zero is not shifted.
-        shifts = np.where(whole != 0, shifts, 0)
-        shifted = [value << shift for value, shift in zip(whole.ravel().tolist(), shifts.ravel().tolist(), strict=True)]
+        shifts = np.where(integers != 0, shifts, 0)
+        shifted = [
+            value << shift for value, shift in zip(integers.ravel().tolist(), shifts.ravel().tolist(), strict=True)
+        ]
         rows, columns = half.shape
-        found.append(fmpz_mat(rows, columns, shifted))
-    return found, fmpz(2) ** -least
+        scaled.append(fmpz_mat(rows, columns, shifted))
+    return scaled, fmpz(2) ** -least
 
 
 def rational_matrix(rows: FractionRows, columns: int) -> fmpq_mat:
@@ -293,13 +295,13 @@ def locate_roots(polynomial: fmpz_poly, *, discrete: bool) -> tuple[Root, ...]:
     at_minus = [(-1) ** power * coefficient for power, coefficient in enumerate(coefficients)]
     mirror = fmpz_poly(coefficients[::-1] if discrete else at_minus)
     common = polynomial.gcd(mirror)
-    found: list[Root] = []
+    roots: list[Root] = []
     # Origin: under the mirror of the unit circle it goes to infinity, and reversing has dropped it.
-    others = primitive(fmpq_poly(polynomial) / fmpq_poly(common)) if common.degree() > 0 else polynomial
-    for part, may_lie_on_boundary in ((common, True), (others, False)):
-        found += _isolated(part, discrete=discrete, may_lie_on_boundary=may_lie_on_boundary)
-    found.sort(key=lambda root: -(abs(root.value) if discrete else root.value.real))
-    return tuple(found)
+    remaining = primitive(fmpq_poly(polynomial) / fmpq_poly(common)) if common.degree() > 0 else polynomial
+    for part, may_lie_on_boundary in ((common, True), (remaining, False)):
+        roots += _isolated(part, discrete=discrete, may_lie_on_boundary=may_lie_on_boundary)
+    roots.sort(key=lambda root: -(abs(root.value) if discrete else root.value.real))
+    return tuple(roots)
 
 
 def primitive(polynomial: fmpq_poly) -> fmpz_poly:
@@ -318,18 +320,18 @@ def _isolated(polynomial: fmpz_poly, *, discrete: bool, may_lie_on_boundary: boo
     if polynomial.degree() <= 0:
         return []
     bits = FIRST_BITS
-    found: list[tuple[flint.acb, int, str]] = []
+    enclosures: list[tuple[flint.acb, int, str]] = []
     for _ in range(MOST_DIGIT_DOUBLINGS):
         with flint.ctx.workprec(bits):
             pairs: Any = polynomial.complex_roots()
-            found = [(root, int(times), _side(root, discrete)) for root, times in pairs]
-        if all(side != "boundary" for _, _, side in found):
+            enclosures = [(root, int(times), _side(root, discrete)) for root, times in pairs]
+        if all(side != "boundary" for _, _, side in enclosures):
             break
         # What mirrors itself within so many digits cannot be one of a pair: those are further apart.
         if may_lie_on_boundary and bits > _separation_bits(polynomial):
             break
         bits *= 2
-    return [Root(_value(root, side, discrete), times, side) for root, times, side in found]
+    return [Root(_value(root, side, discrete), times, side) for root, times, side in enclosures]
 
 
 def _side(root: flint.acb, discrete: bool) -> str:
@@ -354,5 +356,5 @@ def _value(root: flint.acb, side: str, discrete: bool) -> complex:
 
 def rounded_outward(value: Fraction) -> float:
     """Return a double that is not below a rational number."""
-    found = float(value)
-    return found if Fraction(found) >= value else float(np.nextafter(found, np.inf))
+    nearest = float(value)
+    return nearest if Fraction(nearest) >= value else float(np.nextafter(nearest, np.inf))

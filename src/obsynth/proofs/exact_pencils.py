@@ -85,20 +85,20 @@ class ExactPencil:
         rank = self.normal_rank
         if rank == 0 or self._degree == 0 or self._has_no_zero_modulo(rank):
             return fmpz_poly([1])
-        found = self._compressed_determinant(rank)
+        divisor = self._compressed_determinant(rank)
         if self.shape == (rank, rank):
-            return found
+            return divisor
         for _ in range(_MOST_COMPRESSIONS):
-            if found.degree() == 0:
+            if divisor.degree() == 0:
                 break
-            if self._is_coprime_modulo(found, rank):
+            if self._is_coprime_modulo(divisor, rank):
                 return fmpz_poly([1])
-            other = found.gcd(self._compressed_determinant(rank))
-            settled = other.degree() == found.degree() and other.degree() < self._degree
-            found = primitive(fmpq_poly(other))
+            other = divisor.gcd(self._compressed_determinant(rank))
+            settled = other.degree() == divisor.degree() and other.degree() < self._degree
+            divisor = primitive(fmpq_poly(other))
             if settled:
                 break
-        return found
+        return divisor
 
     def zeros(self, *, discrete: bool) -> tuple[Root, ...]:
         """Return the finite zeros and where they are: exact, however close to the stability boundary."""
@@ -122,9 +122,9 @@ class ExactPencil:
             companion[row, degree - 1] = -fmpq(polynomial[row], polynomial[degree])
             if row:
                 companion[row, row - 1] = fmpq(1)
-        one, pairs = identity(degree), zip(self.A.tolist(), self.E.tolist(), strict=True)
-        whole = blocks([[one * a - companion * e for a, e in zip(*pair, strict=True)] for pair in pairs])
-        return int(whole.rank()) // degree
+        unit, pairs = identity(degree), zip(self.A.tolist(), self.E.tolist(), strict=True)
+        substituted = blocks([[unit * a - companion * e for a, e in zip(*pair, strict=True)] for pair in pairs])
+        return int(substituted.rank()) // degree
 
     @cached_property
     def index(self) -> int | None:
@@ -178,15 +178,15 @@ class ExactPencil:
 
         A minor of all columns has the columns in which E is zero. Where A is zero in them too in the rows without E,
         each takes up one of the rows with E."""
-        found, columns = min(self._degree, rank), self.shape[1]
+        degree, columns = min(self._degree, rank), self.shape[1]
         if rank < columns:
-            return found
+            return degree
         e, a = (part.tolist() for part in self._plain_integers)
         moving = [any(row) for row in e]
         still = [j for j in range(columns) if not any(row[j] for row in e)]
         if any(row[j] for row, moves in zip(a, moving, strict=True) if not moves for j in still):
-            return found
-        return min(found, sum(moving) - len(still))
+            return degree
+        return min(degree, sum(moving) - len(still))
 
     @cached_property
     def _rng(self) -> random.Random:
@@ -221,15 +221,15 @@ class ExactPencil:
         coefficients = start.solve(e).charpoly().coeffs()
         return nmod_poly([int(value) for value in coefficients[::-1]], prime)
 
-    def _compressed(self, whole: tuple[Any, Any], rank: int) -> tuple[Any, Any]:
+    def _compressed(self, pencil: tuple[Any, Any], rank: int) -> tuple[Any, Any]:
         """Return both matrices with rows and columns compressed at random to the normal rank."""
-        (e, a), (rows, columns) = whole, self.shape
+        (e, a), (rows, columns) = pencil, self.shape
         if rows > rank:
-            left = self._random(rank, rows)
-            e, a = left * e, left * a
+            row_compression = self._random(rank, rows)
+            e, a = row_compression * e, row_compression * a
         if columns > rank:
-            right = self._random(columns, rank)
-            e, a = e * right, a * right
+            column_compression = self._random(columns, rank)
+            e, a = e * column_compression, a * column_compression
         return e, a
 
     def _compressed_determinant(self, rank: int) -> fmpz_poly:
@@ -267,7 +267,7 @@ def _determinant(e: fmpz_mat, a: fmpz_mat, degree: int) -> fmpz_poly:
         return fmpz_poly([0])
     start = _at(e, a, shift)
     limit, product = 2 * _largest_coefficient(e, start), 1
-    found = [0] * (degree + 1)
+    residues = [0] * (degree + 1)
     for prime in map(_prime, count()):
         if product > limit:
             break
@@ -278,9 +278,9 @@ def _determinant(e: fmpz_mat, a: fmpz_mat, degree: int) -> fmpz_poly:
         coefficients = inner.solve(nmod_mat(e, prime)).charpoly().coeffs()[::-1]
         inverse = pow(product, -1, prime)
         for k, coefficient in enumerate(coefficients[: degree + 1]):
-            found[k] += product * ((size * int(coefficient) - found[k]) * inverse % prime)
+            residues[k] += product * ((size * int(coefficient) - residues[k]) * inverse % prime)
         product *= prime
-    moved = fmpz_poly([value - product if 2 * value > product else value for value in found])
+    moved = fmpz_poly([value - product if 2 * value > product else value for value in residues])
     return primitive(fmpq_poly(moved(fmpz_poly([-shift, 1]))))
 
 

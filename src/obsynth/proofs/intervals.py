@@ -63,10 +63,10 @@ class Interval:
 
     def __add__(self, other: Any) -> Interval:
         """Return all sums."""
-        given = Interval.of(other)
-        if given.low == given.high == 0.0:
+        addend = Interval.of(other)
+        if addend.low == addend.high == 0.0:
             return self
-        return Interval.outward(self.low + given.low, self.high + given.high)
+        return Interval.outward(self.low + addend.low, self.high + addend.high)
 
     def __neg__(self) -> Interval:
         """Return all negatives; exact."""
@@ -78,19 +78,19 @@ class Interval:
 
     def __mul__(self, other: Any) -> Interval:
         """Return all products."""
-        given = Interval.of(other)
-        for one, two in ((self, given), (given, self)):
-            if two.is_point and two.low in (1.0, -1.0):
-                return one if two.low > 0.0 else -one
-        products = [x * y for x in (self.low, self.high) for y in (given.low, given.high)]
+        factor = Interval.of(other)
+        for interval, constant in ((self, factor), (factor, self)):
+            if constant.is_point and constant.low in (1.0, -1.0):
+                return interval if constant.low > 0.0 else -interval
+        products = [x * y for x in (self.low, self.high) for y in (factor.low, factor.high)]
         return Interval.outward(min(products), max(products))
 
     def __truediv__(self, other: Any) -> Interval:
         """Return all quotients; refused where the divisor can be zero."""
-        given = Interval.of(other)
-        if given.low <= 0.0 <= given.high:
-            raise _unbounded(f"a divisor lies between {given.low:.4g} and {given.high:.4g} and can be zero")
-        quotients = [x / y for x in (self.low, self.high) for y in (given.low, given.high)]
+        divisor = Interval.of(other)
+        if divisor.low <= 0.0 <= divisor.high:
+            raise _unbounded(f"a divisor lies between {divisor.low:.4g} and {divisor.high:.4g} and can be zero")
+        quotients = [x / y for x in (self.low, self.high) for y in (divisor.low, divisor.high)]
         return Interval.outward(min(quotients), max(quotients))
 
     def __pow__(self, other: Any) -> Interval:
@@ -99,8 +99,8 @@ class Interval:
         if exponent.is_point and exponent.low.is_integer():
             return self._whole_power(int(exponent.low))
         if self.low >= 0.0 and exponent.is_point and exponent.low > 0.0:
-            found = Interval.outward(self.low**exponent.low, self.high**exponent.low, FUNCTION_ROUNDINGS)
-            return Interval(max(found.low, 0.0), found.high)
+            power = Interval.outward(self.low**exponent.low, self.high**exponent.low, FUNCTION_ROUNDINGS)
+            return Interval(max(power.low, 0.0), power.high)
         if not self.low > 0.0:
             raise _unbounded(
                 f"the base of a power lies between {self.low:.4g} and {self.high:.4g}: it must be positive"
@@ -118,8 +118,8 @@ class Interval:
         low, high = self.low**n, self.high**n
         if n % 2 == 0:
             least = 0.0 if self.low <= 0.0 <= self.high else min(low, high)
-            found = Interval.outward(least, max(low, high), FUNCTION_ROUNDINGS)
-            return Interval(max(found.low, 0.0), found.high)
+            power = Interval.outward(least, max(low, high), FUNCTION_ROUNDINGS)
+            return Interval(max(power.low, 0.0), power.high)
         return Interval.outward(low, high, FUNCTION_ROUNDINGS)
 
 
@@ -191,7 +191,7 @@ def enclosed_range(
     start = tuple(box)
     middle = [0.5 * (low + high) for low, high in start]
     corners = itertools.islice(itertools.product(*start), MOST_BOXES)
-    known = [found for point in (*corners, middle) if math.isfinite(found := value(point))]
+    known = [number for point in (*corners, middle) if math.isfinite(number := value(point))]
     attained_low, attained_high, boxes = min(known, default=math.inf), max(known, default=-math.inf), 1
     width = max(attained_high - attained_low, 0.0)
     ends: dict[float, float] = {}
@@ -229,8 +229,8 @@ def _least(
     """Return how many boxes were tried, a lower bound of ``sign`` times the function, and a value that it takes."""
 
     def bound(part: Part) -> float:
-        found = enclosure(part)
-        return found.low if sign > 0.0 else -found.high
+        interval = enclosure(part)
+        return interval.low if sign > 0.0 else -interval.high
 
     trouble: PreconditionError | None = None
     try:
@@ -250,8 +250,8 @@ def _least(
         if not part[place][0] < middle < part[place][1]:
             done = min(done, low)
             continue
-        taken = value([0.5 * (a + b) for a, b in part])
-        best = min(best, sign * taken) if math.isfinite(taken) else best
+        attained = value([0.5 * (a + b) for a, b in part])
+        best = min(best, sign * attained) if math.isfinite(attained) else best
         for ends in ((part[place][0], middle), (middle, part[place][1])):
             child = (*part[:place], ends, *part[place + 1 :])
             count += 1
@@ -285,8 +285,8 @@ def _waves(function: Callable[[float], float], first_peak: float) -> Callable[[I
 
     def taken(x: Interval) -> Interval:
         ends = function(x.low), function(x.high)
-        found = Interval.outward(min(ends), max(ends), FUNCTION_ROUNDINGS)
-        low, high = found.low, found.high
+        hull = Interval.outward(min(ends), max(ends), FUNCTION_ROUNDINGS)
+        low, high = hull.low, hull.high
         # A little early: a peak that may lie within is taken to lie within.
         slack = FUNCTION_ROUNDINGS * np.finfo(np.float64).eps * (1.0 + max(abs(x.low), abs(x.high)))
         for peak, value in ((first_peak, 1.0), (first_peak + math.pi, -1.0)):
@@ -367,10 +367,10 @@ _OF_TWO: dict[Callable[..., Any], Callable[[Interval, Interval], Any]] = {
 def interval_operation(operation: Callable[..., Any]) -> Callable[..., Any]:
     """Return numpy's operation on intervals, for `Expression.translated`."""
     if operation in _OF_ONE:
-        one = _OF_ONE[operation]
-        return lambda x: one(Interval.of(x))
+        function = _OF_ONE[operation]
+        return lambda x: function(Interval.of(x))
     if operation in _OF_TWO:
-        two = _OF_TWO[operation]
-        return lambda x, y: two(Interval.of(x), Interval.of(y))
+        operator = _OF_TWO[operation]
+        return lambda x, y: operator(Interval.of(x), Interval.of(y))
     # Both branches are possible until a comparison is decided: a choice between formulas may jump.
     raise _unbounded(f"{getattr(operation, '__name__', 'where')} chooses between formulas, which may jump")

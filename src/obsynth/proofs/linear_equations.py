@@ -26,9 +26,9 @@ def enclosed_solution(matrix: Enclosed, right: Enclosed) -> Enclosed | None:
     ``None`` without a proof that every M is nonsingular."""
     if not right.shape[0]:
         return right
-    given: Any = (matrix, right)
-    found: Any = _solved_in_digits(*given) if isinstance(right, ExtendedBall) else _solved_in_doubles(*given)
-    return cast("Enclosed | None", found)
+    equations: Any = (matrix, right)
+    solution: Any = _solved_in_digits(*equations) if isinstance(right, ExtendedBall) else _solved_in_doubles(*equations)
+    return cast("Enclosed | None", solution)
 
 
 def _solved_in_digits(matrix: ExtendedBall, right: ExtendedBall) -> Any:
@@ -44,16 +44,16 @@ def _solved_in_doubles(matrix: Ball, right: Ball) -> Ball | None:
     # Powers of two change no digit.
     rows, columns = equilibrating_factors(np.abs(matrix.midpoint))
     scaled = Ball(*(rows[:, None] * part * columns for part in (matrix.midpoint, matrix.radius)))
-    given = Ball(rows[:, None] * right.midpoint, rows[:, None] * right.radius)
+    scaled_right = Ball(rows[:, None] * right.midpoint, rows[:, None] * right.radius)
     try:
         inverse = np.asarray(np.linalg.inv(scaled.midpoint), dtype=np.float64)
     except np.linalg.LinAlgError:
         return None
-    guess: FloatArray = inverse @ given.midpoint
-    guess = guess + inverse @ (given.midpoint - scaled.midpoint @ guess)
+    guess: FloatArray = inverse @ scaled_right.midpoint
+    guess = guess + inverse @ (scaled_right.midpoint - scaled.midpoint @ guess)
     missing = Ball.exact(np.eye(len(inverse))) - Ball.exact(inverse) @ scaled
     share = float(np.max(rounded_up(missing.magnitude.sum(axis=1), len(inverse) + 2)))
-    apart = (Ball.exact(inverse) @ (given - scaled @ Ball.exact(guess))).magnitude
+    apart = (Ball.exact(inverse) @ (scaled_right - scaled @ Ball.exact(guess))).magnitude
     if not share < MOST_MISSING or not np.all(np.isfinite(apart)):
         return None
     radius = rounded_up(apart + share / (1.0 - share) * np.max(apart, axis=0, keepdims=True), 6)

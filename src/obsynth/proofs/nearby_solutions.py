@@ -75,22 +75,22 @@ def nearby_solution(
     square = SquarePart.of(matrix, radius, weight, units)
     if square is None:
         return _solved_in_rationals(matrix, weight, values, missing, refine=refine)
-    given = values.copy()
+    original = values.copy()
     if refine:
-        left = np.inf
+        smallest = np.inf
         for _ in range(RATIONAL_REFINEMENTS):
             lacking = np.array([float(value) for value in missing(values)])
             size = float(np.max(np.abs(square.step(lacking) / np.ldexp(1.0, square.columns)), initial=0.0))
-            if not size < 0.5 * left:
+            if not size < 0.5 * smallest:
                 break
-            left = size
+            smallest = size
             values[square.chosen] += square.step(lacking)
         sizes = np.abs(np.ldexp(values, -units))
         values[sizes < ROUNDED_VALUE * float(np.max(sizes, initial=0.0))] = 0.0
     bound = square.proved_step(missing(values))
     if bound is None:
         # Rows may depend on each other though rounding hides it; such a part has led values astray.
-        return _solved_in_rationals(matrix, weight, given, missing, refine=refine)
+        return _solved_in_rationals(matrix, weight, original, missing, refine=refine)
     distance = np.zeros(len(values))
     # What is chosen is seen by its radius, though it may be exact.
     distance[square.chosen] = np.maximum(bound, np.finfo(np.float64).tiny)
@@ -141,11 +141,11 @@ def rational_correction(
         return None
     correction = [Fraction(int(step[k, 0].p), int(step[k, 0].q)) for k in range(rank)]
     for row in set(range(len(matrix))) - set(rows.tolist()):
-        seen = sum(
+        product = sum(
             (Fraction(float(matrix[row, c])) * d for c, d in zip(columns, correction, strict=True) if matrix[row, c]),
             start=Fraction(0),
         )
-        if seen != exact[row]:
+        if product != exact[row]:
             return None
     return columns.tolist(), correction
 
@@ -215,8 +215,8 @@ class SquarePart:
             matrix = arb_mat(count, count, [arb(value) for value in self.part.midpoint.ravel().tolist()])
             exact = [Fraction(value) * Fraction(2) ** int(e) for value, e in zip(right, self.rows, strict=True)]
             sides = arb_mat(count, 1, [arb(fmpq(value.numerator, value.denominator)) for value in exact])
-            found = matrix.solve(sides)
-            sizes = [abs(found[k, 0]).upper() for k in range(count)]
+            solution = matrix.solve(sides)
+            sizes = [abs(solution[k, 0]).upper() for k in range(count)]
         except ZeroDivisionError:
             return None
         finally:
@@ -228,5 +228,5 @@ class SquarePart:
         """Return the same for a right side of at most these sizes, where the contraction is below one."""
         magnitude = Ball.exact(np.abs(self.inverse)) @ Ball.exact(np.ldexp(sizes, self.rows)[:, None])
         first = magnitude.magnitude.ravel()
-        rest = self.contraction / (1.0 - self.contraction) * float(np.max(first, initial=0.0))
-        return np.asarray(np.ldexp(rounded_up(first + rest, 8), self.columns))
+        remainder = self.contraction / (1.0 - self.contraction) * float(np.max(first, initial=0.0))
+        return np.asarray(np.ldexp(rounded_up(first + remainder, 8), self.columns))

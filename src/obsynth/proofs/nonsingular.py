@@ -29,10 +29,10 @@ def is_nonsingular_exactly(matrix: FloatArray) -> bool:
     if matrix.shape != (count, count):
         return False
     mantissas, exponents = np.frexp(matrix)
-    whole, places = np.ldexp(mantissas, 53).astype(np.int64).ravel().tolist(), exponents.ravel().tolist()
+    integers, places = np.ldexp(mantissas, 53).astype(np.int64).ravel().tolist(), exponents.ravel().tolist()
     for prime in PRIMES:
         powers = {place: pow(2, place, prime) for place in set(places)}
-        entries = [number * powers[place] % prime for number, place in zip(whole, places, strict=True)]
+        entries = [number * powers[place] % prime for number, place in zip(integers, places, strict=True)]
         if flint.nmod_mat(count, count, entries, prime).rank() == count:
             return True
     return False

@@ -97,11 +97,11 @@ def peak_sums(
 
 def _block(rows: FloatArray, moving: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return rows ``(p, n)`` moved zero times and more, ``(steps, p, n)``, and moved once more than the last."""
-    found = np.empty((STEPS_AT_ONCE, *rows.shape))
-    found[0] = rows
+    moved = np.empty((STEPS_AT_ONCE, *rows.shape))
+    moved[0] = rows
     for i in range(1, STEPS_AT_ONCE):
-        np.matmul(found[i - 1], moving, out=found[i])
-    return found, found[-1] @ moving
+        np.matmul(moved[i - 1], moving, out=moved[i])
+    return moved, moved[-1] @ moving
 
 
 def _missed(matrix: Ball, sizes: FloatArray, growth: float) -> FloatArray:
@@ -157,8 +157,8 @@ def interval_pieces(a: FloatArray, b: FloatArray, into: Ball, length: float) -> 
             at, first = transition @ at, transition @ first
             third = growth @ (ball_a @ first).magnitude
     # What is left, of any sign, in every coordinate at once: as many columns as coordinates.
-    rest = Ball(np.zeros((into.shape[0], m)), rounded_up(into.magnitude @ largest, 2 * len(a) + 6))
-    parts.append(rest)
+    remainder = Ball(np.zeros((into.shape[0], m)), rounded_up(into.magnitude @ largest, 2 * len(a) + 6))
+    parts.append(remainder)
     weights.append(count * step**4 / 12.0)
     joined = Ball(np.hstack([part.midpoint for part in parts]), np.hstack([part.radius for part in parts]))
     scale = rounded_up(np.repeat(np.array(weights), m), 6)
@@ -178,8 +178,8 @@ def _growth(a: FloatArray, step: float) -> FloatArray:
 def gathered(pieces: Pieces, sums: FloatArray, inputs: int) -> FloatArray:
     """Return the bound of each input, ``(..., inputs)``, from the sums ``(..., k)`` of all pieces."""
     weighted = sums * pieces.weights
-    found = np.stack([np.sum(weighted[..., pieces.inputs == i], axis=-1) for i in range(inputs)], axis=-1)
-    return np.asarray(rounded_up(found, len(pieces.weights) + 4))
+    bounds = np.stack([np.sum(weighted[..., pieces.inputs == i], axis=-1) for i in range(inputs)], axis=-1)
+    return np.asarray(rounded_up(bounds, len(pieces.weights) + 4))
 
 
 def absolute_gains(
@@ -189,12 +189,12 @@ def absolute_gains(
 
     ``b`` are the unit vectors, or ``columns (n, m)``.  Bounds hang on the contraction by what is left of the sum alone:
     where it settles, by `LEFT_OF_GAINS` at most, of given columns by `LEFT_OF_SUM`."""
-    n, given = len(a), columns is not None
+    n, has_columns = len(a), columns is not None
     into = Ball.exact(np.eye(n)) if columns is None else columns
     loose = contraction.gain(rows, into.midpoint, into.radius)
     if not loose.size or not n or (not contraction.discrete and n > MOST_CONTINUOUS_STATES):
         return loose
-    left, most = (LEFT_OF_SUM, MOST_STEPS_OF_COLUMNS) if given else (LEFT_OF_GAINS, MOST_STEPS_OF_GAINS)
+    left, most = (LEFT_OF_SUM, MOST_STEPS_OF_COLUMNS) if has_columns else (LEFT_OF_GAINS, MOST_STEPS_OF_GAINS)
     if contraction.discrete:
         return np.asarray(
             np.minimum(loose, peak_sums(Ball.exact(a), rows, into, contraction, left=left, each=True, most=most)[1])
@@ -205,9 +205,9 @@ def absolute_gains(
     rate = float(rounded_up(np.exp(-contraction.rate * length), 4))
     if not rate < 1.0:
         return loose
-    held = replace(contraction, rate=rate, discrete=True)
-    sums = peak_sums(exponential(a, length), rows, gather.columns, held, left=left, each=True, most=most)[1]
-    whole = gathered(gather, sums, loose.shape[1])
-    if given and into.radius.any():
-        whole = rounded_up(whole + contraction.gain(rows, np.zeros_like(into.radius), into.radius), 2)
-    return np.asarray(np.minimum(loose, whole))
+    sampled = replace(contraction, rate=rate, discrete=True)
+    sums = peak_sums(exponential(a, length), rows, gather.columns, sampled, left=left, each=True, most=most)[1]
+    bounds = gathered(gather, sums, loose.shape[1])
+    if has_columns and into.radius.any():
+        bounds = rounded_up(bounds + contraction.gain(rows, np.zeros_like(into.radius), into.radius), 2)
+    return np.asarray(np.minimum(loose, bounds))

@@ -49,8 +49,8 @@ def exponential(matrix: FloatArray, time: float) -> Ball:
     n = len(matrix)
     if not n:
         return Ball.exact(np.zeros((0, 0)))
-    if n > FEW_STATES_FOR_BALLS and (found := _Doubling(matrix, time).exponential()) is not None:
-        return found
+    if n > FEW_STATES_FOR_BALLS and (ball := _Doubling(matrix, time).exponential()) is not None:
+        return ball
     with flint.ctx.workprec(EXPONENTIAL_BITS):
         return as_ball((arb_matrix(matrix) * flint.arb(float(time))).exp())
 
@@ -58,17 +58,17 @@ def exponential(matrix: FloatArray, time: float) -> Ball:
 def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
     r"""Return a ball that holds ``\int_0^t e^{A s} B B' e^{A' s} ds`` (Van Loan), for ``A (n, n)``, ``B (n, m)``."""
     n = len(a)
-    if n > FEW_STATES_FOR_BALLS and (found := _Doubling(a, time).energy(b)) is not None:
-        return found
+    if n > FEW_STATES_FOR_BALLS and (ball := _Doubling(a, time).energy(b)) is not None:
+        return ball
     with flint.ctx.workprec(2 * EXPONENTIAL_BITS):
-        whole = arb_matrix(np.block([[-a, np.zeros((n, n))], [np.zeros((n, n)), a.T]]))
+        block = arb_matrix(np.block([[-a, np.zeros((n, n))], [np.zeros((n, n)), a.T]]))
         square = arb_matrix(b) * arb_matrix(b).transpose()
         for i in range(n):
             for j in range(n):
-                whole[i, n + j] = square[i, j]
-        whole = (whole * flint.arb(float(time))).exp()
-        late = flint.arb_mat([[whole[n + j, n + i] for j in range(n)] for i in range(n)])
-        upper = flint.arb_mat([[whole[i, n + j] for j in range(n)] for i in range(n)])
+                block[i, n + j] = square[i, j]
+        block = (block * flint.arb(float(time))).exp()
+        late = flint.arb_mat([[block[n + j, n + i] for j in range(n)] for i in range(n)])
+        upper = flint.arb_mat([[block[i, n + j] for j in range(n)] for i in range(n)])
         return as_ball(late * upper)
 
 
@@ -98,20 +98,20 @@ class _Doubling:
             return np.asarray(np.ldexp(matrix, sign * (self.exponents[:, None] - self.exponents)))
 
     def _first(self) -> Ball:
-        one = np.eye(len(self.exponents))
-        total = Ball.exact(one)
+        identity = np.eye(len(self.exponents))
+        total = Ball.exact(identity)
         for k in range(ORDER, 0, -1):
-            total = Ball.exact(one) + (self.x @ total).scaled(1.0 / k).widened(UNIT_ROUNDOFF)
+            total = Ball.exact(identity) + (self.x @ total).scaled(1.0 / k).widened(UNIT_ROUNDOFF)
         return total.added(_remainder(self.norm, ORDER + 1, ORDER + 1))
 
     def exponential(self) -> Ball | None:
         """Return a ball that holds the exponential; ``None`` where it is not sharp."""
-        found = self._first()
+        power = self._first()
         for _ in range(self.times):
-            found = found @ found
-        if not _is_sharp(found):
+            power = power @ power
+        if not _is_sharp(power):
             return None
-        return Ball(self._moved(found.midpoint, 1), self._moved(found.radius, 1) + UNDERFLOW)
+        return Ball(self._moved(power.midpoint, 1), self._moved(power.radius, 1) + UNDERFLOW)
 
     def energy(self, b: FloatArray) -> Ball | None:
         """Return a ball that holds the energy of inputs; ``None`` where it is not sharp."""
@@ -154,7 +154,7 @@ def logarithm_of_product(factors: Sequence[Ball], units: FloatArray | None = Non
     size = factors[0].shape[0]
     if not size:
         return -np.inf
-    axes, left, logarithm, slack = np.eye(size), np.eye(size), 0.0, 0.0
+    axes, product, logarithm, slack = np.eye(size), np.eye(size), 0.0, 0.0
     for factor in factors:
         moved = factor if units is None else _in_units(factor, units)
         if not moved.is_finite:
@@ -168,19 +168,19 @@ def logarithm_of_product(factors: Sequence[Ball], units: FloatArray | None = Non
         triangle = near.magnitude
         # What the inverse of the axes has beside their transpose.
         triangle = rounded_up(triangle + slack / (1.0 - slack) * triangle.sum(axis=0, keepdims=True), size + 6)
-        left = rounded_up(triangle @ left, size + 2)
-        largest = float(left.max())
+        product = rounded_up(triangle @ product, size + 2)
+        largest = float(product.max())
         if not np.isfinite(largest):
             return np.inf
         # A power of two divides exactly.
         exponent = int(np.floor(np.log2(largest)))
-        left = np.ldexp(left, -exponent) + UNDERFLOW
+        product = np.ldexp(product, -exponent) + UNDERFLOW
         logarithm += exponent
         axes = following
-    rows, columns = left.sum(axis=1).max(), left.sum(axis=0).max()
+    rows, columns = product.sum(axis=1).max(), product.sum(axis=0).max()
     bound = float(rounded_up(np.asarray(np.sqrt(rows * columns * (1.0 + slack))), 2 * size + 8))
-    found = float(np.log(bound))
-    return found + logarithm * float(np.log(2.0)) + LOGARITHMS * (abs(found) + abs(logarithm))
+    logarithm_of_bound = float(np.log(bound))
+    return logarithm_of_bound + logarithm * float(np.log(2.0)) + LOGARITHMS * (abs(logarithm_of_bound) + abs(logarithm))
 
 
 def _in_units(ball: Ball, units: FloatArray) -> Ball:

@@ -32,8 +32,8 @@ class _Dual:
     __array_ufunc__ = None
 
     @classmethod
-    def of(cls, given: Any) -> _Dual:
-        return given if isinstance(given, _Dual) else cls(Interval.of(given), _ZERO)
+    def of(cls, number: Any) -> _Dual:
+        return number if isinstance(number, _Dual) else cls(Interval.of(number), _ZERO)
 
 
 def slope_over(expression: Expression, name: str, box: Mapping[str, tuple[float, float]]) -> Range:
@@ -78,10 +78,10 @@ def slope_over(expression: Expression, name: str, box: Mapping[str, tuple[float,
 
     def value(point: Any) -> float:
         try:
-            found = enclosure(tuple((float(x), float(x)) for x in point))
+            slope = enclosure(tuple((float(x), float(x)) for x in point))
         except PreconditionError:
             return float("nan")
-        return 0.5 * (found.low + found.high)
+        return 0.5 * (slope.low + slope.high)
 
     return enclosed_range(enclosure, value, ends)
 
@@ -96,15 +96,15 @@ def _operation(operation: Callable[..., Any]) -> Callable[..., Any]:
         if all(part.slope == _ZERO for part in parts):
             return _Dual(value, _ZERO)
         if operation in _TWO:
-            one, other = parts
-            return _Dual(value, _TWO[operation](one, other, value))
+            first, second = parts
+            return _Dual(value, _TWO[operation](first, second, value))
         return _Dual(value, _ONES[operation](parts[0].value, value) * parts[0].slope)
 
     return done
 
 
-def _hull(one: Interval, other: Interval) -> Interval:
-    return Interval(min(one.low, other.low), max(one.high, other.high))
+def _hull(first: Interval, second: Interval) -> Interval:
+    return Interval(min(first.low, second.low), max(first.high, second.high))
 
 
 def _power(base: _Dual, exponent: _Dual, value: Interval) -> Interval:
@@ -143,8 +143,8 @@ _TWO: dict[Callable[..., Any], Callable[[_Dual, _Dual, Interval], Interval]] = {
 
 
 def _function(operation: Callable[..., Any]) -> Callable[[Interval], Interval]:
-    found: Callable[[Interval], Interval] = interval_operation(operation)
-    return found
+    function: Callable[[Interval], Interval] = interval_operation(operation)
+    return function
 
 
 def _absolute(x: Interval, _: Interval) -> Interval:

@@ -166,7 +166,7 @@ def pairs_of(count: int, steps: float | None) -> list[Pair]:
 def prove_gain(
     vertices: Sequence[Vertex], witness: Witness, gain: float, *, discrete: bool, ball: float = 0.0
 ) -> VertexProof:
-    """Try to prove that the l2 (L2) gain from w to z is below ``gain`` for every course of the weights."""
+    """Try to prove that the l2 (L2) gain from w to z is below ``gain`` for every trajectory of the weights."""
     return _proved(vertices, witness, discrete=discrete, ball=ball, gain=gain)
 
 
@@ -401,5 +401,5 @@ def _place(now: FloatArray, then: FloatArray) -> str:
             return f"{used[0] + 1}"
         return " + ".join(f"{weights[i]:.4g} of {i + 1}" for i in used)
 
-    one, other = named(now), named(then)
-    return f"vertex {one}" if one == other else f"vertex {one}, then {other}"
+    first, second = named(now), named(then)
+    return f"vertex {first}" if first == second else f"vertex {first}, then {second}"

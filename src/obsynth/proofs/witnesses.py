@@ -19,6 +19,7 @@ import numpy as np
 from flint import arb, arb_mat, fmpz, fmpz_mat
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.exact_arithmetic import rounded_outward
 
 #: Bits that are tried: few where the inequality has room, many for poles near to each other or to the boundary.
 PRECISIONS = (160, 320, 640, 1280)
@@ -171,10 +172,10 @@ def _cholesky(matrix: list[list[int]], bits: int) -> list[list[int]] | None:
     lower = [[0] * size for _ in range(size)]
     for j in range(size):
         own = lower[j]
-        left = (matrix[j][j] << bits) - sum(value * value for value in own[:j])
-        if left <= 0:
+        square = (matrix[j][j] << bits) - sum(value * value for value in own[:j])
+        if square <= 0:
             return None
-        own[j] = pivot = math.isqrt(left)
+        own[j] = pivot = math.isqrt(square)
         if not pivot:
             return None
         for i in range(j + 1, size):
@@ -185,8 +186,8 @@ def _cholesky(matrix: list[list[int]], bits: int) -> list[list[int]] | None:
 
 def _dominates(rows: list[list[int]], weights: list[int]) -> bool:
     for i, row in enumerate(rows):
-        whole = sum(abs(value) * weight for value, weight in zip(row, weights, strict=True))
-        if not 2 * row[i] * weights[i] > whole:
+        total = sum(abs(value) * weight for value, weight in zip(row, weights, strict=True))
+        if not 2 * row[i] * weights[i] > total:
             return False
     return True
 
@@ -199,16 +200,16 @@ def lyapunov_solution(a: Dyadic, q: Dyadic, rate: float, *, discrete: bool, bits
     size = a.shape[0]
     with flint.ctx.workprec(bits):
         own, total = a.balls(), q.balls()
-        one = Dyadic.identity(size).balls()
+        identity = Dyadic.identity(size).balls()
         try:
             if discrete:
                 moved = own * (arb(1) / arb(rate))
             else:
                 # Cayley's transform with a speed between the slowest and the fastest mode.
-                own = own + one * arb(rate)
+                own = own + identity * arb(rate)
                 speed = arb(max(_size(own), SLOWEST))
-                back = (one * speed - own).inv().mid()
-                moved, total = (one * speed + own) * back, back.transpose() * total * back * (2 * speed)
+                back = (identity * speed - own).inv().mid()
+                moved, total = (identity * speed + own) * back, back.transpose() * total * back * (2 * speed)
         except ZeroDivisionError:
             return None
         return _sum_over_time(moved.mid(), total.mid(), bits)
@@ -217,9 +218,9 @@ def lyapunov_solution(a: Dyadic, q: Dyadic, rate: float, *, discrete: bool, bits
 def _size(matrix: Any) -> float:
     """Return about the geometric mean of the absolute values of eigenvalues; of a singular matrix its largest entry."""
     size = max(int(matrix.nrows()), 1)
-    found = float(abs(matrix.det()).mid()) if size < 400 else 0.0
+    determinant = float(abs(matrix.det()).mid()) if size < 400 else 0.0
     largest = max((abs(float(value.mid())) for value in matrix.entries()), default=1.0)
-    return found ** (1.0 / size) if 0.0 < found < math.inf else largest
+    return determinant ** (1.0 / size) if 0.0 < determinant < math.inf else largest
 
 
 def _sum_over_time(moved: Any, total: Any, bits: int) -> Dyadic | None:
@@ -268,8 +269,8 @@ def lyapunov_witness(a: Dyadic, units: FloatArray, rate: float, *, discrete: boo
         if p is None:
             continue
         half = a.T @ p + p.scaled(rate)
-        left = p.scaled(rate).scaled(rate) - a.T @ p @ a if discrete else -(half + half.T)
-        decreases = definite_witness(left)
+        decrease = p.scaled(rate).scaled(rate) - a.T @ p @ a if discrete else -(half + half.T)
+        decreases = definite_witness(decrease)
         if decreases is not None and (positive := definite_witness(p)) is not None:
             return {"P": p, "P_positive": positive, "decreases": decreases}
     return None
@@ -294,8 +295,8 @@ def inverse_above(p: Dyadic) -> tuple[Dyadic, dict[str, Any]] | None:
                 g = rounded((p.balls().inv() * (1 + arb(2) ** -16)).mid(), bits, symmetric=True)
             except ZeroDivisionError:
                 continue
-        one = Dyadic.identity(size)
-        witness = definite_witness(blocks([[p, one], [one, g]]))
+        identity = Dyadic.identity(size)
+        witness = definite_witness(blocks([[p, identity], [identity, g]]))
         if witness is not None:
             return g, witness
     return None
@@ -307,10 +308,4 @@ def root_above(value: Fraction) -> float:
         return 0.0
     shift = 2 * max(0, 128 - (value.numerator.bit_length() - value.denominator.bit_length()) // 2)
     root = math.isqrt((value.numerator << shift) // value.denominator) + 1
-    return above(Fraction(root, 1 << (shift // 2)))
-
-
-def above(value: Fraction) -> float:
-    """Return a double that is not below a fraction, by less than 2^-20 of it."""
-    found = float(value)
-    return found if Fraction(found) >= value else math.nextafter(found, math.inf)
+    return rounded_outward(Fraction(root, 1 << (shift // 2)))
