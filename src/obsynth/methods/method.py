@@ -67,6 +67,13 @@ class Synthesis:
     # As the recursive methods see it, where given another kind; or with the noise that the design is for.
     plant: DescriptorSystem | TimeVaryingDescriptorSystem | None = None
 
+    @property
+    def linear_observer(self) -> LinearObserver:
+        """The observer of a linear method; raise `TypeError` where it is none."""
+        if not isinstance(self.observer, LinearObserver):
+            raise TypeError(f"{type(self.observer).__name__} is no LinearObserver")
+        return self.observer
+
 
 @dataclass(frozen=True)
 class Method(ABC):

@@ -124,8 +124,9 @@ def courses_of(plant: PolytopicSystem, scenario: Scenario, steps: int, dt: float
     middle = np.full(len(names), 1.0 / len(names)) if held.gives_weights else 0.5 * (held.low + held.high)
     left, right = np.tile(middle, (steps, 1)), np.tile(middle, (steps, 1))
     for name, profile in profiles_of(scenario, "scheduling"):
+        if not isinstance(profile, Additive):
+            raise SpecError(f"A scheduling signal is no {type(profile).__name__.lower()}.", path=f"scheduling.{name}")
         place = names.index(name)
-        assert isinstance(profile, Additive)  # the scenario takes no others
         for ends, values in zip((left, right), profile.sampled(steps, dt), strict=True):
             ends[:, place] += values
     if plant.is_discrete:
@@ -190,11 +191,10 @@ def region_runs(
     steps, runs = left.shape[:2]
     states, outputs = np.empty((steps, runs, plant.nx)), np.empty((steps, runs, plant.ny))
     v = np.repeat((moving.E1 @ start)[:, None], runs, axis=1)
-    before, at = None, moving.at(courses[0][0]) if steps else None
     for k in range(steps):
-        if before is None or not np.array_equal(before, courses[0][k]):
-            before, at = courses[0][k], moving.at(courses[0][k])
-        assert at is not None
+        # A point that stays is not evaluated again.
+        if k == 0 or not np.array_equal(courses[0][k - 1], courses[0][k]):
+            at = moving.at(courses[0][k])
         s, w = left[k].T, noise[k].T
         x = at.state(v, s, w)
         states[k] = x.T

@@ -90,8 +90,8 @@ def held_faults(model: ErrorModel) -> FloatArray:
 
 def _constant(model: ErrorModel, fault: int) -> FloatArray | None:
     """Return the state of the fault model, one of its coordinates, in which a fault alone is one and stays."""
-    assert model.Phi is not None
-    assert model.Cw is not None
+    if model.Phi is None or model.Cw is None:
+        return None
     still = model.Phi - np.eye(len(model.Phi)) * (model.observer.dt > 0.0)
     for place in np.flatnonzero(~still.any(axis=0)):
         shown = model.Cw[:, place]

@@ -115,9 +115,8 @@ def _less_noisy(
     if not _is_as_labelled(other):
         # A W that is the paper's of the merged outputs is another left inverse for those as given.
         other = replace(other, options={**other.options, "weight": "free"})
-    assert isinstance(other.observer, LinearObserver)
-    assert isinstance(made.observer, LinearObserver)
-    return other if fault_deviation(plant, other.observer) < fault_deviation(plant, made.observer) else made
+    merged_deviation = fault_deviation(plant, other.linear_observer)
+    return other if merged_deviation < fault_deviation(plant, made.linear_observer) else made
 
 
 def _for_independent_outputs(
@@ -139,8 +138,7 @@ def _is_as_labelled(made: Synthesis) -> bool:
 
 def _of_merged(plant: DescriptorSystem, merged: MergedOutputs, found: Synthesis) -> Synthesis:
     """Return the filter of a plant from that of it with merged outputs."""
-    observer, weights = found.observer, merged.weights
-    assert isinstance(observer, LinearObserver)
+    observer, weights = found.linear_observer, merged.weights
     return replace(
         found,
         gains={name: gain @ weights if name in _OF_OUTPUTS else gain for name, gain in found.gains.items()}

@@ -113,7 +113,7 @@ def conditions(plant: DescriptorSystem, asked: Options) -> tuple[Condition, ...]
 
 def first_problem(plant: DescriptorSystem, asked: Options) -> tuple[FaultMap, EstimationProblem]:
     """Return the first fault map that exists, of those that the options leave open, with its problem."""
-    last: PreconditionError | None = None
+    last = PreconditionError("No fault map is left open by the options.", condition="fault map")
     for fault_map in _open_maps(plant, asked):
         try:
             problem = problem_of(plant, fault_map)
@@ -125,7 +125,6 @@ def first_problem(plant: DescriptorSystem, asked: Options) -> tuple[FaultMap, Es
                 break
         else:
             return fault_map, problem
-    assert last is not None
     raise last
 
 

@@ -32,7 +32,6 @@ from obsynth.numerics.eigenstructure import checked_poles, place
 from obsynth.numerics.invariant_zeros import is_outside
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE
 from obsynth.numerics.spectra import decay_rates
-from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.faults import Exosystem, exosystem
 from obsynth.plants.polytopic import PolytopicSystem
@@ -178,8 +177,7 @@ def _without_likeness(
         means = np.eye(found.plant.ny) if choice is None else choice.weights
         observer = assembled(
             found.plant, model, (U, D @ means, K @ means), None, {}, structured=not asked.joint
-        ).observer
-        assert isinstance(observer, LinearObserver)
+        ).linear_observer
         poles = np.linalg.eigvals(observer.Az).astype(np.complex128)
         settling = 1.0 / max(float(np.min(decay_rates(poles, observer.dt))), SLOWEST)
         found_costs.append((fault_deviation(found.plant, observer), settling))
