@@ -75,7 +75,7 @@ class Identifiability:
     def __repr__(self) -> str:
         known = zip(self.names, self.deviations, strict=True)
         lines = [f"{n}: deviation {d:.3g} at least" if np.isfinite(d) else f"{n}: not identifiable" for n, d in known]
-        shares = [", ".join(f"{share:.3g} {name}" for name, share in one.items()) for one in self.unseen]
+        shares = [", ".join(f"{share:.3g} {name}" for name, share in direction.items()) for direction in self.unseen]
         return "\n".join([*lines, *(f"no effect on the outputs (in units of scales): {text}" for text in shares)])
 
     def _shares(self, row: FloatArray) -> dict[str, float]:
@@ -173,8 +173,8 @@ def identifiability(
     if not (scales > 0.0).all():
         raise SpecError("state_scales and parameter_scales must be positive.", path="parameter_scales")
     step = ImplicitStep(DAEFunctions(model, method), length)
-    seen, free = _sensitivities(model, step, inputs, x, theta, scales[: model.nx])
-    whitened = np.linalg.solve(root, seen).reshape(-1, seen.shape[2])
+    sensitivities, free = _sensitivities(model, step, inputs, x, theta, scales[: model.nx])
+    whitened = np.linalg.solve(root, sensitivities).reshape(-1, sensitivities.shape[2])
     r = free.shape[1]
     whitened[:, r:] *= scales[model.nx :]
     to_signals = np.block([[free.T, np.zeros((r, model.nq))], [np.zeros((model.nq, model.nx)), np.eye(model.nq)]])
@@ -201,7 +201,7 @@ def _sensitivities(
     """Return derivatives of all outputs by free directions and parameters, and these directions.
     The first step leads onto the algebraic equations: the range of its F holds the directions that are free there."""
     moved = free = np.zeros((model.nx, 0))
-    found = []
+    sensitivities = []
     for k in range(1, len(inputs)):
         solution = step.solve(x, inputs[k], theta, before=inputs[k - 1], k=k)
         F, G, _ = step.sensitivities(solution, x, inputs[k], theta)
@@ -216,8 +216,8 @@ def _sensitivities(
         _, H, L = step.functions.outputs(x, theta)
         rows = H @ moved
         rows[:, free.shape[1] :] += L
-        found.append(rows)
-    return np.array(found), free
+        sensitivities.append(rows)
+    return np.array(sensitivities), free
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,8 +251,8 @@ def index_report(
     decades = np.log10(SHORTENINGS[0] / SHORTENINGS[-1])
     slope = np.log10(min(conditions[-1], 1.0 / np.finfo(np.float64).eps) / conditions[0]) / decades
     index = 1 + max(0, round(float(slope)))
-    found = ((), ()) if index == 1 else involved(model, matrices[-1].matrix)
-    return IndexReport(index, conditions, *found)
+    names = ((), ()) if index == 1 else involved(model, matrices[-1].matrix)
+    return IndexReport(index, conditions, *names)
 
 
 def involved(model: DAEModel, matrix: FloatArray) -> tuple[tuple[str, ...], tuple[str, ...]]:

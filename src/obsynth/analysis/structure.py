@@ -100,7 +100,7 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
     impulse_free = pencil.index is not None and pencil.index <= 1
 
     hidden = judge.hidden_modes()
-    seen = hidden.normal_rank == plant.nx
+    full = hidden.normal_rank == plant.nx
 
     rank_e = decide_rank(E, expected=plant.nx)
     zero, none = np.zeros_like(E), np.zeros_like(C)
@@ -126,8 +126,8 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
         observability_normal_rank=hidden.normal_rank,
         unobservable_modes=hidden.zeros,
         undetectable_modes=hidden.outside,
-        finitely_observable=seen and not hidden.zeros,
-        detectable=seen and not hidden.outside,
+        finitely_observable=full and not hidden.zeros,
+        detectable=full and not hidden.outside,
         impulse_observable=impulse.full,
         causally_observable=causal.full,
         rank_of_E=rank_e,
@@ -146,14 +146,14 @@ def _half_a_point(plant: DescriptorSystem) -> tuple[str, ...]:
     missing = [name for name in measured if name not in point]
     if not missing or not any(point.values()):
         return ()
-    told = f"{', '.join(list(point)[:_MOST_QUESTIONED])}, but not {listed(missing, most=_MOST_QUESTIONED)}"
+    text = f"{', '.join(list(point)[:_MOST_QUESTIONED])}, but not {listed(missing, most=_MOST_QUESTIONED)}"
     return (
-        f"operating_point has {told}: the values of these in a log count as deviations. "
-        f"Give their values at that point as well{_rest(plant, missing)}.",
+        f"operating_point has {text}: the values of these in a log count as deviations. "
+        f"Give their values at that point as well{_resting_outputs(plant, missing)}.",
     )
 
 
-def _rest(plant: DescriptorSystem, missing: Sequence[str]) -> str:
+def _resting_outputs(plant: DescriptorSystem, missing: Sequence[str]) -> str:
     """Return in words where the missing outputs are at rest, if the equations hold for absolute values."""
     names = [name for name in missing if name in plant.output_names]
     if not names or plant.nx > _QUESTIONS_UP_TO:
@@ -167,9 +167,9 @@ def _rest(plant: DescriptorSystem, missing: Sequence[str]) -> str:
     if rank < plant.nx:
         return ""
     values = plain.C @ state + plain.D @ known + plain.Dd @ unknown
-    found = dict(zip(plant.output_names, values, strict=True))
-    told = ", ".join(f"{name} {found[name]:.5g}" for name in names[:_MOST_QUESTIONED])
-    return f" (if the equations hold for absolute values, the plant rests there at {told})"
+    outputs = dict(zip(plant.output_names, values, strict=True))
+    text = ", ".join(f"{name} {outputs[name]:.5g}" for name in names[:_MOST_QUESTIONED])
+    return f" (if the equations hold for absolute values, the plant rests there at {text})"
 
 
 def _other_time(plant: DescriptorSystem) -> tuple[str, ...]:

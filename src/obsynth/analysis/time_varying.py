@@ -41,11 +41,11 @@ def step_blocks(plant: TimeVaryingDescriptorSystem, k: int, late: IntArray) -> S
     Phi, Psi = plant.Phi.at(k), plant.Psi.at(k)
     if not late.size:
         return StepBlocks(E, A, Phi, C, Psi)
-    others = np.setdiff1d(np.arange(plant.ne), late)
+    on_time = np.setdiff1d(np.arange(plant.ne), late)
     return StepBlocks(
-        E[others],
-        A[others],
-        Phi[others],
+        E[on_time],
+        A[on_time],
+        Phi[on_time],
         np.vstack([C, plant.A.at(k + 1)[late]]),
         np.vstack([Psi, plant.Phi.at(k + 1)[late]]),
     )
@@ -102,8 +102,8 @@ def as_time_varying(
     plant = plant.plant if isinstance(plant, Transformation) else plant
     if isinstance(plant, TimeVaryingDescriptorSystem):
         return plant
-    wanted = "an obsynth.DescriptorSystem or TimeVaryingDescriptorSystem"
-    require_kind(plant, DescriptorSystem, "The plant", wanted, path="plant")
+    kinds = "an obsynth.DescriptorSystem or TimeVaryingDescriptorSystem"
+    require_kind(plant, DescriptorSystem, "The plant", kinds, path="plant")
     return TimeVaryingDescriptorSystem.from_descriptor(plant)
 
 

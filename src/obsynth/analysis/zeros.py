@@ -1,4 +1,4 @@
-"""Zero-order-hold sampling of continuous plants."""
+"""Invariant zeros from the faults of a plant to its outputs, its unstable poles, and faults that never show."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ def sampling_zero_warnings(plant: DescriptorSystem) -> tuple[str, ...]:
 
 def unstable_poles(plant: DescriptorSystem) -> tuple[complex, ...]:
     """Return the finite eigenvalues of a plant that are not strictly stable."""
-    found, rate = structure_of(plant), PlantUnits.of(plant).rounded().rate
-    poles = FiniteZeros(rate * found.finite_eigenvalues, found.normal_rank, found.decisions)
-    marked = zip(found.finite_eigenvalues, are_outside(*in_own_units(plant), poles, plant.dt), strict=True)
+    structure, rate = structure_of(plant), PlantUnits.of(plant).rounded().rate
+    poles = FiniteZeros(rate * structure.finite_eigenvalues, structure.normal_rank, structure.decisions)
+    marked = zip(structure.finite_eigenvalues, are_outside(*in_own_units(plant), poles, plant.dt), strict=True)
     return tuple(complex(value) for value, out in marked if out)
 
 

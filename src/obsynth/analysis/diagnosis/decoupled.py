@@ -174,9 +174,9 @@ def decouple(
     kept = (
         [i for i in range(plant.nf) if i not in removed] if faults is None else fault_numbers(plant, faults, "faults")
     )
-    both = [plant.fault_names[i] for i in kept if i in removed]
-    if both:
-        raise SpecError(f"{', '.join(both)}: a fault cannot be kept and removed.", path="without")
+    contradictory = [plant.fault_names[i] for i in kept if i in removed]
+    if contradictory:
+        raise SpecError(f"{', '.join(contradictory)}: a fault cannot be kept and removed.", path="without")
     return decoupled(plant, removed, kept)
 
 
@@ -197,18 +197,18 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
     nx, ny = plant.nx, plant.ny
     pencil_e, pencil_a = unknowns_pencil(plant, removed)
     units = PencilUnits.of(pencil_e, pencil_a)
-    found = left_part(
+    part = left_part(
         units.rows[:, None] * pencil_e * units.columns * units.time, units.rows[:, None] * pencil_a * units.columns
     )
     # Rows of the orthogonal reduction have unit length: what is below rounding is nothing.
-    rows = np.array(found.left)
+    rows = np.array(part.left)
     moving = units.rows[:nx, None] * plant.E * units.columns[:nx]
-    rows[found.order :, :nx] = _without_dynamics(rows[found.order :, :nx], moving)
+    rows[part.order :, :nx] = _without_dynamics(rows[part.order :, :nx], moving)
     rows = np.where(np.abs(rows) > ROTATION_ROUNDING, rows, 0.0) * units.rows
     faults = np.vstack([plant.Bf, plant.Df])[:, list(kept)]
     signals = np.block([[plant.B, np.zeros((nx, ny))], [plant.D, -np.eye(ny)]])
     sizes = np.linalg.norm(units.rows[:, None] * signals, axis=0)
-    k = found.order
+    k = part.order
     parts = {
         "u": product_but_rounding(rows, signals[:, : plant.nu]),
         "y": product_but_rounding(rows, signals[:, plant.nu :]),
@@ -216,9 +216,9 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
         "w": product_but_rounding(rows, np.vstack([plant.Bw, plant.Dw])),
     }
     return DecoupledPlant(
-        E=read_only(_without_rounding(found.E) / units.time),
-        A=read_only(_without_rounding(found.A)),
-        C=read_only(_without_rounding(found.C)),
+        E=read_only(_without_rounding(part.E) / units.time),
+        A=read_only(_without_rounding(part.A)),
+        C=read_only(_without_rounding(part.C)),
         Bu=read_only(parts["u"][:k]),
         By=read_only(parts["y"][:k]),
         F=read_only(parts["f"][:k]),
@@ -228,15 +228,15 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
         G=read_only(parts["f"][k:]),
         M=read_only(parts["w"][k:]),
         rows=read_only(rows),
-        states=read_only((found.right / units.columns)[:, :nx]),
-        removed=finite_values(found) * units.time,
+        states=read_only((part.right / units.columns)[:, :nx]),
+        removed=finite_values(part) * units.time,
         source=plant,
         faults=tuple(plant.fault_names[i] for i in kept),
         without=(*plant.disturbance_names, *(plant.fault_names[i] for i in removed)),
         fault_sizes=read_only(np.linalg.norm(units.rows[:, None] * faults, axis=0)),
         signal_sizes=read_only(np.where(sizes > 0.0, sizes, 1.0)),
         time=units.time,
-        decisions=found.decisions,
+        decisions=part.decisions,
     )
 
 

@@ -127,14 +127,14 @@ def diagnose(
     exactly = decided_exactly(plant)
     report_stage("deciding which faults are detectable")
     decoupled, candidates = DecoupledFaults(plant, exactly), _Candidates(plant) if suggest else None
-    shown = [decoupled.of((), i) for i in range(plant.nf)]
-    free = [decoupled.of(others(plant, i), i) for i in range(plant.nf)]
+    for_detection = [decoupled.of((), i) for i in range(plant.nf)]
+    for_isolation = [decoupled.of(others(plant, i), i) for i in range(plant.nf)]
     faults = tuple(
         _verdict(plant, own, alone, frequencies, model_points(model, i), candidates)
-        for i, (own, alone) in enumerate(zip(shown, free, strict=True))
+        for i, (own, alone) in enumerate(zip(for_detection, for_isolation, strict=True))
     )
     report_stage("deciding which faults can be isolated")
-    weak, strong, pairs = _isolability(plant, shown, decoupled)
+    weak, strong, pairs = _isolability(plant, for_detection, decoupled)
     margins = fault_margins(plant, weak, strong)
     faults = tuple(
         replace(
@@ -155,7 +155,7 @@ def diagnose(
         plant.disturbance_names,
         "; ".join(dict.fromkeys(model.descriptions)),
         exactly,
-        (*_warnings(plant, [*shown, *free, *pairs]), *part),
+        (*_warnings(plant, [*for_detection, *for_isolation, *pairs]), *part),
         margins.pairs,
     )
 
@@ -171,71 +171,80 @@ def model_points(model: Exosystem, fault: int) -> list[complex]:
 
 def _verdict(
     plant: DescriptorSystem,
-    shown: DecoupledFault,
-    free: DecoupledFault,
+    for_detection: DecoupledFault,
+    for_isolation: DecoupledFault,
     frequencies: Sequence[float],
     modes: Sequence[complex],
     candidates: _Candidates | None,
 ) -> FaultDiagnosis:
     points = [complex(np.exp(1j * w * plant.dt)) if plant.dt > 0.0 else 1j * w for w in frequencies]
     return FaultDiagnosis(
-        name=plant.fault_names[shown.number],
-        detectable=shown.visible,
-        detectable_at_rest=shown.shows_at_rest,
-        detectable_at={float(w): shown.visible and shown.shows_at(s) for w, s in zip(frequencies, points, strict=True)},
-        estimable=free.estimable,
-        step_estimable=free.shows_at_rest,
-        model_estimable=free.visible and all(free.shows_at(mode) for mode in modes),
-        order=free.derivatives if free.visible else None,
-        residual_order=shown.residual_order if shown.visible else None,
-        filter_order=free.order,
-        zeros=free.zeros,
-        blocking=free.blocking,
-        sentences=tuple(_sentences(plant, shown, free, candidates)),
-        exact=shown.exactly,
-        gap=min(shown.gap, free.gap),
+        name=plant.fault_names[for_detection.number],
+        detectable=for_detection.visible,
+        detectable_at_rest=for_detection.shows_at_rest,
+        detectable_at={
+            float(w): for_detection.visible and for_detection.shows_at(s)
+            for w, s in zip(frequencies, points, strict=True)
+        },
+        estimable=for_isolation.estimable,
+        step_estimable=for_isolation.shows_at_rest,
+        model_estimable=for_isolation.visible and all(for_isolation.shows_at(mode) for mode in modes),
+        order=for_isolation.derivatives if for_isolation.visible else None,
+        residual_order=for_detection.residual_order if for_detection.visible else None,
+        filter_order=for_isolation.order,
+        zeros=for_isolation.zeros,
+        blocking=for_isolation.blocking,
+        sentences=tuple(_sentences(plant, for_detection, for_isolation, candidates)),
+        exact=for_detection.exactly,
+        gap=min(for_detection.gap, for_isolation.gap),
         margin=np.inf,
         least_step=None,
     )
 
 
 def _sentences(
-    plant: DescriptorSystem, shown: DecoupledFault, free: DecoupledFault, candidates: _Candidates | None
+    plant: DescriptorSystem,
+    for_detection: DecoupledFault,
+    for_isolation: DecoupledFault,
+    candidates: _Candidates | None,
 ) -> list[str]:
     """Return what hides a fault, at which point, and what would help."""
-    name, rest = plant.fault_names[shown.number], dc_point(plant.dt)
+    name, at_rest = plant.fault_names[for_detection.number], dc_point(plant.dt)
     letter = "z" if plant.dt > 0.0 else "s"
-    step, texts = free.shows_at_rest, []
-    if not shown.visible:
+    step, texts = for_isolation.shows_at_rest, []
+    if not for_detection.visible:
         unknown = ", ".join(plant.disturbance_names)
         texts.append(
             f"{name}: not detectable by any residual" + (f" that is decoupled from {unknown}." if unknown else ".")
         )
-    elif not free.visible:
-        others = ", ".join(plant.fault_names[j] for j in free.removed)
-        texts.append(f"{name}: detectable, but not distinguishable from {others} and the unknown inputs together.")
+    elif not for_isolation.visible:
+        other_names = ", ".join(plant.fault_names[j] for j in for_isolation.removed)
+        texts.append(f"{name}: detectable, but not distinguishable from {other_names} and the unknown inputs together.")
     if not step:
-        motion = hidden_motion(plant, shown.number, rest, () if not shown.visible else free.removed)
+        motion = hidden_motion(
+            plant, for_detection.number, at_rest, () if not for_detection.visible else for_isolation.removed
+        )
         if motion is not None:
-            seen = shown.visible and (free.visible or not shown.shows_at_rest)
-            then = " It cannot be estimated; residuals respond only while it changes." if seen else ""
-            texts.append(f"{name}: {motion} ({letter} = {_number(rest)}).{then}")
-    hiding = [zero for zero in free.blocking if abs(zero - rest) > REST_TOLERANCE and zero.imag >= 0.0]
+            leaves_trace = for_detection.visible and (for_isolation.visible or not for_detection.shows_at_rest)
+            then = " It cannot be estimated; residuals respond only while it changes." if leaves_trace else ""
+            texts.append(f"{name}: {motion} ({letter} = {_number(at_rest)}).{then}")
+    hiding = [zero for zero in for_isolation.blocking if abs(zero - at_rest) > REST_TOLERANCE and zero.imag >= 0.0]
     for zero in hiding[:MOST_ZEROS]:
-        motion = hidden_motion(plant, shown.number, complex(zero), free.removed)
+        motion = hidden_motion(plant, for_detection.number, complex(zero), for_isolation.removed)
         at = f"{letter} = {_number(zero)}"
         how = f"output-nulling at {at}" if motion is None else f"{motion} ({at})"
         texts.append(f"{name}: {how}. A fault with this time course cannot be estimated.")
     if len(hiding) > MOST_ZEROS:
         texts.append(f"{name}: output-nulling at {len(hiding) - MOST_ZEROS} more points.")
-    if free.visible and free.derivatives:
-        more = "s" if free.derivatives > 1 else ""
+    if for_isolation.visible and for_isolation.derivatives:
+        more = "s" if for_isolation.derivatives > 1 else ""
         needed = f"sample{more} of delay" if plant.dt > 0.0 else f"derivative{more} of the outputs"
         texts.append(
-            f"{name}: the estimate needs {free.derivatives} {needed}{'; that of a step needs none' if step else ''}."
+            f"{name}: the estimate needs {for_isolation.derivatives} {needed}"
+            f"{'; that of a step needs none' if step else ''}."
         )
-    if candidates is not None and not (step and free.estimable):
-        texts += _suggestion(candidates, name, shown, step=step)
+    if candidates is not None and not (step and for_isolation.estimable):
+        texts += _suggestion(candidates, name, for_detection, step=step)
     return texts
 
 
@@ -274,24 +283,24 @@ class _Candidates:
         return least_additions(self.plant, self.sensors, reached, promising=promising)
 
 
-def _suggestion(candidates: _Candidates, name: str, shown: DecoupledFault, *, step: bool) -> list[str]:
+def _suggestion(candidates: _Candidates, name: str, for_detection: DecoupledFault, *, step: bool) -> list[str]:
     """Return which states to measure, computed; and those that would only show the fault."""
-    plant, fault = candidates.plant, shown.number
-    rest = others(plant, fault)
-    answered: dict[tuple[str, ...], DecoupledFault] = {}
+    plant, fault = candidates.plant, for_detection.number
+    other_faults = others(plant, fault)
+    cached: dict[tuple[str, ...], DecoupledFault] = {}
 
     def free(changed: DescriptorSystem) -> DecoupledFault:
         added = changed.output_names[plant.ny :]
-        return answered.setdefault(added, DecoupledFault(Removal(changed, rest), fault))
+        return cached.setdefault(added, DecoupledFault(Removal(changed, other_faults), fault))
 
-    full = candidates.additions(fault, rest, lambda changed: free(changed).estimable)
-    constant = () if step else candidates.additions(fault, rest, lambda changed: free(changed).shows_at_rest)
+    full = candidates.additions(fault, other_faults, lambda changed: free(changed).estimable)
+    constant = () if step else candidates.additions(fault, other_faults, lambda changed: free(changed).shows_at_rest)
     texts = []
     if full:
         texts.append(f"{name}: Measure one of: {listed_sets(full)}.")
     elif constant:
         texts.append(f"{name}: Measure one of: {listed_sets(constant)} (then a step of it can be estimated).")
-    if not shown.visible:
+    if not for_detection.visible:
         showing = candidates.additions(fault, (), lambda changed: DecoupledFault(Removal(changed, ()), fault).visible)
         more = [names for names in showing if names not in (*full, *constant)]
         if more:
@@ -304,25 +313,25 @@ def _suggestion(candidates: _Candidates, name: str, shown: DecoupledFault, *, st
 
 
 def _isolability(
-    plant: DescriptorSystem, shown: Sequence[DecoupledFault], faults: DecoupledFaults
+    plant: DescriptorSystem, for_detection: Sequence[DecoupledFault], faults: DecoupledFaults
 ) -> tuple[np.ndarray, np.ndarray, list[DecoupledFault]]:
     weak, strong = np.zeros((2, plant.nf, plant.nf), dtype=bool)
-    asked = {(i, j): faults.of((j,), i) for i in range(plant.nf) for j in others(plant, i)}
-    for place, pair in {**asked, **{(i, i): own for i, own in enumerate(shown)}}.items():
+    pairs = {(i, j): faults.of((j,), i) for i in range(plant.nf) for j in others(plant, i)}
+    for place, pair in {**pairs, **{(i, i): own for i, own in enumerate(for_detection)}}.items():
         weak[place], strong[place] = pair.visible, pair.shows_at_rest
-    return read_only(weak, bool), read_only(strong, bool), list(asked.values())
+    return read_only(weak, bool), read_only(strong, bool), list(pairs.values())
 
 
-def _warnings(plant: DescriptorSystem, asked: Sequence[DecoupledFault]) -> tuple[str, ...]:
+def _warnings(plant: DescriptorSystem, faults: Sequence[DecoupledFault]) -> tuple[str, ...]:
     texts = []
     if not structure_of(plant).regular:
         texts.append(
             "sE - A is not regular: the equations leave states open or bind the inputs. The verdicts are about all "
             "trajectories that satisfy them."
         )
-    thin = [one for one in asked if not one.clear]
+    thin = [fault for fault in faults if not fault.clear]
     if thin:
-        worst = min(thin, key=lambda one: one.gap)
+        worst = min(thin, key=lambda fault: fault.gap)
         texts.append(
             f"{plant.fault_names[worst.number]}: the least clear decision has a gap of {worst.gap:.1e} only; orders, "
             "and in the worst case a verdict, may depend on the last digits of the data."

@@ -57,8 +57,8 @@ class ExactDecoupledFault(DecoupledFault):
         the rationals."""
         a, c, right, outputs = self.removal.reduction
         nf = self.source.nf
-        rest = range(nf, right.ncols())
-        parts = (picked_columns(part, of) for of in ([self.number], rest) for part in (right, outputs))
+        known_columns = range(nf, right.ncols())
+        parts = (picked_columns(part, of) for of in ([self.number], known_columns) for part in (right, outputs))
         return a, c, *parts
 
     @cached_property
@@ -72,10 +72,10 @@ class ExactDecoupledFault(DecoupledFault):
         outputs."""
         if not self.reduced:
             # The zeros that the fault adds to those of the pencil of the unknowns.
-            without, whole = self.removal.pencil(), self.removal.pencil(self.number)
-            if whole.normal_rank == without.normal_rank:
+            without, with_fault = self.removal.pencil(), self.removal.pencil(self.number)
+            if with_fault.normal_rank == without.normal_rank:
                 return fmpz_poly([])
-            return primitive(fmpq_poly(whole.zero_polynomial) / fmpq_poly(without.zero_polynomial))
+            return primitive(fmpq_poly(with_fault.zero_polynomial) / fmpq_poly(without.zero_polynomial))
         A, C, F, G, *_ = self._parts
         if _is_zero(F) and _is_zero(G):
             return fmpz_poly([])

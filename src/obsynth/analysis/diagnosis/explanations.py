@@ -55,13 +55,19 @@ def state_sensors(plant: DescriptorSystem, names: Sequence[str] | None = None) -
     return tuple(Sensor(name, eye[plant.state_names.index(name)], *zero) for name in chosen)
 
 
-def recovered_sensors(plant: DescriptorSystem, way: StateRecovery, dropped: Sequence[str]) -> tuple[Sensor, ...]:
+def recovered_sensors(plant: DescriptorSystem, recovery: StateRecovery, dropped: Sequence[str]) -> tuple[Sensor, ...]:
     """Return a sensor for each state as written that is not an output of the reduced plant already; ``dropped`` ones
     are not known."""
     measured = {*plant.output_names, *dropped}
     return tuple(
-        Sensor(name, way.from_state[row], way.from_input[row], way.from_disturbance[row], way.from_fault[row])
-        for row, name in enumerate(way.names)
+        Sensor(
+            name,
+            recovery.from_state[row],
+            recovery.from_input[row],
+            recovery.from_disturbance[row],
+            recovery.from_fault[row],
+        )
+        for row, name in enumerate(recovery.names)
         if name not in measured
     )
 
@@ -108,8 +114,8 @@ def least_additions(
         return ()
     for size in (1, 2) if plant.nx <= most[1] else (1,):
         sets = np.array(list(combinations(range(len(sensors)), size)), dtype=np.int64).reshape(-1, size)
-        asked = sets if promising is None else sets[promising(sets)]
-        sensor_sets = [[sensors[i] for i in chosen] for chosen in asked.tolist()]
+        candidates = sets if promising is None else sets[promising(sets)]
+        sensor_sets = [[sensors[i] for i in chosen] for chosen in candidates.tolist()]
         helping = [chosen for chosen in sensor_sets if reached(with_sensors(plant, chosen))]
         if helping:
             return tuple(tuple(sensor.name for sensor in chosen) for chosen in helping)
@@ -134,12 +140,12 @@ def hidden_motion(plant: DescriptorSystem, fault: int, point: complex, removed: 
     inputs = [_signal(plant.dt, point, name, value) for name, value in values.items() if name in names]
     states = [f"{name} = {_amplitude(value)}" for name, value in values.items() if name not in names]
     more = len(states) - MOST_NAMED_SIGNALS
-    rest = [*states[:MOST_NAMED_SIGNALS], *([f"{more} more states"] if more > 0 else [])]
-    others = [*inputs, *([f"states {', '.join(rest)}"] if rest else [])]
+    state_texts = [*states[:MOST_NAMED_SIGNALS], *([f"{more} more states"] if more > 0 else [])]
+    causes = [*inputs, *([f"states {', '.join(state_texts)}"] if state_texts else [])]
     signal = _signal(plant.dt, point, own, 1.0)
-    if not others:
+    if not causes:
         return f"{signal} has no effect on any sensor from some initial state"
-    return f"{signal} and {' and '.join(others)} cancel at every sensor"
+    return f"{signal} and {' and '.join(causes)} cancel at every sensor"
 
 
 def hiding_amplitudes(
@@ -147,11 +153,11 @@ def hiding_amplitudes(
 ) -> dict[str, complex] | None:
     """Return these amplitudes by name, those of inputs first."""
     e, a = unknowns_pencil(plant, removed)
-    found = _solved(a - point * e, -np.concatenate([plant.Bf[:, fault], plant.Df[:, fault]]))
-    if found is None:
+    amplitudes = _solved(a - point * e, -np.concatenate([plant.Bf[:, fault], plant.Df[:, fault]]))
+    if amplitudes is None:
         return None
     names = (*plant.disturbance_names, *(plant.fault_names[j] for j in removed))
-    return {**_named(names, found[plant.nx :]), **_named(plant.state_names, found[: plant.nx])}
+    return {**_named(names, amplitudes[plant.nx :]), **_named(plant.state_names, amplitudes[: plant.nx])}
 
 
 def _signal(dt: float, point: complex, name: str, value: complex) -> str:
@@ -173,24 +179,26 @@ def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray | None:
     if reach == 0.0:
         return None
 
-    def solve(kept: list[int]) -> tuple[ComplexArray, float]:
-        part, *_ = np.linalg.lstsq(work[:, kept], goal, rcond=RANK_TOLERANCE)
-        return np.asarray(part, dtype=np.complex128), float(np.linalg.norm(work[:, kept] @ part - goal)) / reach
+    def solve(chosen: list[int]) -> tuple[ComplexArray, float]:
+        part, *_ = np.linalg.lstsq(work[:, chosen], goal, rcond=RANK_TOLERANCE)
+        return np.asarray(part, dtype=np.complex128), float(np.linalg.norm(work[:, chosen] @ part - goal)) / reach
 
-    kept = list(range(matrix.shape[1]))
-    part, miss = solve(kept)
+    columns = list(range(matrix.shape[1]))
+    part, miss = solve(columns)
     if miss > EXACTNESS:
         return None
-    for index in sorted(kept, key=lambda j: abs(part[kept.index(j)]))[: len(kept) if len(kept) <= 40 else 0]:
-        fewer = [j for j in kept if j != index]
+    for index in sorted(columns, key=lambda j: abs(part[columns.index(j)]))[
+        : len(columns) if len(columns) <= 40 else 0
+    ]:
+        fewer = [j for j in columns if j != index]
         if solve(fewer)[1] <= EXACTNESS:
-            kept = fewer
-    part, _ = solve(kept)
-    whole = np.zeros(matrix.shape[1], dtype=np.complex128)
-    whole[kept] = part
+            columns = fewer
+    part, _ = solve(columns)
+    amplitudes = np.zeros(matrix.shape[1], dtype=np.complex128)
+    amplitudes[columns] = part
     # What is only rounding in balanced units is nothing in those of the data.
-    whole[np.abs(whole) <= RANK_TOLERANCE * float(np.max(np.abs(whole), initial=0.0))] = 0.0
-    return np.asarray(units.columns * whole)
+    amplitudes[np.abs(amplitudes) <= RANK_TOLERANCE * float(np.max(np.abs(amplitudes), initial=0.0))] = 0.0
+    return np.asarray(units.columns * amplitudes)
 
 
 def _named(names: Sequence[str], values: ComplexArray) -> dict[str, complex]:

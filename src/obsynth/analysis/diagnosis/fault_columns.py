@@ -81,7 +81,7 @@ class Removal:
         inverse = np.linalg.inv(plant.E * plant.time)
         units = (sizes * traces)[places]
         known = plant.signals
-        found = residual_orders(
+        orders = residual_orders(
             inverse @ plant.A,
             plant.C,
             inverse @ plant.F[:, places] / units,
@@ -89,7 +89,7 @@ class Removal:
             inverse @ known[: plant.order],
             known[plant.order :],
         )
-        return {self.kept[place]: order for place, order in zip(places, found, strict=True) if order is not None}
+        return {self.kept[place]: order for place, order in zip(places, orders, strict=True) if order is not None}
 
     def pencil(self, *more: int) -> ExactPencil:
         """Return the pencil of the unknowns, with more faults among them."""
@@ -130,13 +130,13 @@ class DecoupledFault:
     @cached_property
     def plant(self) -> DecoupledPlant:
         """The decoupled plant, in floating point."""
-        whole, place = self.removal.plant, [self.removal.kept.index(self.number)]
+        reduced, place = self.removal.plant, [self.removal.kept.index(self.number)]
         return replace(
-            whole,
-            F=whole.F[:, place],
-            G=whole.G[:, place],
-            fault_sizes=whole.fault_sizes[place],
-            faults=(whole.faults[place[0]],),
+            reduced,
+            F=reduced.F[:, place],
+            G=reduced.G[:, place],
+            fault_sizes=reduced.fault_sizes[place],
+            faults=(reduced.faults[place[0]],),
         )
 
     @cached_property
@@ -165,8 +165,8 @@ class DecoupledFault:
             return False
         plant, column = self.plant, np.vstack(self._scaled)[:, 0] / self.trace
         basis = np.linalg.qr(np.vstack([plant.A - point * plant.E, plant.C]))[0]
-        rest = column - basis @ (basis.conj().T @ column)
-        return float(np.linalg.norm(rest - basis @ (basis.conj().T @ rest))) > TRACE_TOLERANCE
+        remainder = column - basis @ (basis.conj().T @ column)
+        return float(np.linalg.norm(remainder - basis @ (basis.conj().T @ remainder))) > TRACE_TOLERANCE
 
     @property
     def shows_at_rest(self) -> bool:
@@ -175,7 +175,7 @@ class DecoupledFault:
 
     @property
     def estimable(self) -> bool:
-        """Whether the fault's value can be estimated whatever its course is."""
+        """Whether the fault's value can be estimated whatever its time profile is."""
         return self.visible and not self.blocking.size
 
     @cached_property
@@ -202,8 +202,8 @@ class DecoupledFault:
         e, a = self._pencil
         # In discrete time the boundary is a number, not a direction: the unit of s must not move it.
         unit = self.plant.time if self.source.dt > 0.0 else 1.0
-        found = FiniteZeros(self.zeros / (self.plant.time / unit), a.shape[1], ())
-        return np.asarray(self.zeros[np.array(are_outside(e / unit, a, found, self.source.dt), dtype=bool)])
+        zeros = FiniteZeros(self.zeros / (self.plant.time / unit), a.shape[1], ())
+        return np.asarray(self.zeros[np.array(are_outside(e / unit, a, zeros, self.source.dt), dtype=bool)])
 
     @cached_property
     def order(self) -> int:
@@ -284,26 +284,26 @@ def reduced_values(
         kernel = null_basis(e)
         if kernel.ncols() == 0:
             break
-        kept = pivot_columns(e)
-        rest = left_null_basis(a * kernel)
-        e, a, right = rest * picked_columns(e, kept), rest * picked_columns(a, kept), rest * right
+        dynamic = pivot_columns(e)
+        left_null = left_null_basis(a * kernel)
+        e, a, right = left_null * picked_columns(e, dynamic), left_null * picked_columns(a, dynamic), left_null * right
     rows = pivot_columns(e.transpose())
     free = left_null_basis(e)
     top, c, outputs = picked_rows(e, rows), free * a, free * right
     if not rows:
         return zeros_matrix(0, 0), zeros_matrix(c.nrows(), 0), zeros_matrix(0, right.ncols()), outputs, fmpq_poly([1])
-    whole = top.solve(blocks([[picked_rows(a, rows), picked_rows(right, rows)]]))
+    solved = top.solve(blocks([[picked_rows(a, rows), picked_rows(right, rows)]]))
     n = len(rows)
-    a, right = picked_columns(whole, range(n)), picked_columns(whole, range(n, whole.ncols()))
-    seen = row_basis(c)
+    a, right = picked_columns(solved, range(n)), picked_columns(solved, range(n, solved.ncols()))
+    observable = row_basis(c)
     while True:
-        more = row_basis(blocks([[seen], [seen * a]]))
-        if more.nrows() == seen.nrows():
+        more = row_basis(blocks([[observable], [observable * a]]))
+        if more.nrows() == observable.nrows():
             break
-        seen = more
-    if seen.nrows() == n:
+        observable = more
+    if observable.nrows() == n:
         return a, c, right, outputs, fmpq_poly([1])
-    pivots = pivot_columns(seen)
-    kept_a = picked_columns(seen * a, pivots)
+    pivots = pivot_columns(observable)
+    kept_a = picked_columns(observable * a, pivots)
     zeros = a.charpoly() / kept_a.charpoly() if pivots else a.charpoly()
-    return kept_a, picked_columns(c, pivots), seen * right, outputs, fmpq_poly(zeros)
+    return kept_a, picked_columns(c, pivots), observable * right, outputs, fmpq_poly(zeros)

@@ -65,17 +65,17 @@ class Margins:
             return ""
         sizes = self.alike[fault]
         shares = [j for j in np.argsort(-sizes) if j != fault and sizes[j] > LEAST_SHARE * sizes.max()]
-        others = " and ".join(f"{sizes[j]:.3g} of {names[j]}" for j in shares)
+        lookalikes = " and ".join(f"{sizes[j]:.3g} of {names[j]}" for j in shares)
         kind = "a step" if self.at_rest[fault] else f"a sinusoid at {self.frequency:.3g} rad/s"
-        told = (
-            f"{names[fault]}: nearly lost. {kind.capitalize()} of one looks like {others}, but for "
+        text = (
+            f"{names[fault]}: nearly lost. {kind.capitalize()} of one looks like {lookalikes}, but for "
             f"{1.0 / margin:.1e} of its effect: it has to be {margin:.2g} times as large to be distinguished from the "
             "others as to be seen."
         )
         if self.least_steps is None or not self.at_rest[fault]:
-            return told
+            return text
         return (
-            f"{told} A step of {self.least_steps[fault]:.3g} stands out by {DEVIATIONS:g} standard deviations of the "
+            f"{text} A step of {self.least_steps[fault]:.3g} stands out by {DEVIATIONS:g} standard deviations of the "
             f"sensors in the mean of {SAMPLES} samples."
         )
 
@@ -85,27 +85,27 @@ def fault_margins(plant: DescriptorSystem, isolable: np.ndarray, at_rest: np.nda
     distinguished, and as a constant."""
     units = PlantUnits.of(plant).rounded()
     whitening, in_deviations = _whitening(plant, units)
-    rest, moving = dc_point(plant.dt), _own_point(plant, units)
-    still, sinusoid = (_responses(plant, units, whitening, point) for point in (rest, moving))
+    dc, moving = dc_point(plant.dt), _own_point(plant, units)
+    still, sinusoid = (_responses(plant, units, whitening, point) for point in (dc, moving))
     nf = plant.nf
     pairs, alone, alike, least = np.full((nf, nf), np.inf), np.full(nf, np.inf), np.zeros((nf, nf)), np.full(nf, np.inf)
     of_steps = []
     for i in range(nf):
         steps = still is not None and bool(at_rest[i].all())
-        found = still if steps and still is not None else sinusoid
+        responses = still if steps and still is not None else sinusoid
         of_steps.append(steps)
-        if found is None or not isolable[i, i]:
+        if responses is None or not isolable[i, i]:
             continue
-        faults, unknown = found
-        seen = _left(faults[:, i], unknown)[0]
+        faults, unknown = responses
+        effect = _left(faults[:, i], unknown)[0]
         for j in range(nf):
             if isolable[i, j] and j != i:
-                pairs[i, j] = _ratio(seen, _left(faults[:, i], np.hstack([faults[:, [j]], unknown]))[0])
+                pairs[i, j] = _ratio(effect, _left(faults[:, i], np.hstack([faults[:, [j]], unknown]))[0])
         pairs[i, i] = 1.0
-        others = [j for j in range(nf) if j != i]
-        own, sizes = _left(faults[:, i], np.hstack([faults[:, others], unknown]))
-        alone[i] = _ratio(seen, own)
-        alike[i, others] = np.abs(sizes[: nf - 1])
+        other_faults = [j for j in range(nf) if j != i]
+        own, sizes = _left(faults[:, i], np.hstack([faults[:, other_faults], unknown]))
+        alone[i] = _ratio(effect, own)
+        alike[i, other_faults] = np.abs(sizes[: nf - 1])
         if own > 0.0:
             least[i] = DEVIATIONS / (np.sqrt(SAMPLES) * own)
     frequency = abs(np.angle(moving)) / plant.dt if plant.dt else float(abs(moving))
@@ -136,11 +136,11 @@ def _responses(
     pencil = units.equations[:, None] * (point * plant.E - plant.A) * units.states
     if plant.nx and not decide_rank(pencil, expected=plant.nx).full:
         return None
-    entering = units.equations[:, None] * np.hstack([plant.Bf, plant.Bd])
-    shown = (plant.C * units.states) @ np.linalg.solve(pencil, entering) + np.hstack([plant.Df, plant.Dd])
-    found = whitening @ shown
-    found = found.real if point.imag == 0.0 else found
-    return found[:, : plant.nf], found[:, plant.nf :]
+    inputs = units.equations[:, None] * np.hstack([plant.Bf, plant.Bd])
+    outputs = (plant.C * units.states) @ np.linalg.solve(pencil, inputs) + np.hstack([plant.Df, plant.Dd])
+    comparable = whitening @ outputs
+    comparable = comparable.real if point.imag == 0.0 else comparable
+    return comparable[:, : plant.nf], comparable[:, plant.nf :]
 
 
 def _left(column: ComplexArray, beside: ComplexArray) -> tuple[float, ComplexArray]:
@@ -153,5 +153,5 @@ def _left(column: ComplexArray, beside: ComplexArray) -> tuple[float, ComplexArr
     return float(np.linalg.norm(column - (beside / scale) @ sizes)), sizes / scale
 
 
-def _ratio(seen: float, left: float) -> float:
-    return seen / left if left > RANK_TOLERANCE * seen else np.inf
+def _ratio(effect: float, remainder: float) -> float:
+    return effect / remainder if remainder > RANK_TOLERANCE * effect else np.inf

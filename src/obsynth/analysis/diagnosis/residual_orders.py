@@ -98,16 +98,18 @@ def residual_orders(
     """
     n, count = A.shape[0], F.shape[1]
     basis, (new, alone) = _Rows(np.zeros((0, n)), np.zeros((0, 1, count))), _of_degree_zero(A, C, F, G, K, L)
-    found: list[int | None] = [0 if is_alone else None for is_alone in alone.tolist()]
+    orders: list[int | None] = [0 if is_alone else None for is_alone in alone.tolist()]
     scale = largest_singular_value(C)
     for order in range(n + 1):
         new, hidden, terms = _beside(basis, new, scale)
-        shown = _present_faults(hidden, terms)
-        found = [order if seen and one is None else one for one, seen in zip(found, shown.tolist(), strict=True)]
-        if not len(new.z) or all(one is not None for one in found):
+        present = _present_faults(hidden, terms)
+        orders = [
+            order if shows and known is None else known for known, shows in zip(orders, present.tolist(), strict=True)
+        ]
+        if not len(new.z) or all(known is not None for known in orders):
             break
         basis, new, scale = basis.joined(new), new.differentiated(A, F), largest_singular_value(A)
-    return found
+    return orders
 
 
 def _present_faults(hidden: FloatArray, terms: FloatArray) -> NDArray[np.bool_]:
@@ -146,8 +148,8 @@ def _beside(basis: _Rows, rows: _Rows, scale: float) -> tuple[_Rows, FloatArray,
     terms = np.linalg.norm(f, axis=(0, 1))
     for _ in range(2):
         share = z @ basis.z.T
-        taken = _Rows(z, f).joined(basis.combined(-share))
-        z, f = taken.z[: len(z)] + taken.z[len(z) :], taken.f[: len(z)] + taken.f[len(z) :]
+        reduced = _Rows(z, f).joined(basis.combined(-share))
+        z, f = reduced.z[: len(z)] + reduced.z[len(z) :], reduced.f[: len(z)] + reduced.f[len(z) :]
         terms = terms + np.linalg.norm(np.tensordot(np.abs(share), np.abs(basis.f), axes=1), axis=(0, 1))
     left, values, right = np.linalg.svd(z, full_matrices=len(z) > z.shape[1])
     rank = int(np.count_nonzero(values > RANK_TOLERANCE * scale))

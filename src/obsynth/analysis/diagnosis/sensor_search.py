@@ -77,15 +77,15 @@ class SensorResponses:
         fixed = np.broadcast_to(np.arange(self.outputs), (count, self.outputs))
         rows = np.hstack([fixed, self.outputs + sets])
         columns = [*range(self.nd), *(self.nd + j for j in beside)]
-        found = np.zeros(count)
+        shares = np.zeros(count)
         if rows.shape[1] == 0:
-            return found
+            return shares
         for table in self.tables:
             goal = table[:, self.nd + fault][rows]
-            rest = _outside(table[:, columns][rows], goal)
+            parts = _outside(table[:, columns][rows], goal)
             size = np.linalg.norm(goal, axis=1)
-            found = np.maximum(found, np.where(size > 0.0, rest / np.where(size > 0.0, size, 1.0), 0.0))
-        return np.where(found > SHOWN_PART, found, 0.0)
+            shares = np.maximum(shares, np.where(size > 0.0, parts / np.where(size > 0.0, size, 1.0), 0.0))
+        return np.where(shares > SHOWN_PART, shares, 0.0)
 
 
 def _solution(matrix: ComplexArray | FloatArray, right: FloatArray) -> tuple[ComplexArray, FloatArray]:
@@ -95,8 +95,8 @@ def _solution(matrix: ComplexArray | FloatArray, right: FloatArray) -> tuple[Com
 
     .. [Higham2002] N. J. Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., SIAM, 2002.
     """
-    found = np.linalg.solve(matrix, np.hstack([right, np.eye(len(matrix))]))
-    x, inverse = found[:, : right.shape[1]], found[:, right.shape[1] :]
+    solved = np.linalg.solve(matrix, np.hstack([right, np.eye(len(matrix))]))
+    x, inverse = solved[:, : right.shape[1]], solved[:, right.shape[1] :]
     x = x + inverse @ (right - matrix @ x)
     return x, np.abs(inverse) @ (np.abs(matrix) @ np.abs(x) + np.abs(right))
 
@@ -106,9 +106,9 @@ def _outside(span: ComplexArray, vector: ComplexArray) -> NDArray[np.float64]:
     if span.shape[2] == 0:
         return np.asarray(np.linalg.norm(vector, axis=1))
     left, values, _ = np.linalg.svd(span, full_matrices=False)
-    kept = left * (values > RANK_TOLERANCE * np.maximum(values[:, :1], SMALLEST))[:, None, :]
+    directions = left * (values > RANK_TOLERANCE * np.maximum(values[:, :1], SMALLEST))[:, None, :]
     for _ in range(2):
-        vector = vector - np.einsum("nij,nj->ni", kept, np.einsum("nij,ni->nj", kept.conj(), vector))
+        vector = vector - np.einsum("nij,nj->ni", directions, np.einsum("nij,ni->nj", directions.conj(), vector))
     return np.asarray(np.linalg.norm(vector, axis=1))
 
 
@@ -157,8 +157,8 @@ class SensorSearch:
 
     def reachable(self) -> list[Task]:
         """Return the tasks that all candidates together reach: no set can do more, and no sensor takes one away."""
-        whole, had = DecoupledFaults(with_sensors(self.plant, self.sensors), exactly=False), set(self.had)
-        return [task for task in self.tasks(self.plant, self.faults) if task in had or reached(whole, task)]
+        equipped, had = DecoupledFaults(with_sensors(self.plant, self.sensors), exactly=False), set(self.had)
+        return [task for task in self.tasks(self.plant, self.faults) if task in had or reached(equipped, task)]
 
     def equipped(self, chosen: Sequence[int]) -> DescriptorSystem:
         """Return the plant with a set of candidates, each with a fault of its own where sensors may fail."""
@@ -178,82 +178,82 @@ class SensorSearch:
             fault_names=[*plant.fault_names, *(f"sensor {sensor.name}" for sensor in picked)],
         )
 
-    def feasible(self, chosen: Sequence[int], wanted: Sequence[Task]) -> bool:
+    def feasible(self, chosen: Sequence[int], tasks: Sequence[Task]) -> bool:
         """Whether a set reaches all that is wanted (and all about its own faults)."""
         if not chosen:
-            return set(wanted) <= set(self.had)
+            return set(tasks) <= set(self.had)
         plant = self.equipped(chosen)
-        asked = DecoupledFaults(plant, exactly=False)
-        if not all(reached(asked, task) for task in wanted):
+        faults = DecoupledFaults(plant, exactly=False)
+        if not all(reached(faults, task) for task in tasks):
             return False
         if not self.may_fail:
             return True
         known = self.plant.nf
         more = self.tasks(plant, [*self.faults, *range(known, plant.nf)])
-        return all(reached(asked, task) for task in more if max(task.fault, *task.beside, -1) >= known)
+        return all(reached(faults, task) for task in more if max(task.fault, *task.beside, -1) >= known)
 
-    def minimal_sets(self, wanted: Sequence[Task], largest: int, most: int) -> tuple[list[tuple[int, ...]], bool]:
+    def minimal_sets(self, tasks: Sequence[Task], largest: int, most: int) -> tuple[list[tuple[int, ...]], bool]:
         """Return inclusion-minimal sets by size, and whether these are all of them up to the largest size."""
         responses = None if self.may_fail else self.responses
-        found: list[tuple[int, ...]] = []
+        minimal: list[tuple[int, ...]] = []
         count = len(self.sensors)
         for size in range(largest + 1):
             if comb(count * self.copies, size) > MOST_ENUMERATED_SETS:
-                return found, False
+                return minimal, False
             every = dict.fromkeys(combinations([i for i in range(count) for _ in range(self.copies)], size))
-            sets = [chosen for chosen in every if not any(Counter(f) <= Counter(chosen) for f in found)]
+            sets = [chosen for chosen in every if not any(Counter(f) <= Counter(chosen) for f in minimal)]
             new: list[tuple[int, ...]] = []
-            for tried, chosen in enumerate(self._promising(sets, wanted, responses), start=1):
-                if self.feasible(chosen, wanted):
+            for tried, chosen in enumerate(self._promising(sets, tasks, responses), start=1):
+                if self.feasible(chosen, tasks):
                     new.append(chosen)
-                if len(found) + len(new) >= most or tried >= MOST_CONFIRMED:
-                    return [*found, *new], False
-            found += new
-            if () in found:  # every other set holds it
+                if len(minimal) + len(new) >= most or tried >= MOST_CONFIRMED:
+                    return [*minimal, *new], False
+            minimal += new
+            if () in minimal:  # every other set holds it
                 break
-        return found, True
+        return minimal, True
 
     def _promising(
-        self, sets: Sequence[tuple[int, ...]], wanted: Sequence[Task], responses: SensorResponses | None
+        self, sets: Sequence[tuple[int, ...]], tasks: Sequence[Task], responses: SensorResponses | None
     ) -> list[tuple[int, ...]]:
         """Return the sets that pass the rank test, those that show most first."""
         if responses is None or not sets or self.copies > 1:
             return list(sets)
         table = np.array(sets, dtype=np.int64).reshape(len(sets), -1)
         strength = np.full(len(sets), np.inf)
-        for task in wanted:
+        for task in tasks:
             strength = np.minimum(strength, responses.shows(table, task.fault, task.beside))
         order = np.argsort(-strength, kind="stable")
         return [sets[i] for i in order if strength[i] > 0.0]
 
-    def greedy_set(self, wanted: Sequence[Task]) -> tuple[int, ...] | None:
+    def greedy_set(self, tasks: Sequence[Task]) -> tuple[int, ...] | None:
         """Return one inclusion-minimal set: the sensor that reaches most, again and again; then what is not needed."""
         chosen: list[int] = []
-        left = list(range(len(self.sensors)))
-        while not self.feasible(chosen, wanted):
-            if not left:
+        candidates = list(range(len(self.sensors)))
+        while not self.feasible(chosen, tasks):
+            if not candidates:
                 return None
-            scores = [self._score([*chosen, i], wanted) for i in left]
-            chosen.append(left.pop(int(np.argmax(scores))))
+            scores = [self._score([*chosen, i], tasks) for i in candidates]
+            chosen.append(candidates.pop(int(np.argmax(scores))))
         for index in list(chosen):
-            rest = [i for i in chosen if i != index]
-            if self.feasible(rest, wanted):
-                chosen = rest
+            fewer = [i for i in chosen if i != index]
+            if self.feasible(fewer, tasks):
+                chosen = fewer
         return tuple(sorted(chosen))
 
-    def _score(self, chosen: Sequence[int], wanted: Sequence[Task]) -> float:
+    def _score(self, chosen: Sequence[int], tasks: Sequence[Task]) -> float:
         responses = self.responses
         if responses is None:
-            asked = DecoupledFaults(self.equipped(chosen), exactly=False)
-            return float(sum(reached(asked, task) for task in wanted))
+            faults = DecoupledFaults(self.equipped(chosen), exactly=False)
+            return float(sum(reached(faults, task) for task in tasks))
         table = np.array([chosen], dtype=np.int64)
-        shown = [float(responses.shows(table, task.fault, task.beside)[0]) for task in wanted]
-        return sum(value > 0.0 for value in shown) + min([value for value in shown if value > 0.0], default=0.0) / 2.0
+        shares = [float(responses.shows(table, task.fault, task.beside)[0]) for task in tasks]
+        return sum(value > 0.0 for value in shares) + min([value for value in shares if value > 0.0], default=0.0) / 2.0
 
 
 def reached(faults: DecoupledFaults, task: Task) -> bool:
     """Whether a plant reaches a task, decided by taking out what must not show: once for all faults that stay."""
-    asked = faults.of(task.beside, task.fault)
+    decoupled = faults.of(task.beside, task.fault)
     if task.goal == "estimate":
-        return asked.estimable
-    return asked.shows_at_rest if task.goal == "estimate-step" else asked.visible
+        return decoupled.estimable
+    return decoupled.shows_at_rest if task.goal == "estimate-step" else decoupled.visible

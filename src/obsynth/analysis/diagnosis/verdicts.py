@@ -42,25 +42,25 @@ class StructuredResidual:
     order: int | None
 
 
-def residual_bank(faults: DecoupledFaults, whole: bool = False) -> tuple[StructuredResidual, ...]:
+def residual_bank(faults: DecoupledFaults, whole_bank: bool = False) -> tuple[StructuredResidual, ...]:
     """Return the structured residuals that exist, those that see least first: all, or those of `_sets`."""
-    found, plant = [], faults.source
-    for removed in _sets(plant.nf, whole):
+    residuals, plant = [], faults.source
+    for removed in _sets(plant.nf, whole_bank):
         kept = [i for i in range(plant.nf) if i not in removed]
-        asked = [faults.of(removed, i) for i in kept]
-        if not all(one.visible for one in asked):
+        decoupled = [faults.of(removed, i) for i in kept]
+        if not all(fault.visible for fault in decoupled):
             continue
-        orders = [one.residual_order for one in asked]
+        orders = [fault.residual_order for fault in decoupled]
         known = [order for order in orders if order is not None]
-        sets = (kept, removed, [one.number for one in asked if one.shows_at_rest])
+        sets = (kept, removed, [fault.number for fault in decoupled if fault.shows_at_rest])
         sees, blind, at_rest = (tuple(plant.fault_names[i] for i in chosen) for chosen in sets)
-        found.append(StructuredResidual(sees, blind, at_rest, max(known) if len(known) == len(orders) else None))
-    return tuple(sorted(found, key=lambda residual: len(residual.sees)))
+        residuals.append(StructuredResidual(sees, blind, at_rest, max(known) if len(known) == len(orders) else None))
+    return tuple(sorted(residuals, key=lambda residual: len(residual.sees)))
 
 
-def _sets(count: int, whole: bool) -> Iterator[Sequence[int]]:
+def _sets(count: int, whole_bank: bool) -> Iterator[Sequence[int]]:
     """Yield the sets of faults to be blind to."""
-    if whole or count <= MOST_PATTERN_FAULTS:
+    if whole_bank or count <= MOST_PATTERN_FAULTS:
         for size in range(count):
             yield from combinations(range(count), size)
         return
@@ -139,7 +139,7 @@ class FaultDiagnosis:
         """Return the verdicts as plain data, zeros as ``[real, imaginary]``."""
         plain = {field.name: getattr(self, field.name) for field in fields(self)}
         return plain | {
-            "detectable_at": {f"{frequency:g}": found for frequency, found in self.detectable_at.items()},
+            "detectable_at": {f"{frequency:g}": detectable for frequency, detectable in self.detectable_at.items()},
             "zeros": _pairs(self.zeros),
             "blocking": _pairs(self.blocking),
             "sentences": list(self.sentences),
@@ -255,8 +255,8 @@ class Diagnosis:
         """What was asked, in one line."""
         count = len(self.unknown_inputs)
         named = ", ".join(self.unknown_inputs) if count <= 4 else f"{count} unknown inputs"
-        way = "decided exactly" if self.exact else "decided in floating point"
-        return f"What can be diagnosed ({f'decoupled from {named}' if count else 'no unknown inputs'}; {way})"
+        arithmetic = "decided exactly" if self.exact else "decided in floating point"
+        return f"What can be diagnosed ({f'decoupled from {named}' if count else 'no unknown inputs'}; {arithmetic})"
 
     def __repr__(self) -> str:
         if not self.faults:
@@ -279,8 +279,8 @@ def _pairs(values: ComplexArray) -> list[list[float]]:
     return [[float(value.real), float(value.imag)] for value in values]
 
 
-def _word(found: bool) -> str:
-    return "yes" if found else "no"
+def _word(verdict: bool) -> str:
+    return "yes" if verdict else "no"
 
 
 def _count(number: int | None) -> str:

@@ -39,8 +39,8 @@ class PencilUnits:
         balance.add(A, rows, columns)
         balance.add(E, rows, columns, common=m + n)
         factors = np.exp2(balance.solve(whole=True))
-        found = cls(factors[:m], factors[m : m + n], float(factors[-1]))
-        return found if n <= BY_LEAST_SQUARES else found._held_together(E, A)
+        units = cls(factors[:m], factors[m : m + n], float(factors[-1]))
+        return units if n <= BY_LEAST_SQUARES else units._held_together(E, A)
 
     def _held_together(self, E: FloatArray, A: FloatArray) -> PencilUnits:
         """Return units with the largest entry of each row and column near one, and both matrices of one size.
@@ -89,8 +89,8 @@ def left_part(E: FloatArray, A: FloatArray) -> LeftPart:
         reached, values, _ = full_svd(A @ kernel)
         decision = rank_from(values, expected=kernel.shape[1], scale=size_a)
         decisions.append(decision)
-        rest = reached[:, decision.rank :].T
-        E, A, left = rest @ E @ complement, rest @ A @ complement, rest @ left
+        left_null = reached[:, decision.rank :].T
+        E, A, left = left_null @ E @ complement, left_null @ A @ complement, left_null @ left
         right = complement.T @ right
     k = E.shape[1]
     rows = np.linalg.svd(E)[0] if k else np.eye(E.shape[0])
@@ -123,15 +123,15 @@ def _without_zeros(
         nothing = np.zeros((0, 0))
         return LeftPart(e, a, c, left, right, nothing, nothing, tuple(decisions))
     rows = np.linalg.qr(e @ hidden, mode="complete")[0]
-    zero, kept = rows[:, :count].T, rows[:, count:].T
-    seen = np.linalg.qr(hidden, mode="complete")[0][:, count:]
-    left = np.vstack([kept @ left[:k], left[k : k + p]])
+    zero, remaining = rows[:, :count].T, rows[:, count:].T
+    observable = np.linalg.qr(hidden, mode="complete")[0][:, count:]
+    left = np.vstack([remaining @ left[:k], left[k : k + p]])
     return LeftPart(
-        kept @ e @ seen,
-        kept @ a @ seen,
-        c @ seen,
+        remaining @ e @ observable,
+        remaining @ a @ observable,
+        c @ observable,
         left,
-        seen.T @ right,
+        observable.T @ right,
         zero @ e @ hidden,
         zero @ a @ hidden,
         tuple(decisions),
@@ -153,22 +153,22 @@ def _invariant(
     while count:
         left, values, right = np.linalg.svd(leaving, full_matrices=False)
         # What has no row of its own is zero but for the rounding of what it is the rest of.
-        shown = values if len(leaving) >= count else np.append(values, np.finfo(np.float64).eps * size)
-        decision = rank_from(shown, expected=count, scale=size)
+        padded = values if len(leaving) >= count else np.append(values, np.finfo(np.float64).eps * size)
+        decision = rank_from(padded, expected=count, scale=size)
         decisions.append(decision)
         rank, count = decision.rank, count - decision.rank
         if rank == 0:
             break
         turn = _reflection(right[:rank].T)
         hidden, moving, staying = (turn(part)[:, rank:] for part in (hidden, moving, staying))
-        kept = turn(left[:, rank:].T @ leaving)[:, rank:]
+        still_leaving = turn(left[:, rank:].T @ leaving)[:, rank:]
         if count:
             packed, factors, _, _ = dgeqrf(moving)
             moving, staying = (
                 np.triu(packed[:count]),
                 dormqr("L", "T", packed, factors, staying, LAPACK_BLOCK * count)[0],
             )
-        leaving, staying = np.vstack([kept, staying[count:]]), staying[:count]
+        leaving, staying = np.vstack([still_leaving, staying[count:]]), staying[:count]
     return hidden
 
 

@@ -90,11 +90,11 @@ def instability(value: complex, dt: float) -> float:
 
 def independent_disturbances(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
     """Return ``[Bd; Dd]`` as a basis of its range: repeated disturbances would make every rank too low."""
-    whole = np.vstack([plant.Bd, plant.Dd])
-    rank = decide_rank(whole).rank
+    disturbances = np.vstack([plant.Bd, plant.Dd])
+    rank = decide_rank(disturbances).rank
     if rank == plant.nd:
         return plant.Bd, plant.Dd
-    left = np.linalg.svd(whole, full_matrices=False)[0][:, :rank]
+    left = np.linalg.svd(disturbances, full_matrices=False)[0][:, :rank]
     return left[: plant.nx], left[plant.nx :]
 
 
@@ -102,8 +102,8 @@ def in_disturbances(
     plant: DescriptorSystem, inputs: FloatArray, direct: FloatArray, direction: NDArray[Any]
 ) -> FloatArray:
     """Return the size of each disturbance in a combination of independent ones."""
-    whole, basis = np.vstack([plant.Bd, plant.Dd]), np.vstack([inputs, direct])
-    return np.abs(np.linalg.pinv(whole) @ (basis @ direction)) if whole.size else np.zeros(0)
+    disturbances, basis = np.vstack([plant.Bd, plant.Dd]), np.vstack([inputs, direct])
+    return np.abs(np.linalg.pinv(disturbances) @ (basis @ direction)) if disturbances.size else np.zeros(0)
 
 
 def kernel(matrix: NDArray[Any]) -> NDArray[Any]:
@@ -140,12 +140,12 @@ def exact_drops(judge: Evaluator, model: Exosystem) -> tuple[SystemFacts, list[i
         return None
 
     def decided() -> tuple[SystemFacts, list[int]]:
-        whole, below, direct, kept = _exact_pencil(judge, numbers, model)
-        return whole.system(below, direct), kept
+        augmented, below, direct, kept = _exact_pencil(judge, numbers, model)
+        return augmented.system(below, direct), kept
 
     key = ("drops", model.Phi.tobytes(), model.Cw.tobytes(), model.order)
-    found: tuple[SystemFacts, list[int]] = numbers.remembered(key, decided)
-    return found
+    facts: tuple[SystemFacts, list[int]] = numbers.remembered(key, decided)
+    return facts
 
 
 def exact_loss(judge: Evaluator, model: Exosystem, value: complex) -> int | None:
@@ -153,8 +153,8 @@ def exact_loss(judge: Evaluator, model: Exosystem, value: complex) -> int | None
     factor = _factor_of(model, value)
     if judge.numbers is None or factor is None:
         return None
-    whole, below, direct, kept = _exact_pencil(judge, judge.numbers, model)
-    rank = whole.rank_at_root(below, direct, factor)
+    augmented, below, direct, kept = _exact_pencil(judge, judge.numbers, model)
+    rank = augmented.rank_at_root(below, direct, factor)
     return None if rank is None else judge.plant.nx + model.order + len(kept) - rank
 
 
@@ -162,16 +162,16 @@ def _augmented(numbers: PlantNumbers, plant: DescriptorSystem, model: Exosystem)
     count, nx = model.order, plant.nx
     own = numbers.as_own
     across, down = zeros_matrix(nx, count), zeros_matrix(count, nx)
-    course = own(written_matrix(model.Cw))
+    fault_outputs = own(written_matrix(model.Cw))
     changed = {
         "E": blocks([[numbers.matrices["E"], own(across)], [own(down), own(identity(count))]]),
         "A": blocks(
             [
-                [numbers.matrices["A"], numbers.product(numbers.matrices["Bf"], course)],
+                [numbers.matrices["A"], numbers.product(numbers.matrices["Bf"], fault_outputs)],
                 [own(down), own(written_matrix(model.Phi))],
             ]
         ),
-        "C": blocks([[numbers.matrices["C"], numbers.product(numbers.matrices["Df"], course)]]),
+        "C": blocks([[numbers.matrices["C"], numbers.product(numbers.matrices["Df"], fault_outputs)]]),
     }
     rational = {"E": blocks([[numbers.rational["E"], across], [down, identity(count)]])}
     return numbers.with_matrices(changed, rational=rational)

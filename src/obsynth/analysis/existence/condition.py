@@ -67,19 +67,19 @@ class Condition:
     def _opening(self) -> str:
         return NOT_TAKEN if self.of_the_method else NONE_OF_THIS_KIND
 
-    def in_doubt(self, found: Unclear, plant: DescriptorSystem) -> Condition:
+    def in_doubt(self, doubt: Unclear, plant: DescriptorSystem) -> Condition:
         """Return the condition as one that rounding of the data could change, with what tells so in its detail."""
-        return replace(self, holds=False, unclear=found, detail=f"{self.detail.rstrip()} {found.described(plant)}")
+        return replace(self, holds=False, unclear=doubt, detail=f"{self.detail.rstrip()} {doubt.described(plant)}")
 
 
 def up_to_failure(conditions: Iterable[Condition]) -> tuple[Condition, ...]:
     """Return conditions in order, up to the first that fails: those after it may rely on it, and are not asked for."""
-    found = list[Condition]()
+    checked = list[Condition]()
     for condition in conditions:
-        found.append(condition)
+        checked.append(condition)
         if not condition.holds:
             break
-    return tuple(found)
+    return tuple(checked)
 
 
 def require_all(conditions: Iterable[Condition]) -> None:

@@ -55,19 +55,19 @@ def numbers_with_fault_states(plant: DescriptorSystem, numbers: PlantNumbers | N
         return numbers
     nx, nf, count = plant.nx, plant.nf, len(chosen)
     across, down, square = zeros_matrix(nx, count), zeros_matrix(count, nx), zeros_matrix(count, count)
-    shown = picked_columns(identity(nf), chosen)
-    rows = shown.transpose()
-    kept = identity(nf) - shown * rows
+    selected = picked_columns(identity(nf), chosen)
+    rows = selected.transpose()
+    remaining = identity(nf) - selected * rows
     own = numbers.as_own
     changed: dict[str, Any] = {
         "E": blocks([[numbers.matrices["E"], own(across)], [own(down), own(square)]]),
         "A": blocks([[numbers.matrices["A"], own(across)], [own(down), own(-identity(count))]]),
         "Bf": blocks([[numbers.matrices["Bf"]], [own(rows)]]),
-        "C": blocks([[numbers.matrices["C"], numbers.product(numbers.matrices["Df"], own(shown))]]),
-        "Df": numbers.product(numbers.matrices["Df"], own(kept)),
+        "C": blocks([[numbers.matrices["C"], numbers.product(numbers.matrices["Df"], own(selected))]]),
+        "Df": numbers.product(numbers.matrices["Df"], own(remaining)),
     }
     e, c, df = (numbers.rational[name] for name in ("E", "C", "Df"))
-    rational = {"E": blocks([[e, across], [down, square]]), "C": blocks([[c, df * shown]]), "Df": df * kept}
+    rational = {"E": blocks([[e, across], [down, square]]), "C": blocks([[c, df * selected]]), "Df": df * remaining}
     return numbers.with_matrices(changed, rational=rational)
 
 
@@ -76,8 +76,8 @@ def exact_indexes(plant: DescriptorSystem) -> ExactIndexes | None:
     numbers = numbers_of(plant)
     if numbers is None or numbers.computed:
         return None  # a Markov parameter that is zero may have been computed as one that is not
-    found: ExactIndexes | None = numbers.remembered("indexes", lambda: _decided_indexes(plant, numbers))
-    return found
+    indexes: ExactIndexes | None = numbers.remembered("indexes", lambda: _decided_indexes(plant, numbers))
+    return indexes
 
 
 def _decided_indexes(plant: DescriptorSystem, known: PlantNumbers) -> ExactIndexes | None:
@@ -87,16 +87,16 @@ def _decided_indexes(plant: DescriptorSystem, known: PlantNumbers) -> ExactIndex
     t = nonsingular_t(numbers)
     if t is None:
         return None
-    left: Any = numbers.as_own(t)
-    ta, c = numbers.product(left, numbers.matrices["A"]), numbers.matrices["C"]
+    own_t: Any = numbers.as_own(t)
+    ta, c = numbers.product(own_t, numbers.matrices["A"]), numbers.matrices["C"]
     order, indexes, columns = int(t.ncols()), list[int | None](), list[Any]()
     for fault in range(plant.nf):
-        vector = numbers.product(left, numbers.columns("Bf", [fault]))
+        vector = numbers.product(own_t, numbers.columns("Bf", [fault]))
         for step in range(1, order + 1):
-            shown = numbers.product(c, vector)
-            if numbers.rank(shown):
+            response = numbers.product(c, vector)
+            if numbers.rank(response):
                 indexes.append(step)
-                columns.append(shown)
+                columns.append(response)
                 break
             vector = numbers.product(ta, vector)
         else:
@@ -115,8 +115,8 @@ def nonsingular_t(numbers: PlantNumbers) -> fmpq_mat | None:
     free, rng = left_null_basis(stacked), random.Random(_PENCIL_SEED)
     for size in range(MOST_CHOICES):
         mix = fmpq_mat(order, int(free.nrows()), [rng.randint(-size, size) for _ in range(order * int(free.nrows()))])
-        both = inverse + mix * free
-        t = picked_columns(both, range(order))
+        solution = inverse + mix * free
+        t = picked_columns(solution, range(order))
         if t.det() != 0:
             return t
     return None
@@ -165,10 +165,10 @@ def fault_detectability(
         states, outputs = units.states, units.outputs
         if scaling is not None:
             states, outputs = states / scaling.states, outputs / scaling.outputs
-        own, shown, entering = ta * states / states[:, None], outputs[:, None] * c * states, tf / states[:, None]
-        size = largest_singular_value(shown)
-        found = [_first_visible(own, shown, entering[:, i], size) for i in range(tf.shape[1])]
-        results = [(index, states * vector) for index, vector in found]
+        own_a, own_c, own_f = ta * states / states[:, None], outputs[:, None] * c * states, tf / states[:, None]
+        size = largest_singular_value(own_c)
+        visible = [_first_visible(own_a, own_c, own_f[:, i], size) for i in range(tf.shape[1])]
+        results = [(index, states * vector) for index, vector in visible]
     else:
         results = [_at_index(ta, tf[:, i], index) for i, index in enumerate(exact[0])]
     psi = np.column_stack([vector for _, vector in results]) if results else np.zeros((ta.shape[0], 0))

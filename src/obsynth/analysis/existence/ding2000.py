@@ -115,14 +115,14 @@ def _no_zero_on_the_axis(plant: DescriptorSystem) -> tuple[Condition, ...]:
     e = np.zeros_like(a)
     e[: plant.nx, : plant.nx] = plant.E
     zeros = ExactPencil.written(e, a).zeros(discrete=False)
-    found = [complex(root.value) for root in zeros if root.side == "boundary"]
-    if computed and not found:
+    on_axis = [complex(root.value) for root in zeros if root.side == "boundary"]
+    if computed and not on_axis:
         return ()
     detail = (
         "none, exactly"
-        if not found
+        if not on_axis
         else (
-            f"s = {found[0]:.4g}: the unknown inputs do not reach some residual there, and the filter that gives all "
+            f"s = {on_axis[0]:.4g}: the unknown inputs do not reach some residual there, and the filter that gives all "
             "residuals the same gain would not be stable. State noise of the states (Bw)."
         )
     )
@@ -130,11 +130,11 @@ def _no_zero_on_the_axis(plant: DescriptorSystem) -> tuple[Condition, ...]:
         Condition(
             "zeros of the unknown inputs",
             "none on the imaginary axis",
-            not found,
-            float(len(found)),
+            not on_axis,
+            float(len(on_axis)),
             0.0,
             _SOURCE,
             detail,
-            mode=found[0] if found else None,
+            mode=on_axis[0] if on_axis else None,
         ),
     )

@@ -60,12 +60,12 @@ def distance_to_loss(
 
 
 def zeros_at_rounding_level(
-    E: FloatArray, A: FloatArray, found: Iterable[complex], exact: Sequence[complex], *, nx: int
+    E: FloatArray, A: FloatArray, computed: Iterable[complex], exact: Sequence[complex], *, nx: int
 ) -> list[complex]:
     """Return those zeros found in floating point that the exact ones lack only by rounding of the data."""
     return [
         value
-        for value in map(complex, found)
+        for value in map(complex, computed)
         if not any(abs(value - other) <= SAME_ZERO_DISTANCE * max(1.0, abs(other)) for other in exact)
         and relative_singular_values(E, A, [value], nx=nx)[0] <= ROUNDING_LEVEL
     ]
@@ -75,9 +75,9 @@ def relative_singular_values(
     E: FloatArray, A: FloatArray, points: Sequence[complex], *, nx: int, sizes: FloatArray | None = None
 ) -> FloatArray:
     """Return the least singular value over the largest at each point, in units of A or of ``sizes`` of its terms."""
-    found = np.full(len(points), 0.0 if A.shape[1] else np.inf)
+    shares = np.full(len(points), 0.0 if A.shape[1] else np.inf)
     if A.shape[0] < A.shape[1] or not A.size:
-        return found
+        return shares
     groups: dict[tuple[float, bool], list[int]] = {}
     for place, point in enumerate(points):
         groups.setdefault((size_of_point(point), point.imag != 0.0), []).append(place)
@@ -93,9 +93,9 @@ def relative_singular_values(
             largest = values[:, 0]
             if sizes is not None:
                 largest = np.linalg.norm(pencil.A + np.abs(chosen) * np.abs(pencil.E), 2, axis=(1, 2))
-            seen = values[:, 0] > 0.0
-            found[some] = np.where(seen, values[:, -1] / np.where(seen, largest, 1.0), 0.0)
-    return found
+            nonzero = values[:, 0] > 0.0
+            shares[some] = np.where(nonzero, values[:, -1] / np.where(nonzero, largest, 1.0), 0.0)
+    return shares
 
 
 def least_share(matrix: NDArray[Any], sizes: FloatArray, *, rank: int | None = None) -> float:
@@ -117,8 +117,8 @@ def _boundary(E: FloatArray, A: FloatArray, discrete: bool) -> list[complex]:
 
 def _typical_rate(E: FloatArray, A: FloatArray) -> float:
     """Return the size of s at which both matrices weigh the same."""
-    left, right = float(np.linalg.norm(E)), float(np.linalg.norm(A))
-    return right / left if left > 0.0 and right > 0.0 else 1.0
+    size_e, size_a = float(np.linalg.norm(E)), float(np.linalg.norm(A))
+    return size_a / size_e if size_e > 0.0 and size_a > 0.0 else 1.0
 
 
 def _to_boundary(value: complex, discrete: bool) -> complex:
@@ -128,16 +128,16 @@ def _to_boundary(value: complex, discrete: bool) -> complex:
 
 
 def _compressed_points(E: FloatArray, A: FloatArray, discrete: bool) -> list[complex]:
-    rng, found = np.random.default_rng(1), list[complex]()
+    rng, points = np.random.default_rng(1), list[complex]()
     for _ in range(COMPRESSIONS):
-        left = rng.standard_normal((A.shape[1], A.shape[0]))
+        compression = rng.standard_normal((A.shape[1], A.shape[0]))
         # LAPACK gives up on a few pencils: their points are left out.
         try:
-            values = eigenvalues(left @ A, left @ E)
+            values = eigenvalues(compression @ A, compression @ E)
         except np.linalg.LinAlgError:
             continue
         finite = values[np.abs(values) <= FASTEST * (1.0 if discrete else _typical_rate(E, A))]
         outside = finite[np.abs(finite) >= 1.0] if discrete else finite[finite.real >= 0.0]
         upper = outside[outside.imag >= 0.0]
-        found += [complex(value) for value in upper[np.argsort(np.abs(upper))][:MOST_POINTS]]
-    return found
+        points += [complex(value) for value in upper[np.argsort(np.abs(upper))][:MOST_POINTS]]
+    return points

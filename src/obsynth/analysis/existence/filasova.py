@@ -137,18 +137,18 @@ def _explicit_conditions(judge: Evaluator) -> Iterator[Condition]:
     )
 
     def alike(columns: FloatArray) -> tuple[str, tuple[str, ...]]:
-        told = "some faults act nowhere, or in the same direction as others, and cannot be distinguished."
-        return told, _null_names(columns, plant.fault_names)
+        text = "some faults act nowhere, or in the same direction as others, and cannot be distinguished."
+        return text, _null_names(columns, plant.fault_names)
 
     def hidden(rosenbrock: FloatArray) -> tuple[str, tuple[str, ...]]:
         names = leading_names(
             np.linalg.svd(equilibrate(rosenbrock))[2][-1, plant.nx :], plant.fault_names, most=MOST_NAMES
         )
-        told = (
+        text = (
             f"there is a zero at s = 0, where a constant fault {', '.join(map(repr, names))} has no effect on the "
             "outputs in steady state. Measure another signal."
         )
-        return told, names
+        return text, names
 
     yield judge.full_rank("rank F", FullRank([["Bf"], ["Df"]]), alike, source=source)
     yield judge.no_zero_outside(

@@ -51,9 +51,9 @@ def conditions(
             ),
         )
     if sets is not None:
-        return tuple(condition for seen in sets for condition in _residual_conditions(plant, seen, exactly))
-    given = isinstance(fault_model, Exosystem)
-    model = fault_model if given else exosystem(fault_model, plant.fault_names, plant.dt)
+        return tuple(condition for sensitive in sets for condition in _residual_conditions(plant, sensitive, exactly))
+    is_exosystem = isinstance(fault_model, Exosystem)
+    model = fault_model if is_exosystem else exosystem(fault_model, plant.fault_names, plant.dt)
     return tuple(
         condition
         for fault in chosen_faults(faults, plant)
@@ -69,55 +69,55 @@ def _fault_conditions(
 ) -> tuple[Condition, ...]:
     """Return whether one fault, whose model has these poles, can be estimated, free of others and unknown inputs."""
     name = plant.fault_names[fault]
-    asked = decoupled_fault(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
-    seen = _visibility(plant, asked, f"{name} detectable", _rest(plant, fault))
-    if not asked.visible:
-        return (seen,)
-    lost = [point for point in points if not asked.shows_at(point)]
-    doubtful = [point for point in lost if _may_show(asked, point)]
-    shares = {point: _named(plant, asked).last_share(point) for point in points}
+    decoupled = decoupled_fault(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
+    visible = _visibility(plant, decoupled, f"{name} detectable", _rest(plant, fault))
+    if not decoupled.visible:
+        return (visible,)
+    lost = [point for point in points if not decoupled.shows_at(point)]
+    doubtful = [point for point in lost if _may_show(decoupled, point)]
+    shares = {point: _named(plant, decoupled).last_share(point) for point in points}
     least = min(points, key=lambda point: shares[point], default=dc_point(plant.dt))
     share = f", at the poles of its model at least {shares[least]:.2g} of it reaches the outputs" if shares else ""
-    kept = Condition(
+    follows = Condition(
         f"{name} follows its model",
         f"{name} has no zero at a pole of its model ({description})",
         not lost,
         float(len(lost)),
         0.0,
         _SOURCE,
-        f"{_gap(asked)}{share}" if not lost else _hidden(plant, asked, lost[0]),
+        f"{_gap(decoupled)}{share}" if not lost else _hidden(plant, decoupled, lost[0]),
         mode=lost[0] if lost else None,
         signals=(name,) if lost else (),
     )
     if doubtful and len(doubtful) == len(lost):
-        return seen, _in_doubt(kept, plant, asked, doubtful[0])
+        return visible, _in_doubt(follows, plant, decoupled, doubtful[0])
     at_rounding_level = not lost and bool(shares) and shares[least] <= ROUNDING_LEVEL
-    return seen, _in_doubt(kept, plant, asked, least) if at_rounding_level else kept
+    return visible, _in_doubt(follows, plant, decoupled, least) if at_rounding_level else follows
 
 
-def _may_show(asked: DecoupledFault, point: complex | None = None) -> bool:
+def _may_show(decoupled: DecoupledFault, point: complex | None = None) -> bool:
     """Whether a fault that floating point does not see shows on paper (at a point), or may for all that can be
     isolated."""
-    if asked.exactly:
+    if decoupled.exactly:
         return False
-    if not asked.clear:
+    if not decoupled.clear:
         return True
-    plant = asked.source
+    plant = decoupled.source
     if plant.nx + plant.nd + plant.nf > COMPUTED_STATES or plant.exact is not None:
         return False
-    exact = decoupled_fault(plant, asked.removed, asked.number, True)
+    exact = decoupled_fault(plant, decoupled.removed, decoupled.number, True)
     return exact.visible if point is None else exact.shows_at(point)
 
 
-def _named(plant: DescriptorSystem, asked: DecoupledFault) -> NamedPencil:
+def _named(plant: DescriptorSystem, decoupled: DecoupledFault) -> NamedPencil:
     """Return what the fault must not be a combination of, and the fault itself in the last column."""
-    kept = {name: [*asked.removed, asked.number] for name in ("Bf", "Df")}
-    return Evaluator(plant).named(FullRank([["A", "Bd", "Bf"], ["C", "Dd", "Df"]], kept))
+    columns = {name: [*decoupled.removed, decoupled.number] for name in ("Bf", "Df")}
+    return Evaluator(plant).named(FullRank([["A", "Bd", "Bf"], ["C", "Dd", "Df"]], columns))
 
 
-def _in_doubt(condition: Condition, plant: DescriptorSystem, asked: DecoupledFault, point: complex) -> Condition:
+def _in_doubt(condition: Condition, plant: DescriptorSystem, decoupled: DecoupledFault, point: complex) -> Condition:
     """Return the condition as one that rounding of the data could change."""
-    named, name = _named(plant, asked), plant.fault_names[asked.number]
+    named, name = _named(plant, decoupled), plant.fault_names[decoupled.number]
     share = named.last_share(point)
     other = f"hides {name} at {'z' if plant.dt > 0.0 else 's'} = {pole_text(point)}, and no filter estimates it"
     doubt = Evaluator(plant).doubt(named, other, point=point, tolerance=max(ROUNDING_LEVEL, share), last=True)
@@ -125,33 +125,35 @@ def _in_doubt(condition: Condition, plant: DescriptorSystem, asked: DecoupledFau
     return replace(condition, detail=detail, mode=point, signals=(name,)).in_doubt(doubt, plant)
 
 
-def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int], exactly: bool | None) -> list[Condition]:
+def _residual_conditions(plant: DescriptorSystem, sensitive: Sequence[int], exactly: bool | None) -> list[Condition]:
     """Return whether each fault of a set shows in residuals that are blind to all others."""
-    removed = [j for j in range(plant.nf) if j not in seen]
-    found = []
-    for fault in seen:
-        asked = decoupled_fault(plant, removed, fault, exactly)
+    removed = [j for j in range(plant.nf) if j not in sensitive]
+    conditions = []
+    for fault in sensitive:
+        decoupled = decoupled_fault(plant, removed, fault, exactly)
         blind = [*plant.disturbance_names, *(plant.fault_names[j] for j in removed)]
         without = f" without {', '.join(plant.fault_names[j] for j in removed)}" if removed else ""
         name = f"{plant.fault_names[fault]} detectable{without}"
-        found.append(_visibility(plant, asked, name, ", ".join(blind) or "the initial state"))
-    return found
+        conditions.append(_visibility(plant, decoupled, name, ", ".join(blind) or "the initial state"))
+    return conditions
 
 
-def _visibility(plant: DescriptorSystem, asked: DecoupledFault, name: str, rest: str) -> Condition:
+def _visibility(plant: DescriptorSystem, decoupled: DecoupledFault, name: str, unknowns: str) -> Condition:
     """Return the condition of this name that a fault shows, decoupled from the rest."""
-    fault, point = plant.fault_names[asked.number], dc_point(plant.dt)
-    found = Condition(
+    fault, point = plant.fault_names[decoupled.number], dc_point(plant.dt)
+    condition = Condition(
         name,
-        f"{fault} is visible, decoupled from {rest}",
-        asked.visible,
-        float(asked.visible),
+        f"{fault} is visible, decoupled from {unknowns}",
+        decoupled.visible,
+        float(decoupled.visible),
         1.0,
         _SOURCE,
-        _gap(asked) if asked.visible else _hidden(plant, asked, point),
-        signals=() if asked.visible else (fault,),
+        _gap(decoupled) if decoupled.visible else _hidden(plant, decoupled, point),
+        signals=() if decoupled.visible else (fault,),
     )
-    return _in_doubt(found, plant, asked, point) if not asked.visible and _may_show(asked) else found
+    return (
+        _in_doubt(condition, plant, decoupled, point) if not decoupled.visible and _may_show(decoupled) else condition
+    )
 
 
 def _rest(plant: DescriptorSystem, fault: int) -> str:
@@ -159,12 +161,12 @@ def _rest(plant: DescriptorSystem, fault: int) -> str:
     return ", ".join(names) or "the initial state"
 
 
-def _gap(asked: DecoupledFault) -> str:
-    return "decided exactly" if np.isinf(asked.gap) else f"gap {asked.gap:.1e}"
+def _gap(decoupled: DecoupledFault) -> str:
+    return "decided exactly" if np.isinf(decoupled.gap) else f"gap {decoupled.gap:.1e}"
 
 
-def _hidden(plant: DescriptorSystem, asked: DecoupledFault, point: complex) -> str:
-    motion = hidden_motion(plant, asked.number, point, asked.removed)
+def _hidden(plant: DescriptorSystem, decoupled: DecoupledFault, point: complex) -> str:
+    motion = hidden_motion(plant, decoupled.number, point, decoupled.removed)
     if motion is None:
         return "no output responds to it."
     return f"{motion} ({'z' if plant.dt > 0.0 else 's'} = {pole_text(point)})."
@@ -173,11 +175,11 @@ def _hidden(plant: DescriptorSystem, asked: DecoupledFault, point: complex) -> s
 def chosen_faults(faults: Any, plant: DescriptorSystem) -> list[int]:
     """Return the columns of the faults to estimate."""
     listed = [faults] if isinstance(faults, str) else list(plant.fault_names if faults is None else faults)
-    found = fault_numbers(plant, listed, f"{OPTIONS_PATH}.faults")
-    if len(found) < len(listed):
-        there = ", ".join(plant.fault_names)
-        raise SpecError(f"a fault is named twice; there are: {there}.", path=f"{OPTIONS_PATH}.faults")
-    return sorted(found)
+    numbers = fault_numbers(plant, listed, f"{OPTIONS_PATH}.faults")
+    if len(numbers) < len(listed):
+        names = ", ".join(plant.fault_names)
+        raise SpecError(f"a fault is named twice; there are: {names}.", path=f"{OPTIONS_PATH}.faults")
+    return sorted(numbers)
 
 
 def residual_sets(residuals: Any, plant: DescriptorSystem) -> list[list[int]] | None:
@@ -189,8 +191,8 @@ def residual_sets(residuals: Any, plant: DescriptorSystem) -> list[list[int]] | 
         return [everything]
     if residuals == "isolate":
         return [[i] for i in everything]
-    given = [residuals] if isinstance(residuals, str) else list(residuals)
-    sets = [[entry] if isinstance(entry, str) else list(entry) for entry in given]
+    entries = [residuals] if isinstance(residuals, str) else list(residuals)
+    sets = [[entry] if isinstance(entry, str) else list(entry) for entry in entries]
     unknown = sorted({str(name) for entry in sets for name in entry if name not in plant.fault_names})
     if unknown or not all(sets):
         raise SpecError(

@@ -87,22 +87,22 @@ def state_goals(plant: DescriptorSystem, places: Sequence[int], t: FloatArray) -
     scaled = rows * columns
     sizes = np.linalg.norm(scaled, axis=1)
     scaled = scaled / np.where(sizes > 0.0, sizes, 1.0)[:, None]
-    wanted = np.hstack([goal * units.states, np.zeros((len(places), count + nx))])
-    lengths = np.linalg.norm(wanted, axis=1)
-    found = np.zeros((len(places), len(rows)))
+    targets = np.hstack([goal * units.states, np.zeros((len(places), count + nx))])
+    lengths = np.linalg.norm(targets, axis=1)
+    weights = np.zeros((len(places), len(rows)))
     missed = np.ones(len(places))
-    for taken in (order + nx, len(rows)):
+    for width in (order + nx, len(rows)):
         todo = missed > MISSED_SHARE
-        if not todo.any() or not taken:
+        if not todo.any() or not width:
             continue
-        solution = np.linalg.lstsq(scaled[:taken].T, wanted[todo].T, rcond=ROUNDING_SHARE)[0].T
-        left = np.linalg.norm(solution @ scaled[:taken] - wanted[todo], axis=1) / lengths[todo]
-        found[todo] = 0.0
-        found[todo, :taken] = solution / np.where(sizes[:taken] > 0.0, sizes[:taken], 1.0)
-        missed[todo] = left
-    largest = np.max(np.abs(found) * np.where(sizes > 0.0, sizes, 1.0), axis=1, initial=0.0, keepdims=True)
-    found = np.where(np.abs(found) * sizes > ROUNDING_SHARE * largest, found, 0.0)
-    moving, t0, direct = np.split(found, [order, order + nx], axis=1)
+        solution = np.linalg.lstsq(scaled[:width].T, targets[todo].T, rcond=ROUNDING_SHARE)[0].T
+        shares = np.linalg.norm(solution @ scaled[:width] - targets[todo], axis=1) / lengths[todo]
+        weights[todo] = 0.0
+        weights[todo, :width] = solution / np.where(sizes[:width] > 0.0, sizes[:width], 1.0)
+        missed[todo] = shares
+    largest = np.max(np.abs(weights) * np.where(sizes > 0.0, sizes, 1.0), axis=1, initial=0.0, keepdims=True)
+    weights = np.where(np.abs(weights) * sizes > ROUNDING_SHARE * largest, weights, 0.0)
+    moving, t0, direct = np.split(weights, [order, order + nx], axis=1)
     # moving T E - t0 A + direct C = goal
     known = np.hstack([t0 @ plant.B - direct @ plant.D, direct])
     return StateGoals(moving, known, t0, missed)
@@ -118,7 +118,7 @@ class FixedModes:
     T: FloatArray  # (m, nx)
 
 
-def fixed_modes(plant: DescriptorSystem, found: DecoupledPlant, t: FloatArray, rate: float) -> FixedModes:
+def fixed_modes(plant: DescriptorSystem, decoupled_plant: DecoupledPlant, t: FloatArray, rate: float) -> FixedModes:
     """Return the motions at zeros that decay faster than at ``rate`` (1/s), beside the rows ``t`` of the filter.
 
     At such a zero a row ``[t b]`` is orthogonal to all columns of the plant's pencil: ``t A + b C = zero t E``,
@@ -129,7 +129,7 @@ def fixed_modes(plant: DescriptorSystem, found: DecoupledPlant, t: FloatArray, r
     blocks, moved, own = list[FloatArray](), list[FloatArray](), list[FloatArray]()
     units = PlantUnits.of(plant)
     scale = np.concatenate([units.equations, units.outputs])
-    for zero in _decaying(found.removed, plant.dt, rate):
+    for zero in _decaying(decoupled_plant.removed, plant.dt, rate):
         pencil = np.hstack([np.vstack([plant.A - zero * plant.E, plant.C]), columns])
         pencil = scale[:, None] * pencil
         sizes = np.linalg.norm(pencil, axis=0)
@@ -159,7 +159,7 @@ def fixed_modes(plant: DescriptorSystem, found: DecoupledPlant, t: FloatArray, r
 
 def _decaying(zeros: Any, dt: float, rate: float) -> list[complex]:
     """Return the zeros that decay faster than at a rate, one of each complex pair; real ones exactly real."""
-    found = list[complex]()
+    decaying = list[complex]()
     for value in zeros:
         zero = complex(value)
         if abs(zero.imag) <= AS_REAL * max(abs(zero), SMALLEST):
@@ -167,48 +167,48 @@ def _decaying(zeros: Any, dt: float, rate: float) -> list[complex]:
         slowest = np.exp(-rate * dt) * (1.0 - AS_REAL) if dt > 0.0 else max(rate, AS_REAL * abs(zero))
         fast = abs(zero) <= slowest if dt > 0.0 else -zero.real > slowest
         if zero.imag >= 0.0 and fast:
-            found.append(zero)
-    return found
+            decaying.append(zero)
+    return decaying
 
 
 def _adds(rows: FloatArray, new: FloatArray, e: FloatArray) -> bool:
     """Whether all of ``new E`` is independent of ``rows E``."""
-    whole = np.vstack([rows, new]) @ e
-    sizes = np.linalg.norm(whole, axis=1, keepdims=True)
+    joined = np.vstack([rows, new]) @ e
+    sizes = np.linalg.norm(joined, axis=1, keepdims=True)
     if not np.all(sizes > 0.0):
         return False
-    values = np.linalg.svd(whole / sizes, compute_uv=False)
-    return len(whole) <= whole.shape[1] and numerical_rank(values, tolerance=MISSED_SHARE, scale=1.0) == len(whole)
+    values = np.linalg.svd(joined / sizes, compute_uv=False)
+    return len(joined) <= joined.shape[1] and numerical_rank(values, tolerance=MISSED_SHARE, scale=1.0) == len(joined)
 
 
-def filter_rows(plant: DescriptorSystem, found: DecoupledPlant) -> FloatArray:
+def filter_rows(plant: DescriptorSystem, decoupled_plant: DecoupledPlant) -> FloatArray:
     """Return T ``(order, nx)`` of the decoupled plant's states ``T E x``."""
-    if not found.order:
+    if not decoupled_plant.order:
         return np.zeros((0, plant.nx))
-    return np.asarray(np.linalg.solve(found.E, found.rows[: found.order, : plant.nx]))
+    return np.asarray(np.linalg.solve(decoupled_plant.E, decoupled_plant.rows[: decoupled_plant.order, : plant.nx]))
 
 
 def state_conditions(plant: DescriptorSystem, places: Sequence[int], decay: float | None) -> tuple[Condition, ...]:
     """Return, for each state asked for, whether an observer with errors that decay (at least at a rate, 1/s) exists."""
     if not places:
         return ()
-    found = without_faults(plant)
-    t = filter_rows(plant, found)
-    fixed = fixed_modes(plant, found, t, decay or 0.0)
+    decoupled_plant = without_faults(plant)
+    t = filter_rows(plant, decoupled_plant)
+    fixed = fixed_modes(plant, decoupled_plant, t, decay or 0.0)
     goals = state_goals(plant, places, np.vstack([t, fixed.T]))
-    others = ", ".join((*plant.disturbance_names, *plant.fault_names)) or "the initial state"
+    unknowns = ", ".join((*plant.disturbance_names, *plant.fault_names)) or "the initial state"
     conditions, at = [], f" at {decay:.4g} 1/s" if decay else ""
     for place, missed in zip(places, goals.missed, strict=True):
         name = plant.state_names[place]
         holds = bool(missed <= MISSED_SHARE)
         detail = f"share that is missed: {missed:.1e}" if not holds else ""
-        if not holds and len(found.removed):
-            modes = ", ".join(numbers(found.removed[:3]))
+        if not holds and len(decoupled_plant.removed):
+            modes = ", ".join(numbers(decoupled_plant.removed[:3]))
             detail += f"; what is missed may move with zeros of the plant ({modes}), which no gain changes"
         conditions.append(
             Condition(
                 f"{name} determined",
-                f"the outputs determine {name}, but for errors that decay{at}, whatever {others} may be",
+                f"the outputs determine {name}, but for errors that decay{at}, whatever {unknowns} may be",
                 holds,
                 float(holds),
                 1.0,

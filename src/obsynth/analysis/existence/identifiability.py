@@ -34,14 +34,14 @@ _Kernel: TypeAlias = tuple[FloatArray, FloatArray, tuple[str, ...]]
 
 
 def constant_plant(
-    given: DescriptorSystem | TimeVaryingDescriptorSystem | object, varying: TimeVaryingDescriptorSystem
+    original: DescriptorSystem | TimeVaryingDescriptorSystem | object, varying: TimeVaryingDescriptorSystem
 ) -> Evaluator | None:
     """Return what decides about a plant, its parameters as faults; ``None`` where matrices change or are not square."""
     still = all(part.is_constant for part in (varying.E, varying.A, varying.C, varying.Phi, varying.Psi))
     if not still or varying.ne != varying.nx:
         return None
-    if isinstance(given, DescriptorSystem):
-        return Evaluator(given.dense())
+    if isinstance(original, DescriptorSystem):
+        return Evaluator(original.dense())
     plant = DescriptorSystem(
         varying.E.at(1),
         varying.A.at(0),
@@ -71,19 +71,19 @@ def identifiability_condition(
             # What leaves no trace exactly does so nearly in floating point.
             parameters, shares, states = _steady_kernel(plant, settled.rank)
         decision = settled
-    wanted = "rank [A - E, Phi; C, Psi]" if still else "rank of the traces of all parameters"
-    claim = f"{wanted} = {decision.expected}"
+    rank_name = "rank [A - E, Phi; C, Psi]" if still else "rank of the traces of all parameters"
+    claim = f"{rank_name} = {decision.expected}"
     value, bound = float(decision.rank), float(decision.expected)
     if decision.full:
         how = "" if still else ", in floating point along the horizon"
         return Condition(_NAME, claim, True, value, bound, _TRACES_SOURCE, f"{decision.describe()}{how}")
     names = leading_names(shares, plant.parameter_names)
     detail = f"{decision.describe()}: {_explained(parameters, states, names, plant)}"
-    found = Condition(_NAME, claim, False, value, bound, _TRACES_SOURCE, detail, signals=names)
+    condition = Condition(_NAME, claim, False, value, bound, _TRACES_SOURCE, detail, signals=names)
     if constant is None or decision.means != "unclear":
-        return found
+        return condition
     doubt = constant.rank_doubt(NoZeroOutside("Bf").at_zero, decision, point=1 + 0j)
-    return found.in_doubt(replace(doubt, parameters=True), constant.plant)
+    return condition.in_doubt(replace(doubt, parameters=True), constant.plant)
 
 
 def _explained(
@@ -116,8 +116,8 @@ def _steady(plant: TimeVaryingDescriptorSystem) -> tuple[RankDecision, _Kernel]:
 
 
 def _at_rest(plant: TimeVaryingDescriptorSystem) -> EquilibratedPencil:
-    whole = np.block([[plant.A.at(0) - plant.E.at(1), plant.Phi.at(0)], [plant.C.at(1), plant.Psi.at(0)]])
-    return equilibrate_pencil(np.zeros_like(whole), whole)
+    matrix = np.block([[plant.A.at(0) - plant.E.at(1), plant.Phi.at(0)], [plant.C.at(1), plant.Psi.at(0)]])
+    return equilibrate_pencil(np.zeros_like(matrix), matrix)
 
 
 def _steady_kernel(plant: TimeVaryingDescriptorSystem, rank: int) -> _Kernel:
@@ -151,16 +151,16 @@ def _along(plant: TimeVaryingDescriptorSystem, *, early: bool) -> tuple[RankDeci
         noise = np.hstack([np.zeros((len(H), nx)), np.eye(len(H))])
         noise[:ne, :nx] = A @ factor
         right = np.vstack([A @ regressor + Phi, -Psi])
-        found = least_squares_step(H, noise, right) or rank_revealing_step(H, noise, right, np.zeros((len(H), 0)))
-        regressor, factor = found.estimate, found.factor
+        step = least_squares_step(H, noise, right) or rank_revealing_step(H, noise, right, np.zeros((len(H), 0)))
+        regressor, factor = step.estimate, step.factor
         if not max(np.max(np.abs(regressor)), np.max(np.abs(factor))) < OUTGROWN:
             # What is unobservable grows without bound: what has been seen until here decides.
             break
-        here = np.linalg.norm(right, axis=0)
+        lengths = np.linalg.norm(right, axis=0)
         # A regressor that grows in an unobservable state must not hide what was measured before.
-        weight = 1.0 / max(1.0, float(np.max(here / direct)))
-        gathered = np.asarray(np.linalg.qr(np.vstack([gathered, weight * found.innovation]), mode="r"))
-        sizes = np.hypot(sizes, weight * here)
+        weight = 1.0 / max(1.0, float(np.max(lengths / direct)))
+        gathered = np.asarray(np.linalg.qr(np.vstack([gathered, weight * step.innovation]), mode="r"))
+        sizes = np.hypot(sizes, weight * lengths)
     sizes[sizes == 0.0] = 1.0
     # Relative to the terms that a trace is made of: rounding of a trace that vanishes is no trace.
     relative = np.vstack([gathered, np.zeros((nq, nq))]) / sizes
@@ -179,8 +179,8 @@ def _kernel_of(parameters: FloatArray, columns: FloatArray, states: tuple[str, .
 
 def _largest(plant: TimeVaryingDescriptorSystem, steps: int, late: IntArray) -> StepBlocks:
     """Return the largest absolute value of each entry along the horizon: it tells what rows and states are like."""
-    found = [np.abs(matrix) for matrix in step_blocks(plant, 0, late)]
+    sizes = [np.abs(matrix) for matrix in step_blocks(plant, 0, late)]
     for k in range(1, steps):
-        for matrix, here in zip(found, step_blocks(plant, k, late), strict=True):
-            np.maximum(matrix, np.abs(here), out=matrix)
-    return StepBlocks(*found)
+        for matrix, entries in zip(sizes, step_blocks(plant, k, late), strict=True):
+            np.maximum(matrix, np.abs(entries), out=matrix)
+    return StepBlocks(*sizes)

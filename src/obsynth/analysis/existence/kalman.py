@@ -39,42 +39,42 @@ class WithoutUnknownInputs:
 
     plant: TimeVaryingDescriptorSystem
     equations: FloatArray  # N (ne, nx)
-    shown: FloatArray  # V1 (nd, n1)
+    V1: FloatArray  # (nd, n1): the unknown inputs that outputs show directly
     names: tuple[str, ...]  # of the states d1
     scale: FloatArray  # of the prior deviations of d1, (n1,)
     note: str
 
-    def process_covariance(self, given: object) -> object:
+    def process_covariance(self, covariance: object) -> object:
         """Return the covariance of the equations that are left, from that of all: a number or a constant matrix."""
-        if np.ndim(given) == 0:  # type: ignore[arg-type]
-            return given
-        if callable(given) or np.ndim(given) != 2:  # type: ignore[arg-type]
+        if np.ndim(covariance) == 0:  # type: ignore[arg-type]
+            return covariance
+        if callable(covariance) or np.ndim(covariance) != 2:  # type: ignore[arg-type]
             raise SpecError(
                 "Q changes with k, which is not known how to be combined with unknown inputs: give a constant "
                 "covariance.",
                 path="Q",
             )
-        matrix = as_matrix(given, "Q")
+        matrix = as_matrix(covariance, "Q")
         count = self.equations.shape[1]
         require_shape(matrix.shape, (count, count), "Q")
         return self.equations @ matrix @ self.equations.T
 
-    def initial_state(self, given: object) -> object:
+    def initial_state(self, state: object) -> object:
         """Return the mean of the first state: unknown inputs are as likely to be of either sign."""
-        mean = np.zeros(self.equations.shape[1]) if given is None else np.ravel(np.asarray(given, dtype=np.float64))
+        mean = np.zeros(self.equations.shape[1]) if state is None else np.ravel(np.asarray(state, dtype=np.float64))
         return np.concatenate([mean, np.zeros(len(self.names))])
 
-    def initial_covariance(self, given: object) -> object:
+    def initial_covariance(self, covariance: object) -> object:
         """Return the covariance of the first state, in which unknown inputs may have any size."""
         count = self.equations.shape[1]
-        own = np.eye(count) if given is None else as_matrix(given, "initial_covariance")
+        own = np.eye(count) if covariance is None else as_matrix(covariance, "initial_covariance")
         own = own[0, 0] * np.eye(count) if own.shape == (1, 1) else own
         require_shape(own.shape, (count, count), "initial_covariance")
-        whole = np.zeros((count + len(self.names),) * 2)
-        whole[:count, :count] = own
+        joint = np.zeros((count + len(self.names),) * 2)
+        joint[:count, :count] = own
         deviation = UNKNOWN_INPUT_PRIOR * self.scale * max(float(np.sqrt(np.max(np.diag(own)))), 1.0)
-        whole[count:, count:] = np.diag(deviation**2)
-        return whole
+        joint[count:, count:] = np.diag(deviation**2)
+        return joint
 
 
 def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
@@ -89,15 +89,15 @@ def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
     bd, dd = plant.Bd * units, plant.Dd * units
     _, values, right = np.linalg.svd(outputs * dd) if dd.size else (None, np.zeros(0), np.eye(plant.nd))
     rank = numerical_rank(values, scale=1.0)
-    shown, hidden = right[:rank].T, right[rank:].T
+    visible, hidden = right[:rank].T, right[rank:].T
     if rank == plant.nd:
-        shown, names = np.eye(plant.nd), plant.disturbance_names
+        visible, names = np.eye(plant.nd), plant.disturbance_names
     else:
         names = tuple(f"unknown input {i + 1}" for i in range(rank))
     # Equations that no hidden input enters stay as they are: what is exact in them (delays) stays exact.
-    entering = rows * bd @ hidden
-    reached = np.flatnonzero(np.any(entering != 0.0, axis=1))
-    left, sizes_of_entry, _ = np.linalg.svd(entering[reached])
+    hidden_effect = rows * bd @ hidden
+    reached = np.flatnonzero(np.any(hidden_effect != 0.0, axis=1))
+    left, sizes_of_entry, _ = np.linalg.svd(hidden_effect[reached])
     moved = numerical_rank(sizes_of_entry, scale=1.0)
     if moved == plant.nx:
         raise SpecError(
@@ -113,10 +113,10 @@ def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
     if rank == plant.nd:
         # In their own units again, with their own names.
         bd, dd = plant.Bd, plant.Dd
-    through, direct = product_but_rounding(equations, bd) @ shown, dd @ shown
-    scale = 1.0 / np.linalg.norm(np.vstack([bd, dd]) @ shown, axis=0)
+    through, direct = product_but_rounding(equations, bd) @ visible, dd @ visible
+    scale = 1.0 / np.linalg.norm(np.vstack([bd, dd]) @ visible, axis=0)
     count = known.nx
-    taken = TimeVaryingDescriptorSystem(
+    reduced = TimeVaryingDescriptorSystem(
         np.hstack([product_but_rounding(equations, plant.E), np.zeros((len(equations), rank))]),
         np.hstack([product_but_rounding(equations, plant.A), through]),
         product_but_rounding(equations, plant.B),
@@ -140,7 +140,7 @@ def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
         parts.append(f"{moved} of {count} equations were removed with the unknown inputs that reach no output directly")
     note = f"Nothing is assumed about the unknown inputs {', '.join(map(repr, plant.disturbance_names))}: "
     return WithoutUnknownInputs(
-        taken, equations, shown, names, scale, note + ("; ".join(parts) or "they have no effect") + "."
+        reduced, equations, visible, names, scale, note + ("; ".join(parts) or "they have no effect") + "."
     )
 
 
@@ -162,8 +162,8 @@ def with_stated_noise(
 ) -> dict[str, Any]:
     """Return the options with Q and R from the noise that a time-invariant plant states, where none are given."""
     resolved = dict(options)
-    wanted = [name for name in ("Q", "R") if resolved[name] is None]
-    if not isinstance(plant, DescriptorSystem) or not plant.nw or not wanted:
+    missing = [name for name in ("Q", "R") if resolved[name] is None]
+    if not isinstance(plant, DescriptorSystem) or not plant.nw or not missing:
         return resolved
     if np.any(plant.Bw @ plant.Dw.T):
         raise SpecError(

@@ -32,31 +32,31 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
             of_the_method=True,
         )
         return
-    found = index_report(model, dt)
-    growth = ", then ".join(f"{value:.3g}" for value in found.conditions)
+    report = index_report(model, dt)
+    growth = ", then ".join(f"{value:.3g}" for value in report.conditions)
     detail = f"the condition of dF/dx' / dt + dF/dx is {growth} when dt falls to a tenth"
-    if found.index == 0:
+    if report.index == 0:
         detail += (
-            f": it is singular for every dt; the equations {', '.join(map(repr, found.equations))} are not independent"
+            f": it is singular for every dt; the equations {', '.join(map(repr, report.equations))} are not independent"
         )
-    elif found.index > 1:
+    elif report.index > 1:
         detail += (
-            f": index {found.index}, because of the equations {', '.join(map(repr, found.equations))}; differentiate "
+            f": index {report.index}, because of the equations {', '.join(map(repr, report.equations))}; differentiate "
             "the constraint until it determines the algebraic states"
         )
     yield Condition(
         "index",
         "the plant has index 1",
-        found.index == 1,
-        float(found.index),
+        report.index == 1,
+        float(report.index),
         1.0,
         f"{SOURCE}, (7)",
         detail,
-        signals=found.states,
+        signals=report.states,
         of_the_method=True,
     )
-    if found.index == 1 and model.nq:
-        told = _unidentified(model, dt)
+    if report.index == 1 and model.nq:
+        note = _unidentified(model, dt)
         yield Condition(
             "parameters",
             "the plant has parameters to estimate",
@@ -64,7 +64,7 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
             float(model.nq),
             1.0,
             f"{SOURCE}, (3)",
-            f"{model.nq} parameter(s){told}",
+            f"{model.nq} parameter(s){note}",
             of_the_method=True,
         )
 
@@ -72,7 +72,7 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
 def known_parameters(plant: DAEModel) -> Condition:
     """Return the condition that a plant has no parameters to estimate."""
     names = ", ".join(plant.parameter_names)
-    told = f"{names}. Make them constants, or take dae-adaptive-observer, which estimates them." if names else "none"
+    text = f"{names}. Make them constants, or take dae-adaptive-observer, which estimates them." if names else "none"
     return Condition(
         "known parameters",
         "a plant without unknown parameters",
@@ -80,7 +80,7 @@ def known_parameters(plant: DAEModel) -> Condition:
         float(plant.nq),
         0.0,
         "this method",
-        told,
+        text,
         signals=plant.parameter_names,
         of_the_method=True,
     )
@@ -96,16 +96,16 @@ def _unidentified(model: DAEModel, dt: float) -> str:
     scales = np.where(theta != 0.0, np.abs(theta), 1.0 / np.where(effects > 0.0, effects, 1.0))
     u = np.tile(model.nominal_input, (NOMINAL_SAMPLES, 1))
     try:
-        found = identifiability(model, u, dt=dt, R=np.diag(sizes**2), parameter_scales=scales)
+        result = identifiability(model, u, dt=dt, R=np.diag(sizes**2), parameter_scales=scales)
     except SolverError as error:
         return f"; at nominal inputs there is no trajectory: {error}"
-    if not found.unidentifiable:
-        faintest = found.singular_values[-1] / found.singular_values[0]
+    if not result.unidentifiable:
+        faintest = result.singular_values[-1] / result.singular_values[0]
         return (
             "; at nominal constant inputs the outputs determine every direction of parameters and initial state, the "
             f"weakest {faintest:.1e} times as strongly as the strongest"
         )
-    listed = "; ".join(", ".join(f"{name} ({share:+.3g})" for name, share in row.items()) for row in found.unseen)
+    listed = "; ".join(", ".join(f"{name} ({share:+.3g})" for name, share in row.items()) for row in result.unseen)
     return (
         f"; at nominal constant inputs the outputs do not determine these directions: {listed}. Ask "
         "obsynth.identifiability whether other inputs excite them, or add a sensor"

@@ -66,11 +66,13 @@ class NamedPencil:
     @cached_property
     def _whole(self) -> list[tuple[Rational, list[int]]]:
         """A and E in whole numbers, each row over its own denominator."""
-        found = []
+        integer_rows = []
         for matrix in (self.A, self.E):
             rows = [_whole_numbers(row) for row in matrix.tolist()]
-            found.append((_objects([row for row, _ in rows], matrix.shape), [denominator for _, denominator in rows]))
-        return found
+            integer_rows.append(
+                (_objects([row for row, _ in rows], matrix.shape), [denominator for _, denominator in rows])
+            )
+        return integer_rows
 
     @cached_property
     def _weights(self) -> FloatArray:
@@ -99,11 +101,11 @@ class NamedPencil:
         rows, columns = self.rows * pencil.rows, self.columns * pencil.columns
         if not matrix.size or not np.all(np.isfinite(rows[:, None] * matrix * columns)):
             return None
-        whole = rows[:, None] * matrix * columns
+        balanced = rows[:, None] * matrix * columns
         if last:
-            vector = np.append(-np.linalg.lstsq(whole[:, :-1], whole[:, -1], rcond=RANK_TOLERANCE)[0], 1.0)
+            vector = np.append(-np.linalg.lstsq(balanced[:, :-1], balanced[:, -1], rcond=RANK_TOLERANCE)[0], 1.0)
         else:
-            vector = np.linalg.svd(whole)[2][-1].conj()
+            vector = np.linalg.svd(balanced)[2][-1].conj()
         vector = vector / vector[int(np.argmax(np.abs(vector)))]
         best: Witness | None = None
         for digits in WITNESS_DIGITS:
@@ -119,13 +121,13 @@ class NamedPencil:
         """Return how much of the last column no combination of the others makes, beside the terms it is made of."""
         a, e = self._doubles
         matrix = a - (point if point.imag else point.real) * e
-        whole = self.rows[:, None] * matrix * self.columns
-        sizes = np.abs(whole) if self.terms is None else self.rows[:, None] * self.terms * self.columns
-        left, values, _ = np.linalg.svd(whole[:, :-1], full_matrices=False)
+        scaled = self.rows[:, None] * matrix * self.columns
+        sizes = np.abs(scaled) if self.terms is None else self.rows[:, None] * self.terms * self.columns
+        left, values, _ = np.linalg.svd(scaled[:, :-1], full_matrices=False)
         basis = left[:, values > RANK_TOLERANCE * np.max(values, initial=0.0)]
-        rest = whole[:, -1] - basis @ (basis.conj().T @ whole[:, -1])
+        remainder = scaled[:, -1] - basis @ (basis.conj().T @ scaled[:, -1])
         size = float(np.linalg.norm(sizes[:, -1]))
-        return float(np.linalg.norm(rest)) / size if size > 0.0 else 0.0
+        return float(np.linalg.norm(remainder)) / size if size > 0.0 else 0.0
 
     def _changes(
         self, vector: tuple[Rational, Rational], point: tuple[Fraction, Fraction], rows: FloatArray, columns: FloatArray
@@ -135,26 +137,26 @@ class NamedPencil:
         real, imaginary = vector[0] * scale, vector[1] * scale
         # (A - s E) v, s = a + b j.
         (of_a, of_e) = ([_product(*matrix, part) for part in (real, imaginary)] for matrix in self._whole)
-        rest = (
+        residual = (
             of_a[0] - point[0] * of_e[0] + point[1] * of_e[1],
             of_a[1] - point[0] * of_e[1] - point[1] * of_e[0],
         )
         weights = np.asarray(vector[0] + 0.0, dtype=float) + 1j * np.asarray(vector[1] + 0.0, dtype=float)
-        found, size = list[EntryChange](), 0.0
+        changes, size = list[EntryChange](), 0.0
         for i in range(len(self.A)):
-            if not rest[0][i] and not rest[1][i]:
+            if not residual[0][i] and not residual[1][i]:
                 continue
-            solved = self._row_changes(i, (rest[0][i], rest[1][i]), (real, imaginary), weights)
+            solved = self._row_changes(i, (residual[0][i], residual[1][i]), (real, imaginary), weights)
             if solved is None:
                 return (), np.inf
             for j, delta in solved:
                 name, row, column = self.owners[i, j]
-                found.append(EntryChange(name, row, column, self.A[i, j], self.A[i, j] + delta))
+                changes.append(EntryChange(name, row, column, self.A[i, j], self.A[i, j] + delta))
                 size = max(size, float(rows[i] * columns[j] * abs(float(delta))))
-        return tuple(change for change in found if change.before != change.after), size
+        return tuple(change for change in changes if change.before != change.after), size
 
     def _row_changes(
-        self, i: int, rest: tuple[Fraction, Fraction], vector: tuple[Rational, Rational], weights: ComplexArray
+        self, i: int, residual: tuple[Fraction, Fraction], vector: tuple[Rational, Rational], weights: ComplexArray
     ) -> list[tuple[int, Fraction]] | None:
         """Return changes of one row or two entries of it that make its product with the vector zero."""
         known = self._weights[i]
@@ -163,8 +165,8 @@ class NamedPencil:
         if scores[j] == 0.0:
             return None
         real, imaginary = vector
-        if rest[0] * imaginary[j] == rest[1] * real[j]:
-            part = (rest[0], real[j]) if real[j] else (rest[1], imaginary[j])
+        if residual[0] * imaginary[j] == residual[1] * real[j]:
+            part = (residual[0], real[j]) if real[j] else (residual[1], imaginary[j])
             return [(j, -part[0] / part[1])]
         areas = known * np.abs(np.imag(np.conj(weights[j]) * weights))
         k = int(np.argmax(areas))
@@ -172,15 +174,15 @@ class NamedPencil:
         if not area:
             return None
         return [
-            (j, -(rest[0] * imaginary[k] - rest[1] * real[k]) / area),
-            (k, -(rest[1] * real[j] - rest[0] * imaginary[j]) / area),
+            (j, -(residual[0] * imaginary[k] - residual[1] * real[k]) / area),
+            (k, -(residual[1] * real[j] - residual[0] * imaginary[j]) / area),
         ]
 
 
 def _product(numerators: Rational, denominators: list[int], vector: Rational) -> Rational:
     """Return the product of whole rows over their denominators with a rational vector ``(n,)``."""
-    whole, common = _whole_numbers(vector.tolist())
-    products = zip(numerators @ _objects(whole, vector.shape), denominators, strict=True)
+    integers, common = _whole_numbers(vector.tolist())
+    products = zip(numerators @ _objects(integers, vector.shape), denominators, strict=True)
     return as_array([[Fraction(value, common * own) for value, own in products]], (len(denominators),))
 
 
@@ -247,9 +249,9 @@ def named_pencil(
     terms: list[list[FloatArray]] = []
     rows: list[FloatArray] = []
     for row in layout:
-        shown = next(name for name in row if name is not None) in ("C", "Df", "Dd")
-        rows.append(units.outputs if shown else units.equations)
-        height = plant.ny if shown else plant.nx
+        is_output = next(name for name in row if name is not None) in ("C", "Df", "Dd")
+        rows.append(units.outputs if is_output else units.equations)
+        height = plant.ny if is_output else plant.nx
         blocks.append([])
         moving.append([])
         owners.append([])
@@ -276,12 +278,12 @@ def named_augmented(
 ) -> NamedPencil:
     """Return ``[A - s E, Bf Cw, Bd; 0, Phi - s, 0; C, Df Cw, Dd]``; entries of Phi are named ``of_the_model`` only."""
     layout = [["A", "Bf", "Bd"], ["C", "Df", "Dd"]]
-    whole = named_pencil(plant, units, layout, kept={"Bd": kept, "Dd": kept})
+    pencil = named_pencil(plant, units, layout, kept={"Bd": kept, "Dd": kept})
     nx, nf, count = plant.nx, plant.nf, model.order
-    courses, phi = rational(model.Cw), rational(model.Phi)
-    states, faults, rest = np.split(np.arange(whole.A.shape[1]), [nx, nx + nf])
+    cw, phi = rational(model.Cw), rational(model.Phi)
+    states, faults, disturbances = np.split(np.arange(pencil.A.shape[1]), [nx, nx + nf])
     order = (np.arange(nx), np.arange(nx, nx + plant.ny))
-    width = nx + count + len(rest)
+    width = nx + count + len(disturbances)
     middle = as_array([[Fraction(0)] * (count * width)], (count, width))
     slope, owners = middle.copy(), np.empty((count, width), dtype=object)
     middle[:, nx : nx + count] = phi
@@ -289,37 +291,39 @@ def named_augmented(
     if of_the_model:
         owners[:, nx : nx + count] = _owned("Phi", count, range(count))
     # An entry of Bf or Df can be changed through a state of the model that is a fault by itself.
-    alone = [np.flatnonzero(courses[:, j] != 0) for j in range(count)]
-    single = [int(rows[0]) if len(rows) == 1 and courses[rows[0], j] == 1 else -1 for j, rows in enumerate(alone)]
+    alone = [np.flatnonzero(cw[:, j] != 0) for j in range(count)]
+    single = [int(rows[0]) if len(rows) == 1 and cw[rows[0], j] == 1 else -1 for j, rows in enumerate(alone)]
 
     def stacked(matrix: Rational, through: Rational, part: Rational) -> Rational:
-        top, bottom = (np.hstack([matrix[rows][:, states], through[rows], matrix[rows][:, rest]]) for rows in order)
+        top, bottom = (
+            np.hstack([matrix[rows][:, states], through[rows], matrix[rows][:, disturbances]]) for rows in order
+        )
         return np.vstack([top, part, bottom])
 
-    named = np.empty((len(whole.A), count), dtype=object)
+    named = np.empty((len(pencil.A), count), dtype=object)
     for j, fault in enumerate(single):
         if fault >= 0:
-            named[:, j] = whole.owners[:, faults[fault]]
-    through = whole.A[:, faults] @ courses
+            named[:, j] = pencil.owners[:, faults[fault]]
+    through = pencil.A[:, faults] @ cw
     terms = None
-    if whole.terms is not None:
-        between = whole.terms[:, faults] @ np.abs(model.Cw)
-        terms = stacked(whole.terms, between, np.abs(nearest(middle)))
-    columns = np.concatenate([whole.columns[states], units.model, whole.columns[rest]])
+    if pencil.terms is not None:
+        between = pencil.terms[:, faults] @ np.abs(model.Cw)
+        terms = stacked(pencil.terms, between, np.abs(nearest(middle)))
+    columns = np.concatenate([pencil.columns[states], units.model, pencil.columns[disturbances]])
     return NamedPencil(
-        stacked(whole.A, through, middle),
-        stacked(whole.E, 0 * through, slope),
-        stacked(whole.owners, named, owners),
-        np.concatenate([whole.rows[:nx], 1.0 / units.model, whole.rows[nx:]]),
+        stacked(pencil.A, through, middle),
+        stacked(pencil.E, 0 * through, slope),
+        stacked(pencil.owners, named, owners),
+        np.concatenate([pencil.rows[:nx], 1.0 / units.model, pencil.rows[nx:]]),
         columns,
         terms,
     )
 
 
 def _owned(name: Cell, height: int, columns: Sequence[int]) -> Rational:
-    found = np.empty((height, len(columns)), dtype=object)
+    owners = np.empty((height, len(columns)), dtype=object)
     if name is not None:
         for i in range(height):
             for place, j in enumerate(columns):
-                found[i, place] = (name, i, j)
-    return found
+                owners[i, place] = (name, i, j)
+    return owners

@@ -62,8 +62,8 @@ def conditions_over_region(plant: PolytopicSystem, *, exactly: bool = True) -> t
 def examine_over_region(plant: PolytopicSystem) -> tuple[tuple[Condition, ...], FilterOverRegion | None]:
     """Return the existence conditions over a region, and the constant parts of the filter where they hold."""
     made: list[FilterOverRegion] = []
-    found = tuple(_in_order(plant, True, made))
-    return found, made[0] if made else None
+    conditions = tuple(_in_order(plant, True, made))
+    return conditions, made[0] if made else None
 
 
 def constant_outputs(plant: PolytopicSystem, product: str, source: str) -> Condition:
@@ -85,10 +85,14 @@ def frozen_points(plant: PolytopicSystem) -> Iterator[tuple[str, DescriptorSyste
     """Yield name and plant at every vertex, then in the middle of the region: a parameter may rest anywhere."""
     for place, vertex in enumerate(plant.vertices):
         yield plant.scheduling.vertex_name(place), vertex
-    held = plant.scheduling
+    scheduling = plant.scheduling
     if plant.count > 1:
-        middle = np.full(plant.count, 1.0 / plant.count) if held.gives_weights else 0.5 * (held.low + held.high)
-        words = ", ".join(f"{name} = {value:.6g}" for name, value in zip(held.names, middle, strict=True))
+        middle = (
+            np.full(plant.count, 1.0 / plant.count)
+            if scheduling.gives_weights
+            else 0.5 * (scheduling.low + scheduling.high)
+        )
+        words = ", ".join(f"{name} = {value:.6g}" for name, value in zip(scheduling.names, middle, strict=True))
         yield f"the middle of the region ({words})", plant.at(middle.tolist())
 
 
@@ -131,8 +135,8 @@ def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion
     )
     if reach is None:
         return
-    found = _constant_parts(plant, Bf0, Delta, reach)
-    late = [name for name, index in zip(plant.fault_names, found[1], strict=True) if index != 1]
+    parts = _constant_parts(plant, Bf0, Delta, reach)
+    late = [name for name, index in zip(plant.fault_names, parts[1], strict=True) if index != 1]
     yield Condition(
         "one sample to the outputs",
         "every fault reaches the outputs after one sample: C T Bf0 has full column rank",
@@ -145,7 +149,7 @@ def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion
         of_the_method=True,
     )
     if not late:
-        made.append(found[0])
+        made.append(parts[0])
 
 
 def _directions(plant: PolytopicSystem) -> tuple[FloatArray, tuple[FloatArray, ...]] | None:
@@ -169,18 +173,18 @@ def _cleaned(matrix: FloatArray) -> FloatArray:
     return np.where(np.abs(matrix) > len(matrix) * 16.0 * np.finfo(np.float64).eps * size, matrix, 0.0)
 
 
-def _direction_condition(plant: PolytopicSystem, found: object) -> Condition:
+def _direction_condition(plant: PolytopicSystem, directions: object) -> Condition:
     return Condition(
         "directions of the faults",
         "Bf(mu) = Bf0 Delta(mu): the faults keep the space of their directions over the region",
-        found is not None,
+        directions is not None,
         float(plant.nf),
         float(plant.nf),
         _SOURCE,
         ""
-        if found is not None
+        if directions is not None
         else "a fault turns with the scheduling; a filter with exact decoupling for that is not known here",
-        signals=() if found is not None else plant.fault_names,
+        signals=() if directions is not None else plant.fault_names,
         of_the_method=True,
     )
 

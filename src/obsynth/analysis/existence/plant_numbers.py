@@ -77,7 +77,7 @@ class PlantNumbers:
     discrete: bool
     computed: bool = False
     bits: int | None = None
-    kept: dict[object, Any] = field(default_factory=dict, repr=False)
+    cache: dict[object, Any] = field(default_factory=dict, repr=False)
 
     @property
     def exact(self) -> bool:
@@ -114,7 +114,7 @@ class PlantNumbers:
     def with_matrices(self, changes: Mapping[str, Any], *, rational: Mapping[str, fmpq_mat]) -> PlantNumbers:
         """Return the same with some matrices replaced, and what is rational of those of a sampled plant."""
         own = {**self.rational, **(changes if self.exact else rational)}
-        return replace(self, matrices={**self.matrices, **changes}, rational=own, kept={})
+        return replace(self, matrices={**self.matrices, **changes}, rational=own, cache={})
 
     @property
     def regular_rank(self) -> int:
@@ -129,10 +129,10 @@ class PlantNumbers:
         e, a, c = self.rational["E"], self.matrices["A"], self.matrices["C"]
         if self.bits is None:
             return system_pencil(e, a, inputs, c, direct)
-        whole = blocks([[a, inputs], [c, direct]])
+        matrix = blocks([[a, inputs], [c, direct]])
         states, outputs, extra = int(a.nrows()), int(c.nrows()), int(inputs.ncols())
-        rest = zeros_matrix(states, extra), zeros_matrix(outputs, states), zeros_matrix(outputs, extra)
-        return EnclosedPencil(blocks([[e, rest[0]], [rest[1], rest[2]]]), whole.tolist(), self.bits)
+        nothing = zeros_matrix(states, extra), zeros_matrix(outputs, states), zeros_matrix(outputs, extra)
+        return EnclosedPencil(blocks([[e, nothing[0]], [nothing[1], nothing[2]]]), matrix.tolist(), self.bits)
 
     def rank_at_root(self, inputs: Any, direct: Any, polynomial: fmpz_poly) -> int | None:
         """Return the rank of ``[A - s E, inputs; C, direct]`` at the roots of an irreducible polynomial.
@@ -151,9 +151,9 @@ class PlantNumbers:
     def _decided(self, pencil: ExactPencil | EnclosedPencil) -> SystemFacts:
         rank, columns = pencil.normal_rank, pencil.shape[1]
         if isinstance(pencil, ExactPencil):
-            found = pencil.zeros(discrete=self.discrete) if rank == columns else ()
-            values = tuple(root.value for root in found for _ in range(root.multiplicity))
-            outside = tuple(root.value for root in found if root.side != "stable")
+            roots = pencil.zeros(discrete=self.discrete) if rank == columns else ()
+            values = tuple(root.value for root in roots for _ in range(root.multiplicity))
+            outside = tuple(root.value for root in roots if root.side != "stable")
             return SystemFacts(rank, columns, outside, values, True, self.computed)
         values = tuple(sorted(pencil.zeros, key=abs, reverse=True)) if rank == columns else ()
         stable = rank < columns or pencil.stable
@@ -162,9 +162,9 @@ class PlantNumbers:
 
     def remembered(self, key: object, decide: Callable[[], Any]) -> Any:
         """Return what has been decided before under this key, or decide it."""
-        if key not in self.kept:
-            self.kept[key] = decide()
-        return self.kept[key]
+        if key not in self.cache:
+            self.cache[key] = decide()
+        return self.cache[key]
 
 
 def sampled_numbers(exact: Mapping[str, fmpq_mat], sample_time: Any, *, computed: bool = False) -> PlantNumbers:
@@ -173,15 +173,15 @@ def sampled_numbers(exact: Mapping[str, fmpq_mat], sample_time: Any, *, computed
     width = faults + unknown
     step = flint.fmpq(sample_time.numerator, sample_time.denominator)
     below = [zeros_matrix(width, count) for count in (states, faults, unknown)]
-    whole = blocks([[exact["A"], exact["Bf"], exact["Bd"]], below]) if width else exact["A"]
-    left = {name: exact[name] for name in ("E", "C", "Df", "Dd")}
+    block = blocks([[exact["A"], exact["Bf"], exact["Bd"]], below]) if width else exact["A"]
+    unchanged = {name: exact[name] for name in ("E", "C", "Df", "Dd")}
     bits = bits_for(states)
     with flint.ctx.workprec(bits):
-        rows = picked_rows(exponential(whole * step), range(states))
-        held = {"A": (0, states), "Bf": (states, states + faults), "Bd": (states + faults, states + width)}
-        matrices: dict[str, Any] = {name: picked_columns(rows, range(*ends)) for name, ends in held.items()}
-        matrices |= {name: arb_mat(matrix) for name, matrix in left.items()}
-    return PlantNumbers(matrices, left, discrete=True, computed=computed, bits=bits)
+        rows = picked_rows(exponential(block * step), range(states))
+        ranges = {"A": (0, states), "Bf": (states, states + faults), "Bd": (states + faults, states + width)}
+        matrices: dict[str, Any] = {name: picked_columns(rows, range(*ends)) for name, ends in ranges.items()}
+        matrices |= {name: arb_mat(matrix) for name, matrix in unchanged.items()}
+    return PlantNumbers(matrices, unchanged, discrete=True, computed=computed, bits=bits)
 
 
 def numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:

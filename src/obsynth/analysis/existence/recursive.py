@@ -101,8 +101,8 @@ def _rank_of_steps(
     """Return the condition that equations and outputs determine the state at every step."""
     name = "rank [E; C; algebraic rows of A]" if early else "rank [E; C]"
     late = early_rows(plant, early=early)
-    said = FullRank([["E"], ["C"], ["A"]], last_rows=late.tolist()) if late.size else FullRank([["E"], ["C"]])
-    worst = ranks.worst if constant is None else constant.rank(said, ranks.worst)
+    statement = FullRank([["E"], ["C"], ["A"]], last_rows=late.tolist()) if late.size else FullRank([["E"], ["C"]])
+    worst = ranks.worst if constant is None else constant.rank(statement, ranks.worst)
     condition = rank_condition(name, worst, "", source=f"{SOURCE}, A2")
     if constant is None and ranks.steps > 1:
         condition = replace(condition, detail=f"{condition.detail}, in floating point along the horizon")
@@ -127,10 +127,10 @@ def _rank_of_steps(
     remedies.append("leave out states that nothing depends on")
     at = "" if ranks.steps == 1 else f"at k = {ranks.worst_k} "
     detail = f"{worst.describe()}: {at}equations and outputs do not determine {_listed(names)}. {_sentence(remedies)}"
-    found = replace(condition, detail=detail, signals=names)
+    failure = replace(condition, detail=detail, signals=names)
     if constant is None or worst.means != "unclear":
-        return found
-    return found.in_doubt(constant.rank_doubt(said, worst), constant.plant)
+        return failure
+    return failure.in_doubt(constant.rank_doubt(statement, worst), constant.plant)
 
 
 def detectability_condition(plant: TimeVaryingDescriptorSystem) -> Condition:
@@ -176,10 +176,10 @@ def _hidden_modes(
     hidden = sorted(modes, key=lambda z: (-abs(z), -z.imag))
     mode = hidden[0]
     names = _open_states(tall_e, tall_a, mode, plant)
-    others = [described_mode(z) for z in hidden[1:] if z.imag >= 0.0 and z != mode]
+    other_modes = [described_mode(z) for z in hidden[1:] if z.imag >= 0.0 and z != mode]
     detail = (
         f"the mode z = {described_mode(mode)} of {_listed(names)} is unobservable"
-        + (f" (as the modes {', '.join(others)})" if others else "")
+        + (f" (as the modes {', '.join(other_modes)})" if other_modes else "")
         + f", so that an error in it {'grows' if abs(mode) > 1.0 + RANK_TOLERANCE else 'stays'} for ever. Measure "
         "something that it moves, or leave it out of the model."
     )
@@ -228,5 +228,5 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _sentence(remedies: Sequence[str]) -> str:
-    first, *rest = remedies
-    return f"{first[0].upper()}{first[1:]}" + "".join(f", {text}" for text in rest[:-1]) + f", or {rest[-1]}."
+    first, *more = remedies
+    return f"{first[0].upper()}{first[1:]}" + "".join(f", {text}" for text in more[:-1]) + f", or {more[-1]}."

@@ -128,8 +128,8 @@ def _equivalent(work: DescriptorSystem) -> tuple[Scaling, FloatArray, FloatArray
     return min(tried, key=lambda entry: entry[0])[1]
 
 
-def _are_same(one: Scaling, other: Scaling) -> bool:
-    pairs = (one.equations, other.equations), (one.states, other.states), (one.outputs, other.outputs)
+def _are_same(first: Scaling, second: Scaling) -> bool:
+    pairs = (first.equations, second.equations), (first.states, second.states), (first.outputs, second.outputs)
     return all(np.array_equal(*pair) for pair in pairs)
 
 
@@ -143,15 +143,17 @@ def prepare(plant: DescriptorSystem, s: FloatArray | None = None, *, exactly: bo
         t, n = restricted_equivalent_from(work.E, work.C, s)
         t, n = t / scaling.states[:, None] / scaling.equations, n / scaling.states[:, None] / scaling.outputs
     ta, tf = t @ a, t @ scaling.scale_input(work.Bf)
-    shown = np.eye(work.ny) - c @ n
+    projection = np.eye(work.ny) - c @ n
 
     def error_input(b: FloatArray, d: FloatArray) -> tuple[FloatArray, FloatArray]:
         direct = scaling.scale_feedthrough(d)
-        return t @ scaling.scale_input(b) - ta @ (n @ direct), shown @ direct
+        return t @ scaling.scale_input(b) - ta @ (n @ direct), projection @ direct
 
-    found = fault_detectability(ta, c, tf, plant=work, scaling=scaling, exact=exact_indexes(plant) if exactly else None)
+    detectability = fault_detectability(
+        ta, c, tf, plant=work, scaling=scaling, exact=exact_indexes(plant) if exactly else None
+    )
     bd, dd = error_input(work.Bd, work.Dd)
     bw, dw = error_input(work.Bw, work.Dw)
     return PreparedPlant(
-        plant=work, scaling=scaling, T=t, N=n, TA=ta, C=c, Bd=bd, Dd=dd, Bw=bw, Dw=dw, detectability=found
+        plant=work, scaling=scaling, T=t, N=n, TA=ta, C=c, Bd=bd, Dd=dd, Bw=bw, Dw=dw, detectability=detectability
     )

@@ -80,9 +80,9 @@ def existence_conditions(plant: DescriptorSystem, model: Exosystem) -> tuple[Con
 def existence(plant: DescriptorSystem, model: Exosystem, *, exactly: bool = True) -> Existence:
     """Return the existence conditions of the unknown-input PI observer, and the plant to design for."""
     judge = Evaluator(plant.dense(), exactly)
-    found = reconsidered(judge, lambda judge: _decided(judge, model), lambda found: found.conditions)
-    _known(plant)[_key(model, exactly=exactly)] = found.conditions
-    return found
+    outcome = reconsidered(judge, lambda judge: _decided(judge, model), lambda each: each.conditions)
+    _known(plant)[_key(model, exactly=exactly)] = outcome.conditions
+    return outcome
 
 
 def _key(model: Exosystem, *, exactly: bool) -> tuple[bool, *tuple[bytes, ...]]:
@@ -112,21 +112,21 @@ def _decided(judge: Evaluator, model: Exosystem) -> Existence:
 
     def decide(judge: Evaluator) -> Existence:
         # (D1) and the others fail independently: a user wants to know both.
-        found = [enough, decoupling_condition(judge, before, after)]
-        working, fixed, whole = judge.plant, np.zeros(0, dtype=np.complex128), replace(judge, model=model)
-        found.append(_zero_condition(judge, whole.natural, whole.units))
-        if found[-1].holds:
-            found += model_conditions(whole, model)
-        if all(condition.holds for condition in found):
-            found += order_conditions(whole, model)
-            if found[-1].holds:
-                fixed, condition = _fixed_modes(whole, model)
-                found.append(condition)
-        return Existence(tuple(found), working, transformation, fixed)
+        conditions = [enough, decoupling_condition(judge, before, after)]
+        working, fixed, with_model = judge.plant, np.zeros(0, dtype=np.complex128), replace(judge, model=model)
+        conditions.append(_zero_condition(judge, with_model.natural, with_model.units))
+        if conditions[-1].holds:
+            conditions += model_conditions(with_model, model)
+        if all(condition.holds for condition in conditions):
+            conditions += order_conditions(with_model, model)
+            if conditions[-1].holds:
+                fixed, condition = _fixed_modes(with_model, model)
+                conditions.append(condition)
+        return Existence(tuple(conditions), working, transformation, fixed)
 
     if transformation is None:
         return decide(judge)
-    return reconsidered(Evaluator(transformation.plant, judge.exactly), decide, lambda found: found.conditions)
+    return reconsidered(Evaluator(transformation.plant, judge.exactly), decide, lambda each: each.conditions)
 
 
 def _zero_condition(judge: Evaluator, plant: DescriptorSystem, units: PlantUnits) -> Condition:
@@ -165,8 +165,8 @@ def _zero_failure(
         f"at {where} the states {', '.join(map(repr, states))} move{masked} along an undetectable mode: it has no "
         "effect on the outputs, and does not decay. Measure something that they move."
     )
-    found = _zeros(False, instability(value, plant.dt), 0.0, detail)
-    return replace(found, mode=value, signals=(*states, *disturbances))
+    condition = _zeros(False, instability(value, plant.dt), 0.0, detail)
+    return replace(condition, mode=value, signals=(*states, *disturbances))
 
 
 def _visible_as_given(judge: Evaluator, model: Exosystem, drop: complex) -> bool:

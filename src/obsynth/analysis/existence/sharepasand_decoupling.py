@@ -67,22 +67,22 @@ def _eliminated(plant: DescriptorSystem) -> Transformation:
     """Eliminate algebraic states in the plant's own units (orthogonal combinations depend on them), then undo these."""
     units = PlantUnits.of(plant)
     basis = dynamic_coordinates(units.scaled_plant(plant))
-    found = eliminated_exactly(plant, None if basis is None else units.states[:, None] * basis)
-    if found is not None:
-        return found
-    found = eliminate_algebraic_states(plant)
-    if found.plant.exact is not None:
-        return found
+    elimination = eliminated_exactly(plant, None if basis is None else units.states[:, None] * basis)
+    if elimination is not None:
+        return elimination
+    elimination = eliminate_algebraic_states(plant)
+    if elimination.plant.exact is not None:
+        return elimination
     exact = units.rounded()
-    found = eliminate_algebraic_states(exact.scaled_plant(plant))
-    if set(found.plant.state_names) <= set(plant.state_names):
-        return _in_given_units(found, plant, exact)
+    elimination = eliminate_algebraic_states(exact.scaled_plant(plant))
+    if set(elimination.plant.state_names) <= set(plant.state_names):
+        return _in_given_units(elimination, plant, exact)
     return _in_given_units(eliminate_algebraic_states(units.scaled_plant(plant)), plant, units)
 
 
-def _in_given_units(found: Transformation, plant: DescriptorSystem, units: PlantUnits) -> Transformation:
-    kept = dict(zip(plant.state_names, units.states, strict=True))
-    states = np.array([kept.get(name, 1.0) for name in found.plant.state_names])
+def _in_given_units(elimination: Transformation, plant: DescriptorSystem, units: PlantUnits) -> Transformation:
+    unit_of = dict(zip(plant.state_names, units.states, strict=True))
+    states = np.array([unit_of.get(name, 1.0) for name in elimination.plant.state_names])
     back = replace(
         units,
         time=1.0 / units.time,
@@ -92,9 +92,9 @@ def _in_given_units(found: Transformation, plant: DescriptorSystem, units: Plant
         faults=1.0 / units.faults,
         disturbances=1.0 / units.disturbances,
     )
-    old = found.recovery
+    old = elimination.recovery
     # A source state that cannot be recovered is not among these.
-    own = np.array([kept.get(name, 1.0) for name in old.names])[:, None]
+    own = np.array([unit_of.get(name, 1.0) for name in old.names])[:, None]
     recovery = StateRecovery(
         old.names,
         own * old.from_state / states,
@@ -105,7 +105,10 @@ def _in_given_units(found: Transformation, plant: DescriptorSystem, units: Plant
         old.noise_kept,
     )
     return replace(
-        found, source=plant, plant=back.scaled_plant(found.plant).replace(E=None, dt=plant.dt), recovery=recovery
+        elimination,
+        source=plant,
+        plant=back.scaled_plant(elimination.plant).replace(E=None, dt=plant.dt),
+        recovery=recovery,
     )
 
 
@@ -118,8 +121,8 @@ def _without_rounding(transformation: Transformation) -> Transformation:
     units = PlantUnits.of(plant.replace(Dd=np.zeros_like(plant.Dd), Df=np.zeros_like(plant.Df)))
     scaled = units.scaled_plant(plant)
     changes = {}
-    for direct, entering in (("Dd", scaled.Bd), ("Df", scaled.Bf)):
-        sizes = np.max(np.abs(entering), axis=0, initial=0.0)
+    for direct, state_effect in (("Dd", scaled.Bd), ("Df", scaled.Bf)):
+        sizes = np.max(np.abs(state_effect), axis=0, initial=0.0)
         negligible = np.abs(getattr(scaled, direct)) <= ELIMINATION_ROUNDING * sizes
         changes[direct] = np.where(negligible, 0.0, getattr(plant, direct))
     return replace(transformation, plant=plant.replace(**changes))
@@ -138,7 +141,7 @@ def decoupling_condition(judge: Evaluator, before: str, after: str) -> Condition
             if set(signals) & set(plant.disturbance_names)
             else f"the states {', '.join(map(repr, signals))} are neither dynamic nor measured."
         )
-    found = Condition(
+    condition = Condition(
         "(D1) decoupling",
         "rank [E 0 Bd; C Dd 0; 0 0 Dd] = nx + rank Dd + rank [Bd; Dd]",
         decision.full,
@@ -149,13 +152,15 @@ def decoupling_condition(judge: Evaluator, before: str, after: str) -> Condition
         signals=signals,
     )
     if decision.means != "unclear":
-        return found
+        return condition
     # Without direct parts, as almost always, the condition is that [E Bd; C 0] has full rank.
     kept = judge.kept_disturbances
     free = [j for j in kept if not plant.Dd[:, j].any()]
-    seen = [j for j in kept if j not in free]
-    layout: list[list[str | None]] = [["E", "Bd"], ["C", None]] if not seen else [["E", "Bd", None], ["C", None, "Dd"]]
-    return found.in_doubt(judge.rank_doubt(FullRank(layout, {"Bd": free, "Dd": seen}), decision), plant)
+    direct = [j for j in kept if j not in free]
+    layout: list[list[str | None]] = (
+        [["E", "Bd"], ["C", None]] if not direct else [["E", "Bd", None], ["C", None, "Dd"]]
+    )
+    return condition.in_doubt(judge.rank_doubt(FullRank(layout, {"Bd": free, "Dd": direct}), decision), plant)
 
 
 def _undecoupled(judge: Evaluator) -> tuple[str, ...]:

@@ -37,38 +37,38 @@ def model_conditions(judge: Evaluator, model: Exosystem) -> list[Condition]:
     sizes = None if judge.terms is None else units.scaled_plant(judge.terms)
     eigenvalues = map(complex, scaled_model.eigenvalues)
     unstable = [value for value in eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
-    found = []
+    conditions = []
     for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
         lost = exact_loss(judge, model, units.eigenvalue(value))
         decision = _model_rank(plant, scaled_model, value, lost, sizes)
         if lost is None and not decision.full:
             # Of a plant of many parts its own units drift apart; rounding is as small in those that were given.
             as_given = _model_rank(judge.plant, model, units.eigenvalue(value), None)
-            decision = max(decision, as_given, key=lambda found: found.rank)
+            decision = max(decision, as_given, key=lambda each: each.rank)
         condition = _model_condition(scaled_model, decision, plant, value, units)
         if decision.means == "unclear":
             point = units.eigenvalue(value)
             other = f"hides a fault that follows its model at {number(point)}, and no observer estimates it"
             named = _named(judge, model, of_the_model=False)
             condition = condition.in_doubt(judge.doubt(named, other, point=point), judge.plant)
-        found.append(condition)
-        if not found[-1].holds:
+        conditions.append(condition)
+        if not conditions[-1].holds:
             break
-    return found
+    return conditions
 
 
-def _model_matrix(plant: DescriptorSystem, courses: NDArray[Any], value: complex) -> NDArray[Any]:
-    """Return the matrix of (D3) at an eigenvalue; ``courses``: of the faults along its eigenvectors ``(nf, any)``."""
+def _model_matrix(plant: DescriptorSystem, amplitudes: NDArray[Any], value: complex) -> NDArray[Any]:
+    """Return the matrix of (D3) at an eigenvalue; ``amplitudes (nf, any)``: of the faults along its eigenvectors."""
     inputs, direct = independent_disturbances(plant)
     return np.block(
         [
-            [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
-            [plant.C.astype(complex), plant.Df @ courses, direct],
+            [value * plant.E - plant.A, -plant.Bf @ amplitudes, -inputs],
+            [plant.C.astype(complex), plant.Df @ amplitudes, direct],
         ]
     )
 
 
-def _courses(model: Exosystem, value: complex) -> NDArray[Any]:
+def _fault_amplitudes(model: Exosystem, value: complex) -> NDArray[Any]:
     return np.asarray(model.Cw @ kernel(model.Phi - value * np.eye(model.order)))
 
 
@@ -76,22 +76,22 @@ def _model_rank(
     plant: DescriptorSystem, model: Exosystem, value: complex, lost: int | None, sizes: DescriptorSystem | None = None
 ) -> RankDecision:
     """Decide (D3); ``sizes`` of the terms that the entries of the plant are sums of."""
-    courses, share = _courses(model, value), np.inf
-    matrix = _model_matrix(plant, courses, value)
+    amplitudes, share = _fault_amplitudes(model, value), np.inf
+    matrix = _model_matrix(plant, amplitudes, value)
     if sizes is not None:
         # Disturbances that are combinations of others are judged as those: their own terms are not known.
         inputs, direct = independent_disturbances(plant)
         own = inputs.shape == plant.Bd.shape
-        whole = np.block(
+        terms = np.block(
             [
-                [abs(value) * sizes.E + sizes.A, sizes.Bf @ np.abs(courses), sizes.Bd if own else np.abs(inputs)],
-                [sizes.C, sizes.Df @ np.abs(courses), sizes.Dd if own else np.abs(direct)],
+                [abs(value) * sizes.E + sizes.A, sizes.Bf @ np.abs(amplitudes), sizes.Bd if own else np.abs(inputs)],
+                [sizes.C, sizes.Df @ np.abs(amplitudes), sizes.Dd if own else np.abs(direct)],
             ]
         )
-        share = least_share(matrix, whole)
+        share = least_share(matrix, terms)
     width = matrix.shape[1]
-    found = decide_rank(equilibrated(matrix)[0], expected=width, equilibrated=False)
-    return settled_rank(found, None if lost is None else width - lost, share)
+    decision = decide_rank(equilibrated(matrix)[0], expected=width, equilibrated=False)
+    return settled_rank(decision, None if lost is None else width - lost, share)
 
 
 def _model_condition(
@@ -102,11 +102,11 @@ def _model_condition(
     signals: tuple[str, ...] = ()
     detail = decision.describe()
     if not decision.full:
-        courses = _courses(model, value)
-        width = courses.shape[1]
-        scaled, columns = equilibrated(_model_matrix(plant, courses, value))
+        amplitudes = _fault_amplitudes(model, value)
+        width = amplitudes.shape[1]
+        scaled, columns = equilibrated(_model_matrix(plant, amplitudes, value))
         direction = columns * np.linalg.svd(scaled)[2][-1].conj()
-        faults = leading_names(np.abs(courses @ direction[plant.nx : plant.nx + width]), plant.fault_names)
+        faults = leading_names(np.abs(amplitudes @ direction[plant.nx : plant.nx + width]), plant.fault_names)
         shares = in_disturbances(plant, *independent_disturbances(plant), direction[plant.nx + width :])
         # Where states alone already hide the fault, no disturbance does.
         without = scaled[:, : plant.nx + width]
@@ -160,7 +160,7 @@ def order_conditions(judge: Evaluator, model: Exosystem) -> list[Condition]:
         f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be distinguished "
         "from zero in double precision. Lower its order."
     )
-    found = Condition(
+    condition = Condition(
         "order of the fault model",
         "the augmented plant is observable in double precision at the points where it is least so",
         decision.full,
@@ -171,13 +171,13 @@ def order_conditions(judge: Evaluator, model: Exosystem) -> list[Condition]:
         mode=None if decision.full else point,
         signals=() if decision.full else plant.fault_names,
     )
-    return [found if decision.full else found.in_doubt(_order_doubt(judge, model, point), judge.plant)]
+    return [condition if decision.full else condition.in_doubt(_order_doubt(judge, model, point), judge.plant)]
 
 
 def rank_at(augmented: AugmentedPlant, disturbances: tuple[FloatArray, FloatArray], point: complex) -> RankDecision:
     """Decide whether plant and fault model have a mode at a point that these disturbances can hide."""
-    entering, direct = disturbances
-    below = augmented.below(entering)
+    inputs, direct = disturbances
+    below = augmented.below(inputs)
     matrix = np.block([[point * augmented.E - augmented.A, -below], [augmented.C.astype(complex), direct]])
     return decide_rank(equilibrated(matrix)[0], expected=matrix.shape[1], equilibrated=False)
 
@@ -196,7 +196,7 @@ def _order_doubt(judge: Evaluator, model: Exosystem, point: complex) -> Unclear:
 def lost_in_rounding(judge: Evaluator, model: Exosystem, mode: complex) -> Condition:
     """Return the failing condition for a mode that seems fixed and unstable, against all other conditions."""
     order = judge.plant.nx + model.order
-    found = Condition(
+    condition = Condition(
         "fault model in double precision",
         "no mode of plant and fault model seems unobservable by rounding alone",
         False,
@@ -209,4 +209,4 @@ def lost_in_rounding(judge: Evaluator, model: Exosystem, mode: complex) -> Condi
         mode=mode,
         signals=judge.plant.fault_names,
     )
-    return found.in_doubt(_order_doubt(judge, model, mode), judge.plant)
+    return condition.in_doubt(_order_doubt(judge, model, mode), judge.plant)

@@ -38,12 +38,12 @@ def _in_order(plant: PolytopicSystem, model: Exosystem, exactly: bool) -> Iterat
     if not constant.holds:
         return
     for where, point in frozen_points(plant):
-        found = existence(point, model, exactly=exactly)
-        for condition in found.conditions:
+        at_point = existence(point, model, exactly=exactly)
+        for condition in at_point.conditions:
             if not condition.holds:
                 yield replace(condition, name=f"{condition.name} at {where}")
                 return
-        if found.transformation is not None:
+        if at_point.transformation is not None:
             yield Condition(
                 f"(D1) decoupling at {where}",
                 "(D1) holds with the algebraic states in place",
@@ -72,8 +72,8 @@ def _in_order(plant: PolytopicSystem, model: Exosystem, exactly: bool) -> Iterat
         return
     for place, vertex in enumerate(plant.vertices):
         # With a constant U every direction of an unknown input is decoupled at every point.
-        whole = stacked.replace(A=vertex.A, B=vertex.B, Bf=vertex.Bf, exact=None)
-        for condition in existence(whole, model, exactly=exactly).conditions:
+        vertex_plant = stacked.replace(A=vertex.A, B=vertex.B, Bf=vertex.Bf, exact=None)
+        for condition in existence(vertex_plant, model, exactly=exactly).conditions:
             if not condition.holds:
                 where = plant.scheduling.vertex_name(place)
                 yield replace(condition, name=f"{condition.name} with all directions, at {where}", source=_SOURCE)

@@ -50,7 +50,7 @@ SCATTER = 1e-2
 SAME_SHARE = 1e-6
 
 
-Found = TypeVar("Found")
+Decided = TypeVar("Decided")
 
 
 def settled_rank(decision: RankDecision, exact_rank: int | None, share: float = np.inf) -> RankDecision:
@@ -111,8 +111,8 @@ def _lost_in_computing(
     dt = 1.0 if discrete else 0.0
     values = [*facts.zeros, *map(complex, system_zeros(E, A, nx=nx).values)]
     outside = [value for value in values if is_outside(value, dt)]
-    found = zip(map(float, relative_singular_values(E, A, outside, nx=nx)), outside, strict=True)
-    best = min(found, key=itemgetter(0), default=None)
+    candidates = zip(map(float, relative_singular_values(E, A, outside, nx=nx)), outside, strict=True)
+    best = min(candidates, key=itemgetter(0), default=None)
     return best if best is not None and best[0] <= COMPUTED else None
 
 
@@ -120,10 +120,10 @@ def believed(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int) -> Sy
     """Return the facts without zeros that rounding of computed data has brought in from infinity."""
     if not facts.computed or not facts.zeros:
         return facts
-    found = system_zeros(E, A, nx=nx).values
+    computed = system_zeros(E, A, nx=nx).values
 
     def near(value: complex) -> bool:
-        return bool(np.any(np.abs(found - value) <= SCATTER * max(1.0, abs(value))))
+        return bool(np.any(np.abs(computed - value) <= SCATTER * max(1.0, abs(value))))
 
     zeros, outside = (tuple(filter(near, values)) for values in (facts.zeros, facts.outside))
     return replace(facts, zeros=zeros, outside=outside)
@@ -185,8 +185,8 @@ class Evaluator:
         """The unknown inputs that are no combinations of those before them."""
         kept = list[int]()
         for column in range(self.plant.nd):
-            said = FullRank([["Bd"], ["Dd"]], {name: [*kept, column] for name in ("Bd", "Dd")})
-            if self.rank_itself(said) == len(kept) + 1:
+            statement = FullRank([["Bd"], ["Dd"]], {name: [*kept, column] for name in ("Bd", "Dd")})
+            if self.rank_itself(statement) == len(kept) + 1:
                 kept.append(column)
         return kept
 
@@ -195,31 +195,34 @@ class Evaluator:
         """The plant with the sizes of the terms of its entries in their place; ``None`` where there are none."""
         return sized_plant(self.plant)
 
-    def _sizes(self, said: FullRank) -> tuple[list[int], list[int]]:
+    def _sizes(self, statement: FullRank) -> tuple[list[int], list[int]]:
         """Return the heights of the rows of blocks, and their widths."""
-        names = [next(name for name in row if name) for row in said.blocks]
-        columns = [next(row[j] or "" for row in said.blocks if row[j]) for j in range(len(said.blocks[0]))]
-        widths = [len(said.kept[name]) if name in said.kept else getattr(self.plant, name).shape[1] for name in columns]
+        names = [next(name for name in row if name) for row in statement.blocks]
+        columns = [next(row[j] or "" for row in statement.blocks if row[j]) for j in range(len(statement.blocks[0]))]
+        widths = [
+            len(statement.kept[name]) if name in statement.kept else getattr(self.plant, name).shape[1]
+            for name in columns
+        ]
         return [getattr(self.plant, name).shape[0] for name in names], widths
 
-    def arranged(self, said: FullRank, plant: DescriptorSystem) -> FloatArray:
+    def arranged(self, statement: FullRank, plant: DescriptorSystem) -> FloatArray:
         """Return the blocks of a plant of the same size as a matrix."""
 
         def block(name: str | None, height: int, width: int) -> FloatArray:
             if name is None:
                 return np.zeros((height, width))
             matrix: FloatArray = getattr(plant, name)
-            return matrix[:, list(said.kept[name])] if name in said.kept else matrix
+            return matrix[:, list(statement.kept[name])] if name in statement.kept else matrix
 
-        heights, widths = self._sizes(said)
+        heights, widths = self._sizes(statement)
         rows = [
             np.hstack([block(name, height, width) for name, width in zip(row, widths, strict=True)])
-            for row, height in zip(said.blocks, heights, strict=True)
+            for row, height in zip(statement.blocks, heights, strict=True)
         ]
-        rows[-1] = rows[-1] if said.last_rows is None else rows[-1][list(said.last_rows)]
+        rows[-1] = rows[-1] if statement.last_rows is None else rows[-1][list(statement.last_rows)]
         return np.vstack(rows)
 
-    def exact_rank(self, said: FullRank) -> int | None:
+    def exact_rank(self, statement: FullRank) -> int | None:
         """Return the rank on the numbers as written; ``None`` in floating point."""
         numbers = self.numbers
         if numbers is None:
@@ -228,54 +231,63 @@ class Evaluator:
         def block(name: str | None, height: int, width: int) -> Any:
             if name is None:
                 return numbers.zeros(height, width)
-            return numbers.columns(name, said.kept.get(name))
+            return numbers.columns(name, statement.kept.get(name))
 
-        heights, widths = self._sizes(said)
+        heights, widths = self._sizes(statement)
         rows = [
             [block(name, height, width) for name, width in zip(row, widths, strict=True)]
-            for row, height in zip(said.blocks, heights, strict=True)
+            for row, height in zip(statement.blocks, heights, strict=True)
         ]
-        if said.last_rows is not None:
-            rows[-1] = [picked_rows(part, said.last_rows) for part in rows[-1]]
+        if statement.last_rows is not None:
+            rows[-1] = [picked_rows(part, statement.last_rows) for part in rows[-1]]
         return numbers.rank(blocks(rows))
 
-    def rank_itself(self, said: FullRank) -> int:
+    def rank_itself(self, statement: FullRank) -> int:
         """Return the rank that blocks have."""
-        exact = self.exact_rank(said)
-        return decide_rank(self.arranged(said, self.natural)).rank if exact is None else exact
+        exact = self.exact_rank(statement)
+        return decide_rank(self.arranged(statement, self.natural)).rank if exact is None else exact
 
-    def rank(self, said: FullRank, known: RankDecision | None = None) -> RankDecision:
+    def rank(self, statement: FullRank, known: RankDecision | None = None) -> RankDecision:
         """Decide a rank; ``known``: what a tolerance says of it, where that was asked already."""
-        matrix, exact = self.arranged(said, self.natural), self.exact_rank(said)
-        expected = matrix.shape[0 if said.of_rows else 1] if said.rank is None else said.rank
+        matrix, exact = self.arranged(statement, self.natural), self.exact_rank(statement)
+        expected = matrix.shape[0 if statement.of_rows else 1] if statement.rank is None else statement.rank
         if exact is None:
-            return known or rank_in_any_units(matrix, self.arranged(said, self.plant), expected=expected)
+            return known or rank_in_any_units(matrix, self.arranged(statement, self.plant), expected=expected)
         share = np.inf
-        if self.terms is not None and not said.of_rows:
-            share = least_share(matrix, self.arranged(said, self.units.scaled_plant(self.terms)), rank=expected)
+        if self.terms is not None and not statement.of_rows:
+            share = least_share(matrix, self.arranged(statement, self.units.scaled_plant(self.terms)), rank=expected)
         return settled_rank(known or decide_rank(matrix, expected=expected), exact, share)
 
     def full_rank(
-        self, name: str, said: FullRank, failure: Callable[[FloatArray], tuple[str, tuple[str, ...]]], *, source: str
+        self,
+        name: str,
+        statement: FullRank,
+        failure: Callable[[FloatArray], tuple[str, tuple[str, ...]]],
+        *,
+        source: str,
     ) -> Condition:
         """Return the condition that a rank is full; ``failure(matrix)`` says what to do, and which signals it is."""
-        decision = self.rank(said)
-        remedy, signals = ("", ()) if decision.full else failure(self.arranged(said, self.natural))
-        found = rank_condition(name, decision, remedy, source=source, signals=signals)
-        return found.in_doubt(self.rank_doubt(said, decision), self.plant) if decision.means == "unclear" else found
+        decision = self.rank(statement)
+        remedy, signals = ("", ()) if decision.full else failure(self.arranged(statement, self.natural))
+        condition = rank_condition(name, decision, remedy, source=source, signals=signals)
+        return (
+            condition.in_doubt(self.rank_doubt(statement, decision), self.plant)
+            if decision.means == "unclear"
+            else condition
+        )
 
-    def rank_doubt(self, said: FullRank, decision: RankDecision, point: complex | None = None) -> Unclear:
+    def rank_doubt(self, statement: FullRank, decision: RankDecision, point: complex | None = None) -> Unclear:
         """Return why a rank is unclear, with ``A - point E`` for A."""
-        named = self.named(said)
-        if said.last_rows is not None:
-            before = sum(self._sizes(said)[0][:-1])
-            named = named.with_rows([*range(before), *(before + int(row) for row in said.last_rows)])
+        named = self.named(statement)
+        if statement.last_rows is not None:
+            before = sum(self._sizes(statement)[0][:-1])
+            named = named.with_rows([*range(before), *(before + int(row) for row in statement.last_rows)])
         other = f"has rank {decision.expected - 1}"
-        return self.doubt(named.transposed if said.of_rows else named, other, point=point)
+        return self.doubt(named.transposed if statement.of_rows else named, other, point=point)
 
-    def named(self, said: FullRank) -> NamedPencil:
+    def named(self, statement: FullRank) -> NamedPencil:
         """Return the blocks as a pencil of which each entry is known by its name."""
-        return named_pencil(self.plant, self.units, said.blocks, kept=said.kept)
+        return named_pencil(self.plant, self.units, statement.blocks, kept=statement.kept)
 
     def doubt(
         self,
@@ -293,62 +305,62 @@ class Evaluator:
         witness = named.witness(tolerance, point, dt=self.plant.dt if moving else None, last=last)
         return Unclear(max(tolerance, 0.0 if witness is None else witness.size), witness, other, decider)
 
-    def pencil(self, said: NoZeroOutside) -> tuple[FloatArray, FloatArray]:
+    def pencil(self, statement: NoZeroOutside) -> tuple[FloatArray, FloatArray]:
         """Return the two matrices of a pencil ``A - s E``."""
-        whole = self.arranged(said.at_zero, self.plant)
-        moving = np.zeros_like(whole)
+        matrix = self.arranged(statement.at_zero, self.plant)
+        moving = np.zeros_like(matrix)
         moving[: self.plant.nx, : self.plant.nx] = self.plant.E
-        return moving, whole
+        return moving, matrix
 
     def _in_own_units(
-        self, said: NoZeroOutside, moving: FloatArray, whole: FloatArray
+        self, statement: NoZeroOutside, moving: FloatArray, matrix: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return a pencil in units of the plant's own, time among them: no answer may hang on those of the data."""
-        scales = {"Bf": self.units.faults, "Bd": self.units.disturbances, "": np.zeros(0)}[said.inputs]
-        scales = scales if said.kept is None else scales[list(said.kept)]
+        scales = {"Bf": self.units.faults, "Bd": self.units.disturbances, "": np.zeros(0)}[statement.inputs]
+        scales = scales if statement.kept is None else scales[list(statement.kept)]
         rate = np.concatenate([np.full(self.plant.nx, self.units.rate), np.ones(self.plant.ny)])[:, None]
-        own = self.units.scaled_pencil(moving, whole, scales)
+        own = self.units.scaled_pencil(moving, matrix, scales)
         return own[0], rate * own[1]
 
-    def own_pencil(self, said: NoZeroOutside) -> tuple[FloatArray, FloatArray]:
+    def own_pencil(self, statement: NoZeroOutside) -> tuple[FloatArray, FloatArray]:
         """Return the two matrices of a pencil ``A - s E`` in units of the plant's own."""
-        return self._in_own_units(said, *self.pencil(said))
+        return self._in_own_units(statement, *self.pencil(statement))
 
-    def floating_facts(self, said: NoZeroOutside) -> SystemFacts:
+    def floating_facts(self, statement: NoZeroOutside) -> SystemFacts:
         """Return the facts on a pencil by floating point."""
-        pencil = self.own_pencil(said)
-        found = system_zeros(*pencil, nx=self.plant.nx) if said.inputs else finite_zeros(*pencil)
-        values = tuple(complex(value) for value in found.values)
-        marked = zip(values, are_outside(*pencil, found, self.plant.dt), strict=True)
+        pencil = self.own_pencil(statement)
+        zeros = system_zeros(*pencil, nx=self.plant.nx) if statement.inputs else finite_zeros(*pencil)
+        values = tuple(complex(value) for value in zeros.values)
+        marked = zip(values, are_outside(*pencil, zeros, self.plant.dt), strict=True)
         outside = tuple(value for value, out in marked if out)
-        facts = SystemFacts(found.normal_rank, pencil[1].shape[1], outside, values, False, decisions=found.decisions)
+        facts = SystemFacts(zeros.normal_rank, pencil[1].shape[1], outside, values, False, decisions=zeros.decisions)
         return facts.timed(1.0 / self.units.rate)
 
-    def facts(self, said: NoZeroOutside) -> SystemFacts:
+    def facts(self, statement: NoZeroOutside) -> SystemFacts:
         """Return the facts on a pencil."""
         numbers, plant = self.numbers, self.plant
         if numbers is None:
-            return self.floating_facts(said)
-        if not said.inputs:
+            return self.floating_facts(statement)
+        if not statement.inputs:
             return numbers.system(numbers.zeros(plant.nx, 0), numbers.zeros(plant.ny, 0))
-        return numbers.system(*(numbers.columns(str(row[1]), said.kept) for row in said.at_zero.blocks))
+        return numbers.system(*(numbers.columns(str(row[1]), statement.kept) for row in statement.at_zero.blocks))
 
-    def verdict(self, said: NoZeroOutside) -> ZeroVerdict:
+    def verdict(self, statement: NoZeroOutside) -> ZeroVerdict:
         """Decide where the zeros of a pencil are."""
-        facts, pencil = self.facts(said), self.own_pencil(said)
+        facts, pencil = self.facts(statement), self.own_pencil(statement)
         if self.numbers is None:
             return ZeroVerdict("no" if facts.outside or not facts.full else "yes", facts)
         sizes = None
         if self.terms is not None:
-            sizes = self._in_own_units(said, pencil[0], self.arranged(said.at_zero, self.terms))[1]
+            sizes = self._in_own_units(statement, pencil[0], self.arranged(statement.at_zero, self.terms))[1]
         discrete = self.plant.is_discrete
-        found = zero_verdict(facts.timed(self.units.rate), *pencil, nx=self.plant.nx, discrete=discrete, sizes=sizes)
-        point = None if found.point is None else self.units.eigenvalue(found.point)
-        return replace(found, facts=found.facts.timed(1.0 / self.units.rate), point=point)
+        scaled = zero_verdict(facts.timed(self.units.rate), *pencil, nx=self.plant.nx, discrete=discrete, sizes=sizes)
+        point = None if scaled.point is None else self.units.eigenvalue(scaled.point)
+        return replace(scaled, facts=scaled.facts.timed(1.0 / self.units.rate), point=point)
 
     def no_zero_outside(
         self,
-        said: NoZeroOutside,
+        statement: NoZeroOutside,
         *,
         holding: Callable[[SystemFacts], Condition],
         lost: Callable[[SystemFacts], Condition],
@@ -356,52 +368,54 @@ class Evaluator:
     ) -> Condition:
         """Return the condition that a pencil has no zero outside: where it holds, and what hides where it does not.
         ``what`` would exist."""
-        verdict = self.verdict(said)
+        verdict = self.verdict(statement)
         facts, point = verdict.facts, verdict.point
         if verdict.answer == "no":
-            found = lost(facts)
-            gain = "" if found.mode is None or self.numbers is None else self._needed_gain(said, found.mode)
-            return replace(found, detail=f"{found.detail} {gain}".rstrip())
-        found = holding(facts)
+            condition = lost(facts)
+            gain = (
+                "" if condition.mode is None or self.numbers is None else self._needed_gain(statement, condition.mode)
+            )
+            return replace(condition, detail=f"{condition.detail} {gain}".rstrip())
+        condition = holding(facts)
         if point is None:
-            return found
+            return condition
         if verdict.answer == "yes":
             least = f"least singular value {verdict.least:.2g} of the scaled pencil outside (near {pole_text(point)})"
-            return replace(found, detail=f"{found.detail}; {least}, {verdict.means}")
+            return replace(condition, detail=f"{condition.detail}; {least}, {verdict.means}")
         detail = (
             f"{'An' if what[0] in 'aeiou' else 'A'} {what} exists for the numbers as written ({verdict.means}), but "
             f"the least singular value of the scaled pencil outside is {verdict.least:.1g}: rounding of the data, or "
             "of any gains, is as large."
         )
-        seen = self.floating_facts(said).outside or (() if said.inputs else (point,))
-        found = replace(found, holds=False, detail=detail)
-        if seen:
-            found = lost(replace(facts, outside=seen))
-            found = replace(found, detail=f"{detail} In floating point, {found.detail}")
-        return found.in_doubt(self._zero_doubt(said, point, verdict.least, what), self.plant)
+        apparent = self.floating_facts(statement).outside or (() if statement.inputs else (point,))
+        condition = replace(condition, holds=False, detail=detail)
+        if apparent:
+            condition = lost(replace(facts, outside=apparent))
+            condition = replace(condition, detail=f"{detail} In floating point, {condition.detail}")
+        return condition.in_doubt(self._zero_doubt(statement, point, verdict.least, what), self.plant)
 
-    def _zero_doubt(self, said: NoZeroOutside, point: complex, least: float, what: str) -> Unclear:
+    def _zero_doubt(self, statement: NoZeroOutside, point: complex, least: float, what: str) -> Unclear:
         """Return why it is unclear whether a pencil has a zero outside."""
         return self.doubt(
-            self.named(said.at_zero),
+            self.named(statement.at_zero),
             f"has a zero at {pole_text(point, 6)}, and no {what}",
             point=point,
             tolerance=max(ROUNDING_LEVEL, least),
             moving=True,
         )
 
-    def _needed_gain(self, said: NoZeroOutside, point: complex) -> str:
+    def _needed_gain(self, statement: NoZeroOutside, point: complex) -> str:
         """Return which gain any observer would need, were the last digits of data off that hide something only
         exactly.  Empty where no digits would help: with as many inputs as outputs a zero stays."""
-        plant, units, inputs = self.plant, self.units, said.inputs
-        entering = getattr(plant, inputs) if inputs else np.zeros((plant.nx, 0))
+        plant, units, inputs = self.plant, self.units, statement.inputs
+        input_matrix = getattr(plant, inputs) if inputs else np.zeros((plant.nx, 0))
         direct = getattr(plant, f"D{inputs[1:]}") if inputs else np.zeros((plant.ny, 0))
-        if plant.ny <= entering.shape[1]:
+        if plant.ny <= input_matrix.shape[1]:
             return ""
         scales = {"Bf": units.faults, "Bd": units.disturbances, "": np.zeros(0)}[inputs]
         columns = np.concatenate([units.states, scales])
         rows = np.concatenate([units.equations, units.outputs])[:, None]
-        pencil = np.block([[plant.A - point * plant.E, entering], [plant.C, direct]])
+        pencil = np.block([[plant.A - point * plant.E, input_matrix], [plant.C, direct]])
         scaled = np.linalg.svd(rows * pencil * columns)[2][-1].conj()
         scaled = np.where(np.abs(scaled) > RANK_TOLERANCE, scaled, 0.0)
         signals = np.abs(columns * scaled)
@@ -410,26 +424,26 @@ class Evaluator:
         # What a fault moves is asked for by the fault; a mode by the state that moves most.
         faults = np.arange(len(signals)) >= plant.nx if inputs == "Bf" else np.zeros(len(signals), dtype=bool)
         shares = np.abs(scaled) * (faults if np.any(np.abs(scaled[faults]) > NAMED_SHARE) else ~faults)
-        wanted, shown = _first_of_the_largest(shares), _first_of_the_largest(terms)
-        if terms[shown] == 0.0:
+        signal, output = _first_of_the_largest(shares), _first_of_the_largest(terms)
+        if terms[output] == 0.0:
             return "No output depends on it: more digits of the data would not help."
-        gain = signals[wanted] / (UNIT_ROUNDOFF * terms[shown])
+        gain = signals[signal] / (UNIT_ROUNDOFF * terms[output])
         return (
             "This holds exactly, on the numbers as written: if their last digits are wrong, every observer needs a "
-            f"gain of about {gain:.0e} from {plant.output_names[shown]!r} to {names[wanted]!r}."
+            f"gain of about {gain:.0e} from {plant.output_names[output]!r} to {names[signal]!r}."
         )
 
     def hidden_modes(self) -> SystemFacts:
         """Return the facts on ``[A - s E; C]``, with the modes that only rounding of the data lets show."""
-        said, nx = NoZeroOutside(), self.plant.nx
-        seen, pencil, rate = self.floating_facts(said), self.own_pencil(said), self.units.rate
+        statement, nx = NoZeroOutside(), self.plant.nx
+        floating, pencil, rate = self.floating_facts(statement), self.own_pencil(statement), self.units.rate
         if self.numbers is None:
-            return seen
-        seen = seen.timed(rate)
-        exact = believed(self.facts(said).timed(rate), *pencil, nx=nx)
-        nearly = zeros_at_rounding_level(*pencil, seen.zeros, exact.zeros, nx=nx)
+            return floating
+        floating = floating.timed(rate)
+        exact = believed(self.facts(statement).timed(rate), *pencil, nx=nx)
+        nearly = zeros_at_rounding_level(*pencil, floating.zeros, exact.zeros, nx=nx)
         modes = sorted((*exact.zeros, *nearly), key=lambda value: (value.real, value.imag))
-        undetectable = (*exact.outside, *(value for value in nearly if value in seen.outside))
+        undetectable = (*exact.outside, *(value for value in nearly if value in floating.outside))
         return replace(exact, zeros=tuple(modes), outside=undetectable).timed(1.0 / rate)
 
 
@@ -439,14 +453,14 @@ def _first_of_the_largest(shares: NDArray[Any]) -> int:
 
 
 def reconsidered(
-    judge: Evaluator, decide: Callable[[Evaluator], Found], told: Callable[[Found], Sequence[Condition]]
-) -> Found:
+    judge: Evaluator, decide: Callable[[Evaluator], Decided], conditions_of: Callable[[Decided], Sequence[Condition]]
+) -> Decided:
     """Return a decision; a refusal that rests on numbers taken for rounding gives way to the doubt without that."""
-    found, exact = decide(judge), judge.plant.exact
+    decision, exact = decide(judge), judge.plant.exact
     if judge.numbers is None or exact is None or exact.uncleaned is None:
-        return found
-    if all(condition.holds or condition.unclear for condition in told(found)):
-        return found
+        return decision
+    if all(condition.holds or condition.unclear for condition in conditions_of(decision)):
+        return decision
     other = decide(replace(judge, plant=judge.plant.replace(exact=exact.before_cleaning())))
-    failed = [condition for condition in told(other) if not condition.holds]
-    return other if failed and all(condition.unclear for condition in failed) else found
+    failed = [condition for condition in conditions_of(other) if not condition.holds]
+    return other if failed and all(condition.unclear for condition in failed) else decision

@@ -53,9 +53,9 @@ def index_doubt(judge: Evaluator, detectability: FaultDetectability) -> Unclear 
     direction = np.linalg.svd(detectability.Upsilon / lengths)[2][-1] / lengths
     direction = direction / direction[int(np.argmax(np.abs(direction)))]
     for digits in WITNESS_DIGITS:
-        found = _changed(plant, units, detectability.indexes, np.round(direction, digits))
-        if found is not None and (best is None or found.size < best.size):
-            best = found
+        witness = _changed(plant, units, detectability.indexes, np.round(direction, digits))
+        if witness is not None and (best is None or witness.size < best.size):
+            best = witness
         if best is not None and best.size <= ROUNDING_LEVEL:
             break
     size = 0.0 if best is None else best.size
@@ -72,10 +72,10 @@ def _is_in_doubt(judge: Evaluator, detectability: FaultDetectability) -> bool:
     # Of computed data only floating point has spoken: what they were rounded to may say otherwise.
     if judge.numbers is None:
         return False
-    found = _exact(judge.plant)
-    if found is None:
+    exact = _exact(judge.plant)
+    if exact is None:
         return False
-    a, c, faults, _ = found
+    a, c, faults, _ = exact
     columns = [c * _moved(a, faults, fault, index) for fault, index in enumerate(detectability.indexes)]
     return int(blocks([columns]).rank()) == rank.expected
 
@@ -102,19 +102,19 @@ def _changed(
     plant: DescriptorSystem, units: PlantUnits, indexes: tuple[int | None, ...], direction: np.ndarray
 ) -> Witness | None:
     """Return the changes of the column of the fault whose share of the direction is one, where there are any."""
-    found, chosen = _exact(plant), int(np.argmax(np.abs(direction)))
-    if found is None:
+    numbers, chosen = _exact(plant), int(np.argmax(np.abs(direction)))
+    if numbers is None:
         return None
-    a, c, faults, t = found
+    a, c, faults, t = numbers
     # Of shares that rounding has made alike another one may be the first of the largest, with the other sign.
     shares = [_scalar(Fraction(float(share)) / Fraction(float(direction[chosen]))) for share in direction]
     parts = [c * _moved(a, faults, fault, index) * shares[fault] for fault, index in enumerate(indexes)]
-    rest, maps, through = sum(parts[1:], start=parts[0]), list["fmpq_mat"](), t
+    residual, maps, through = sum(parts[1:], start=parts[0]), list["fmpq_mat"](), t
     for _ in range(int(indexes[chosen] or 1)):
         maps.append(c * through)
         through = a * through
     order = np.argsort(-units.equations[: plant.nx], kind="stable")[::-1]
-    solved = _solution(maps, rest, [int(i) for i in order])
+    solved = _solution(maps, residual, [int(i) for i in order])
     if solved is None:
         return None
     exact = rational_matrices(plant)["Bf"]
@@ -126,17 +126,17 @@ def _changed(
     return Witness(changes, size) if changes else None
 
 
-def _solution(maps: list[fmpq_mat], rest: fmpq_mat, order: list[int]) -> list[tuple[int, Fraction]] | None:
+def _solution(maps: list[fmpq_mat], residual: fmpq_mat, order: list[int]) -> list[tuple[int, Fraction]] | None:
     """Return delta with ``maps[-1] delta = rest``, and zero for all maps before it, on few equations in this order."""
-    whole = blocks([[part] for part in maps])
-    picked = picked_columns(whole, order)
-    right = blocks([[zeros_matrix(int(whole.nrows()) - int(rest.nrows()), 1)], [rest]])
+    stacked = blocks([[part] for part in maps])
+    picked = picked_columns(stacked, order)
+    right = blocks([[zeros_matrix(int(stacked.nrows()) - int(residual.nrows()), 1)], [residual]])
     pivots = pivot_columns(picked)
     basis = picked_columns(picked, pivots)
     if not pivots or blocks([[basis, right]]).rank() > len(pivots):
         return None
-    found = (basis.transpose() * basis).solve(basis.transpose() * right)
-    return [(order[j], Fraction(int(found[k, 0].p), int(found[k, 0].q))) for k, j in enumerate(pivots)]
+    solution = (basis.transpose() * basis).solve(basis.transpose() * right)
+    return [(order[j], Fraction(int(solution[k, 0].p), int(solution[k, 0].q))) for k, j in enumerate(pivots)]
 
 
 def _scalar(value: Fraction) -> fmpq_mat:
@@ -160,22 +160,22 @@ def examine_fault_filter(
     """Return the existence conditions, and the prepared plant on which the last of them were decided."""
     dense = plant.dense()
     merged = merged_outputs(dense)
-    found = _decide(dense if merged is None else merged.plant, exactly)
-    if merged is not None and not merged.exact and not found[0][-1].holds:
+    result = _decide(dense if merged is None else merged.plant, exactly)
+    if merged is not None and not merged.exact and not result[0][-1].holds:
         # The outputs as written show more than the merged ones, by their rounding: that is unclear, not a refusal.
-        found = _decide(dense, exactly)
-    _decided(plant)[exactly] = found[0]
-    return found
+        result = _decide(dense, exactly)
+    _decided(plant)[exactly] = result[0]
+    return result
 
 
 def _decide(plant: DescriptorSystem, exactly: bool) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
-    return reconsidered(Evaluator(plant, exactly), _examined, lambda found: found[0])
+    return reconsidered(Evaluator(plant, exactly), _examined, lambda result: result[0])
 
 
 def _examined(judge: Evaluator) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
     prepared = list[PreparedPlant]()
-    found = up_to_failure(_in_order(judge, prepared))
-    return found, prepared[0] if prepared else None
+    conditions = up_to_failure(_in_order(judge, prepared))
+    return conditions, prepared[0] if prepared else None
 
 
 def _in_order(judge: Evaluator, made: list[PreparedPlant]) -> Iterator[Condition]:
@@ -278,11 +278,11 @@ def _rank_conditions(judge: Evaluator) -> Iterator[Condition]:
 
     def unknown(matrix: FloatArray) -> tuple[str, tuple[str, ...]]:
         names = leading_names(np.linalg.svd(matrix)[2][-1], work.state_names, most=MOST_NAMES)
-        told = (
+        text = (
             "not every state is either dynamic or measured. Measure more, or eliminate the algebraic states first "
             "(transform: {eliminate_algebraic_states: true} in a spec)."
         )
-        return told, names
+        return text, names
 
     yield judge.full_rank("rank C", outputs, repeated, source=source)
     yield judge.full_rank("rank [E; C]", states, unknown, source="Wang 2015, eq. (2)")

@@ -55,11 +55,11 @@ class EntryChange:
         if sides is None:
             place += " of the fault model" if self.matrix == "Phi" else " of the observer"
         else:
-            said = [
+            signals = [
                 f"{kind} {names[kind][number]!r}" if kind in names else f"{kind} {number + 1}"
                 for kind, number in zip(sides, (self.row, self.column), strict=True)
             ]
-            place += f" ({', '.join(said)})"
+            place += f" ({', '.join(signals)})"
             place = place.replace("fault ", "parameter ") if parameters else place
         return f"{place} from {_number(self.before)} to {_after(self.before, self.after)}"
 
@@ -110,12 +110,14 @@ class Unclear:
     def described(self, plant: DescriptorSystem) -> str:
         """Return all of it in words."""
         if self.witness is None:
-            shown = f"{self.other}; no single entries were found that do it."
+            witness = f"{self.other}; no single entries were found that do it."
         elif not self.witness.changes:
-            shown = f"the {_kind(plant)} as it is rounded to double precision {self.other}."
+            witness = f"the {_kind(plant)} as it is rounded to double precision {self.other}."
         else:
-            shown = f"the {_kind(plant)} with {self.witness.described(plant, parameters=self.parameters)} {self.other}."
-        return f"Tolerance: {self.tolerance:.1g} of the largest scaled entry. Witness: {shown} {self.decider}"
+            witness = (
+                f"the {_kind(plant)} with {self.witness.described(plant, parameters=self.parameters)} {self.other}."
+            )
+        return f"Tolerance: {self.tolerance:.1g} of the largest scaled entry. Witness: {witness} {self.decider}"
 
 
 def _kind(plant: DescriptorSystem) -> str:
@@ -143,9 +145,9 @@ def rational(matrix: FloatArray) -> Rational:
 
 def as_array(rows: Sequence[Sequence[Fraction]], shape: tuple[int, ...]) -> Rational:
     """Return fractions, row by row, as an array of a shape."""
-    found = np.empty(int(np.prod(shape)), dtype=object)
-    found[:] = [value for row in rows for value in row]
-    return found.reshape(shape)
+    array = np.empty(int(np.prod(shape)), dtype=object)
+    array[:] = [value for row in rows for value in row]
+    return array.reshape(shape)
 
 
 def nearest(matrix: Rational) -> FloatArray:
