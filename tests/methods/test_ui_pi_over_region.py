@@ -307,3 +307,64 @@ def test_auto_takes_the_method_that_exists() -> None:
     assert found.method == "ui-pi-observer"
     names = set(obsynth.check(continuous_plant()))
     assert {"fault-estimation-filter", "ui-pi-observer"} <= names
+
+
+def slow_plant(rate: float | None) -> PolytopicSystem:
+    """Return a spring whose stiffness moves slowly, in continuous time."""
+    scheduling = {"k": {"range": [1, 6], **({"rate": rate} if rate else {})}}
+    return PolytopicSystem(
+        plant={"A": [[0, 1], ["-k", -0.1]], "B": [[0], [1]], "C": [[1, 0]], "Bf": [[0], [1]]}, scheduling=scheduling
+    )
+
+
+@pytest.fixture(scope="module")
+def slow() -> ObserverDesign:
+    return obsynth.ui_pi_observer(slow_plant(0.1))
+
+
+@pytest.mark.long
+def test_a_rate_buys_a_smaller_gain_in_continuous_time(slow: ObserverDesign) -> None:
+    any_course = obsynth.ui_pi_observer(slow_plant(None))
+    assert slow.certificate.claims["region_gain"] < 0.95 * any_course.certificate.claims["region_gain"]
+    assert "changes by at most 0.1 in a second" in slow.report["gain over the region"].claim
+    assert "every course of k" in slow.report["decay over the region"].claim
+    # What it claims is no less than the gain at rest of any point.
+    plant, observer = slow.scheduled
+    drive, frequencies = slow.certificate.matrices["tracking"][:, plant.nx :], np.logspace(-2, 2, 400)
+    worst = 0.0
+    for share in np.linspace(0.0, 1.0, 21):
+        A = (1.0 - share) * observer.Az[0] + share * observer.Az[1]
+        for w in frequencies:
+            inner = np.linalg.solve(1j * w * np.eye(len(A)) - A, drive)
+            worst = max(worst, float(np.linalg.norm(observer.Cz[observer.fault_rows] @ inner, 2)))
+    assert 0.9 * slow.certificate.claims["region_gain"] < worst <= slow.certificate.claims["region_gain"]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("change", ["faster", "smaller", "other", "fewer"])
+def test_a_certificate_for_slow_courses_proves_nothing_else(slow: ObserverDesign, change: str) -> None:
+    matrices, claims, plant = dict(slow.certificate.matrices), dict(slow.certificate.claims), slow.plant
+    assert len(matrices["P_gain"]) > 1
+    if change == "faster":
+        plant = slow_plant(50.0)
+    if change == "smaller":
+        claims["region_gain"] *= 0.9
+    if change == "other":
+        matrices["P_gain"] = matrices["P_gain"][::-1]
+    if change == "fewer":
+        matrices["P_gain"] = matrices["P_gain"][:1]
+    observer = slow.observer if plant is slow.plant else replace(slow.observer, scheduling=plant.scheduling)  # type: ignore[type-var]
+    changed = replace(slow, plant=plant, observer=observer, certificate=Certificate(matrices, claims))
+    report = obsynth.verify(changed)
+    assert not report.passed
+    assert [row.name for row in report.failures] == ["gain over the region"]
+
+
+@pytest.mark.long
+def test_a_design_for_slow_courses_is_saved_and_runs(slow: ObserverDesign, tmp_path: Path) -> None:
+    again = obsynth.load(slow.save(tmp_path / "slow.gains.json"))
+    assert obsynth.verify(again).passed
+    observer = again.scheduled[1]
+    y, u = np.zeros((5, 1)), np.column_stack([np.zeros(5), [3.0, 3.01, 3.02, 4.0, 4.01]])
+    _, claimed = observer.record(y, u, sample_time=0.5)
+    assert not claimed[3]

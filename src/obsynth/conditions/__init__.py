@@ -3,8 +3,9 @@
 ``wang2015``, ``filasova_theorem1``, ``filasova_theorem2``, ``sharepasand``, ``kalman``, ``hinf_filter`` and
 ``h2_filter`` return `Conditions`;
 ``vertex_inequalities`` returns those of an `ErrorPolytope`, whose matrices lie in the hull of vertices,
-``slope_inequality`` those of `SlopedErrors` with a multiplier; ``nonlinear_region``, or ``region`` of a model, those of
-a nonlinear plant over a region;
+``rated_inequalities`` those where its one parameter is slow, in continuous time, ``slope_inequality`` those of
+`SlopedErrors` with a multiplier; ``nonlinear_region``, or ``region`` of a model, those of a nonlinear plant over a
+region;
 ``bounded_real``, ``h2``, ``region`` and ``admissible`` return constraints; ``disk``, ``half_plane`` and ``sector`` are
 regions for the eigenvalues.  ``Conditions.bisect`` returns a `Bisection` over a parameter.
 """
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from obsynth.conditions.nonlinear_plants import nonlinear_region
     from obsynth.conditions.polytope import vertex_inequalities
     from obsynth.conditions.problem import Conditions
+    from obsynth.conditions.rated_polytope import rated_inequalities
     from obsynth.conditions.share_pasand import sharepasand
     from obsynth.conditions.slope_multipliers import SlopedErrors, slope_inequality
     from obsynth.conditions.wang import wang2015
@@ -46,6 +48,7 @@ __all__ = [
     "hinf_filter",
     "kalman",
     "nonlinear_region",
+    "rated_inequalities",
     "region",
     "sampled_polytope",
     "sector",
@@ -66,6 +69,7 @@ _HOMES = {
         "conditions.least_filter": "h2_filter hinf_filter",
         "conditions.nonlinear_plants": "nonlinear_region",
         "conditions.polytope": "vertex_inequalities",
+        "conditions.rated_polytope": "rated_inequalities",
         "conditions.slope_multipliers": "SlopedErrors slope_inequality",
         "conditions.problem": "Conditions",
         "conditions.share_pasand": "sharepasand",

@@ -212,9 +212,15 @@ class Scheduling:
 
     def step_of(self, dt: float) -> float | None:
         """Return by how much the weight of the second of two vertices can change within a sample, where it is known."""
+        rate = self.rate_of_weight
+        return None if rate is None else rate * dt
+
+    @property
+    def rate_of_weight(self) -> float | None:
+        """By how much the weight of the second of two vertices can change in a second, where it is known."""
         if self.count != 2 or len(self.names) != 1 or self.rates[0] is None or self.functions != self.names:
             return None
-        return self.rates[0] * dt * (1.0 + 2.0 * RATE_TOLERANCE) / float(self.high[0] - self.low[0])
+        return self.rates[0] * (1.0 + 2.0 * RATE_TOLERANCE) / float(self.high[0] - self.low[0])
 
     def sentence(self) -> str:
         """Return the region in words."""

@@ -20,6 +20,7 @@ from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.scheduling import Scheduling
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.extended_balls import Enclosed
+from obsynth.proofs.rated_inequalities import prove_rated_gain
 from obsynth.proofs.vertex_inequalities import (
     Pair,
     Vertex,
@@ -62,7 +63,7 @@ def courses(scheduling: Scheduling, steps: float | None) -> str:
 def same_scheduling_row(plant: PolytopicSystem, observer: ScheduledObserver) -> Check:
     """Return the row that plant and observer read the same parameters in the same way."""
     one, other = plant.scheduling, observer.scheduling
-    wrong = [name for name in ("names", "functions") if getattr(one, name) != getattr(other, name)]
+    wrong = [name for name in ("names", "functions", "rates") if getattr(one, name) != getattr(other, name)]
     wrong += [
         name for name in ("low", "high", "corners") if not np.array_equal(getattr(one, name), getattr(other, name))
     ]
@@ -140,6 +141,15 @@ def region_gain_row(
     """Return the row that a gain over the region is below ``level``, with words of its own."""
     sound = witness is not None and np.isfinite(level) and level > 0.0
     proof = prove_gain(vertices, witness, level, discrete=discrete) if sound and witness else _no_certificate()
+    return _proof_row(name, claim, level, proof)
+
+
+def rated_gain_row(
+    name: str, claim: str, vertices: Sequence[Vertex], P: Sequence[FloatArray], rate: float, level: float
+) -> Check:
+    """Return the row that a gain is below ``level`` in continuous time while the weight moves by at most ``rate``."""
+    sound = np.isfinite(level) and level > 0.0
+    proof = prove_rated_gain(vertices, P, rate, level) if sound else _no_certificate()
     return _proof_row(name, claim, level, proof)
 
 

@@ -112,7 +112,7 @@ def certified(
     # A little more decay than asked for: what a solver leaves of its constraints is off by its tolerances.
     asked = None if decay is None else decay * (1.0 - DECAY_ROOM if errors.dt > 0.0 else 1.0 + DECAY_ROOM)
     options: dict[str, Any] = {"goal": goal, "decay": asked, "lyapunov": lyapunov, "steps": steps, "gain": gain}
-    units = _Units.of(errors)
+    units = ErrorUnits.of(errors)
     runs: list[dict[str, Any]] = []
     prover = prove_gain if goal == "gain" else prove_mean_square
     more = {"ball": errors.ball} if goal == "gain" else {}
@@ -124,7 +124,7 @@ def certified(
         z_unit = z_unit if target == level or least >= NEGLIGIBLE[0] * size else _power_of_two(target)
         moved = units.moved(z_unit)
         found = vertex_inequalities(moved, level=target / z_unit, gains=units.gains_in(gains), **options)
-        if not _solve(found, solver, settings, runs):
+        if not has_numbers(found, solver, settings, runs):
             continue
         inner, own = witness_of(moved, found, steps=steps)
         several = [own]
@@ -141,13 +141,18 @@ def certified(
     if level is not None and level < least:
         raise SolverError(
             f"No observer with one certificate over the region was found at {level:.6g}: the least level found for "
-            f"the inequalities at the vertices is {least:.6g}. Give more than that, a smaller region, or (where the "
-            "parameter is slow) its rate."
+            f"the inequalities at the vertices is {least:.6g}. Give more than that, {_remedy(errors)}."
         )
     raise SolverError(
         "A gain was found, but no certificate at the vertices could be proved. That is no proof that there is none: "
         "give a smaller region, or a larger margin.",
     )
+
+
+def _remedy(errors: ErrorPolytope) -> str:
+    """Return what helps where there is no common Lyapunov matrix."""
+    slow = errors.dt > 0.0 and errors.count == 2
+    return "a smaller region, or (where the parameter is slow) its rate" if slow else "a smaller region"
 
 
 def _one_gain_is_enough(errors: ErrorPolytope) -> bool:
@@ -200,7 +205,7 @@ def best_decay(
         No decay at all is proved.
     """
     discrete = errors.dt > 0.0
-    units = _Units.of(errors)
+    units = ErrorUnits.of(errors)
     moved = units.moved(1.0)
     low, high = (0.0, slowest) if discrete else (0.0, limit)
     best: tuple[float, Witness, list[FloatArray]] | None = None
@@ -214,7 +219,7 @@ def best_decay(
             gain_limit=None if gains else limit,
             **options,
         )
-        good = _solve(found, "CLARABEL", None, [])
+        good = has_numbers(found, "CLARABEL", None, [])
         if good:
             inner, own = witness_of(moved, found, steps=options.get("steps"))
             made = [units.gain_out(L) for L in own] if gains is None else list(gains)
@@ -232,8 +237,8 @@ def best_decay(
             break
     if best is None:
         raise SolverError(
-            "No certificate of stability at the vertices was found. That is no proof that there is none: give a "
-            "smaller region, or (where the parameter is slow) its rate."
+            "No certificate of stability at the vertices was found. That is no proof that there is none: give "
+            f"{_remedy(errors)}."
         )
     return best
 
@@ -271,7 +276,7 @@ def _decay_of(errors: ErrorPolytope, gains: Sequence[FloatArray], witness: Witne
 
 
 def _least(
-    units: _Units, options: Mapping[str, Any], gains: Any, solver: str, settings: Any, runs: list[dict[str, Any]]
+    units: ErrorUnits, options: Mapping[str, Any], gains: Any, solver: str, settings: Any, runs: list[dict[str, Any]]
 ) -> tuple[float, float, float]:
     """Return the least level, the unit of z in which it is near one, and what a level is about without any gain."""
     plain = units.moved(1.0)
@@ -284,11 +289,11 @@ def _least(
     for _ in range(MOST_RESCALINGS):
         moved = units.moved(unit)
         found = vertex_inequalities(moved, gains=units.gains_in(gains), **options)
-        if not _solve(found, solver, settings, runs):
+        if not has_numbers(found, solver, settings, runs):
             raise SolverError(
                 "No common Lyapunov matrix was found for the vertices: the solver ended with "
-                f"{runs[-1]['status']!r}. That is no proof that there is none. Give a smaller region, a slower decay, "
-                "or (where the parameter is slow) its rate.",
+                f"{runs[-1]['status']!r}. That is no proof that there is none. Give a slower decay, or "
+                f"{_remedy(plain)}.",
                 record=runs[-1],
             )
         squared = found.variables["gamma_squared" if options["goal"] == "gain" else "mean_square"].value
@@ -307,7 +312,7 @@ def _power_of_two(value: float) -> float:
     return float(np.exp2(np.round(np.log2(value))))
 
 
-def _solve(found: Any, solver: str, settings: Mapping[str, Any] | None, runs: list[dict[str, Any]]) -> bool:
+def has_numbers(found: Any, solver: str, settings: Mapping[str, Any] | None, runs: list[dict[str, Any]]) -> bool:
     """Solve, and return whether there are numbers to look at."""
     record = {"what": found.source, "solver": str(solver), "settings": dict(settings or {})}
     try:
@@ -325,7 +330,7 @@ def _solve(found: Any, solver: str, settings: Mapping[str, Any] | None, runs: li
 
 
 @dataclass(frozen=True, eq=False)
-class _Units:
+class ErrorUnits:
     """Powers of two for states and measurements, in which the vertices are balanced."""
 
     errors: ErrorPolytope
@@ -333,7 +338,7 @@ class _Units:
     outputs: FloatArray
 
     @classmethod
-    def of(cls, errors: ErrorPolytope) -> _Units:
+    def of(cls, errors: ErrorPolytope) -> ErrorUnits:
         """Return units that suit all vertices."""
         n, m = errors.order, errors.outputs
         if errors.ball or (errors.differential is not None and errors.differential < n):

@@ -26,6 +26,7 @@ from obsynth.verification.over_region import (
     courses,
     decay_row,
     forgetting_row,
+    rated_gain_row,
     region_gain_row,
     same_scheduling_row,
     switching_row,
@@ -114,6 +115,12 @@ def _vertices(observer: ScheduledObserver, tracking: FloatArray, nx: int) -> lis
     return [vertex_of(place) for place in range(observer.count)]
 
 
+def _moves(matrices: Mapping[str, FloatArray]) -> bool:
+    """Whether the certificate of the gain is one with several matrices and no slack: coefficients in the parameter."""
+    P = matrices.get(GAIN_WITNESSES[0])
+    return P is not None and P.ndim == 3 and len(P) > 1 and GAIN_WITNESSES[1] not in matrices
+
+
 def _proved_rows(design: ObserverDesign, plant: PolytopicSystem, observer: ScheduledObserver) -> Iterator[Check]:
     claims, matrices = design.certificate.claims, design.certificate.matrices
     slack = WITNESSES[1] in matrices or GAIN_WITNESSES[1] in matrices
@@ -127,15 +134,22 @@ def _proved_rows(design: ObserverDesign, plant: PolytopicSystem, observer: Sched
         level = claimed(claims, "region_gain")
         witness = witness_of_certificate(matrices, pairs, GAIN_WITNESSES)
         what = "their change in a sample" if plant.is_discrete else "their derivative"
-        yield region_gain_row(
-            REGION_GAIN_ROW,
+        claim = (
             f"the l2 gain from what drives the fault models (for steps: {what}) to the errors of the fault estimates "
-            f"is below this, {words}",
-            vertices,
-            witness,
-            level,
-            discrete=plant.is_discrete,
         )
+        rate = plant.scheduling.rate_of_weight if _moves(matrices) and not plant.is_discrete else None
+        if rate is not None:
+            claim += f"is below this, {courses(plant.scheduling, rate)}"
+            yield rated_gain_row(REGION_GAIN_ROW, claim, vertices, list(matrices[GAIN_WITNESSES[0]]), rate, level)
+        else:
+            yield region_gain_row(
+                REGION_GAIN_ROW,
+                f"{claim}is below this, {words}",
+                vertices,
+                witness,
+                level,
+                discrete=plant.is_discrete,
+            )
         if plant.is_discrete and steps is None:
             yield switching_row(vertices, level)
     yield forgetting_row(decay, observer.forgetting, discrete=plant.is_discrete)

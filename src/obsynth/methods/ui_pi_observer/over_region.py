@@ -17,7 +17,8 @@ from obsynth.analysis.existence.sharepasand_over_region import pi_conditions_ove
 from obsynth.conditions.augmented_plant import combinations_seen, realise
 from obsynth.conditions.lmi import chosen_solver
 from obsynth.conditions.share_pasand_over_region import PiOverRegion, checked_free_gains, pi_over_region
-from obsynth.errors import SpecError
+from obsynth.errors import SolverError, SpecError
+from obsynth.methods.engines.rated_certificates import rated_certificate, rated_gains
 from obsynth.methods.engines.vertex_certificates import VertexCertificate, certified, proved_decay
 from obsynth.methods.method import Synthesis
 from obsynth.methods.refusals import require_all_conditions
@@ -62,8 +63,10 @@ def synthesise_over_region(
         solver=solver,
         settings=asked.solver_options,
     )
+    rate = None if plant.is_discrete else plant.scheduling.rate_of_weight
+    found = found if rate is None else _for_slow_courses(parts, found, rate, asked)
     progress("building the realisation and its certificates")
-    made = _synthesis(plant, model, parts, found, steps, decay=asked.decay)
+    made = _synthesis(plant, model, parts, found, steps, decay=asked.decay, rate=rate)
     return replace(made, options=asked.resolved(model, plant.fault_names))
 
 
@@ -96,6 +99,25 @@ def _steps(plant: PolytopicSystem) -> float | None:
     return steps if steps is not None and steps < 1.0 else None
 
 
+def _for_slow_courses(
+    parts: PiOverRegion, found: VertexCertificate, rate: float, asked: UiPiObserver
+) -> VertexCertificate:
+    """Return gains that are better for a slow parameter in continuous time, where they are, with one P for a decay."""
+    errors, scaled = parts.errors, rate * parts.units.time
+    decay = _scaled_decay(asked.decay, parts, 0.0)
+    solver: dict[str, Any] = {"solver": asked.solver, "settings": asked.solver_options}
+    try:
+        gains = rated_gains(errors, scaled, decay=decay or 0.0, **solver)
+        slow = rated_certificate(errors, scaled, gains, scale=found.level, **solver)
+        if slow is None or slow.level >= found.level:
+            return found
+        # A step of implicit Euler shrinks errors in the norm of one P, which these gains need too.
+        own = certified(errors, margin=DESIGN_MARGIN, decay=decay, gains=gains, **solver)
+    except SolverError:
+        return found
+    return replace(own, runs=(*found.runs, *slow.runs, *own.runs))
+
+
 def _scaled_decay(decay: float | None, parts: PiOverRegion, dt: float) -> float | None:
     """Return a decay in 1/s as a factor a sample, or in scaled time."""
     if not decay:
@@ -111,6 +133,7 @@ def _synthesis(
     steps: float | None,
     *,
     decay: float | None,
+    rate: float | None = None,
 ) -> Synthesis:
     U_a, D_a, K_a = parts.letters(found.gains)
     seen = combinations_seen(plant.center)
@@ -123,25 +146,29 @@ def _synthesis(
         G=None if found.witness.G is None else [G / states / states[:, None] for G in found.witness.G],
     )
     wanted = None if not decay else float(np.exp(-decay * plant.dt)) if plant.dt > 0.0 else decay
-    rate = proved_decay(shipped.errors, shipped.none, witness, wanted=wanted)
+    shrinking = proved_decay(shipped.errors, shipped.none, witness, wanted=wanted)
     matrices: dict[str, FloatArray] = {"tracking": U_a, "Phi": model.Phi, "Cw": model.Cw}
     matrices |= _stored(witness, WITNESSES)
-    claims, runs = {"region_decay": rate}, list(found.runs)
+    claims, runs, slow = {"region_decay": shrinking}, list(found.runs), None
     if plant.nf:
         lyapunov = "common" if steps is None else "vertex"
         gain = certified(shipped.errors, margin=ANALYSIS_MARGIN, gains=shipped.none, lyapunov=lyapunov, steps=steps)
-        matrices |= _stored(gain.witness, GAIN_WITNESSES)
-        claims["region_gain"] = gain.level
-        runs += gain.runs
+        if rate is not None:
+            slow = rated_certificate(shipped.errors, rate, shipped.none, scale=gain.level)
+        used = slow if slow is not None and slow.level < gain.level else gain
+        slow = slow if used is slow else None
+        matrices |= _stored(gain.witness, GAIN_WITNESSES) if slow is None else {GAIN_WITNESSES[0]: np.array(slow.P)}
+        claims["region_gain"] = used.level
+        runs += used.runs
     letters = {"U_a": U_a, "D_a": D_a, "Phi": model.Phi, "Cw": model.Cw}
     letters |= {f"K_a[{i + 1}]": K for i, K in enumerate(K_a)}
     return Synthesis(
         {},
         letters,
-        _observer(plant, made, rate),
+        _observer(plant, made, shrinking),
         Certificate(matrices, claims),
         {"engine": "lmi", "runs": runs},
-        _notes(plant, rate, steps, constant=len(found.gains) == 1),
+        _notes(plant, shrinking, used=steps is not None or slow is not None, constant=len(found.gains) == 1),
     )
 
 
@@ -201,7 +228,7 @@ def _observer(plant: PolytopicSystem, made: Sequence[LinearObserver], rate: floa
     )
 
 
-def _notes(plant: PolytopicSystem, rate: float, steps: float | None, *, constant: bool) -> tuple[str, ...]:
+def _notes(plant: PolytopicSystem, rate: float, *, used: bool, constant: bool) -> tuple[str, ...]:
     left = forgetting_of(rate, discrete=plant.is_discrete)
     for_how_long = f"{left} rows" if plant.is_discrete else f"{left:.4g} s"
     notes = [
@@ -209,6 +236,11 @@ def _notes(plant: PolytopicSystem, rate: float, steps: float | None, *, constant
         "parameter outside or missing is out: the parameter is moved into its range, and nothing is claimed for "
         f"{for_how_long} from the last such row on."
     ]
+    if used and not plant.is_discrete:
+        notes.append(
+            "The gain over the region is proved for courses with the stated rate, by a Lyapunov matrix that moves with "
+            "the parameter; the decay for every course."
+        )
     if constant and plant.count > 1:
         notes.append("The gain is the same at all vertices: in continuous time one that changes would be no better.")
     if not plant.is_discrete:
@@ -220,9 +252,10 @@ def _notes(plant: PolytopicSystem, rate: float, steps: float | None, *, constant
     rated = [
         name for name, known in zip(plant.scheduling.names, plant.scheduling.rates, strict=True) if known is not None
     ]
-    if rated and steps is None:
+    if rated and not used:
         notes.append(
             f"The rate of {', '.join(rated)} is not used: the certificate is for every course. One with a rate is "
-            "sought in discrete time, for one parameter that enters linearly and cannot cross its range in a sample."
+            "sought for one parameter that enters linearly, in discrete time where it cannot cross its range in a "
+            "sample; it is taken where it proves more."
         )
     return tuple(notes)

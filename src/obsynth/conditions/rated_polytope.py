@@ -1,0 +1,190 @@
+r"""Observers of polytopic plants whose parameter moves slowly, in continuous time: a Lyapunov matrix that moves along.
+
+Two vertices, a weight t of the second one with ``|t'| <= nu``, and P(t), Y(t) in Bernstein form; ``L = P^-1 Y``:
+
+.. math::
+    \begin{bmatrix} \mathrm{He}(P A - Y C) \pm \nu P' & P B - Y D & C_z^T \\ * & -\gamma^2 I & D_z^T \\ * & * & -I
+    \end{bmatrix} < 0, \qquad P > 0 \tag{V6}
+
+The coefficients on equal pieces of [0, 1] are negative definite (`obsynth.numerics.bernstein`), or with ``2 a P`` in
+the first place and without w and z for a decay.  Gains that are given stand for Y: ``P (A - L C)``, L linear in t.
+
+Reference: Wu, Yang, Packard, Becker, Int. J. Robust Nonlinear Control 6 (1996).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from obsynth.conditions import lazy_cvxpy as cp
+from obsynth.conditions import lmi
+from obsynth.conditions.lmi import MARGIN
+from obsynth.conditions.polytope import MOST_ROOM, TRACE
+from obsynth.conditions.problem import Conditions, Values
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import arguments_checked, chosen, real_number, shown
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.bernstein import coefficients_on_pieces, product_coefficients
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_polytope import ErrorPolytope
+
+
+@arguments_checked
+def rated_inequalities(
+    errors: ErrorPolytope,
+    rate: float,
+    *,
+    goal: str = "gain",
+    level: float | None = None,
+    decay: float = 0.0,
+    degree: int = 1,
+    pieces: int = 4,
+    gains: Sequence[FloatArray] | None = None,
+    gain_limit: float | None = None,
+    margin: float = MARGIN,
+) -> Conditions:
+    """Return the inequalities of an error system whose weight moves slowly, in P and Y.
+
+    Parameters
+    ----------
+    errors : ErrorPolytope
+        Two vertices, in continuous time, without algebraic errors; C and D constant unless gains are given.
+    rate : float
+        Largest change of the weight of the second vertex in a second.
+    goal : {"gain", "decay"}, optional
+        The least L2 gain from w to z, or the largest slack of ``decay``.
+    level : float, optional
+        A given gain: the largest slack at that level is sought instead, which is what makes a proof pass.
+    decay : float, optional
+        Errors decay at least like ``exp(-decay time)``, in 1/s; part of either goal's inequality.
+    degree : int, optional
+        Of P and Y, 0 to 5.
+    pieces : int, optional
+        Of [0, 1], a power of two: more of them allow more, at more cost.
+    gains : sequence of array_like, optional
+        One gain, or one at each end, linear between: they are analysed.
+    gain_limit : float, optional
+        Largest Frobenius norm of each coefficient of Y.
+    margin : float, optional
+        What the inequalities keep to the boundary of the cone.
+
+    Returns
+    -------
+    Conditions
+        Variables ``P[1]``, ..., ``Y[1]``, ... (Bernstein coefficients), ``gamma_squared`` or ``room``; gains ``P[1]``,
+        ..., and ``L[1]``, ``L[2]``: those at the ends.
+
+    Raises
+    ------
+    SpecError
+        An option is out of range, or the error system is of another kind.
+
+    Examples
+    --------
+    The commutator of a gain with the unit lag: 1 for any course, about the rate for slow ones.
+
+    >>> import numpy as np
+    >>> errors = ErrorPolytope(
+    ...     [-np.eye(2)] * 2, np.zeros((0, 2)), B=[[[1.0], [-1]], [[1.0], [1]]], Cz=[[[-1.0, -1]], [[1.0, -1]]], dt=0.0
+    ... )
+    >>> found = rated_inequalities(errors, 0.1, degree=1, pieces=4)
+    >>> found.solve("CLARABEL", {})
+    >>> 0.2 < float(found.variables["gamma_squared"].value) ** 0.5 < 0.8
+    True
+    """
+    chosen(goal, "goal", ("gain", "decay"))
+    _require_fitting(errors, rate, level, decay, gains)
+    n, m, p = errors.order, errors.outputs, errors.inputs
+    q = len(errors.Cz[0])
+    P = [cp.Variable((n, n), symmetric=True, name=f"P[{k + 1}]") for k in range(degree + 1)]
+    given = None if gains is None else [np.asarray(L, np.float64) for L in gains]
+    Y = [cp.Variable((n, m), name=f"Y[{k + 1}]") for k in range(degree + 1)] if given is None else []
+    room = cp.Variable(name="room") if goal == "decay" or level is not None else None
+    kept: Any = margin if room is None else room
+    squared = cp.Variable(nonneg=True, name="gamma_squared") if room is None else None
+    value: Any = squared if level is None else level**2
+    closed = None if given is None else [errors.at(unit, given) for unit in np.eye(2)]
+    A, B = (errors.A, errors.B) if closed is None else ([c[0] for c in closed], [c[1] for c in closed])
+    constraints: dict[str, Any] = {}
+    for place, weights in coefficients_on_pieces(degree, pieces):
+        constraints[f"P, {place}"] = lmi.at_least(_sum(P, weights), kept)
+    for at in product_coefficients(degree, pieces):
+        low, high = _sum(P, at.low), _sum(P, at.high)
+        PA, PB = low @ A[0] + high @ A[1], low @ B[0] + high @ B[1]
+        if Y:
+            moved = _sum(Y, at.low + at.high)
+            PA, PB = PA - moved @ errors.C[0], PB - moved @ errors.D[0]
+        Z, Dz = (at.ends[0] * one[0] + at.ends[1] * one[1] for one in (errors.Cz, errors.Dz))
+        for sign in (-1.0, 1.0) if rate else (1.0,):
+            first = -2.0 * PA - sign * rate * _sum(P, at.slope) - 2.0 * decay * (low + high)
+            lower = [[first]]
+            if goal == "gain":
+                lower = [[first], [-PB.T, at.scale * value * np.eye(p)], [-Z, -Dz, at.scale * np.eye(q)]]
+            name = f"(V6) {'+' if sign > 0.0 else '-'}, {at.place}"
+            constraints[name] = lmi.at_least(lmi.symmetric_blocks(lower), kept)
+    variables = {each.name(): each for each in (*P, *Y)}
+    if room is not None:
+        variables["room"] = room
+        constraints["room"] = room <= MOST_ROOM
+    else:
+        variables["gamma_squared"] = squared
+    if goal == "decay":
+        constraints["trace"] = sum(cp.trace(each) for each in P) <= TRACE * n
+    if gain_limit is not None:
+        constraints |= {f"limit, {each.name()}": cp.norm(each, "fro") <= gain_limit for each in Y}
+
+    def own_gains(_: Values) -> dict[str, FloatArray]:
+        known = {each.name(): 0.5 * (each.value + each.value.T) for each in P}
+        ends = given if given is not None else [np.linalg.solve(known[P[k].name()], Y[k].value) for k in (0, degree)]
+        return known | {f"L[{i + 1}]": np.asarray(L) for i, L in enumerate(ends)}
+
+    def unsupported(_: dict[str, FloatArray], name: str) -> ObserverDesign:
+        raise SpecError(f"The error system of {name!r} has no plant: design by a method.", path="errors")
+
+    return Conditions(
+        "inequalities of a slow parameter (V6)",
+        lmi.semidefinite_problem(
+            cp.Maximize(room) if room is not None else cp.Minimize(squared), list(constraints.values())
+        ),
+        variables,
+        {},
+        {f"A[{i + 1}]": matrix for i, matrix in enumerate(errors.A)},
+        constraints,
+        tuple,
+        own_gains,
+        unsupported,
+    )
+
+
+def _require_fitting(errors: ErrorPolytope, rate: float, level: Any, decay: Any, gains: Any) -> None:
+    if errors.count != 2:
+        raise SpecError(
+            f"A rate is for two vertices (one parameter that enters linearly), there are {errors.count}: leave it out.",
+            path="rate",
+        )
+    if errors.dt > 0.0 or errors.ball or (errors.differential or errors.order) != errors.order:
+        raise SpecError(
+            "These inequalities are for continuous time, without algebraic errors: take vertex_inequalities, with "
+            "steps in discrete time.",
+            path="errors",
+        )
+    if not (np.isfinite(rate) and rate >= 0.0):
+        raise SpecError(
+            f"rate is {shown(rate)}: give a finite number, 0 or more, or vertex_inequalities for any course.",
+            path="rate",
+        )
+    if level is not None:
+        real_number(level, "level", "a positive number", above=0.0)
+    if not decay >= 0.0:
+        raise SpecError(f"decay is {shown(decay)}: give a rate, 0 or more.", path="decay")
+    if gains is None and not errors.constant_output:
+        raise SpecError("A gain that changes needs the same C and D at both vertices: give gains.", path="gains")
+    if gains is not None:
+        errors.closed(gains)
+
+
+def _sum(parts: Sequence[Any], weights: FloatArray) -> Any:
+    return sum(float(weight) * part for part, weight in zip(parts, weights, strict=True) if weight) + 0.0 * parts[0]
