@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -302,3 +303,38 @@ def test_a_spec_may_have_its_plant_in_a_mat_file(tmp_path):
     spec.write_text("schema_version: 1\nname: mat\nplant: {file: plant.yaml, faults: [u3]}\n")
     with pytest.raises(obsynth.SpecError, match=r"plant\.faults: unknown key beside a file that is no \.mat"):
         obsynth.load_spec(spec)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("version", "before", "after", "words"),
+    [
+        ("3.0", 'variability="continuous"/></ModelVariables>', 'variability="continuous" unit="min"/></ModelVariables>',
+         "'time' is in 'min'"),
+        ("3.0", "</ModelVariables>", '<Clock name="tick" valueReference="50" causality="local" '
+         'intervalVariability="constant" intervalDecimal="0.1"/></ModelVariables>', "the clock 'tick'"),
+        ("3.0", "</ModelVariables>", '<Boolean name="open" valueReference="51" causality="input" variability="discrete"'
+         ' start="false"/></ModelVariables>', "inputs open are no continuous"),
+        ("2.0", "</ModelVariables>", '<ScalarVariable name="mode" valueReference="52" causality="input" '
+         'variability="discrete"><Integer start="1"/></ScalarVariable></ModelVariables>', "inputs mode are no"),
+        ("2.0", 'name="outflow" valueReference="5" causality="output" variability="continuous"',
+         'name="outflow" valueReference="5" causality="output" variability="discrete"', "outputs outflow are no"),
+    ],
+)  # fmt: skip
+def test_what_a_description_of_an_fmu_says_and_a_linear_model_does_not_have_is_named(
+    tmp_path, version, before, after, words
+):
+    pytest.importorskip("fmpy", reason="fmpy is not installed (obsynth[fmu])")
+    from tank_fmu import tank
+
+    built, changed = tank(tmp_path, version), tmp_path / "changed.fmu"
+    with zipfile.ZipFile(built) as source, zipfile.ZipFile(changed, "w") as target:
+        for name in source.namelist():
+            data = source.read(name)
+            if name == "modelDescription.xml":
+                assert before.encode() in data
+                data = data.replace(before.encode(), after.encode())
+                data = data.replace(b"</UnitDefinitions>", b'<Unit name="min"/></UnitDefinitions>')
+            target.writestr(name, data)
+    with pytest.raises(SpecError, match=words):
+        obsynth.from_fmu(changed, equilibrium=True)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from decimal import Decimal
 from fractions import Fraction
+from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -12,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
+import scipy.signal
 import sympy
 
 import obsynth
@@ -53,6 +56,8 @@ def test_units_of_signals_are_read_and_an_unknown_field_is_named(tmp_path):
     assert obsynth.from_matlab(written(tmp_path, **fields, Notes="")).units == {"gauge": "V"}
     with pytest.raises(obsynth.SpecError, match="Offsets"):
         obsynth.from_matlab(written(tmp_path, Ts=0.0, Offsets=[[1.0]]))
+    with pytest.raises(obsynth.SpecError, match="Kalman"):
+        obsynth.from_matlab(written(tmp_path, Ts=0.0, Kalman=[[1.0]]))
     with pytest.raises(obsynth.SpecError, match="fortnights"):
         obsynth.from_matlab(written(tmp_path, Ts=0.0, TimeUnit="fortnights"))
 
@@ -206,3 +211,107 @@ def test_what_a_design_states_of_outliers_is_the_rule_everywhere():
         assert np.allclose(obsynth.run_on_data(design, log).table["xhat[x1]"], own)
     unsaid = obsynth.descriptor_kalman(plant, Q=[[0.01]], R=[[0.01]])
     assert obsynth.run_on_data(unsaid, log).outliers == {"y1": 1}
+
+
+def test_the_offsets_of_a_linearised_model_are_its_operating_point(tmp_path):
+    offsets = {"dx": [[0.0]], "x": [[3.0]], "u": [[2.0]], "y": [[5.0]]}
+    plant = obsynth.from_matlab(written(tmp_path, Ts=0.0, Offsets=offsets))
+    assert dict(plant.operating_point) == {"x1": 3.0, "u1": 2.0, "y1": 5.0}
+    for wrong, words in (
+        ({"dx": [[1.0]]}, "no equilibrium"),
+        ({"z": [[1.0]]}, "'z'"),
+        ({"x": [[1.0, 2.0]]}, "x0 has 2"),
+    ):
+        with pytest.raises(obsynth.SpecError, match=words):
+            obsynth.from_matlab(written(tmp_path, Ts=0.0, Offsets={**offsets, **wrong}))
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"x0": [[1.0, 2.0]]}, "x0 has 2 entries, but there are 1"),
+        ({"OutputUnit": np.array(["V", "A"], dtype=object)}, "OutputUnit has 2 entries"),
+        ({"dt": 0.5}, "Ts = 0 and dt = 0.5"),
+        ({"inputdelay": 0.5}, "did you mean 'InputDelay'"),
+    ],
+)
+def test_fields_that_contradict_the_matrices_are_refused(tmp_path, fields, words):
+    with pytest.raises(obsynth.SpecError, match=words):
+        obsynth.from_matlab(written(tmp_path, Ts=0.0, **fields))
+
+
+def test_of_a_file_with_many_variables_misspelt_ones_are_refused_and_others_left(tmp_path):
+    path = tmp_path / "workspace.mat"
+    matrices = {"A": [[-1.0]], "C": [[1.0]], "Ts": 0.0}
+    scipy.io.savemat(path, {**matrices, "Q": [[1.0]]})
+    assert obsynth.from_matlab(path).nx == 1
+    scipy.io.savemat(path, {**matrices, "timeunit": "minutes"})
+    with pytest.raises(obsynth.SpecError, match="did you mean 'TimeUnit'"):
+        obsynth.from_matlab(path)
+
+
+LINEAR_MODEL = Path(__file__).parent / "linear_models" / "linearized_model.mo"
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("B * u;", "B * u + f0;", "x\\+B\\*u\\+f0"),
+        ("der(x)", "60 * der(x)", "60\\*der"),
+        ("y = C * x", "y = C * delay(x, 0.5)", "delay"),
+        ("parameter Real D", "parameter Real tau = 0.5; parameter Real D", "declares tau"),
+    ],
+)
+def test_what_a_linear_model_of_openmodelica_does_not_have_is_named(tmp_path, before, after, words):
+    text = LINEAR_MODEL.read_text()
+    assert before in text
+    path = tmp_path / "linearized_model.mo"
+    path.write_text(text.replace(before, after, 1))
+    with pytest.raises(obsynth.SpecError, match=words):
+        obsynth.from_modelica(path)
+
+
+def test_an_attribute_that_is_not_of_python_control_is_named():
+    system = control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]])
+    connected = control.interconnect(
+        [control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]], inputs="u", outputs="y", name="first")],
+        inputs="u", outputs="y",
+    )  # fmt: skip
+    assert obsynth.from_control(system).nx == obsynth.from_control(connected).nx == 1
+    system.InputDelay = 2.0
+    with pytest.raises(obsynth.SpecError, match="InputDelay"):
+        obsynth.from_control(system)
+
+
+def test_a_continuous_system_of_scipy_is_not_taken_as_sampled():
+    system = scipy.signal.lti([1.0], [1.0, 0.5])
+    with pytest.raises(obsynth.SpecError, match="continuous"):
+        obsynth.from_scipy(system, dt=0.1)
+    assert obsynth.from_scipy(system, dt=0.0).dt == 0.0
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        scipy.signal.lti([1, 0, 0], [1, 1]),
+        scipy.signal.ZerosPolesGain([-1.0, -2.0], [-3.0], 2.0),
+        scipy.signal.lti([1, 1], [1, 2, 3]),
+    ],
+)
+def test_transfer_functions_of_scipy_proper_or_not(system):
+    plant = obsynth.from_scipy(system, input_names=["pump"])
+    function = system.to_tf()
+    for s in (0.3 + 0.7j, 2.0j, 1.5):
+        wanted = np.polyval(np.ravel(function.num), s) / np.polyval(function.den, s)
+        assert np.allclose(response(plant, s), wanted, rtol=1e-10)
+    assert plant.input_names == ("pump",)
+
+
+def test_a_pencil_of_andes_with_an_unknown_key_is_refused(tmp_path):
+    shipped = Path(__file__).parents[2] / "designs" / "smib"
+    for name in ("E.mtx", "A.mtx"):
+        (tmp_path / name).write_bytes((shipped / name).read_bytes())
+    names = json.loads((shipped / "names.json").read_text())
+    (tmp_path / "names.json").write_text(json.dumps({**names, "time_unit": "ms"}))
+    with pytest.raises(obsynth.SpecError, match="time_unit"):
+        obsynth.from_andes(tmp_path, outputs=["omega GENCLS 1"])

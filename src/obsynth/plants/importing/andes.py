@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,6 +24,9 @@ from obsynth.plants.signal_names import checked_names
 Picked: TypeAlias = "Sequence[str] | Mapping[str, Sequence[str]]"
 
 _PENCIL = ("E.mtx", "A.mtx", "names.json")
+
+#: A rate or an imbalance (per unit) that the power flow's tolerance explains.
+_AT_REST = 1e-4
 
 
 #: Devices that a message lists.
@@ -60,6 +64,11 @@ def from_andes(
     SpecError
         ANDES is not installed (it is licensed under the GPL and no dependency of ours), it cannot read or solve the
         case, or a name is unknown.
+
+    Warns
+    -----
+    UserWarning
+        ANDES does not start the case at rest: a linear model of deviations has no constant term.
 
     Examples
     --------
@@ -102,6 +111,9 @@ def _written_pencil(folder: Path) -> tuple[FloatArray, FloatArray, list[str]]:
         e, a = (np.asarray(_dense(scipy.io.mmread(folder / name)), dtype=np.float64) for name in _PENCIL[:2])
         names = json.loads((folder / _PENCIL[2]).read_text(encoding="utf-8"))
         listed = [*names["differential"], *names["algebraic"]]
+        unknown = [key for key in names if key not in ("differential", "algebraic") and names[key]]
+        if unknown:
+            raise ValueError(f"{_PENCIL[2]} has the unknown key {unknown[0]!r}, whose meaning is not known here")
     except READING_ERRORS as error:
         raise SpecError(f"{folder} holds no pencil of ANDES: {error}", path=str(folder)) from error
     return e, a, listed
@@ -129,7 +141,20 @@ def _solved_case(case: Any) -> tuple[FloatArray, FloatArray, list[str], dict[str
     e[np.arange(n), np.arange(n)] = np.asarray(dae.Tf, dtype=np.float64)
     names = _completed_names(system, [str(name) for name in (*dae.x_name, *dae.y_name)], n)
     values = np.concatenate([np.asarray(dae.x), np.asarray(dae.y)])
+    _say_where_not_at_rest(np.concatenate([np.asarray(dae.f), np.asarray(dae.g)]), names)
     return e, a, names, dict(zip(names, map(float, values), strict=True))
+
+
+def _say_where_not_at_rest(residuals: FloatArray, names: Sequence[str]) -> None:
+    """Warn of a point at which ANDES does not start at rest: deviations from it obey no linear model."""
+    worst = int(np.argmax(np.abs(residuals)))
+    if not abs(residuals[worst]) <= _AT_REST:
+        warnings.warn(
+            f"ANDES does not start this case at rest: the equation of {names[worst]!r} is off by "
+            f"{residuals[worst]:.3g}, and a linear model of deviations has no term for that. Mend the data of that "
+            "device (ANDES lists limits and initial values that do not fit).",
+            stacklevel=4,
+        )
 
 
 def _completed_names(system: Any, names: list[str], differential: int) -> list[str]:

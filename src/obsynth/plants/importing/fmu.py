@@ -38,6 +38,9 @@ _SPELLED = {
 
 _GET, _SET, _UPDATE = 1, 2, 3
 
+#: Spellings of the second, the unit of an FMU's independent variable where it states none.
+_SECONDS = ("", "s", "sec", "second", "seconds")
+
 
 #: A step of central differences, in sizes of the variable: it balances rounding with the third derivative.
 STEP = float(np.cbrt(np.finfo(np.float64).eps))
@@ -263,7 +266,9 @@ def from_fmu(
     Raises
     ------
     SpecError
-        fmpy is not installed, the file is no such FMU, or a name is unknown.
+        fmpy is not installed, the file is no such FMU, a name is unknown, its time is not in seconds, it has a clock,
+        or, unless ``inputs`` and ``outputs`` say which to use, inputs that are no continuous real numbers or outputs
+        that change at events alone.
     PreconditionError
         The operating point is no equilibrium (a linear model of deviations would not be one), or none is found.
 
@@ -277,6 +282,7 @@ def from_fmu(
     for name, value in (at or {}).items():
         real_number(value, f"at[{name!r}]", "a finite number", path="at")
     with _instance(path_of(path)) as instance:
+        _require_linear_meaning(instance.description, path_of(path), inputs, outputs)
         used = _used(instance.input_names, inputs, "inputs"), _used(instance.output_names, outputs, "outputs")
         for name in at or {}:
             if name not in instance.settable:
@@ -363,6 +369,49 @@ def _differentiates(fmpy: Any, path: Path) -> bool:
     # fmpy does not read the attribute of FMI 3, which is spelled differently.
     named = "providesDirectionalDerivative" + ("" if version.startswith("2") else "s")
     return exchange.get(named) in ("true", "1")
+
+
+def _require_linear_meaning(
+    description: Any, path: Path, inputs: Sequence[str] | None, outputs: Sequence[str] | None
+) -> None:
+    """Refuse, by name, what a description states and a linear model in seconds of its real variables does not have:
+    another unit of time, clocks, inputs that are no real numbers, outputs that change at events alone."""
+    for variable in description.modelVariables:
+        if variable.causality == "independent":
+            unit = variable.unit or (variable.declaredType.unit if variable.declaredType is not None else None) or ""
+            if unit not in _SECONDS:
+                raise SpecError(
+                    f"{path}: its independent variable {variable.name!r} is in {unit!r}, not in seconds: derivatives "
+                    "would be per that unit. Export the FMU in seconds.",
+                    path=str(path),
+                )
+        if variable.type == "Clock":
+            raise SpecError(
+                f"{path} has the clock {variable.name!r}: a part of it is sampled, and a linear model in continuous "
+                "time would leave it out. Export the FMU without it.",
+                path=str(path),
+            )
+    # An input that is left at its value may switch the equations; an output that changes at events alone has no row.
+    strange = {
+        "inputs": [v for v in description.modelVariables if v.causality == "input" and not _is_continuous(v)],
+        "outputs": [
+            v
+            for v in description.modelVariables
+            if v.causality == "output" and v.type in _REAL and v.variability == "discrete"
+        ],
+    }
+    for what, picked in (("inputs", inputs), ("outputs", outputs)):
+        if picked is None and strange[what]:
+            names = ", ".join(v.name for v in strange[what])
+            raise SpecError(
+                f"{path}: its {what} {names} are no continuous real numbers, and a linear model has no such signal: "
+                f"name those that it shall have by {what}=[...]; the others keep the values that they start with.",
+                path=what,
+            )
+
+
+def _is_continuous(variable: Any) -> bool:
+    return variable.type in _REAL and variable.variability in (None, "continuous")
 
 
 def _used(known: Sequence[str], picked: Sequence[str] | None, what: str) -> list[str]:

@@ -6,7 +6,7 @@ import errno
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,9 @@ _INNER_DELAYS = ("InternalDelay", "IODelay", "ioDelay")
 
 #: Fields with an operating point, and with units: what they are of.
 _POINTS = {"x0": "state_names", "u0": "input_names", "y0": "output_names"}
+
+#: MATLAB's operating point of a linearised model: ``dx`` is the rate there, which a linear model has no term for.
+_OFFSETS = {"x": "x0", "u": "u0", "y": "y0"}
 
 _UNIT_FIELDS = {"StateUnit": "state_names", "InputUnit": "input_names", "OutputUnit": "output_names"}
 
@@ -93,6 +96,16 @@ _POINT = re.compile(r"parameter\s+Real\s+([xu])0\s*\[[^\]]*\]\s*=\s*(\{[^}]*\}|z
 
 _ALIAS = re.compile(r"Real\s+'([xuy])_([^']*)'\s*=\s*([xuy])\[(\d+)\]\s*;")
 
+_PARAMETER = re.compile(r"parameter\s+\w+\s+(\w+)")
+
+#: What OpenModelica declares: sizes, operating point, matrices; those with z recover all variables of the model.
+_MODELICA_PARAMETERS = frozenset((*"nmpklABCD", "x0", "u0", "z0", "nz", "Cz", "Dz"))
+
+_EQUATION = re.compile(r"\bequation\b(.*?)\bend\b", re.DOTALL)
+
+#: The equations of a linear model, without blanks; any other changes what the matrices mean.
+_MODELICA_EQUATIONS = re.compile(r"(der\(x\)=A\*x(\+B\*u)?|y=C\*x(\+D\*u)?|z=Cz\*x(\+Dz\*u)?|y=D\*u|z=Dz\*u)")
+
 # OpenModelica makes outputs that are states into states of their own name.
 _OUTPUT_ALIAS = "$outputAlias_"
 
@@ -127,8 +140,8 @@ def from_matlab(
     Returns
     -------
     DescriptorSystem
-        With the names and units in the file, in seconds whatever the ``TimeUnit``, with ``x0, u0, y0`` as operating
-        point, and with ``InputDelay`` and ``OutputDelay`` as delays.
+        With the names and units in the file, in seconds whatever the ``TimeUnit``, with ``x0, u0, y0`` or MATLAB's
+        ``Offsets`` as operating point, and with ``InputDelay`` and ``OutputDelay`` as delays.
 
     Raises
     ------
@@ -153,6 +166,7 @@ def from_matlab(
         raise SpecError(
             f"{source} has no matrix A{_in(variable)}; it has: {', '.join(fields) or 'nothing'}.", path=str(source)
         )
+    fields = _with_offsets(fields, source)
     _require_understood(fields, source, is_struct=fields is not content and fields.keys() != content.keys())
     unit = _seconds_of_unit(fields, source)
     step = _step(fields, dt, unit, source)
@@ -166,8 +180,8 @@ def from_matlab(
         {**{name: given[name] for name in _MORE if name in given}, **names, **plant},
         labels=labels,
         dt=step,
-        point=_point(fields, labels),
-        units=_units(fields, labels),
+        point=_point(fields, labels, given, source),
+        units=_units(fields, labels, given, source),
         delays=_delays(fields, labels, given, step or unit, source),
     )
 
@@ -237,6 +251,13 @@ def _require_understood(fields: Mapping[str, Any], source: Path, *, is_struct: b
             )
     delays = (*_INNER_DELAYS, *_DELAYS_OF)
     known = {*_MODEL_MATRICES, *_MORE, *_MATLAB_NAMES, *_SAMPLE_TIME_NAMES, *delays, *_POINTS, *_UNIT_FIELDS}
+    spelled = {name.lower(): name for name in (*known, "TimeUnit") if len(name) > 1}
+    for name in fields:
+        # A variable beside matrices may be anything, but not the sampling time by another spelling.
+        if name not in known | _WITHOUT_MEANING and name.lower() in spelled:
+            raise SpecError(
+                f"{source} has {name!r}, which is not read: did you mean {spelled[name.lower()]!r}?", path=str(source)
+            )
     unknown = [
         name
         for name, value in fields.items()
@@ -248,6 +269,28 @@ def _require_understood(fields: Mapping[str, Any], source: Path, *, is_struct: b
             "matrices do not depend on them.",
             path=str(source),
         )
+
+
+def _with_offsets(fields: Mapping[str, Any], source: Path) -> dict[str, Any]:
+    """Return fields with the operating point of MATLAB's ``Offsets`` as ``x0``, ``u0`` and ``y0``."""
+    offsets = fields.get("Offsets")
+    if getattr(getattr(offsets, "dtype", None), "names", None) is None:
+        return dict(fields)
+    rest = {name: value for name, value in fields.items() if name != "Offsets"}
+    if offsets.size != 1:
+        return rest if not offsets.size else dict(fields)
+    record = offsets.reshape(-1)[0]
+    given = {name: record[name] for name in offsets.dtype.names if np.size(record[name])}
+    unknown = [name for name in given if name not in (*_OFFSETS, "dx")]
+    if unknown:
+        raise SpecError(f"{source}: Offsets has the field {unknown[0]!r}; known are dx, x, u, y.", path=str(source))
+    if np.any(_numbers_in(given.pop("dx", 0.0))):
+        raise SpecError(
+            f"{source}: Offsets.dx is not zero, so the operating point is no equilibrium and deviations from it obey "
+            "no linear model without a constant term: linearise in a steady state.",
+            path=str(source),
+        )
+    return {**rest, **{_OFFSETS[name]: value for name, value in given.items()}}
 
 
 def _numbers_in(value: Any) -> FloatArray:
@@ -279,6 +322,8 @@ def _step(fields: Mapping[str, Any], dt: float | None, unit: float, source: Path
     times = [
         float(np.squeeze(fields[name])) for name in _SAMPLE_TIME_NAMES if name in fields and np.size(fields[name]) == 1
     ]
+    if len(set(times)) > 1:
+        raise SpecError(f"{source} has Ts = {times[0]:g} and dt = {times[1]:g}: keep one of them.", path=str(source))
     if not times:
         if dt is None:
             raise SpecError(
@@ -311,35 +356,56 @@ def _per_second(given: Mapping[str, Any], unit: float, source: Path) -> dict[str
     return {name: np.asarray(value) / unit if name in dynamic else value for name, value in given.items()}
 
 
-def _labelled(fields: Mapping[str, Any], labels: Mapping[str, Any], wanted: Mapping[str, str], prefixes: str) -> Any:
+def _labelled(
+    fields: Mapping[str, Any],
+    labels: Mapping[str, Any],
+    given: Mapping[str, Any],
+    wanted: Mapping[str, str],
+    source: Path,
+) -> Iterator[tuple[str, Any]]:
     """Yield names of signals with what a field says of each of them."""
-    for (field, kind), prefix in zip(wanted.items(), prefixes, strict=True):
-        if field in fields:
-            values = np.ravel(_dense_value(fields[field]))
-            names = labels[kind] or [f"{prefix}{i + 1}" for i in range(len(values))]
-            yield from zip(names, values, strict=False)
+    counts = _signal_counts(given)
+    for (field, kind), prefix in zip(wanted.items(), "xuy", strict=True):
+        values = np.ravel(_dense_value(fields[field])) if field in fields else np.zeros(0)
+        if not values.size:
+            continue
+        if len(values) != counts[kind]:
+            raise SpecError(
+                f"{source}: {field} has {len(values)} entries, but there are {counts[kind]} such signals.",
+                path=str(source),
+            )
+        yield from zip(labels[kind] or [f"{prefix}{i + 1}" for i in range(counts[kind])], values, strict=True)
 
 
-def _point(fields: Mapping[str, Any], labels: Mapping[str, Any]) -> dict[str, float]:
-    """Return the operating point of states, inputs and outputs, as fields ``x0``, ``u0`` and ``y0`` have it."""
-    if not any(name in fields for name in _POINTS):
-        return {}
-    return {name: float(np.squeeze(value)) for name, value in _labelled(fields, labels, _POINTS, "xuy")}
-
-
-def _units(fields: Mapping[str, Any], labels: Mapping[str, Any]) -> dict[str, str]:
-    found = {
-        name: str(np.squeeze(cell)) for name, cell in _labelled(fields, labels, _UNIT_FIELDS, "xuy") if np.size(cell)
+def _signal_counts(given: Mapping[str, Any]) -> dict[str, int]:
+    """Return the numbers of states, inputs and outputs by the field that names them."""
+    return {
+        "state_names": np.shape(given["A"])[-1],
+        "input_names": next((np.shape(given[name])[-1] for name in "BD" if name in given), 0),
+        "output_names": len(given["C"] if "C" in given else given["A"]),
     }
-    return {name: unit.strip() for name, unit in found.items() if unit.strip()}
+
+
+def _point(
+    fields: Mapping[str, Any], labels: Mapping[str, Any], given: Mapping[str, Any], source: Path
+) -> dict[str, float]:
+    """Return the operating point of states, inputs and outputs, as fields ``x0``, ``u0`` and ``y0`` have it."""
+    return {name: float(np.squeeze(value)) for name, value in _labelled(fields, labels, given, _POINTS, source)}
+
+
+def _units(
+    fields: Mapping[str, Any], labels: Mapping[str, Any], given: Mapping[str, Any], source: Path
+) -> dict[str, str]:
+    stated = _labelled(fields, labels, given, _UNIT_FIELDS, source)
+    units = {name: str(np.squeeze(cell)).strip() for name, cell in stated if np.size(cell)}
+    return {name: unit for name, unit in units.items() if unit}
 
 
 def _delays(
     fields: Mapping[str, Any], labels: Mapping[str, Any], given: Mapping[str, Any], unit: float, source: Path
 ) -> dict[str, float]:
     """Return delays in s by input or output; ``unit``: seconds in what the file counts them in, samples or TimeUnit."""
-    sizes = {"input_names": next((np.shape(given[name])[-1] for name in "BD" if name in given), 0)}
-    sizes["output_names"] = len(given["C"]) if "C" in given else len(given["A"])
+    sizes = _signal_counts(given)
     found: dict[str, float] = {}
     for (field, kind), prefix in zip(_DELAYS_OF.items(), "uy", strict=True):
         values = np.ravel(_numbers_in(fields[field])) if field in fields else np.zeros(0)
@@ -431,6 +497,7 @@ def from_modelica(path: str | Path, **plant: Any) -> DescriptorSystem:
         raise SpecError(
             f"{source} is no linear model as OpenModelica writes it: it has no {missing[0]}.", path=str(source)
         )
+    _require_plain_model(text, source)
     shapes = {"A": ("n", "n"), "B": ("n", "m"), "C": ("p", "n"), "D": ("p", "m")}
     matrices = {
         name: _matrix(found[name], sizes[rows], sizes[columns], name, source)
@@ -453,6 +520,25 @@ def from_modelica(path: str | Path, **plant: Any) -> DescriptorSystem:
         matrices |= {"C": np.eye(sizes["n"]), "D": np.zeros((sizes["n"], sizes["m"]))}
     labels = {"state_names": names["x"], "input_names": names["u"], "output_names": names["y" if measured else "x"]}
     return plant_of(matrices, plant, labels=labels, dt=0.0, point=point)
+
+
+def _require_plain_model(text: str, source: Path) -> None:
+    """Refuse, by name, parameters and equations that a linear model of OpenModelica does not have."""
+    unknown = [name for name in _PARAMETER.findall(text) if name not in _MODELICA_PARAMETERS]
+    if unknown:
+        raise SpecError(
+            f"{source} declares {', '.join(unknown)}, which a linear model of OpenModelica does not have: its meaning "
+            "is not known here. Give the file as OpenModelica writes it.",
+            path=str(source),
+        )
+    for section in _EQUATION.findall(text):
+        for equation in filter(None, (re.sub(r"\s", "", part) for part in section.split(";"))):
+            if not _MODELICA_EQUATIONS.fullmatch(equation):
+                raise SpecError(
+                    f"{source} has the equation {equation!r}, which is not one of x' = A x + B u and y = C x + D u: "
+                    "the matrices alone do not say what it means.",
+                    path=str(source),
+                )
 
 
 def _matrix(body: str, rows: int, columns: int, name: str, source: Path) -> FloatArray:

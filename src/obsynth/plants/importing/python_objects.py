@@ -23,6 +23,32 @@ from obsynth.plants.signal_names import suggestion
 #: What goes in and what comes out, by the names that CasADi's integrators have; y is ours.
 INTEGRATOR_INPUTS, OUTPUTS = ("x", "z", "u", "p"), ("ode", "alg", "y")
 
+#: What an object of python-control has beside matrices and labels, without meaning for them.
+_PARTS_OF_CONTROL = frozenset(
+    (
+        *(
+            "A",
+            "B",
+            "C",
+            "D",
+            "dt",
+            "name",
+            "ninputs",
+            "noutputs",
+            "nstates",
+            "updfcn",
+            "outfcn",
+            "params",
+            "num",
+            "den",
+        ),
+        *("input_index", "output_index", "state_index", "input_labels", "output_labels", "state_labels"),
+        *("num_array", "den_array", "display_format", "repr_format", "syslist", "syslist_index", "state_offset"),
+        *("input_offset", "output_offset", "connect_map", "input_map", "output_map", "connection_type"),
+        *("remove_useless_states", "warn_duplicate", "states", "inputs", "outputs"),
+    )
+)
+
 
 @arguments_checked
 def from_control(
@@ -58,7 +84,8 @@ def from_control(
     Raises
     ------
     SpecError
-        It is no linear system, python-control is not installed, a name is unknown, or the sampling time is missing.
+        It is no linear system, python-control is not installed, a name is unknown, the sampling time is missing, or
+        somebody gave the object an attribute (``InputDelay``, ``units``) that python-control does not know.
 
     Examples
     --------
@@ -68,6 +95,13 @@ def from_control(
     [[-1.0]]
     """
     control = imported("control", extra=None)
+    require_kind(
+        system,
+        (control.StateSpace, control.TransferFunction),
+        "system",
+        "a control.StateSpace, such as control.ss(...)",
+    )
+    _require_understood(system)
     if isinstance(system, control.TransferFunction):
         system, chain = realised(system, control)
         if chain is not None:
@@ -79,7 +113,6 @@ def from_control(
                 labels={"input_names": system.input_labels, "output_names": system.output_labels},
                 dt=_sampling_time(system.dt, dt),
             )
-    require_kind(system, control.StateSpace, "system", "a control.StateSpace, such as control.ss(...)")
     labels = {
         "state_names": system.state_labels,
         "input_names": system.input_labels,
@@ -107,7 +140,8 @@ def from_scipy(
     Parameters
     ----------
     system : scipy.signal.lti or scipy.signal.dlti
-        A ``StateSpace``, or what ``to_ss`` makes into one.
+        A ``StateSpace``, or what ``to_ss`` makes into one; a transfer function with more zeros than poles as
+        `from_control` takes it.
     E : array_like, optional
         ``(nx, nx)``: scipy has none; ``None`` means the identity.
     input_names, output_names : list of str, optional
@@ -126,7 +160,8 @@ def from_scipy(
     Raises
     ------
     SpecError
-        It is no linear system of scipy, a name is unknown, or a discrete system does not say its ``dt``.
+        It is no linear system of scipy, a name is unknown, a discrete system does not say its ``dt``, or a continuous
+        one is given a ``dt``.
 
     Examples
     --------
@@ -137,6 +172,22 @@ def from_scipy(
     """
     signal = imported("scipy.signal", extra=None)
     require_kind(system, (signal.lti, signal.dlti), "system", "a scipy.signal.StateSpace")
+    if isinstance(system, signal.lti) and plant.get("dt"):
+        raise SpecError(
+            f"dt is {plant['dt']}, but the system is continuous: leave dt out, and sample it by obsynth.discretise.",
+            path="dt",
+        )
+    if _is_improper(system, signal):
+        if E is not None:
+            raise SpecError("E is for systems of states: a transfer function has its own.", path="E")
+        function = system.to_tf()
+        labels = {"inputs": input_names, "outputs": output_names}
+        dt = _sampling_time(function.dt, plant.pop("dt", None))
+        # Numbers of scipy are arrays of one row for each output.
+        rows = [[list(row)] for row in np.atleast_2d(function.num)]
+        bottoms = [[list(function.den)] for _ in rows]
+        ours = {name: names for name, names in labels.items() if names is not None}
+        return from_control(imported("control", extra=None).TransferFunction(rows, bottoms, dt, **ours), **plant)
     state_space = system.to_ss()
     return plant_of(
         {"E": E, **{name: np.asarray(getattr(state_space, name)) for name in "ABCD"}},
@@ -144,6 +195,31 @@ def from_scipy(
         labels={"input_names": input_names, "output_names": output_names},
         dt=_sampling_time(state_space.dt, plant.pop("dt", None)),
     )
+
+
+def _require_understood(system: Any) -> None:
+    """Refuse, by name, attributes that are not python-control's: they may change what the matrices mean."""
+    unknown = [
+        name
+        for name, value in getattr(system, "__dict__", {}).items()
+        if not name.startswith("_") and name not in _PARTS_OF_CONTROL and value is not None and np.size(value)
+    ]
+    if unknown:
+        raise SpecError(
+            f"system has the attribute {unknown[0]!r}, which python-control does not know and is not read: give "
+            "delays, units and an operating point as arguments of from_control, and delete it.",
+            path="system",
+        )
+
+
+def _is_improper(system: Any, signal: Any) -> bool:
+    """Whether a system of scipy has more zeros than poles, which ``to_ss`` does not take."""
+    if isinstance(system, signal.ZerosPolesGain):
+        return np.size(system.zeros) > np.size(system.poles)
+    if not isinstance(system, signal.TransferFunction):
+        return False
+    rows = [np.trim_zeros(np.asarray(row), "f") for row in np.atleast_2d(system.num)]
+    return any(len(row) > len(np.trim_zeros(np.atleast_1d(system.den), "f")) for row in rows)
 
 
 def _sampling_time(own: Any, given: float | None) -> float:
