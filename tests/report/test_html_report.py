@@ -10,6 +10,7 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+import pandas as pd
 import pytest
 
 mpl.use("Agg")
@@ -308,3 +309,13 @@ def test_the_page_says_what_holds_within_the_tolerances(tmp_path: Path) -> None:
     assert "bounds stay finite for ever" in page
     bare = design.replace(plant=design.plant.replace(uncertainty=None))
     assert "every claim is for the exact model" in html_report(bare, tmp_path / "q.html").read_text(encoding="utf-8")
+
+
+def test_a_log_without_a_rule_for_alarms_is_not_said_to_be_free_of_them(continuous, tmp_path):
+    log = pd.DataFrame({"time": np.arange(40) * 0.1, **{name: 0.0 for name in continuous.plant.output_names}})
+    for name in continuous.plant.input_names:
+        log[name] = 0.0
+    run = obsynth.run_on_data(continuous, log)
+    text = html_report(continuous, tmp_path / "page.html", run=run).read_text(encoding="utf-8")
+    assert 'class="verdict undecided">40 rows, and no rule for alarms' in text
+    assert "No alarm" not in text

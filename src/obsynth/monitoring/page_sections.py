@@ -109,9 +109,10 @@ def data_section(design: ObserverDesign, run: DataRun, statement: str) -> Iterat
     # The page itself tells what the threshold means.
     shown, count = replace(run, statement=""), panel_count(run, design=design)
     if count:
+        watched = bool(run.statement or run.thresholds)
         text = (
-            "Measured outputs and their estimates, fault estimates, residuals and the monitor's statistic. Grey: "
-            "settling or gap, no decision. Red: alarm."
+            f"Measured outputs and their estimates, fault estimates, residuals{' and what is monitored' * watched}. "
+            f"Grey: settling or gap, no decision.{' Red: alarm.' * bool(run.events)}"
         )
         yield stacked("", text, count, lambda axes: plot_data(shown, design=design, axes=axes)).html()
     yield from fact_rows(_counts(run, statement))

@@ -68,9 +68,10 @@ def headline(design: ObserverDesign, run: DataRun | None) -> Iterator[str]:
 
 def _of_run(run: DataRun) -> str:
     if not run.events:
-        watched = run.statement or run.thresholds
-        told = f"No alarm in {run.rows} rows." if watched else f"{run.rows} rows; nothing was monitored."
-        return f'<p class="verdict holds">{told}</p>'
+        if not (run.statement or run.thresholds):
+            told = f"{run.rows} rows, and no rule for alarms: nothing is decided. Give one by --threshold or --monitor."
+            return f'<p class="verdict undecided">{told}</p>'
+        return f'<p class="verdict holds">No alarm in {run.rows} rows.</p>'
     first = run.events[0]
     named = f" Probable fault: {first.fault}." if first.clear else ""
     more = f" {len(run.events)} alarms in all." if len(run.events) > 1 else ""

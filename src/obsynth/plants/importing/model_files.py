@@ -273,7 +273,7 @@ def _require_understood(fields: Mapping[str, Any], source: Path, *, is_struct: b
 
 def _with_offsets(fields: Mapping[str, Any], source: Path) -> dict[str, Any]:
     """Return fields with the operating point of MATLAB's ``Offsets`` as ``x0``, ``u0`` and ``y0``."""
-    offsets = fields.get("Offsets")
+    offsets: Any = fields.get("Offsets")
     if getattr(getattr(offsets, "dtype", None), "names", None) is None:
         return dict(fields)
     rest = {name: value for name, value in fields.items() if name != "Offsets"}
