@@ -28,7 +28,7 @@ def task_of(plant: obsynth.DescriptorSystem, *, theorem: int, delta: float, deca
     empty = np.zeros((0, 0))
     return PdTask(
         plants=((augmented.A, augmented.C),), theorem=theorem, delta=delta, decay=decay, disk=None, gain_bound=None,
-        gain_unit=1.0, rate_gain=None, noise_gain=None, rate=empty, shown=empty, process=empty, sensor=empty,
+        gain_unit=1.0, rate_gain=None, noise_gain=None, rate=empty, fault_error=empty, process=empty, sensor=empty,
         sensor_rate=empty,
     )  # fmt: skip
 

@@ -114,7 +114,7 @@ def bounded_real(
     pa, pb = _moved(A, P, Y, Cy), _moved(B, P, Y, Dy)
     level = _square(gamma) if gamma_squared is None else _scalar(gamma_squared, "gamma_squared")
     if dt > 0.0:
-        whole = lmi.symmetric_blocks(
+        inequality = lmi.symmetric_blocks(
             [
                 [P],
                 [np.zeros((nw, n)), level * np.eye(nw)],
@@ -123,9 +123,9 @@ def bounded_real(
             ]
         )
     else:
-        whole = -lmi.symmetric_blocks([[pa + pa.T], [pb.T, -level * np.eye(nw)], [C, D, -np.eye(nz)]])
+        inequality = -lmi.symmetric_blocks([[pa + pa.T], [pb.T, -level * np.eye(nw)], [C, D, -np.eye(nz)]])
     own = [] if detectable else some_gain_stabilises(A, dt, Cy, margin=BESIDE_MARGIN)
-    return [lmi.at_least(P, margin), lmi.at_least(whole, margin), *own]
+    return [lmi.at_least(P, margin), lmi.at_least(inequality, margin), *own]
 
 
 @arguments_checked
@@ -363,8 +363,8 @@ def admissible(
     if dt > 0.0:
         if Y is not None:
             raise SpecError("Y is for continuous time: A' P A is not linear in P and Y.", path="Y")
-        kept = e.T @ P @ e
-        return [lmi.at_least(kept), lmi.at_most(a.T @ P @ a - kept, -margin)]
+        energy = e.T @ P @ e
+        return [lmi.at_least(energy), lmi.at_most(a.T @ P @ a - energy, -margin)]
     moving = P.T @ a if Y is None else P.T @ a - Y @ Cy
     return [P.T @ e == e.T @ P, lmi.at_least(e.T @ P), lmi.at_most(moving + moving.T, -margin)]
 
@@ -375,8 +375,8 @@ def some_gain_stabilises(A: Any, dt: float, Cy: Any, *, margin: float = HOMOGENE
     Q = lmi.symmetric_variable(n)
     Y = None if Cy is None else lmi.matrix_variable(n, _shape(Cy)[0])
     moved = _moved(A, Q, Y, Cy)
-    whole = lmi.symmetric_blocks([[Q], [moved, Q]]) if dt > 0.0 else -(moved + moved.T)
-    return [lmi.at_least(Q, margin), lmi.at_least(whole, margin)]
+    inequality = lmi.symmetric_blocks([[Q], [moved, Q]]) if dt > 0.0 else -(moved + moved.T)
+    return [lmi.at_least(Q, margin), lmi.at_least(inequality, margin)]
 
 
 def _moved(matrix: Any, P: Any, Y: Any, measured: Any) -> Any:
@@ -428,6 +428,6 @@ def _sizes(A: Any, B: Any, C: Any, D: Any, P: Any) -> tuple[int, int, int]:
         if len(shape) != 2:
             raise SpecError(f"{name} is {shape}: give a matrix.", path=name)
     nw, nz = shapes["B"][1], shapes["C"][0]
-    for name, wanted in (("B", (n, nw)), ("C", (nz, n)), ("D", (nz, nw))):
-        require_shape(shapes[name], wanted, name)
+    for name, expected in (("B", (n, nw)), ("C", (nz, n)), ("D", (nz, nw))):
+        require_shape(shapes[name], expected, name)
     return n, nw, nz

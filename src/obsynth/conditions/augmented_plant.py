@@ -33,7 +33,7 @@ class Decoupled:
     Dhat: FloatArray  # (nx, ny)
     free_U: FloatArray  # (n_free, nx)
     free_D: FloatArray  # (n_free, ny)
-    seen: FloatArray  # (ny2, ny), orthonormal rows: outputs that no disturbance reaches directly
+    undisturbed: FloatArray  # (ny2, ny), orthonormal rows: outputs that no disturbance reaches directly
     injection: FloatArray  # (nx, ny): the part Bd Dd^+ of the equations that is fed with y
 
 
@@ -61,10 +61,10 @@ def decouple(plant: DescriptorSystem) -> Decoupled:
     With the annihilator Bp of Bd2 and ``Q = [Bp E; C2]``: ``[Ut Dt] = Q^+ + Z N``, N a basis of the left null space of
     Q, and Z such that Ut has full column rank: the polar factor of what makes ``[Ut; N_U]`` orthogonal.
     """
-    seen, injection, remaining = direct_part(plant)
+    undisturbed, injection, remaining = direct_part(plant)
     nx, left_over = plant.nx, plant.nx - remaining.shape[1]
-    kept = np.linalg.svd(remaining)[0][:, remaining.shape[1] :].T if remaining.shape[1] else np.eye(nx)
-    stacked = np.vstack([kept @ plant.E, seen @ plant.C])
+    annihilator = np.linalg.svd(remaining)[0][:, remaining.shape[1] :].T if remaining.shape[1] else np.eye(nx)
+    stacked = np.vstack([annihilator @ plant.E, undisturbed @ plant.C])
     q, r = np.linalg.qr(stacked, mode="complete")
     inverse = np.linalg.solve(r[:nx], q[:, :nx].T)
     inverse = inverse + (np.eye(nx) - inverse @ stacked) @ inverse
@@ -75,14 +75,21 @@ def decouple(plant: DescriptorSystem) -> Decoupled:
     generic = np.random.default_rng(0).standard_normal((nx, nx))
     # Where no equation has a derivative, ut is the rounding of the whole inverse.
     size = largest_singular_value(inverse) if inverse.size else 0.0
-    z = _completing(ut, nu, plant.A.T @ kept.T, generic @ kept.T, size)
-    return Decoupled((ut + z @ nu) @ kept, (dt + z @ nd) @ seen, nu @ kept, nd @ seen, seen, injection)
+    z = _completing(ut, nu, plant.A.T @ annihilator.T, generic @ annihilator.T, size)
+    return Decoupled(
+        (ut + z @ nu) @ annihilator,
+        (dt + z @ nd) @ undisturbed,
+        nu @ annihilator,
+        nd @ undisturbed,
+        undisturbed,
+        injection,
+    )
 
 
-def _completing(ut: FloatArray, nu: FloatArray, wanted: FloatArray, generic: FloatArray, size: float) -> FloatArray:
+def _completing(ut: FloatArray, nu: FloatArray, target: FloatArray, generic: FloatArray, size: float) -> FloatArray:
     """Return Z such that ``ut + Z nu`` has full column rank; ``[ut; nu]`` has, so what ut lacks, nu sees.
 
-    Kernel directions of ut go outside its range, near where ``wanted`` sends them, or else ``generic``: no choice hangs
+    Kernel directions of ut go outside its range, near where ``target`` sends them, or else ``generic``: no choice hangs
     on rounding.  ``size``: of what ut is a part of.
     """
     rows, columns = ut.shape
@@ -96,10 +103,10 @@ def _completing(ut: FloatArray, nu: FloatArray, wanted: FloatArray, generic: Flo
         return np.zeros((rows, nu.shape[0]))
     kernel = right[rank:].T
     free = left[:, rank:]
-    scale = float(np.linalg.norm(wanted))
-    outside = free @ _nearest_isometry(free.T @ wanted @ kernel, free.T @ generic @ kernel, scale)
-    shown = nu @ kernel
-    return np.asarray(outside @ np.linalg.pinv(shown) * largest)
+    scale = float(np.linalg.norm(target))
+    outside = free @ _nearest_isometry(free.T @ target @ kernel, free.T @ generic @ kernel, scale)
+    image = nu @ kernel
+    return np.asarray(outside @ np.linalg.pinv(image) * largest)
 
 
 def _nearest_isometry(matrix: FloatArray, otherwise: FloatArray, scale: float) -> FloatArray:
@@ -107,12 +114,12 @@ def _nearest_isometry(matrix: FloatArray, otherwise: FloatArray, scale: float) -
     Directions in which the matrix is nothing beside ``scale`` go where ``otherwise (m, n)`` sends them."""
     left, values, right = np.linalg.svd(matrix)
     rank = numerical_rank(values, scale=scale)
-    found = left[:, :rank] @ right[:rank]
+    isometry = left[:, :rank] @ right[:rank]
     if rank < matrix.shape[1]:
         outer, inner = left[:, rank:], right[rank:]
         turned = np.linalg.svd(outer.T @ otherwise @ inner.T, full_matrices=False)
-        found = found + outer @ turned[0] @ turned[2] @ inner
-    return np.asarray(found)
+        isometry = isometry + outer @ turned[0] @ turned[2] @ inner
+    return np.asarray(isometry)
 
 
 def paper_decoupling(
@@ -129,10 +136,10 @@ def paper_decoupling(
     size = np.abs(e_sharp) @ np.abs(plant.E) + np.abs(c_sharp) @ np.abs(plant.C) + np.eye(nx)
     if np.max(miss) > RANK_TOLERANCE * np.max(size):
         raise SpecError(f"E_sharp E + C_sharp C misses the identity by {np.max(miss):.3g}.", path="E_sharp")
-    shown = plant.C @ e_sharp @ plant.Bd
+    output_effect = plant.C @ e_sharp @ plant.Bd
     # Judged against its factors, not against its own norm: it may be nothing but rounding.
     norms = [largest_singular_value(part) for part in (plant.C, e_sharp, plant.Bd)] if plant.nd else [1.0]
-    rank = decide_rank(shown, expected=plant.nd, scale=float(np.prod(norms)), equilibrated=False)
+    rank = decide_rank(output_effect, expected=plant.nd, scale=float(np.prod(norms)), equilibrated=False)
     if not rank.full:
         raise SpecError(
             f"With this E_sharp, C E# Bd has {rank.describe()}: choose another E_sharp, or leave it out.",
@@ -144,8 +151,8 @@ def paper_decoupling(
     inverse: FloatArray = np.zeros((0, ny))
     if plant.nd:
         # By normal equations, so that simple numbers stay exact; one refinement makes up for their condition.
-        inverse = np.asarray(np.linalg.solve(shown.T @ shown, shown.T), dtype=np.float64)
-        inverse = inverse + (np.eye(plant.nd) - inverse @ shown) @ inverse
+        inverse = np.asarray(np.linalg.solve(output_effect.T @ output_effect, output_effect.T), dtype=np.float64)
+        inverse = inverse + (np.eye(plant.nd) - inverse @ output_effect) @ inverse
     basis = e_sharp @ plant.Bd @ inverse
     correction = basis + g @ (np.eye(ny) - plant.C @ basis)
     u = remaining @ (np.eye(nx) - basis @ plant.C) @ e_sharp
@@ -153,10 +160,10 @@ def paper_decoupling(
 
 
 def realise(
-    plant: DescriptorSystem, model: Exosystem, gains: tuple[FloatArray, FloatArray, FloatArray], seen: FloatArray
+    plant: DescriptorSystem, model: Exosystem, gains: tuple[FloatArray, FloatArray, FloatArray], undisturbed: FloatArray
 ) -> tuple[LinearObserver, dict[str, FloatArray]]:
     """Return the observer with gains ``U (na, na)``, ``D (na, ny)`` and ``K (na, ny)`` of the augmented plant, and its
-    matrices by the paper's letters; ``seen (nr, ny)``."""
+    matrices by the paper's letters; ``undisturbed (nr, ny)``."""
     u, d, k = gains
     augmented = AugmentedPlant.of(plant, model)
     nx, na = plant.nx, augmented.order
@@ -165,11 +172,13 @@ def realise(
     b_hat = product_but_rounding(a_hat, d, k)
     j_hat = u @ augmented.B
     faults = np.hstack([np.zeros((plant.nf, nx)), model.Cw])
-    rows = np.vstack([np.eye(nx, na), faults, -seen @ augmented.C])
-    shown = np.vstack([np.zeros((nx + plant.nf, plant.ny)), seen])
-    direct = product_but_rounding(rows, d, shown)
+    rows = np.vstack([np.eye(nx, na), faults, -undisturbed @ augmented.C])
+    output_part = np.vstack([np.zeros((nx + plant.nf, plant.ny)), undisturbed])
+    direct = product_but_rounding(rows, d, output_part)
     names = (
-        plant.output_names if np.array_equal(seen, np.eye(plant.ny)) else tuple(f"r{i + 1}" for i in range(len(seen)))
+        plant.output_names
+        if np.array_equal(undisturbed, np.eye(plant.ny))
+        else tuple(f"r{i + 1}" for i in range(len(undisturbed)))
     )
     observer = LinearObserver(
         Az=a_hat,
@@ -196,8 +205,8 @@ def combinations_seen(plant: DescriptorSystem) -> FloatArray:
     if not plant.Dd.any():
         return np.eye(plant.ny)
     units = PlantUnits.of(plant)
-    seen = direct_part(units.scaled_plant(plant))[0] * units.outputs
-    return np.asarray(seen / np.linalg.norm(seen, axis=1, keepdims=True))
+    undisturbed = direct_part(units.scaled_plant(plant))[0] * units.outputs
+    return np.asarray(undisturbed / np.linalg.norm(undisturbed, axis=1, keepdims=True))
 
 
 def with_faults(
@@ -205,6 +214,6 @@ def with_faults(
 ) -> tuple[FloatArray, FloatArray]:
     """Return ``U_a = [U, -Dhat Df Cw; 0, I]`` and ``D_a = [Dhat; 0]``: the faults are never read from y directly."""
     nx, count = plant.nx, model.order
-    whole = np.eye(nx + count)
-    whole[:nx, :nx], whole[:nx, nx:] = u, -d @ plant.Df @ model.Cw
-    return whole, np.vstack([d, np.zeros((count, plant.ny))])
+    u_a = np.eye(nx + count)
+    u_a[:nx, :nx], u_a[:nx, nx:] = u, -d @ plant.Df @ model.Cw
+    return u_a, np.vstack([d, np.zeros((count, plant.ny))])

@@ -51,7 +51,7 @@ def bisected(answer: Callable[[float], Answer], feasible: float, infeasible: flo
     """
     known: dict[float, Answer] = {}
 
-    def nearest(first: float, last: float, wanted: Answer) -> float:
+    def nearest(first: float, last: float, target: Answer) -> float:
         """Return the level nearest to the last, from the first on, that has the wanted answer."""
         for _ in range(MOST_HALVINGS):
             if abs(last - first) <= tolerance * max(abs(first), abs(last)):
@@ -64,7 +64,7 @@ def bisected(answer: Callable[[float], Answer], feasible: float, infeasible: flo
             else:
                 last = levels[0]
                 continue
-            first, last = (level, last) if known[level] == wanted else (first, level)
+            first, last = (level, last) if known[level] == target else (first, level)
         return first
 
     known[infeasible] = answer(infeasible)
@@ -73,9 +73,9 @@ def bisected(answer: Callable[[float], Answer], feasible: float, infeasible: flo
     least = nearest(feasible, infeasible, "feasible")
     refuted = np.nan
     if known[infeasible] == "infeasible":
-        told = [level for level, found in known.items() if found == "infeasible"]
-        refuted = nearest(min(told, key=lambda level: abs(level - least)), least, "infeasible")
-    return Bisection(least, refuted, tuple(sorted(level for level, found in known.items() if found == "unknown")))
+        refuted_levels = [level for level, verdict in known.items() if verdict == "infeasible"]
+        refuted = nearest(min(refuted_levels, key=lambda level: abs(level - least)), least, "infeasible")
+    return Bisection(least, refuted, tuple(sorted(level for level, verdict in known.items() if verdict == "unknown")))
 
 
 def _between(first: float, last: float, share: float) -> float:

@@ -173,8 +173,8 @@ def _theorem(
             raise SpecError(f"{name} is {shown(number)}: give a number {least}.", path=name)
     safe = chosen(reading, "reading", ("safe", "printed")) == "safe"
     own = linear_plant(plant)
-    held = pd_observer_conditions(own)
-    require_data(held, solvers=LEFT_TO_THE_PD_INEQUALITY)
+    conditions = pd_observer_conditions(own)
+    require_data(conditions, solvers=LEFT_TO_THE_PD_INEQUALITY)
     form = explicit_form(own.dense())
     work = own.dense() if form is None else form.plant
     A_o, C_o = _augmented(work)
@@ -216,7 +216,7 @@ def _theorem(
         {},
         {"A_o": A_o, "C_o": C_o},
         constraints,
-        lambda: held,
+        lambda: conditions,
         gains,
         design_of("filasova", plant, float(decay)),
     )
@@ -241,16 +241,16 @@ def _region(where: LMIRegion, P: Any, moving: Any, still: Any, delta: float, mar
     ``(Ae - s D) x = 0`` the vector ``[v x x; s v x x]`` makes ``(v* (L + s M + conj(s) M') v) x* P x < 0`` of it.
     """
     n, k = still.shape[0], len(where.L)
-    left, right = cp.kron(np.eye(k), moving), cp.kron(np.eye(k), still)
-    whole = lmi.symmetric_blocks(
+    moving_k, still_k = cp.kron(np.eye(k), moving), cp.kron(np.eye(k), still)
+    inequality = lmi.symmetric_blocks(
         [
-            [cp.kron(where.L, P) + left + left.T],
-            [cp.kron(where.M.T, P) + delta * left - right.T, -delta * (right + right.T)],
+            [cp.kron(where.L, P) + moving_k + moving_k.T],
+            [cp.kron(where.M.T, P) + delta * moving_k - still_k.T, -delta * (still_k + still_k.T)],
         ]
     )
     # P > 0 follows where L < 0 does not; asked for in the same block, so that it is one constraint.
     zero = np.zeros((n, 2 * k * n))
-    return lmi.at_most(cp.bmat([[whole, zero.T], [zero, -P]]), -margin)
+    return lmi.at_most(cp.bmat([[inequality, zero.T], [zero, -P]]), -margin)
 
 
 def _augmented(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:

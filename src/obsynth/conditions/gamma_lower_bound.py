@@ -104,10 +104,10 @@ def _growing(top: FloatArray, image: FloatArray, reached: FloatArray) -> FloatAr
     while True:
         states, following = outside.T @ top @ pairs, outside.T @ image @ pairs
         inverse = np.linalg.pinv(states)
-        kept = null_space(following - states @ inverse @ following)
-        if kept.shape[1] == pairs.shape[1]:
+        further = null_space(following - states @ inverse @ following)
+        if further.shape[1] == pairs.shape[1]:
             break
-        pairs = pairs @ kept
+        pairs = pairs @ further
     if pairs.shape[1] == 0:
         return np.zeros((top.shape[0], 0))
     _, vectors, count = schur(
@@ -171,26 +171,26 @@ def _with_fewer_disturbances(problem: GainProblem) -> Iterator[GainProblem]:
     sizes = np.linalg.norm(np.vstack([problem.B, problem.D, problem.Zd]), axis=0)
     count = len(sizes)
     for share in NEGLIGIBLE_DISTURBANCES:
-        kept = sizes > share * np.max(sizes, initial=0.0)
-        if 0 < np.sum(kept) < count:
-            count = int(np.sum(kept))
-            yield replace(problem, B=problem.B[:, kept], D=problem.D[:, kept], Zd=problem.Zd[:, kept])
+        large = sizes > share * np.max(sizes, initial=0.0)
+        if 0 < np.sum(large) < count:
+            count = int(np.sum(large))
+            yield replace(problem, B=problem.B[:, large], D=problem.D[:, large], Zd=problem.Zd[:, large])
 
 
 def _bound_in(normalised: NormalisedProblem, solver: str) -> float:
     # On the states that matter: outside the dual inequalities have no strict solution.
-    whole = normalised.problem
-    top, _, image = invisible_pairs(whole)
+    full = normalised.problem
+    top, _, image = invisible_pairs(full)
     reached = reached_from_rest(top, image)
     subspace = _range(np.hstack([reached, _growing(top, image, reached)]))
     t = subspace.T
     work = replace(
-        whole,
-        A=t @ whole.A @ subspace,
-        C=whole.C @ subspace,
-        Z=whole.Z @ subspace,
-        B=t @ whole.B,
-        Bn=t @ whole.Bn,
+        full,
+        A=t @ full.A @ subspace,
+        C=full.C @ subspace,
+        Z=full.Z @ subspace,
+        B=t @ full.B,
+        Bn=t @ full.Bn,
     )
     if work.disturbances == 0:
         return 0.0
@@ -209,13 +209,13 @@ def _bound_in(normalised: NormalisedProblem, solver: str) -> float:
 class _DualProblem:
     """Dual inequalities, ``Q = image Z1 image' - top Z1 top'``, where a strictly feasible point is near the identity.
 
-    ``shown``, ``bottom``: xi and d on the output-nulling directions; ``outputs``: xi on states and disturbance.
+    ``errors``, ``bottom``: xi and d on the output-nulling directions; ``outputs``: xi on states and disturbance.
     """
 
     top: FloatArray
     bottom: FloatArray
     image: FloatArray
-    shown: FloatArray
+    errors: FloatArray
     outputs: FloatArray
     free_weight: bool
 
@@ -232,9 +232,9 @@ class _DualProblem:
         slack = image @ point @ image.T - top @ point @ top.T
         invisible, states = np.linalg.cholesky(point), np.linalg.cholesky(0.5 * (slack + slack.T))
         back, outputs = np.linalg.inv(states), np.hstack([z @ states, zd])
-        shown = (z @ top + zd @ bottom) @ invisible
+        errors = (z @ top + zd @ bottom) @ invisible
         moved = (back @ top @ invisible, bottom @ invisible, back @ image @ invisible)
-        return cls(*moved, shown, outputs, free_weight), np.asarray(invisible), np.asarray(states)
+        return cls(*moved, errors, outputs, free_weight), np.asarray(invisible), np.asarray(states)
 
 
 def _best_dual_point(dual: _DualProblem, *, solver: str) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -242,19 +242,19 @@ def _best_dual_point(dual: _DualProblem, *, solver: str) -> tuple[FloatArray, Fl
     (n, size), nd = dual.top.shape, dual.bottom.shape[0]
     z1 = lmi.symmetric_variable(size)
     q = dual.image @ z1 @ dual.image.T - dual.top @ z1 @ dual.top.T
-    shown = cp.trace(dual.shown @ z1 @ dual.shown.T)
+    error_energy = cp.trace(dual.errors @ z1 @ dual.errors.T)
     energy = cp.trace(dual.bottom @ z1 @ dual.bottom.T)
     second, corner, last = q, np.zeros((nd, n)), np.zeros((nd, nd))
     if not dual.free_weight:
         corner, last = lmi.matrix_variable(nd, n), lmi.symmetric_variable(nd)
         second = lmi.symmetric_blocks([[q], [corner, last]])
-        shown, energy = shown + cp.trace(dual.outputs @ second @ dual.outputs.T), energy + cp.trace(last)
+        error_energy, energy = error_energy + cp.trace(dual.outputs @ second @ dual.outputs.T), energy + cp.trace(last)
     constraints = [
         lmi.at_least(z1, DUAL_MARGIN * 2),
         lmi.at_least(second, DUAL_MARGIN * 2),
         lmi.at_most(cp.reshape(energy, (1, 1), order="C"), 1.0),
     ]
-    lmi.minimise(-shown, constraints, what="lower bound on the gain", solver=solver)
+    lmi.minimise(-error_energy, constraints, what="lower bound on the gain", solver=solver)
     return lmi.value_of(z1), lmi.value_of(corner), lmi.value_of(last)
 
 
@@ -274,12 +274,12 @@ def _checked_bound(dual: _DualProblem, z1: FloatArray, corner: FloatArray, last:
         short = max(0.0, 2.0 * DUAL_MARGIN - least)
     if least < DUAL_MARGIN:
         return 0.0
-    shown = float(np.trace(dual.shown @ z1 @ dual.shown.T))
+    error_energy = float(np.trace(dual.errors @ z1 @ dual.errors.T))
     energy = float(np.trace(dual.bottom @ z1 @ dual.bottom.T))
     if not dual.free_weight:
-        shown += float(np.trace(dual.outputs @ second @ dual.outputs.T))
+        error_energy += float(np.trace(dual.outputs @ second @ dual.outputs.T))
         energy += float(np.trace(last))
-    return float(np.sqrt(max(shown, 0.0) / energy)) * (1.0 - BOUND_MARGIN) if energy > 0.0 else 0.0
+    return float(np.sqrt(max(error_energy, 0.0) / energy)) * (1.0 - BOUND_MARGIN) if energy > 0.0 else 0.0
 
 
 def least_gain_certificate(
@@ -304,17 +304,17 @@ def least_gain_certificate(
     pairs = InvisiblePairs.of(work, gains)
     if pairs is None:
         return {}, 0.0
-    s, top, bottom, image, shown, z, zd = (nearest_doubles(getattr(pairs, name)) for name in _BOUND_PARTS)
+    s, top, bottom, image, errors, z, zd = (nearest_doubles(getattr(pairs, name)) for name in _BOUND_PARTS)
     # Orthonormal coordinates: of the errors in the given sizes, of the pairs as they come.
     back = np.linalg.pinv(np.linalg.qr(factor @ s, mode="r")) if s.shape[1] else np.zeros((0, 0))
-    whole = np.vstack([np.linalg.pinv(back) @ top, bottom]) if s.shape[1] else bottom
-    turn = np.linalg.pinv(np.linalg.qr(whole, mode="r")) if whole.shape[1] else np.zeros((0, 0))
+    stacked = np.vstack([np.linalg.pinv(back) @ top, bottom]) if s.shape[1] else bottom
+    turn = np.linalg.pinv(np.linalg.qr(stacked, mode="r")) if stacked.shape[1] else np.zeros((0, 0))
     if not all(np.all(np.isfinite(part)) for part in (back, turn)):
         return {}, 0.0
     forth = np.linalg.pinv(back)
     moved = (forth @ top @ turn, bottom @ turn, forth @ image @ turn)
     attempts: list[Callable[[], tuple[FloatArray, FloatArray, FloatArray]]] = [
-        lambda: _two_steps(*moved, shown @ turn, z @ back, zd, free_weight)
+        lambda: _two_steps(*moved, errors @ turn, z @ back, zd, free_weight)
     ]
     if np.any(top):
         attempts.append(lambda: _mixture(*moved, z @ back, zd, free_weight, lambda dual: _best_run(dual, gain)))
@@ -332,10 +332,10 @@ def least_gain_certificate(
         except (SolverError, np.linalg.LinAlgError):
             continue
         made = {LEAST_GAIN_PAIRS: turn @ f, LAST: last @ forth, ALONE: alone}
-        found = {name: matrix for name, matrix in made.items() if np.any(matrix)}
-        bound = pairs.bound(found, free_weight=free_weight)
+        matrices = {name: matrix for name, matrix in made.items() if np.any(matrix)}
+        bound = pairs.bound(matrices, free_weight=free_weight)
         if bound > least:
-            best, least = found, bound
+            best, least = matrices, bound
     return (best, least) if least >= gain * (1.0 - PROVED_SHARE) else ({}, 0.0)
 
 
@@ -346,8 +346,8 @@ def _is_hopeless(problem: GainProblem, gain: float, *, thorough: bool) -> bool:
     top, bottom, image = invisible_pairs(problem)
     if thorough and reached_from_rest(top, image).shape[1] <= MOST_REACHED:
         return False
-    _, both = _first_two(top, bottom, image, problem.Z @ top + problem.Zd @ bottom, problem.Z, problem.Zd)
-    most = both[:, : both.shape[1] - problem.Zd.shape[1]] if problem.weight_is_free else both
+    _, two_steps = _first_two(top, bottom, image, problem.Z @ top + problem.Zd @ bottom, problem.Z, problem.Zd)
+    most = two_steps[:, : two_steps.shape[1] - problem.Zd.shape[1]] if problem.weight_is_free else two_steps
     return not most.size or largest_singular_value(most) < PROMISING_SHARE * gain
 
 
@@ -367,31 +367,31 @@ def _best_run(dual: _DualProblem, enough: float) -> tuple[FloatArray, FloatArray
             raise np.linalg.LinAlgError("every disturbance from zero initial state has an effect on the outputs")
         sizes = np.linalg.inv(np.linalg.qr(np.vstack([dual.bottom @ pair for pair in run]), mode="r"))
         run = [pair @ sizes for pair in run]
-        blocks = [[dual.shown @ pair, np.zeros((len(dual.shown), d.shape[1]))] for pair in run]
+        blocks = [[dual.errors @ pair, np.zeros((len(dual.errors), d.shape[1]))] for pair in run]
         if not dual.free_weight:
             blocks.append([dual.outputs[:, : len(top)] @ dual.image @ run[-1], dual.outputs[:, len(top) :]])
         _, values, vectors = np.linalg.svd(np.block(blocks), full_matrices=False)
-        shown, strongest = float(values[0]), vectors[0]
-        long_enough = shown >= enough * (1.0 - LONG_ENOUGH)
+        ratio, strongest = float(values[0]), vectors[0]
+        long_enough = ratio >= enough * (1.0 - LONG_ENOUGH)
         if long_enough or width + starts.shape[1] > MOST_RUN_UNKNOWNS or len(run) >= MOST_RUN_UNKNOWNS:
             break
         # Pairs that go on: what leads out of the states of all pairs is left out.
-        kept = null_space(outside @ dual.image @ run[-1]) if len(outside) else np.eye(width)
-        run = [np.hstack([pair @ kept, np.zeros((len(pair), starts.shape[1]))]) for pair in run]
-        run.append(np.hstack([forth @ dual.image @ run[-1][:, : kept.shape[1]], starts]))
+        further = null_space(outside @ dual.image @ run[-1]) if len(outside) else np.eye(width)
+        run = [np.hstack([pair @ further, np.zeros((len(pair), starts.shape[1]))]) for pair in run]
+        run.append(np.hstack([forth @ dual.image @ run[-1][:, : further.shape[1]], starts]))
     pairs = np.array([pair @ strongest[:width] for pair in run]).T
     reached, later = dual.image @ pairs[:, -1], strongest[width:] if d.size else np.zeros(nd)
     return pairs @ pairs.T, np.outer(later, reached), np.outer(later, later)
 
 
 def _first_two(
-    top: FloatArray, bottom: FloatArray, image: FloatArray, shown: FloatArray, z: FloatArray, zd: FloatArray
+    top: FloatArray, bottom: FloatArray, image: FloatArray, errors: FloatArray, z: FloatArray, zd: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the invisible pairs at rest in units of d, and what they (at once, then later) and one more d show."""
     starts = null_space(top) if top.shape[0] else np.eye(bottom.shape[1])
     sizes = np.linalg.pinv(np.linalg.qr(bottom @ starts, mode="r")) if starts.shape[1] else np.zeros((0, 0))
     starts = starts @ sizes
-    first = shown @ starts
+    first = errors @ starts
     return starts, np.block([[first, np.zeros((len(first), zd.shape[1]))], [z @ (image @ starts), zd]])
 
 
@@ -399,17 +399,17 @@ def _two_steps(
     top: FloatArray,
     bottom: FloatArray,
     image: FloatArray,
-    shown: FloatArray,
+    errors: FloatArray,
     z: FloatArray,
     zd: FloatArray,
     free_weight: bool,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the best disturbance of one sample from rest that no gain sees, with one more where W is fixed."""
-    starts, both = _first_two(top, bottom, image, shown, z, zd)
+    starts, two_steps = _first_two(top, bottom, image, errors, z, zd)
     nd, s = zd.shape[1], top.shape[0]
     if free_weight:
-        return starts @ _strongest(shown @ starts)[:, None], np.zeros((nd, s)), np.zeros((nd, 1))
-    strongest = _strongest(both)
+        return starts @ _strongest(errors @ starts)[:, None], np.zeros((nd, s)), np.zeros((nd, 1))
+    strongest = _strongest(two_steps)
     f, later = starts @ strongest[: starts.shape[1]], strongest[starts.shape[1] :]
     reached = image @ f
     size = float(reached @ reached)

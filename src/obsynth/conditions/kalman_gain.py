@@ -93,12 +93,12 @@ def kalman(
     ('optimal', ['K', 'L', 'covariance'])
     """
     own = linear_plant(plant).dense()
-    held = tuple(kalman_conditions(own))
-    require_data(held, solvers=("detectability",))
+    conditions = tuple(kalman_conditions(own))
+    require_data(conditions, solvers=("detectability",))
     varying, process, sensor = _noisy_plant(own, Q, R)
 
     design = design_of("kalman", plant, Q, R, (varying, process, sensor))
-    return steady_gain(varying, process, sensor, margin=margin, held=held, design=design)
+    return steady_gain(varying, process, sensor, margin=margin, conditions=conditions, design=design)
 
 
 def steady_gain(
@@ -107,7 +107,7 @@ def steady_gain(
     sensor: FloatArray,
     *,
     margin: float,
-    held: Sequence[Condition],
+    conditions: Sequence[Condition],
     design: Callable[[dict[str, FloatArray], str], ObserverDesign],
 ) -> Conditions:
     """Return the inequalities of a plant without unknown inputs, constant matrices, with its covariances."""
@@ -170,7 +170,7 @@ def steady_gain(
         {},
         data,
         constraints,
-        lambda: held,
+        lambda: conditions,
         gains,
         design,
     )
@@ -178,20 +178,20 @@ def steady_gain(
 
 def _noisy_plant(own: DescriptorSystem, Q: Any, R: Any) -> tuple[TimeVaryingDescriptorSystem, FloatArray, FloatArray]:
     """Return the plant without unknown inputs, with covariances of its equations and of its outputs."""
-    given = with_stated_noise(own, {"Q": Q, "R": R})
-    q = 1.0 if given["Q"] is None else given["Q"]
+    options = with_stated_noise(own, {"Q": Q, "R": R})
+    q = 1.0 if options["Q"] is None else options["Q"]
     if own.nd:
         reduced = without_unknown_inputs(own)
         varying, q = reduced.plant, reduced.process_covariance(q)
     else:
         varying = as_time_varying(own)
     process = _covariance(q, varying.ne, "Q")
-    return varying, process, _covariance(1.0 if given["R"] is None else given["R"], varying.ny, "R")
+    return varying, process, _covariance(1.0 if options["R"] is None else options["R"], varying.ny, "R")
 
 
-def _covariance(given: Any, size: int, name: str) -> FloatArray:
-    matrix = as_matrix(given, name)
-    matrix = float(matrix[0, 0]) * np.eye(size) if np.ndim(given) == 0 else matrix
+def _covariance(covariance: Any, size: int, name: str) -> FloatArray:
+    matrix = as_matrix(covariance, name)
+    matrix = float(matrix[0, 0]) * np.eye(size) if np.ndim(covariance) == 0 else matrix
     require_shape(matrix.shape, (size, size), name)
     return matrix
 

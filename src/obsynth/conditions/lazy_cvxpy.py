@@ -9,5 +9,5 @@ def __getattr__(name: str) -> Any:
     import cvxpy
 
     # Looked up once: from then on it is a name of this module.
-    found = globals()[name] = getattr(cvxpy, name)
-    return found
+    attribute = globals()[name] = getattr(cvxpy, name)
+    return attribute

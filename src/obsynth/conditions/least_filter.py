@@ -84,7 +84,7 @@ def hinf_filter(
     1.0000
     """
     options = {"delay": delay, "reference": reference, "exact": exact, "decoupled": decoupled}
-    data, design, held = _problem(plant, options)
+    data, design, conditions = _problem(plant, options)
     P, Y, Z0 = _variables(data)
     level = cp.Variable(name="gamma_squared")
     positive, bounded = atoms.bounded_real(
@@ -107,7 +107,7 @@ def hinf_filter(
         {},
         data,
         constraints,
-        lambda: held,
+        lambda: conditions,
         _gains,
         design,
     )
@@ -164,7 +164,7 @@ def h2_filter(
             path="plant",
         )
     options = {"delay": delay, "reference": reference, "exact": exact, "decoupled": decoupled, "norm": "h2"}
-    data, design, held = _problem(plant, options)
+    data, design, conditions = _problem(plant, options)
     P, Y, Z0 = _variables(data)
     Z = cp.Variable((data["B"].shape[1],) * 2, symmetric=True, name="Z")
     stable, covariance = atoms.h2(
@@ -178,7 +178,7 @@ def h2_filter(
         {},
         data,
         constraints,
-        lambda: held,
+        lambda: conditions,
         _gains,
         design,
     )
@@ -188,7 +188,7 @@ def _problem(
     plant: DescriptorSystem | Transformation, options: dict[str, Any]
 ) -> tuple[dict[str, FloatArray], Any, Any]:
     """Return the data, how gains become a design, and the conditions that were examined."""
-    white, asked, unit = registered("problem_of_options")(linear_plant(plant).dense(), options)
+    white, resolved, unit = registered("problem_of_options")(linear_plant(plant).dense(), options)
     core = white.problem
     if not len(core.A) or not len(core.C):
         raise SpecError(
@@ -196,7 +196,7 @@ def _problem(
             path="plant",
         )
     data = {name: getattr(core, name) for name in ("A", "B", "C", "D", "L", "D1")}
-    return data | {"unit": np.array([[unit]])}, design_of("optimal filter", plant, asked), asked[2]
+    return data | {"unit": np.array([[unit]])}, design_of("optimal filter", plant, resolved), resolved[2]
 
 
 def _variables(data: dict[str, FloatArray]) -> tuple[Any, Any, Any]:

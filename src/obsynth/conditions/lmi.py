@@ -40,13 +40,13 @@ def semidefinite_solvers() -> tuple[str, ...]:
     """Return the installed solvers of cvxpy that take semidefinite constraints."""
     from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC
 
-    taken = {
+    cones_of = {
         name: {cone.__name__ for cone in SOLVER_MAP_CONIC[name].SUPPORTED_CONSTRAINTS}
         for name in cp.installed_solvers()
         if name in SOLVER_MAP_CONIC
     }
     # Newer versions know a cone of scaled triangles besides that of matrices.
-    return tuple(name for name, cones in taken.items() if cones & {"PSD", "SvecPSD"})
+    return tuple(name for name, cones in cones_of.items() if cones & {"PSD", "SvecPSD"})
 
 
 def chosen_solver(name: str, options: Mapping[str, Any] | None) -> ChosenSolver:
@@ -84,11 +84,14 @@ def symmetric_blocks(lower: Sequence[Sequence[Any]]) -> Any:
     `at_least` and `at_most` ask something of the symmetric part: each block stands here once, since cvxpy works through
     an expression as often as it is written.  For the same reason ``2 X`` does for ``X + X'`` on the diagonal.
     """
-    kept = [i for i, row in enumerate(lower) if row[i].shape[0] > 0]
+    nonempty = [i for i, row in enumerate(lower) if row[i].shape[0] > 0]
     return cp.bmat(
         [
-            [lower[i][j] if j == i else 2.0 * lower[i][j] if j < i else np.zeros(lower[j][i].shape[::-1]) for j in kept]
-            for i in kept
+            [
+                lower[i][j] if j == i else 2.0 * lower[i][j] if j < i else np.zeros(lower[j][i].shape[::-1])
+                for j in nonempty
+            ]
+            for i in nonempty
         ]
     )
 

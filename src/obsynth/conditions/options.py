@@ -25,13 +25,13 @@ SolverOptions: TypeAlias = Annotated[Any, WrittenAs("solver options")]
 
 def own_terms(method: Any) -> tuple[str, ...]:
     """Return the names of the options that put something of one's own into the inequality."""
-    found = []
+    names = []
     for name in ("constraints", "objective", "region"):
         value = getattr(method, name)
         own = callable(value) if name != "region" else isinstance(value, (LMIRegion, list, tuple))
         if own or (name == "objective" and isinstance(value, str) and value == "h2"):
-            found.append(name)
-    return tuple(found)
+            names.append(name)
+    return tuple(names)
 
 
 def own_term_conflicts(method: Any, *, beside: tuple[str, ...], engines: tuple[str, ...] = ()) -> Iterator[str]:

@@ -39,7 +39,7 @@ class PdTask:
     rate_gain: float | None  # l2 gain from the fault's rate to the fault error
     noise_gain: float | None  # from noise and its derivative, separate inputs
     rate: FloatArray  # (n, nf), where the rate enters
-    shown: FloatArray  # (nf, n), error to fault error
+    fault_error: FloatArray  # (nf, n): from the error
     process: FloatArray  # (n, nw)
     sensor: FloatArray  # (ny, nw)
     sensor_rate: FloatArray  # (ny, nw), of the noise's derivative
@@ -68,17 +68,19 @@ def solve(task: PdTask, *, solver: str) -> PdSolution:
     n, ny = task.plants[0][1].shape[1], task.plants[0][1].shape[0]
     p3 = lmi.symmetric_variable(n) if task.theorem == 2 else lmi.matrix_variable(n, n)
     z = lmi.matrix_variable(n, ny)
-    found = _Variables(p3, lmi.matrix_variable(n, ny), z)
+    variables = _Variables(p3, lmi.matrix_variable(n, ny), z)
     own = [lmi.symmetric_variable(n) for _ in task.plants]
     constraints = [lmi.at_least(2.0 * p3, 2.0)]
     for (a, c), p in zip(task.plants, own, strict=True):
-        constraints += [lmi.at_least(p, PD_MARGIN), lmi.at_most(_stability(task, found, a, c, p), -PD_MARGIN)]
-    constraints += _further(task, found)
-    size = cp.norm(cp.hstack([found.Y, found.Z]), "fro") + cp.norm(cp.hstack([p3]), "fro")
+        constraints += [lmi.at_least(p, PD_MARGIN), lmi.at_most(_stability(task, variables, a, c, p), -PD_MARGIN)]
+    constraints += _further(task, variables)
+    size = cp.norm(cp.hstack([variables.Y, variables.Z]), "fro") + cp.norm(cp.hstack([p3]), "fro")
     record = lmi.minimise(size, constraints, what=f"a PD observer by Theorem {task.theorem}", solver=solver)
     p3_value = lmi.value_of(p3)
     try:
-        gain_j, gain_l = (np.asarray(np.linalg.solve(p3_value.T, lmi.value_of(part))) for part in (found.Y, found.Z))
+        gain_j, gain_l = (
+            np.asarray(np.linalg.solve(p3_value.T, lmi.value_of(part))) for part in (variables.Y, variables.Z)
+        )
     except np.linalg.LinAlgError as error:
         raise SolverError("The solver returned a singular P3: the result is inconclusive.", record=record) from error
     p1 = tuple(symmetric(lmi.value_of(p)) for p in own)
@@ -87,63 +89,65 @@ def solve(task: PdTask, *, solver: str) -> PdSolution:
     )
 
 
-def _stability(task: PdTask, found: _Variables, a: FloatArray, c: FloatArray, p: Any) -> Any:
+def _stability(task: PdTask, variables: _Variables, a: FloatArray, c: FloatArray, p: Any) -> Any:
     shifted = a + task.decay * np.eye(len(a))
-    return lmi.symmetric_blocks(_blocks(task, found, found.P3.T @ shifted - found.Y @ c, c, p, (0.0, 1.0, 0.0)))
+    return lmi.symmetric_blocks(
+        _blocks(task, variables, variables.P3.T @ shifted - variables.Y @ c, c, p, (0.0, 1.0, 0.0))
+    )
 
 
-def _blocks(task: PdTask, found: _Variables, moving: Any, c: FloatArray, p: Any, weights: tuple[float, ...]) -> Any:
+def _blocks(task: PdTask, variables: _Variables, moving: Any, c: FloatArray, p: Any, weights: tuple[float, ...]) -> Any:
     """Return the lower triangle of blocks; ``moving`` is M and ``weights`` are (a, b, c) of the module's text.
 
     On the diagonal stands what has the symmetric part that is meant.
     """
-    still = found.P3.T + found.Z @ c
+    still = variables.P3.T + variables.Z @ c
     first, second, third = (weight * p if weight else np.zeros(p.shape) for weight in weights)
     return [[2.0 * moving + first], [task.delta * moving - still.T + second, -2.0 * task.delta * still + third]]
 
 
-def _further(task: PdTask, found: _Variables) -> list[Any]:
+def _further(task: PdTask, variables: _Variables) -> list[Any]:
     """Return the constraints of what is asked besides a decay rate, for the plant itself (not shifted)."""
     a, c = task.plants[0]
-    proportional = found.Y + task.decay * found.Z  # P3' J
-    moving = found.P3.T @ a - proportional @ c
+    proportional = variables.Y + task.decay * variables.Z  # P3' J
+    moving = variables.P3.T @ a - proportional @ c
     constraints: list[Any] = []
     if task.disk is not None:
         centre, radius = task.disk
         p = lmi.symmetric_variable(len(a))
-        blocks = _blocks(task, found, moving, c, p, (centre**2 - radius**2, centre, 1.0))
+        blocks = _blocks(task, variables, moving, c, p, (centre**2 - radius**2, centre, 1.0))
         constraints += [lmi.at_least(p, PD_MARGIN), lmi.at_most(lmi.symmetric_blocks(blocks), -PD_MARGIN)]
     if task.gain_bound is not None:
         # P3' P3 >= P3 + P3' - I, so that [Y Z][Y Z]' <= r^2 (P3 + P3' - I) bounds the norm of [J L] by r.
-        constraints.append(_bounded(task, found, proportional, task.gain_bound))
+        constraints.append(_bounded(task, variables, proportional, task.gain_bound))
     if task.rate_gain is not None:
-        row = found.P3.T @ task.rate
-        constraints += _gain(task, found, moving, c, row.T, task.rate_gain)
+        row = variables.P3.T @ task.rate
+        constraints += _gain(task, variables, moving, c, row.T, task.rate_gain)
     if task.noise_gain is not None:
-        direct = found.P3.T @ task.process - proportional @ task.sensor
-        row = cp.vstack([direct.T, -(found.Z @ task.sensor_rate).T])
-        constraints += _gain(task, found, moving, c, row, task.noise_gain)
+        direct = variables.P3.T @ task.process - proportional @ task.sensor
+        row = cp.vstack([direct.T, -(variables.Z @ task.sensor_rate).T])
+        constraints += _gain(task, variables, moving, c, row, task.noise_gain)
     return constraints
 
 
-def _bounded(task: PdTask, found: _Variables, proportional: Any, bound: float) -> Any:
-    n, ny = task.shown.shape[1], task.sensor.shape[0]
+def _bounded(task: PdTask, variables: _Variables, proportional: Any, bound: float) -> Any:
+    n, ny = task.fault_error.shape[1], task.sensor.shape[0]
     return lmi.at_least(
         lmi.symmetric_blocks(
             [
-                [2.0 * found.P3 - np.eye(n)],
+                [2.0 * variables.P3 - np.eye(n)],
                 [task.gain_unit * proportional.T / bound, np.eye(ny)],
-                [found.Z.T / bound, np.zeros((ny, ny)), np.eye(ny)],
+                [variables.Z.T / bound, np.zeros((ny, ny)), np.eye(ny)],
             ]
         )
     )
 
 
-def _gain(task: PdTask, found: _Variables, moving: Any, c: FloatArray, row: Any, level: float) -> list[Any]:
+def _gain(task: PdTask, variables: _Variables, moving: Any, c: FloatArray, row: Any, level: float) -> list[Any]:
     """Return the bounded real inequality of the pencil; the scale theta of the fault error is free."""
-    p, theta = lmi.symmetric_variable(task.shown.shape[1]), cp.Variable(nonneg=True)
-    stability = _blocks(task, found, moving, c, p, (0.0, 1.0, 0.0))
-    stability[0][0] = stability[0][0] + theta * (task.shown.T @ task.shown)
+    p, theta = lmi.symmetric_variable(task.fault_error.shape[1]), cp.Variable(nonneg=True)
+    stability = _blocks(task, variables, moving, c, p, (0.0, 1.0, 0.0))
+    stability[0][0] = stability[0][0] + theta * (task.fault_error.T @ task.fault_error)
     inputs = row.shape[0]
     blocks = [*stability, [row, task.delta * row, -(level**2) * theta * np.eye(inputs)]]
     return [lmi.at_least(p, PD_MARGIN), lmi.at_most(lmi.symmetric_blocks(blocks), -PD_MARGIN)]

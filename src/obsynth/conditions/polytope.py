@@ -115,7 +115,7 @@ def vertex_inequalities(
     _require_fitting(errors, goal, level, decay, lyapunov, steps, gain, gains)
     forms = _Forms.of(errors, lyapunov=lyapunov, steps=steps, gain=gain, gains=gains)
     room = cp.Variable(name="room") if level is not None or goal == "decay" else None
-    kept = margin if room is None else room
+    slack = margin if room is None else room
     variables = forms.variables()
     value: Any = None
     if goal != "decay":
@@ -125,8 +125,8 @@ def vertex_inequalities(
             variables[name] = value
     constraints: dict[str, Any] = {}
     for place, now, then in forms.places():
-        constraints |= forms.at(place, now, then, goal, value, decay, kept)
-    constraints |= {f"P{name}": lmi.at_least(P, kept) for name, P in forms.positive()}
+        constraints |= forms.at(place, now, then, goal, value, decay, slack)
+    constraints |= {f"P{name}": lmi.at_least(P, slack) for name, P in forms.positive()}
     if room is not None:
         variables["room"] = room
         constraints["room"] = room <= MOST_ROOM
@@ -156,15 +156,15 @@ def witness_of(
     errors: ErrorPolytope, conditions: Conditions, *, steps: float | None = None
 ) -> tuple[Witness, list[FloatArray]]:
     """Return the Lyapunov matrices and the gains of the variables' present values."""
-    found = conditions.gains()
-    several = "P[2]" in found
-    P = [found[f"P[{i + 1}]"] for i in range(errors.count)] if several else [found["P"]]
-    names = [f"G[{i + 1}]" for i in range(errors.count)] if "G[2]" in found else ["G"] if "G" in found else []
-    gains = [found[f"L[{i + 1}]"] for i in range(errors.count)] if "L[2]" in found else [found["L[1]"]]
-    slack = [found[name] for name in names] or None
+    values = conditions.gains()
+    by_vertex = "P[2]" in values
+    P = [values[f"P[{i + 1}]"] for i in range(errors.count)] if by_vertex else [values["P"]]
+    names = [f"G[{i + 1}]" for i in range(errors.count)] if "G[2]" in values else ["G"] if "G" in values else []
+    gains = [values[f"L[{i + 1}]"] for i in range(errors.count)] if "L[2]" in values else [values["L[1]"]]
+    slacks = [values[name] for name in names] or None
     pairs = pairs_of(errors.count, steps) if steps is not None else None
-    multiplier = float(found["t"].item()) if "t" in found else 0.0
-    return Witness(P, slack, pairs, multiplier, errors.differential), gains
+    multiplier = float(values["t"].item()) if "t" in values else 0.0
+    return Witness(P, slacks, pairs, multiplier, errors.differential), gains
 
 
 def _require_fitting(
@@ -208,24 +208,24 @@ class _Forms:
     Y: list[Any]
     slack: bool
     pairs: list[Pair] | None
-    given: Sequence[FloatArray] | None
+    given_gains: Sequence[FloatArray] | None
     t: Any
 
     @classmethod
     def of(cls, errors: ErrorPolytope, *, lyapunov: str, steps: float | None, gain: str, gains: Any) -> _Forms:
         """Return new variables."""
         n, m, count, k = errors.order, errors.outputs, errors.count, errors.differential
-        several, moving = lyapunov == "vertex", lyapunov == "vertex" or steps is not None
+        by_vertex, moving = lyapunov == "vertex", lyapunov == "vertex" or steps is not None
         t = cp.Variable(nonneg=True, name="t") if errors.ball else None
         below = 0 if k is None else n - k
         if below:
             P, G = descriptor_variables(n, n - below)
             Ps, Gs = [P] * count, [G] * count
         else:
-            Ps = [cp.Variable((n, n), symmetric=True, name=f"P[{i + 1}]") for i in range(count)] if several else []
+            Ps = [cp.Variable((n, n), symmetric=True, name=f"P[{i + 1}]") for i in range(count)] if by_vertex else []
             Ps = Ps or [cp.Variable((n, n), symmetric=True, name="P")] * count
-            one = steps is not None or gain == "constant"
-            slack = [cp.Variable((n, n), name="G")] * count if one else []
+            common = steps is not None or gain == "constant"
+            slack = [cp.Variable((n, n), name="G")] * count if common else []
             slack = slack or [cp.Variable((n, n), name=f"G[{i + 1}]") for i in range(count)]
             Gs = slack if moving else Ps
         if gains is not None:
@@ -242,10 +242,10 @@ class _Forms:
 
     def variables(self) -> dict[str, Any]:
         """Return the variables by name."""
-        found: dict[str, Any] = {}
-        for matrix in (*self.P, *(self.G if self.slack else ()), *(self.Y if self.given is None else ())):
-            found |= {part.name(): part for part in matrix.variables()}
-        return found | ({"t": self.t} if self.t is not None else {})
+        variables: dict[str, Any] = {}
+        for matrix in (*self.P, *(self.G if self.slack else ()), *(self.Y if self.given_gains is None else ())):
+            variables |= {part.name(): part for part in matrix.variables()}
+        return variables | ({"t": self.t} if self.t is not None else {})
 
     def unknown_gains(self) -> list[tuple[str, Any]]:
         """Return the gains that are sought, with the ends of their names."""
@@ -267,7 +267,7 @@ class _Forms:
         return [(f"[{i + 1}]", now, then) for i, (now, then) in enumerate(self.pairs)]
 
     def at(
-        self, place: str, now: FloatArray, then: FloatArray, goal: str, value: Any, decay: float | None, kept: Any
+        self, place: str, now: FloatArray, then: FloatArray, goal: str, value: Any, decay: float | None, slack: Any
     ) -> dict[str, Any]:
         """Return the inequalities at weights, by name."""
         errors = self.errors
@@ -277,33 +277,33 @@ class _Forms:
         Z, Dz = _mean(list(errors.Cz), now), _mean(list(errors.Dz), now)
         if errors.dt > 0.0:
             low = G + G.T - _mean(self.P, then) if self.slack else _mean(self.P, then)
-            return self._discrete(place, _mean(self.P, now), low, G, GA, GB, Z, Dz, goal, value, decay, kept)
-        return self._continuous(place, _mean(self.P, now), GA, GB, Z, Dz, goal, value, decay, kept)
+            return self._discrete(place, _mean(self.P, now), low, G, GA, GB, Z, Dz, goal, value, decay, slack)
+        return self._continuous(place, _mean(self.P, now), GA, GB, Z, Dz, goal, value, decay, slack)
 
     def _discrete(
         self, place: str, P: Any, low: Any, G: Any, GA: Any, GB: Any, Z: Any, Dz: Any,
-        goal: str, value: Any, decay: float | None, kept: Any,
+        goal: str, value: Any, decay: float | None, slack: Any,
     ) -> dict[str, Any]:  # fmt: skip
         n, p, q = P.shape[0], Dz.shape[1], Dz.shape[0]
-        rest = self.errors.ball**2 * self.t * np.eye(n) if self.t is not None else 0.0
-        found = {}
+        remainder = self.errors.ball**2 * self.t * np.eye(n) if self.t is not None else 0.0
+        constraints = {}
         if goal == "gain":
             lower = [
-                [P - rest],
+                [P - remainder],
                 [np.zeros((p, n)), value * np.eye(p)],
                 [GA, GB, low],
                 [Z, Dz, np.zeros((q, n)), np.eye(q)],
             ]
-            found[f"(V1){place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, G, 2)), kept)
+            constraints[f"(V1){place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, G, 2)), slack)
         if goal == "power":
             W = cp.Variable((p, p), symmetric=True)
-            found[f"(V2){place}"] = lmi.at_least(lmi.symmetric_blocks([[P - Z.T @ Z], [GA, low]]), kept)
-            found[f"(V2) trace{place}"] = cp.trace(W) + float(np.sum(Dz**2)) + kept <= value
-            found[f"(V2) noise{place}"] = lmi.at_least(lmi.symmetric_blocks([[W], [GB, low]]), 0.0)
+            constraints[f"(V2){place}"] = lmi.at_least(lmi.symmetric_blocks([[P - Z.T @ Z], [GA, low]]), slack)
+            constraints[f"(V2) trace{place}"] = cp.trace(W) + float(np.sum(Dz**2)) + slack <= value
+            constraints[f"(V2) noise{place}"] = lmi.at_least(lmi.symmetric_blocks([[W], [GB, low]]), 0.0)
         if decay is not None:
-            lower = [[decay**2 * P - rest], [GA, low]]
-            found[f"decay{place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, G, 1)), kept)
-        return found
+            lower = [[decay**2 * P - remainder], [GA, low]]
+            constraints[f"decay{place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, G, 1)), slack)
+        return constraints
 
     def _with_ball(self, lower: list[list[Any]], G: Any, next_error: int) -> list[list[Any]]:
         if self.t is None:
@@ -323,35 +323,39 @@ class _Forms:
         goal: str,
         value: Any,
         decay: float | None,
-        kept: Any,
+        slack: Any,
     ) -> dict[str, Any]:
         p = Dz.shape[1]
-        found = {}
+        constraints = {}
         if goal == "gain":
             lower = [[-2.0 * GA - Z.T @ Z], [-(GB + Z.T @ Dz).T, value * np.eye(p) - Dz.T @ Dz]]
-            found[f"(V4){place}"] = lmi.at_least(lmi.symmetric_blocks(lower), kept)
+            constraints[f"(V4){place}"] = lmi.at_least(lmi.symmetric_blocks(lower), slack)
         if goal == "power":
             W = cp.Variable((p, p), symmetric=True)
-            found[f"(V4) power{place}"] = lmi.at_least(-2.0 * GA - Z.T @ Z, kept)
-            found[f"(V4) trace{place}"] = cp.trace(W) + float(np.sum(Dz**2)) + kept <= value
+            constraints[f"(V4) power{place}"] = lmi.at_least(-2.0 * GA - Z.T @ Z, slack)
+            constraints[f"(V4) trace{place}"] = cp.trace(W) + float(np.sum(Dz**2)) + slack <= value
             k = self.errors.differential or P.shape[0]
-            found[f"(V4) noise{place}"] = lmi.at_least(lmi.symmetric_blocks([[W], [GB[:k], P[:k, :k]]]), 0.0)
+            constraints[f"(V4) noise{place}"] = lmi.at_least(lmi.symmetric_blocks([[W], [GB[:k], P[:k, :k]]]), 0.0)
         if decay is not None:
-            found[f"decay{place}"] = lmi.at_least(-2.0 * GA - 2.0 * decay * P, kept)
-        return found
+            constraints[f"decay{place}"] = lmi.at_least(-2.0 * GA - 2.0 * decay * P, slack)
+        return constraints
 
     def gains(self, values: Values) -> dict[str, FloatArray]:
         """Return gains and Lyapunov matrices of the values of the variables."""
-        found: dict[str, FloatArray] = {}
+        matrices: dict[str, FloatArray] = {}
         distinct = list(dict.fromkeys(self.P))
         for i, P in enumerate(distinct):
             matrix = np.asarray(P.value)
-            found[f"P[{i + 1}]" if len(distinct) > 1 else "P"] = 0.5 * (matrix + matrix.T)
+            matrices[f"P[{i + 1}]" if len(distinct) > 1 else "P"] = 0.5 * (matrix + matrix.T)
         slack = list(dict.fromkeys(self.G)) if self.slack else []
         for i, G in enumerate(slack):
-            found[f"G[{i + 1}]" if len(slack) > 1 else "G"] = np.asarray(G.value)
-        if self.given is not None:
-            return found | {f"L[{i + 1}]": np.asarray(L) for i, L in enumerate(self.given)} | self._multiplier(values)
+            matrices[f"G[{i + 1}]" if len(slack) > 1 else "G"] = np.asarray(G.value)
+        if self.given_gains is not None:
+            return (
+                matrices
+                | {f"L[{i + 1}]": np.asarray(L) for i, L in enumerate(self.given_gains)}
+                | self._multiplier(values)
+            )
         known: dict[Any, FloatArray] = {}
         for G, Y in zip(self.G, self.Y, strict=True):
             if (G, Y) not in known:
@@ -359,8 +363,8 @@ class _Forms:
                 known[G, Y] = np.linalg.solve(
                     matrix.T if self.slack else 0.5 * (matrix + matrix.T), np.asarray(Y.value)
                 )
-                found[f"L[{len(known)}]"] = known[G, Y]
-        return found | self._multiplier(values)
+                matrices[f"L[{len(known)}]"] = known[G, Y]
+        return matrices | self._multiplier(values)
 
     def _multiplier(self, values: Values) -> dict[str, FloatArray]:
         return {"t": np.atleast_2d(values["t"])} if self.t is not None else {}

@@ -113,14 +113,14 @@ class Conditions:
         VerificationError
             The gains fail a check, which is named.
         """
-        found = self._design(self.gains(), name)
-        if not found.report.passed:
+        design = self._design(self.gains(), name)
+        if not design.report.passed:
             raise VerificationError(
-                f"The gains of this solution fail: {failed_rows(found.report)}. Solve to more digits, or leave more "
+                f"The gains of this solution fail: {failed_rows(design.report)}. Solve to more digits, or leave more "
                 "room in the constraints.",
-                report=found.report,
+                report=design.report,
             )
-        return found.replace(solver={**found.solver, "conditions": self.source, "status": str(self.problem.status)})
+        return design.replace(solver={**design.solver, "conditions": self.source, "status": str(self.problem.status)})
 
     def solve(self, solver: str, settings: Mapping[str, Any]) -> None:
         """Solve the problem; whatever the solver does ends in values, in a status, or in a `SolverError`.
@@ -222,10 +222,10 @@ class Conditions:
                 f"{solver} has no answer at {parameter} = {first:g} (status {self.problem.status}): the result is "
                 "inconclusive. Give a level further inside."
             )
-        found = bisected(answer, first, last, share)
+        bisection = bisected(answer, first, last, share)
         # The variables have the values of whatever was tried last.
-        answer(found.feasible)
-        return found
+        answer(bisection.feasible)
+        return bisection
 
     def _answer(self, parameter: str, level: float, solver: str, settings: Mapping[str, Any]) -> Answer:
         """Return what a solver finds at a level; whatever is neither a solution nor a plain no is unknown."""
@@ -242,7 +242,9 @@ class Conditions:
         if any(value is None or not np.all(np.isfinite(value)) for value in values):
             return "unknown"
         size = max((float(np.max(np.abs(value), initial=1.0)) for value in values), default=1.0)
-        worst = max((float(np.max(one.violation(), initial=0.0)) for one in self.problem.constraints), default=0.0)
+        worst = max(
+            (float(np.max(constraint.violation(), initial=0.0)) for constraint in self.problem.constraints), default=0.0
+        )
         return "feasible" if worst <= VIOLATION_SHARE * size else "unknown"
 
     def letters(self) -> Letters:
@@ -280,10 +282,10 @@ class Conditions:
                 f"There is no constraint {unknown[0]!r}; there are: {', '.join(map(repr, self.constraints))}.",
                 path="drop",
             )
-        kept = {key: value for key, value in self.constraints.items() if key not in set(drop)}
-        kept |= named_constraints(constraints, len(kept))
+        remaining = {key: value for key, value in self.constraints.items() if key not in set(drop)}
+        remaining |= named_constraints(constraints, len(remaining))
         goal = self.problem.objective if objective is None else checked_objective(objective)
-        return replace(self, problem=lmi.semidefinite_problem(goal, list(kept.values())), constraints=kept)
+        return replace(self, problem=lmi.semidefinite_problem(goal, list(remaining.values())), constraints=remaining)
 
     def _value(self, name: str, variable: Any) -> FloatArray:
         value = variable.value
@@ -325,34 +327,38 @@ class Letters(dict[str, Any]):
         )
 
 
-def named_constraints(given: Any, count: int = 0) -> dict[str, Any]:
+def named_constraints(constraints: Any, count: int = 0) -> dict[str, Any]:
     """Return constraints by name, the others numbered; raise `SpecError` for what is none."""
     from cvxpy.constraints.constraint import Constraint
 
-    if isinstance(given, Constraint):
-        given = [given]
-    if not isinstance(given, Mapping) and not isinstance(given, Iterable):
-        raise SpecError(f"constraints are {shown(given)}: give a list of cvxpy constraints.", path="constraints")
-    pairs = dict(given) if isinstance(given, Mapping) else {f"own {i + 1}": part for i, part in enumerate(given)}
+    if isinstance(constraints, Constraint):
+        constraints = [constraints]
+    if not isinstance(constraints, Mapping) and not isinstance(constraints, Iterable):
+        raise SpecError(f"constraints are {shown(constraints)}: give a list of cvxpy constraints.", path="constraints")
+    pairs = (
+        dict(constraints)
+        if isinstance(constraints, Mapping)
+        else {f"own {i + 1}": part for i, part in enumerate(constraints)}
+    )
     for name, part in pairs.items():
-        wanted = "cvxpy constraints, such as P >> numpy.eye(n)"
-        require_kind(part, Constraint, f"Constraint {name!r}", wanted, path="constraints")
+        expected = "cvxpy constraints, such as P >> numpy.eye(n)"
+        require_kind(part, Constraint, f"Constraint {name!r}", expected, path="constraints")
         if not part.is_dcp():
             who = f"Your constraint {name.removeprefix('own ')}" if name.startswith("own ") else f"Constraint {name!r}"
             raise SpecError(f"{who} is not convex: {part}", path="constraints")
     return pairs
 
 
-def checked_objective(given: Any) -> Any:
+def checked_objective(objective: Any) -> Any:
     """Return a cvxpy objective, minimising an expression; raise `SpecError` for anything else."""
-    if isinstance(given, (cp.Minimize, cp.Maximize)):
-        return given
-    if not isinstance(given, cp.Expression) or given.size != 1:
+    if isinstance(objective, (cp.Minimize, cp.Maximize)):
+        return objective
+    if not isinstance(objective, cp.Expression) or objective.size != 1:
         raise SpecError(
-            f"The objective is {a_kind(given)}: give cvxpy.Minimize(...), or a scalar expression.",
+            f"The objective is {a_kind(objective)}: give cvxpy.Minimize(...), or a scalar expression.",
             path="objective",
         )
-    return cp.Minimize(given)
+    return cp.Minimize(objective)
 
 
 def require_data(conditions: Sequence[Condition], *, solvers: tuple[str, ...]) -> None:

@@ -123,8 +123,8 @@ def sharepasand(
     'optimal'
     """
     if isinstance(plant, PolytopicSystem):
-        given = {"region": region, "poles": poles, "E_sharp": E_sharp, "C_sharp": C_sharp, "G": G}
-        for name, value in given.items():
+        refused = {"region": region, "poles": poles, "E_sharp": E_sharp, "C_sharp": C_sharp, "G": G}
+        for name, value in refused.items():
             if value is not None:
                 raise SpecError(f"Over a region there is no {name}: leave it out.", path=name)
         return share_pasand_over_region(plant, fault_model=fault_model, margin=margin)
@@ -132,18 +132,18 @@ def sharepasand(
         raise SpecError("poles and region are given: use one of them.", path="poles")
     own = linear_plant(plant).dense()
     model = exosystem(fault_model, own.fault_names, own.dt)
-    found = existence(own, model)
-    require_data(found.conditions, solvers=LEFT_TO_THE_UI_PI_INEQUALITY)
-    parts = _decoupling(found.plant, E_sharp, C_sharp, G)  # (10), (11)
-    target = plant if found.transformation is None else found.transformation
+    result = existence(own, model)
+    require_data(result.conditions, solvers=LEFT_TO_THE_UI_PI_INEQUALITY)
+    parts = _decoupling(result.plant, E_sharp, C_sharp, G)  # (10), (11)
+    target = plant if result.transformation is None else result.transformation
     return augmented_problem(
-        found.plant,
+        result.plant,
         model,
-        with_faults(parts.U, parts.Dhat, found.plant, model),
+        with_faults(parts.U, parts.Dhat, result.plant, model),
         region=region,
         poles=poles,
         margin=margin,
-        held=found.conditions,
+        conditions=result.conditions,
         design=design_of("sharepasand", target, fault_model),
     )
 
@@ -154,28 +154,28 @@ def augmented_problem(
     decoupling: tuple[FloatArray, FloatArray],
     *,
     margin: float,
-    held: Sequence[Condition],
+    conditions: Sequence[Condition],
     design: Callable[[dict[str, FloatArray], str], ObserverDesign],
     region: LMIRegion | None = None,
     poles: Sequence[Any] | None = None,
     X: FloatArray | None = None,
 ) -> Conditions:
     """Return the conditions for given ``U_a (na, na)`` and ``D_a (na, ny)`` (19), in coordinates ``X (na, na)``."""
-    whole = AugmentedPlant.of(plant, model)  # (13)
+    augmented = AugmentedPlant.of(plant, model)  # (13)
     U_a, D_a = decoupling
     # Outputs that show d directly are solved for it; the others are left for the gain.
-    seen, injection, _ = direct_part(plant)
+    undisturbed, injection, _ = direct_part(plant)
     injected = np.vstack([injection, np.zeros((model.order, plant.ny))])
-    UA, shown = U_a @ (whole.A - injected @ whole.C), seen @ whole.C
-    na, m = whole.order, len(shown)
+    UA, own_c = U_a @ (augmented.A - injected @ augmented.C), undisturbed @ augmented.C
+    na, m = augmented.order, len(own_c)
     stable = disk(0.0, 1.0) if plant.is_discrete else half_plane(0.0)
     where = stable if region is None else stable & checked_region(region)
 
     P = cp.Variable((na, na), symmetric=True, name="P")
     constraints = {"P": lmi.at_least(P, 1.0)}  # the inequalities leave the scale free
     if poles is None:
-        X = _coordinates(UA, shown, where, discrete=plant.is_discrete) if X is None else X
-        UAx, Cx = np.linalg.solve(X, UA @ X), shown @ X
+        X = _coordinates(UA, own_c, where, discrete=plant.is_discrete) if X is None else X
+        UAx, Cx = np.linalg.solve(X, UA @ X), own_c @ X
         Y = cp.Variable((na, m), name="Y")
         # As P >= I, the first is no less than the norm of K_a; the second makes the optimum one that solvers agree on.
         variables, goal = {"P": P, "Y": Y}, cp.norm(Y, "fro") + cp.trace(P)
@@ -183,17 +183,17 @@ def augmented_problem(
         if region is not None:
             constraints["region"] = atoms.region(UAx, P, region, Y=Y, Cy=Cx, margin=margin)[1]
     else:
-        wanted = checked_poles(poles, na, np.zeros(0, dtype=np.complex128), plant.dt, of="ui-pi-observer")
-        K = place(UA, shown, wanted, dt=plant.dt, objective="gain")[0]
-        contraction = prove_contraction(UA - K @ shown, discrete=plant.is_discrete)
+        targets = checked_poles(poles, na, np.zeros(0, dtype=np.complex128), plant.dt, of="ui-pi-observer")
+        K = place(UA, own_c, targets, dt=plant.dt, objective="gain")[0]
+        contraction = prove_contraction(UA - K @ own_c, discrete=plant.is_discrete)
         X = np.eye(na) if contraction is None else contraction.inverse
         variables, goal = {"P": P}, cp.trace(P)
-        closed = np.linalg.solve(X, (UA - K @ shown) @ X)
+        closed = np.linalg.solve(X, (UA - K @ own_c) @ X)
         constraints["stability"] = atoms.region(closed, P, stable, margin=margin)[1]
 
     def gains(values: Values) -> dict[str, FloatArray]:
         free = K if poles is not None else X @ np.linalg.solve(values["P"], values["Y"])
-        K_a = free @ seen + U_a @ injected
+        K_a = free @ undisturbed + U_a @ injected
         letters = realise(plant, model, (U_a, D_a, K_a), combinations_seen(plant))[1]
         nx = plant.nx
         return {**letters, "U": U_a[:nx, :nx], "D": D_a[:nx], "K": K_a[:nx], "F": K_a[nx:]}
@@ -201,12 +201,12 @@ def augmented_problem(
     data = {
         "U_a": U_a,
         "D_a": D_a,
-        "E_a": whole.E,
-        "A_a": whole.A,
-        "B_da": whole.Bd,
-        "C_a": whole.C,
+        "E_a": augmented.E,
+        "A_a": augmented.A,
+        "B_da": augmented.Bd,
+        "C_a": augmented.C,
         "UA": UA,
-        "C_seen": shown,
+        "C_seen": own_c,
         "X": X,
         "Phi": model.Phi,
         "Cw": model.Cw,
@@ -218,7 +218,7 @@ def augmented_problem(
         {},
         data,
         constraints,
-        lambda: held,
+        lambda: conditions,
         gains,
         design,
     )
@@ -228,13 +228,13 @@ def _coordinates(F: FloatArray, C: FloatArray, where: LMIRegion, *, discrete: bo
     """Return a state change ``(n, n)`` in which the errors of a Kalman filter of the region's speed are alike."""
 
     n = len(F)
-    found = [x for x in (_REAL_NUMBERS if discrete else _REAL_RATES) if where.contains(x)]
-    if not found:
+    reals = [x for x in (_REAL_NUMBERS if discrete else _REAL_RATES) if where.contains(x)]
+    if not reals:
         return np.eye(n)
     if discrete:
-        covariance = discrete_solution(F / max(np.abs(found)), C, np.eye(n), np.eye(len(C)))
+        covariance = discrete_solution(F / max(np.abs(reals)), C, np.eye(n), np.eye(len(C)))
     else:
-        covariance = continuous_solution(F - max(found) * np.eye(n), C, np.eye(n), np.eye(len(C)))
+        covariance = continuous_solution(F - max(reals) * np.eye(n), C, np.eye(n), np.eye(len(C)))
     if covariance is None or not is_positive(covariance):
         return np.eye(n)
     # What comes of it is a scale alone.
@@ -243,13 +243,13 @@ def _coordinates(F: FloatArray, C: FloatArray, where: LMIRegion, *, discrete: bo
 
 def _decoupling(plant: DescriptorSystem, E_sharp: Any, C_sharp: Any, G: Any) -> Decoupled:
     """Return ``U`` and ``Dhat`` with ``U Bd = 0``, ``U E + Dhat C = I``: the paper's (11), or one of full rank."""
-    given = {"E_sharp": E_sharp, "C_sharp": C_sharp, "G": G}
-    if all(matrix is None for matrix in given.values()):
+    sharps = {"E_sharp": E_sharp, "C_sharp": C_sharp, "G": G}
+    if all(matrix is None for matrix in sharps.values()):
         return decouple(plant)
-    missing = [name for name, matrix in given.items() if matrix is None]
+    missing = [name for name, matrix in sharps.items() if matrix is None]
     if missing:
         raise SpecError(f"{', '.join(missing)} is missing: give E_sharp, C_sharp and G together.", path=missing[0])
-    e_sharp, c_sharp, g = (as_matrix(matrix, name) for name, matrix in given.items())
+    e_sharp, c_sharp, g = (as_matrix(matrix, name) for name, matrix in sharps.items())
     _, u, d = paper_decoupling(plant, e_sharp=e_sharp, c_sharp=c_sharp, g=g)
-    seen, injection, _ = direct_part(plant)
-    return Decoupled(u, d, np.zeros((0, plant.nx)), np.zeros((0, plant.ny)), seen, injection)
+    undisturbed, injection, _ = direct_part(plant)
+    return Decoupled(u, d, np.zeros((0, plant.nx)), np.zeros((0, plant.ny)), undisturbed, injection)

@@ -28,7 +28,7 @@ from obsynth.results.registered import registered
 from obsynth.verification.error_polytope import ErrorPolytope
 from obsynth.verification.identities import EQUALITY_TOLERANCE
 
-#: How strongly states are driven by default, beside fault models: a plant is better known than the course of a fault.
+#: How strongly states are driven by default, beside fault models: a plant is better known than how a fault evolves.
 PROCESS_SHARE = 0.1
 #: Noise on innovations that have none of their own, relative to the outputs' noise.
 INNOVATION_NOISE = 0.1
@@ -52,7 +52,7 @@ class PiOverRegion:
         states, outputs = units.augmented_states[:, None], units.outputs
         each = gains * (self.errors.count if len(gains) == 1 else 1)
         K = [
-            states * (free @ self.decoupled.seen + injected) * outputs / units.rate
+            states * (free @ self.decoupled.undisturbed + injected) * outputs / units.rate
             for free, injected in zip(each, self.injected, strict=True)
         ]
         return states * self.U * units.augmented_equations, states * self.D * outputs, K
@@ -64,16 +64,16 @@ def pi_over_region(plant: PolytopicSystem, model: Exosystem, *, noise: Mapping[s
     ``noise``: deviations and weights as for `obsynth.ui_pi_observer`.
     """
     weights = dict(noise or {})
-    whole = with_all_directions(plant)
-    units = PlantUnits.of(whole, model).for_decoupling(whole)
+    widened = with_all_directions(plant)
+    units = PlantUnits.of(widened, model).for_decoupling(widened)
     scaled_model = units.scaled_model(model)
-    decoupled = decouple(units.scaled_plant(whole))
-    names = whole.disturbance_names
+    decoupled = decouple(units.scaled_plant(widened))
+    names = widened.disturbance_names
     works = [
         units.scaled_plant(
             vertex.replace(
-                Bd=np.hstack([vertex.Bd, np.zeros((vertex.nx, whole.nd - vertex.nd))]),
-                Dd=whole.Dd,
+                Bd=np.hstack([vertex.Bd, np.zeros((vertex.nx, widened.nd - vertex.nd))]),
+                Dd=widened.Dd,
                 disturbance_names=names,
                 exact=None,
             )
@@ -83,10 +83,10 @@ def pi_over_region(plant: PolytopicSystem, model: Exosystem, *, noise: Mapping[s
     u, d = with_faults(decoupled.U, decoupled.Dhat, works[0], scaled_model)
     bw, dw = _noise(works[0], units, weights)
     size = float(np.sqrt(np.mean(np.sum(dw**2, axis=1)))) if dw.any() else 1.0
-    order, ny = scaled_model.order, whole.ny
+    order, ny = scaled_model.order, widened.ny
     strength = np.concatenate(
         [
-            np.full(whole.nx, PROCESS_SHARE * weights.get("process", 1.0)),
+            np.full(widened.nx, PROCESS_SHARE * weights.get("process", 1.0)),
             np.full(order, weights.get("fault", 1.0)),
         ]
     )
@@ -95,28 +95,28 @@ def pi_over_region(plant: PolytopicSystem, model: Exosystem, *, noise: Mapping[s
         augmented = AugmentedPlant.of(work, scaled_model)
         fed = np.vstack([direct_part(work)[1], np.zeros((order, ny))])
         F = u @ (augmented.A - fed @ augmented.C)
-        entering = u @ np.vstack([bw, np.zeros((order, bw.shape[1]))]) - F @ d @ dw - u @ fed @ dw
+        noise_effect = u @ np.vstack([bw, np.zeros((order, bw.shape[1]))]) - F @ d @ dw - u @ fed @ dw
         A.append(F)
         # Noise that enters the states counts as another than that of the innovations: what is proved is no less true.
-        B.append(np.hstack([size * np.diag(strength), entering]))
+        B.append(np.hstack([size * np.diag(strength), noise_effect]))
         injected.append(u @ fed)
-    seen = decoupled.seen @ AugmentedPlant.of(works[0], scaled_model).C
-    shown = decoupled.seen @ (np.eye(ny) - AugmentedPlant.of(works[0], scaled_model).C @ d) @ dw
-    m = len(seen)
-    D = np.hstack([np.zeros((m, B[0].shape[1])), shown, INNOVATION_NOISE * size * np.eye(m)])
+    own_c = decoupled.undisturbed @ AugmentedPlant.of(works[0], scaled_model).C
+    own_d = decoupled.undisturbed @ (np.eye(ny) - AugmentedPlant.of(works[0], scaled_model).C @ d) @ dw
+    m = len(own_c)
+    D = np.hstack([np.zeros((m, B[0].shape[1])), own_d, INNOVATION_NOISE * size * np.eye(m)])
     B = [np.hstack([b, np.zeros((len(b), D.shape[1] - b.shape[1]))]) for b in B]
-    errors = ErrorPolytope(A, seen, B=B, D=D, dt=1.0 if units.discrete else 0.0)
+    errors = ErrorPolytope(A, own_c, B=B, D=D, dt=1.0 if units.discrete else 0.0)
     return PiOverRegion(model, units, decoupled, u, d, tuple(injected), errors)
 
 
 def _noise(plant: DescriptorSystem, units: PlantUnits, weights: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
     """Return the noise inputs of a scaled plant: what is asked for, what the plant states, or one on each output."""
-    given = weights.get("measurement")
-    if given is None and plant.Dw.any():
+    measurement = weights.get("measurement")
+    if measurement is None and plant.Dw.any():
         return plant.Bw, plant.Dw
     deviations = np.ones(plant.ny)
-    if given is not None:
-        listed = [given[name] if isinstance(given, Mapping) else given for name in plant.output_names]
+    if measurement is not None:
+        listed = [measurement[name] if isinstance(measurement, Mapping) else measurement for name in plant.output_names]
         deviations = np.array(listed) * units.outputs / (1.0 if units.discrete else np.sqrt(units.time))
     stated = np.zeros((plant.ny, plant.nw))
     return np.hstack([plant.Bw, np.zeros((plant.nx, plant.ny))]), np.hstack([stated, np.diag(deviations)])
@@ -128,10 +128,10 @@ def share_pasand_over_region(plant: PolytopicSystem, *, fault_model: Any, margin
     conditions = pi_conditions_over_region(plant, model)
     require_data(conditions, solvers=())
     parts = pi_over_region(plant, model)
-    found = vertex_inequalities(parts.errors, margin=margin)
+    inequalities = vertex_inequalities(parts.errors, margin=margin)
 
     def gains(values: Values) -> dict[str, FloatArray]:
-        own = found._gains(values)
+        own = inequalities._gains(values)
         free = [own[name] for name in (f"L[{i + 1}]" for i in range(parts.errors.count)) if name in own]
         U_a, D_a, K_a = parts.letters(free)
         return {"U_a": U_a, "D_a": D_a} | {f"K_a[{i + 1}]": K for i, K in enumerate(K_a)}
@@ -142,7 +142,7 @@ def share_pasand_over_region(plant: PolytopicSystem, *, fault_model: Any, margin
     data = {f"UA[{i + 1}]": A for i, A in enumerate(parts.errors.A)} | {"C_seen": parts.errors.C[0]}
     data |= {"U_a": parts.U, "D_a": parts.D, "Phi": model.Phi, "Cw": model.Cw}
     return replace(
-        found,
+        inequalities,
         source="Share Pasand, Aliyari, Taghirad, (13), (19) at every vertex",
         data=data,
         _examined=lambda: conditions,
@@ -153,13 +153,13 @@ def share_pasand_over_region(plant: PolytopicSystem, *, fault_model: Any, margin
 
 def checked_free_gains(parts: PiOverRegion, K_a: list[FloatArray]) -> list[FloatArray]:
     """Return the free gains of ``K_a`` at each vertex in the plant's units; `SpecError` where they decouple nothing."""
-    units, seen = parts.units, parts.decoupled.seen
-    found = []
+    units, undisturbed = parts.units, parts.decoupled.undisturbed
+    gains = []
     for K, injected in zip(K_a, parts.injected, strict=True):
         scaled = K / units.augmented_states[:, None] / units.outputs * units.rate
-        free = (scaled - injected) @ seen.T
-        miss = float(np.abs(free @ seen + injected - scaled).max())
+        free = (scaled - injected) @ undisturbed.T
+        miss = float(np.abs(free @ undisturbed + injected - scaled).max())
         if not miss <= EQUALITY_TOLERANCE * (1.0 + float(np.abs(scaled).max())):
             raise SpecError("K_a does not decouple the unknown inputs.", path="K_a")
-        found.append(free)
-    return found
+        gains.append(free)
+    return gains

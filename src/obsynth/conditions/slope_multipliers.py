@@ -122,9 +122,9 @@ def slope_inequality(
     above = cp.Variable((k, m), name="Y")
     Y = cp.vstack([above, np.zeros((n - k, m))]) if k < n else above
     room = cp.Variable(name="room") if goal == "decay" else None
-    kept: Any = margin if room is None else room
+    slack: Any = margin if room is None else room
     level = cp.Variable(nonneg=True, name="gamma_squared" if goal == "gain" else "mean_square")
-    constraints: dict[str, Any] = {"P": lmi.at_least(P[:k, :k], kept)}
+    constraints: dict[str, Any] = {"P": lmi.at_least(P[:k, :k], slack)}
     GA, GW = G.T @ own.A[0] - Y @ own.C[0], G.T @ errors.W - Y @ errors.Wy
     GB, Z = G.T @ own.B[0] - Y @ own.D[0], own.Cz[0]
 
@@ -134,14 +134,14 @@ def slope_inequality(
         lower = [[-(2.0 * GA + first + errors.V.T @ Q @ errors.V)], [-(GW + errors.V.T @ S).T, -R]]
         if driven:
             lower.append([-GB.T, np.zeros((p, errors.count)), level * np.eye(p)])
-        constraints[name] = lmi.at_least(lmi.symmetric_blocks(lower), kept)
+        constraints[name] = lmi.at_least(lmi.symmetric_blocks(lower), slack)
 
     if goal == "gain":
         with_multiplier("gain", Z.T @ Z, driven=True)
     if goal == "power":
         with_multiplier("power", Z.T @ Z, driven=False)
         noise = cp.Variable((p, p), symmetric=True)
-        constraints["trace"] = cp.trace(noise) + kept <= level
+        constraints["trace"] = cp.trace(noise) + slack <= level
         constraints["noise"] = lmi.at_least(lmi.symmetric_blocks([[noise], [GB[:k], P[:k, :k]]]), 0.0)
     if decay is not None:
         with_multiplier("decay", 2.0 * decay * P, driven=False)
@@ -152,8 +152,8 @@ def slope_inequality(
     variables |= {"room": room} if room is not None else {level.name(): level}
 
     def gains(_: Values) -> dict[str, FloatArray]:
-        found = np.linalg.solve(np.asarray(G.value).T, np.asarray(Y.value))
-        return {"L[1]": found, "P": np.asarray(P.value), "G": np.asarray(G.value)}
+        L = np.linalg.solve(np.asarray(G.value).T, np.asarray(Y.value))
+        return {"L[1]": L, "P": np.asarray(P.value), "G": np.asarray(G.value)}
 
     def unsupported(_: dict[str, FloatArray], name: str) -> ObserverDesign:
         raise SpecError(f"The error system of {name!r} has no plant: design by obsynth.region_observer.", path="errors")

@@ -128,8 +128,8 @@ def wang2015(
             raise SpecError("Over a region there are gamma and margin: leave S, T, N, W and coordinates out.", path="W")
         return wang_over_region(plant, gamma=gamma, margin=margin)
     own = linear_plant(plant).dense()
-    held, _ = examine_fault_filter(own)
-    require_data(held, solvers=("fault zeros",))
+    conditions, _ = examine_fault_filter(own)
+    require_data(conditions, solvers=("fault zeros",))
     work = with_sensor_faults_as_states(own)
     A, C, F, D = work.A, work.C, work.Bf, work.Bd
     n, m, q = work.nx, work.ny, work.nf
@@ -142,10 +142,10 @@ def wang2015(
     W0 = _left_inverse(W, Upsilon)  # (47)
     V = null_basis(Upsilon.T)
     L0 = TA @ Psi @ W0
-    rest = np.eye(m) - Upsilon @ W0  # I - Upsilon Upsilon^+
-    A1, C1 = TA - L0 @ C, rest @ C  # (46)
+    unweighted = np.eye(m) - Upsilon @ W0  # I - Upsilon Upsilon^+
+    A1, C1 = TA - L0 @ C, unweighted @ C  # (46)
     shown_d = (np.eye(m) - C @ N) @ work.Dd  # of d in the innovation: zero in the paper, as D1 and Zd
-    TD, D1 = T @ D - TA @ (N @ work.Dd) - L0 @ shown_d, rest @ shown_d
+    TD, D1 = T @ D - TA @ (N @ work.Dd) - L0 @ shown_d, unweighted @ shown_d
     convex = GainProblem(
         A=A1,
         C=V.T @ C,
@@ -161,14 +161,14 @@ def wang2015(
     X, R0, unit = as_matrix(np.eye(n), "X"), np.zeros((n, m)), 1.0
     if chosen(coordinates, "coordinates", ("plant", "balanced")) == "balanced":
         start = search_least_gain(convex)
-        found = normalise(convex, start=start.injection, gain=start.gain or None)
-        X, rest, unit = found.states, found.measurements @ V.T, found.gain or 1.0
+        normalised = normalise(convex, start=start.injection, gain=start.gain or None)
+        X, unweighted, unit = normalised.states, normalised.measurements @ V.T, normalised.gain or 1.0
         R0 = start.injection.R @ V.T
         A1 = np.asarray(np.linalg.solve(X, (A1 - R0 @ C) @ X))
         TD = np.asarray(np.linalg.solve(X, TD - R0 @ shown_d) / unit)
-        C1, D1 = rest @ C @ X, rest @ shown_d / unit
+        C1, D1 = unweighted @ C @ X, unweighted @ shown_d / unit
 
-    P, Y = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((n, len(rest)), name="Y")
+    P, Y = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((n, len(unweighted)), name="Y")
     variables: dict[str, Any] = {"P": P, "Y": Y}
     if gamma is None:
         gamma_squared = variables["gamma_squared"] = cp.Variable(nonneg=True, name="gamma_squared")
@@ -187,20 +187,20 @@ def wang2015(
     else:
         Z, Zd = W0 @ C @ X, W0 @ shown_d / unit
     driven = P @ A1 - Y @ C1, P @ TD - Y @ D1
-    whole = _matrix_45(P, gamma_squared / unit**2, driven, Z, Zd, free=free)
-    constraints = {"P": lmi.at_least(P, margin), "(45)": lmi.at_most(whole, -margin)}
-    if not all(condition.holds for condition in held) and _hides_a_mode(A1, np.vstack([C1, W0 @ C @ X])):
+    inequality = _matrix_45(P, gamma_squared / unit**2, driven, Z, Zd, free=free)
+    constraints = {"P": lmi.at_least(P, margin), "(45)": lmi.at_most(inequality, -margin)}
+    if not all(condition.holds for condition in conditions) and _hides_a_mode(A1, np.vstack([C1, W0 @ C @ X])):
         # A P that is nothing in a mode that no gain moves would be within the tolerance of any solver.
         own, stable = atoms.some_gain_stabilises(A1, 1.0, C1)
         constraints |= {"Q": own, "some gain is stable": stable}
 
     def gains(values: Values) -> dict[str, FloatArray]:
-        R = R0 + X @ np.linalg.solve(values["P"], values["Y"]) @ rest  # (63)
+        R = R0 + X @ np.linalg.solve(values["P"], values["Y"]) @ unweighted  # (63)
         weight = W0 + values["Vw"] @ V.T if "Vw" in values else W0
         return {"T": T, "N": N, "L": L0 + R, "W": weight, "Psi": Psi, "Upsilon": Upsilon, "R": R}  # (60)
 
     data = {"T": T, "N": N, "Psi": Psi, "Upsilon": Upsilon, "W": W0, "A1": A1, "C1": C1, "TD": TD}
-    data |= {"L0": L0, "D1": D1, "X": X, "R0": R0, "rest": rest}
+    data |= {"L0": L0, "D1": D1, "X": X, "R0": R0, "rest": unweighted}
     return Conditions(
         "Wang et al. 2015, Theorem 2, (45)",
         lmi.semidefinite_problem(goal, list(constraints.values())),
@@ -208,17 +208,17 @@ def wang2015(
         {} if gamma is None else {"gamma_squared": gamma_squared},
         data,
         constraints,
-        partial(_existence, held, convex, gamma),
+        partial(_existence, conditions, convex, gamma),
         gains,
         design_of("wang2015", plant, convex),
         weight=Wx if free else None,
     )
 
 
-def _hides_a_mode(A: FloatArray, seen: FloatArray) -> bool:
+def _hides_a_mode(A: FloatArray, outputs: FloatArray) -> bool:
     """Return whether a mode on or outside the unit circle has no part in what is seen."""
     poles = [pole for pole in np.linalg.eigvals(A) if is_outside(complex(pole), 1.0)]
-    pencils = (np.vstack([A - pole * np.eye(len(A)), seen]) for pole in poles)
+    pencils = (np.vstack([A - pole * np.eye(len(A)), outputs]) for pole in poles)
     return any(not decide_rank(pencil, expected=len(A), tolerance=HIDDEN_MODE_TOLERANCE).full for pencil in pencils)
 
 
@@ -247,9 +247,9 @@ def _restricted_equivalent(
     if S is not None:
         return restricted_equivalent_from(work.E, work.C, as_matrix(S, "S"))
     if T is None:
-        found = prepare(plant)
-        states = found.scaling.states[:, None]
-        return states * found.T * found.scaling.equations, states * found.N * found.scaling.outputs
+        prepared = prepare(plant)
+        states = prepared.scaling.states[:, None]
+        return states * prepared.T * prepared.scaling.equations, states * prepared.N * prepared.scaling.outputs
     t, n = as_matrix(T, "T"), as_matrix(N, "N")
     for name, matrix, shape in (("T", t, (work.nx, work.nx)), ("N", n, (work.nx, work.ny))):
         require_shape(matrix.shape, shape, name)
@@ -259,10 +259,12 @@ def _restricted_equivalent(
 
 def _psi(plant: DescriptorSystem, TA: FloatArray, C: FloatArray, TF: FloatArray) -> FloatArray:
     """Return ``Psi`` (20), with the detectability indexes (19)."""
-    found = fault_detectability(TA, C, TF, plant=with_sensor_faults_as_states(plant), exact=exact_indexes(plant))
-    if not found.finite:
+    detectability = fault_detectability(
+        TA, C, TF, plant=with_sensor_faults_as_states(plant), exact=exact_indexes(plant)
+    )
+    if not detectability.finite:
         raise SpecError("With this T some fault never reaches the outputs: choose another.", path="T")
-    return found.Psi
+    return detectability.Psi
 
 
 def _left_inverse(W: Any, Upsilon: FloatArray) -> FloatArray:
@@ -277,17 +279,17 @@ def _left_inverse(W: Any, Upsilon: FloatArray) -> FloatArray:
     return weight
 
 
-def _require_identity(name: str, found: FloatArray, size: FloatArray) -> None:
-    miss = float(np.max(np.abs(found - np.eye(len(found))) / np.maximum(size, 1.0), initial=0.0))
+def _require_identity(name: str, product: FloatArray, size: FloatArray) -> None:
+    miss = float(np.max(np.abs(product - np.eye(len(product))) / np.maximum(size, 1.0), initial=0.0))
     if not miss <= RANK_TOLERANCE:
         raise SpecError(f"{name} misses the identity by {miss:.3g}: give all digits.", path=name.split()[0])
 
 
-def _existence(held: Sequence[Condition], convex: GainProblem, gamma: float | None) -> list[Condition]:
+def _existence(conditions: Sequence[Condition], convex: GainProblem, gamma: float | None) -> list[Condition]:
     """Return the existence conditions, and whether a filter of a given level can be."""
-    found = list(held)
-    if gamma is None or not convex.disturbances or not all(condition.holds for condition in held):
-        return found
+    listed = list(conditions)
+    if gamma is None or not convex.disturbances or not all(condition.holds for condition in conditions):
+        return listed
     best = search_least_gain(convex)
     bound = (
         best.gain
@@ -298,41 +300,41 @@ def _existence(held: Sequence[Condition], convex: GainProblem, gamma: float | No
     detail = f"the best filter found has {best.gain:.9g}, and none with this T, N and W is below {bound:.9g}"
     source = "dual of (45), checked without the solver"
     claim = "gamma is not below the least gain for this T, N and W"
-    return [*found, Condition("gamma", claim, holds, gamma, bound, source, detail)]
+    return [*listed, Condition("gamma", claim, holds, gamma, bound, source, detail)]
 
 
 def noise_paths(
-    plant: DescriptorSystem, found: Conditions, b: FloatArray, d: FloatArray
+    plant: DescriptorSystem, conditions: Conditions, b: FloatArray, d: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return how inputs by ``b (nx, k)`` and ``d (ny, k)`` enter the errors, but for R, and the outputs less C N d."""
-    work, data = with_sensor_faults_as_states(plant), found.data
+    work, data = with_sensor_faults_as_states(plant), conditions.data
     free = (np.eye(work.ny) - work.C @ data["N"]) @ d
     return data["T"] @ b - data["T"] @ work.A @ (data["N"] @ d) - data["L0"] @ free, free
 
 
 def h2_terms(
-    plant: DescriptorSystem, found: Conditions, entering: FloatArray, free: FloatArray
+    plant: DescriptorSystem, conditions: Conditions, error_input: FloatArray, free: FloatArray
 ) -> tuple[Any, Any, Any]:
-    """Return the H2 inequalities for inputs that enter the errors by ``entering - R free`` and the estimates by W free.
+    """Return the H2 inequalities of inputs that enter the errors by ``error_input - R free``, estimates by ``W free``.
 
     They are a constraint of stability and one of variance; the third is the variable whose trace bounds the variance.
     """
     if not free.shape[1]:
         # Older cvxpy has no variable without entries: an input that does nothing stands for none.
-        entering, free = np.zeros((len(entering), 1)), np.zeros((len(free), 1))
-    data, k = found.data, free.shape[1]
+        error_input, free = np.zeros((len(error_input), 1)), np.zeros((len(free), 1))
+    data, k = conditions.data, free.shape[1]
     C = with_sensor_faults_as_states(plant).C
     Z = cp.Variable((k, k), symmetric=True, name="Z")
-    weight = found.weight if found.weight is not None else data["W"]
+    weight = conditions.weight if conditions.weight is not None else data["W"]
     stable, variance = atoms.h2(
         data["A1"],
-        np.linalg.solve(data["X"], entering - data["R0"] @ free),
+        np.linalg.solve(data["X"], error_input - data["R0"] @ free),
         weight @ (C @ data["X"]),
         weight @ free,
-        found.variables["P"],
+        conditions.variables["P"],
         Z,
         plant.dt,
-        Y=found.variables["Y"],
+        Y=conditions.variables["Y"],
         Cy=data["C1"],
         Dy=data["rest"] @ free,
         detectable=True,
@@ -345,5 +347,5 @@ def error_norm(plant: DescriptorSystem, gains: Mapping[str, FloatArray]) -> floa
     work = with_sensor_faults_as_states(plant)
     T, N, L, W = (gains[letter] for letter in "TNLW")
     shown_d = (np.eye(work.ny) - work.C @ N) @ work.Dd
-    entering = T @ work.Bd - T @ work.A @ (N @ work.Dd) - L @ shown_d
-    return float(hinf_norm(T @ work.A - L @ work.C, entering, W @ work.C, W @ shown_d).upper)
+    error_input = T @ work.Bd - T @ work.A @ (N @ work.Dd) - L @ shown_d
+    return float(hinf_norm(T @ work.A - L @ work.C, error_input, W @ work.C, W @ shown_d).upper)

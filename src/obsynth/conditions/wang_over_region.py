@@ -32,10 +32,10 @@ def wang_over_region(plant: PolytopicSystem, *, gamma: float | None = None, marg
         raise SpecError("The plant has no filter over its region.", path="plant")
     W = np.asarray(np.linalg.pinv(parts.Upsilon))
     errors, L0, U2 = errors_over_region(parts, W)
-    found = vertex_inequalities(errors, level=gamma, margin=margin)
+    inequalities = vertex_inequalities(errors, level=gamma, margin=margin)
 
     def gains(values: Values) -> dict[str, FloatArray]:
-        own = found._gains(values)
+        own = inequalities._gains(values)
         R = [own[f"L[{i + 1}]"] for i in range(errors.count)]
         L = {f"L[{i + 1}]": first + r @ U2.T for i, (first, r) in enumerate(zip(L0, R, strict=True))}
         constant = {"T": parts.T, "N": parts.N, "W": W, "Psi": parts.Psi, "Upsilon": parts.Upsilon}
@@ -48,9 +48,9 @@ def wang_over_region(plant: PolytopicSystem, *, gamma: float | None = None, marg
     data |= {f"A1[{i + 1}]": A for i, A in enumerate(errors.A)} | {"C1": errors.C[0]}
     data |= {f"TD[{i + 1}]": B for i, B in enumerate(errors.B)}
     return replace(
-        found,
+        inequalities,
         source="Wang et al. 2015, Theorem 2, (45) at every vertex",
-        constraints={named(name): constraint for name, constraint in found.constraints.items()},
+        constraints={named(name): constraint for name, constraint in inequalities.constraints.items()},
         data=data,
         _examined=lambda: conditions,
         _gains=gains,
@@ -62,13 +62,13 @@ def errors_over_region(parts: FilterOverRegion, W: FloatArray) -> tuple[ErrorPol
     """Return the error system in R at each vertex, ``L0`` at each vertex, and U2: ``L = L0 + R U2'``."""
     U2 = null_basis(parts.Upsilon.T)
     C, Dd, T, N = parts.work[0].C, parts.work[0].Dd, parts.T, parts.N
-    shown = (np.eye(len(C)) - C @ N) @ Dd
+    output_part = (np.eye(len(C)) - C @ N) @ Dd
     A1, B1, L0 = [], [], []
     for vertex in parts.work:
         TA = T @ vertex.A
         first = TA @ parts.Psi @ W
         L0.append(first)
         A1.append(TA - first @ C)
-        B1.append(T @ vertex.Bd - TA @ (N @ Dd) - first @ shown)
-    errors = ErrorPolytope(A1, U2.T @ C, B=B1, D=U2.T @ shown, Cz=W @ C, Dz=-W @ shown, dt=parts.work[0].dt)
+        B1.append(T @ vertex.Bd - TA @ (N @ Dd) - first @ output_part)
+    errors = ErrorPolytope(A1, U2.T @ C, B=B1, D=U2.T @ output_part, Cz=W @ C, Dz=-W @ output_part, dt=parts.work[0].dt)
     return errors, L0, U2

@@ -81,7 +81,7 @@ def _share_pasand(design: ObserverDesign) -> Conditions:
     X = np.asarray(np.linalg.inv(matrices["stability"]))
     model = shipped_model(matrices, plant.nf)
     held = existence_conditions(plant, model)
-    found = augmented_problem(plant, model, (U_a, gains["D_a"]), X=X, margin=0.0, held=held, design=_kept(design))
+    found = augmented_problem(plant, model, (U_a, gains["D_a"]), X=X, margin=0.0, conditions=held, design=_kept(design))
     seen, injection, _ = direct_part(plant)
     injected = np.vstack([injection, np.zeros((model.order, plant.ny))])
     gain = (K_a - U_a @ injected) @ seen.T
@@ -95,7 +95,7 @@ def _kalman(design: ObserverDesign) -> Conditions:
     process, sensor = observer.Q.at(0), observer.R.at(0)
     held = tuple(recursive_conditions(plant, parameters=False))
     steady = steady_state_filter(plant, Q=process, R=sensor)
-    found = steady_gain(plant, process, sensor, margin=0.0, held=held, design=_kept(design))
+    found = steady_gain(plant, process, sensor, margin=0.0, conditions=held, design=_kept(design))
     data = found.data
     S = np.hstack([steady.L - data["L0"], steady.K - data["K0"]]) @ np.hstack([data["N1"], data["N2"]]).T
     X = data["X"]

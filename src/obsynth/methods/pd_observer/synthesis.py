@@ -329,7 +329,7 @@ def _task(
         rate_gain=asked.fault_rate_gain,
         noise_gain=asked.noise_gain,
         rate=unit * rate / states[:, None],
-        shown=shown * states,
+        fault_error=shown * states,
         process=unit * padded / states[:, None],
         sensor=noisy.Dw / outputs[:, None],
         sensor_rate=unit * noisy.Dw / outputs[:, None],

@@ -89,7 +89,7 @@ def placement_problem(
     augmented = AugmentedPlant.of(scaled, model)
     injection = np.vstack([decoupled.injection, np.zeros((model.order, plant.ny))])
     injected = product_but_rounding(-injection, augmented.C, augmented.A)
-    f, c = product_but_rounding(u, injected), product_but_rounding(decoupled.seen, augmented.C)
+    f, c = product_but_rounding(u, injected), product_but_rounding(decoupled.undisturbed, augmented.C)
     fixed_modes = units.rate * fixed_modes
     free = 0
     if joint:
@@ -128,7 +128,7 @@ def _completed(problem: PlacementProblem, k: FloatArray) -> tuple[FloatArray, Fl
         z = -k[:, : problem.free]
         u, d = u + z @ more_u, d + z @ more_d
     injection = np.vstack([decoupled.injection, np.zeros((model.order, plant.ny))])
-    return u, d, k[:, problem.free :] @ decoupled.seen + u @ injection
+    return u, d, k[:, problem.free :] @ decoupled.undisturbed + u @ injection
 
 
 def _given_decoupling(plant: DescriptorSystem, units: PlantUnits, given: Mapping[str, Any]) -> Decoupled:
@@ -169,7 +169,7 @@ def kalman_problem(problem: PlacementProblem, weights: Mapping[str, Any]) -> Kal
     injection = np.vstack([problem.decoupled.injection, np.zeros((order, plant.ny))])
     entering = problem.U @ augmented_bw - problem.F @ problem.D @ dw - problem.U @ injection @ dw
     shown = np.eye(plant.ny) - AugmentedPlant.of(plant, problem.model).C @ problem.D
-    measured = problem.decoupled.seen @ shown @ dw
+    measured = problem.decoupled.undisturbed @ shown @ dw
     size = float(np.sqrt(np.mean(np.sum(dw**2, axis=1)))) if dw.any() else 1.0
     if problem.free:
         # The free outputs carry the noise of derivatives; as a stand-in they get the size of the others.

@@ -194,7 +194,7 @@ def _without_likeness(
 def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str) -> Choice:
     """Return the gain for given poles; its size is that in the user's units where outputs are not mixed."""
     split, plant, units = problem.split, problem.plant, problem.units
-    plain_outputs = problem.free == 0 and np.array_equal(problem.decoupled.seen, np.eye(plant.ny))
+    plain_outputs = problem.free == 0 and np.array_equal(problem.decoupled.undisturbed, np.eye(plant.ny))
     outputs = units.outputs if plain_outputs else np.ones(len(split.C))
     scaled_poles = [units.rate * pole for pole in wanted]
     gain, condition = place(
