@@ -196,13 +196,13 @@ def test_what_passes_at_once_bounds_every_filter(case, bound) -> None:
     from obsynth.verification.invisible_at_infinity import proved_at_infinity
     from obsynth.verification.invisible_faults import Setting
 
-    found = proved_at_infinity(case, Setting(0, ONE_FAULT, False))
+    found = proved_at_infinity(case, Setting((), (ONE_FAULT,), False))
     assert bound * (1 - 1e-14) <= found <= bound
-    assert proved_at_infinity(case, Setting(0, (*ONE_FAULT[:3], np.zeros((1, 1))), False)) is None
-    assert proved_at_infinity(case.replace(dt=1.0), Setting(0, ONE_FAULT, False)) is None
+    assert proved_at_infinity(case, Setting((), ((*ONE_FAULT[:3], np.zeros((1, 1))),), False)) is None
+    assert proved_at_infinity(case.replace(dt=1.0), Setting((), (ONE_FAULT,), False)) is None
     # A derivative of the noise reaches the output: more of it, the faster it is.
     derived = plant(E=[[0, 1], [0, 0]], A=np.eye(2), Bf=[[0], [0]], Bw=[[0], [-1]], C=[[1, 0]], Df=[[1]], dt=0.0)
-    assert proved_at_infinity(derived, Setting(0, ONE_FAULT, False)) is None
+    assert proved_at_infinity(derived, Setting((), (ONE_FAULT,), False)) is None
 
 
 def test_the_papers_plant_has_exactly_1_and_with_one_more_sample_0() -> None:
@@ -215,6 +215,52 @@ def test_the_papers_plant_has_exactly_1_and_with_one_more_sample_0() -> None:
     assert none.delay == 2
     assert none.gain < 1e-8
     assert [(row.delay, round(row.gain, 8)) for row in none.trade_off] == [(1, 1.0), (2, 0.0)]
+
+
+TWO_DELAYS = plant(
+    A=np.diag([0.5, 0.0, 0.0]) + np.eye(3, k=-1), Bf=[[1, 0], [0, 0], [0, 1]], Bw=np.zeros((3, 2)),
+    C=[[0, 1, 0], [0, 0, 1]], Dw=np.diag([1.0, 2.0]),
+)  # fmt: skip
+
+
+def test_each_fault_has_its_own_delay() -> None:
+    """y1 is f1 filtered, two samples late; y2 is y1 a sample late, and f2: f2 = y2_+1 - y1_0.
+
+    What f1 costs is |1 - z/2| = 1.5 of its noise; f2 costs 2 and 1 beside each other.
+    """
+    design = obsynth.optimal_filter(TWO_DELAYS, delay={"f1": 2, "f2": 1})
+    assert design.report.passed
+    assert design.delays == {"f1": 2, "f2": 1}
+    assert design.options["delay"] == [2, 1]
+    assert design.least == pytest.approx(design.gain, rel=1e-7)
+    assert "and delay 2, 1: between" in design.notes[0]
+    assert "With delay 3, 2: " in design.notes[0]
+    rng = np.random.default_rng(5)
+    faults = rng.normal(size=(40, 2))
+    _, y, _ = dlsim((TWO_DELAYS.A, TWO_DELAYS.Bf, TWO_DELAYS.C, np.zeros((2, 2)), 1.0), faults)
+    estimates = design.observer.run(y, np.zeros((40, 0))).faults
+    np.testing.assert_allclose(estimates[20:, 0], faults[18:-2, 0], atol=1e-9)
+    np.testing.assert_allclose(estimates[20:, 1], faults[19:-1, 1], atol=1e-9)
+    assert obsynth.optimal_filter(TWO_DELAYS, delay=(2, 1)).gain == design.gain
+    # What each fault costs alone is no more than what both do.
+    alone = obsynth.optimal_filter(plant(
+        A=TWO_DELAYS.A, Bf=TWO_DELAYS.Bf[:, :1], Bd=TWO_DELAYS.Bf[:, 1:], Bw=TWO_DELAYS.Bw, C=TWO_DELAYS.C, Dw=TWO_DELAYS.Dw
+    ), delay=2,
+                                   decoupled="d1")  # fmt: skip
+    assert alone.gain == pytest.approx(1.5, rel=1e-7)
+    assert alone.gain <= design.gain
+    later = changed(design, claims={"delay": 3.0}, options={"delay": [3, 1]},
+                    observer=replace(design.observer, fault_delays=(3, 1)))  # fmt: skip
+    assert "fault map" in {check.name for check in obsynth.verify(later).failures}
+
+
+def test_delays_that_are_open_are_as_short_as_the_gain_allows() -> None:
+    design = obsynth.optimal_filter(TWO_DELAYS, delay={"f1": "auto", "f2": "auto"})
+    assert design.report.passed
+    assert design.delays == {"f1": 2, "f2": 1}
+    assert [row.delay for row in design.trade_off] == [2, 3, 4, 5, 6]
+    assert obsynth.optimal_filter(TWO_DELAYS, delay={"f1": 4, "f2": "auto"}).delays == {"f1": 4, "f2": 1}
+    assert obsynth.plotting.plot_delays(design).get_xlabel()
 
 
 def test_the_statement_has_bounds_one_more_sample_and_the_limit() -> None:
@@ -311,7 +357,13 @@ def test_no_filter_of_finite_response_is_below_the_least(seed: int) -> None:
 @pytest.mark.parametrize(
     ("case", "options", "error", "words"),
     [
-        (LATE, {"delay": 0}, obsynth.PreconditionError, "delay"),
+        (LATE, {"delay": 0}, obsynth.PreconditionError, "shortest delays are 1 samples"),
+        (WANG, {"delay": [2, 0]}, obsynth.PreconditionError, "delay of 2, 0 .* shortest delays are 0, 1 samples"),
+        (WANG, {"delay": {"f1": 2}}, obsynth.SpecError, "no entry for f2"),
+        (WANG, {"delay": {"f1": 2, "f2": 1, "f3": 1}}, obsynth.SpecError, "f3"),
+        (WANG, {"delay": [1, 2, 3]}, obsynth.SpecError, "3 entries"),
+        (WANG, {"delay": [1, -2]}, obsynth.SpecError, "at least 0"),
+        (WANG, {"delay": [1, "soon"]}, obsynth.SpecError, "'auto'"),
         (UNSTABLE_ZERO, {"delay": 3}, obsynth.PreconditionError, "zero"),
         (LATE, {"delay": -1}, obsynth.SpecError, "at least 0"),
         (LATE, {"delay": 1, "reference": ONE}, obsynth.SpecError, "give one"),
@@ -435,7 +487,7 @@ def test_points_that_are_moved_give_no_false_bound(good) -> None:
     for _ in range(20):
         near = [point * (1 + 0.3 * rng.normal()) + 0.1j * rng.normal() for point in points]
         near = [point if abs(point) > 1.0 else 2.0 * point / abs(point) for point in near]
-        bound = proved_least(seen_plant(good.plant, ()), near, 3, Setting(1, None, True), level=good.gain)
+        bound = proved_least(seen_plant(good.plant, ()), near, 3, Setting((1,), (), True), level=good.gain)
         assert bound is None or bound <= good.gain
 
 

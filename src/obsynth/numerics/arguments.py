@@ -336,8 +336,13 @@ def _problem_with_written(value: Any, name: str, kind: str) -> str | None:
     if kind == "named bounds" and is_number(value):
         return _problem_with_bound(value, name)
     if kind == "delay":
-        fits = (isinstance(value, str) and value == "auto") or (is_whole(value) and 0 <= value <= MOST_COUNTED)
-        return None if fits else f"{name} is {shown(value)}: give a whole number of samples, at least 0, or 'auto'."
+        each = value.values() if isinstance(value, Mapping) else value
+        each = [value] if isinstance(each, str) or not isinstance(each, Iterable) else [*each]
+        fits = all(
+            (isinstance(one, str) and one == "auto") or (is_whole(one) and 0 <= one <= MOST_COUNTED) for one in each
+        )
+        wanted = "a whole number of samples, at least 0, or 'auto', or one of these for each fault"
+        return None if fits else f"{name} is {shown(value)}: give {wanted}."
     if kind == "reference model":
         fits = value is None or isinstance(value, Mapping) or hasattr(value, "dt")
         fits = fits or (isinstance(value, (list, tuple)) and len(value) == 4)

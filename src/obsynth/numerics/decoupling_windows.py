@@ -131,7 +131,7 @@ def estimation_problem(
     if reference is not None and exact and plant.dt > 0.0:
         lags, reference = _without_dead_samples(reference, longest=len(form.A) + 1)
     lags = lags + form.shift
-    window = _decoupling_window(form.A, form.C, (bh, dh), (bw, dw), nf if exact else 0, lags, plant.dt, nf)
+    window = _decoupling_window(form.A, form.C, (bh, dh), (bw, dw), nf if exact else 0, lags, plant.dt, nf, form.shift)
     core = _core(form.A, (bw, dw), window, len(form.C))
     if reference is not None:
         newest = np.hstack([np.zeros((nf, bw.shape[1] * window.length)), np.eye(nf, bw.shape[1])])
@@ -180,6 +180,7 @@ def _decoupling_window(
     lags: NDArray[np.int64],
     dt: float,
     nf: int,
+    shift: int,
 ) -> _Window:
     """Return the shortest window in which faults and unknown inputs can be told; raise where there is none."""
     n, (bh, dh) = len(a), hidden
@@ -204,13 +205,22 @@ def _decoupling_window(
             condition="decoupling",
         )
     if not window.estimates_faults:
+        first = _first_lags(window.Th, nh, nf)
         raise PreconditionError(
-            f"No causal filter has the exact fault map with a delay of {_listed(lags)} samples: allow a longer delay.",
+            f"No causal filter has the exact fault map with a delay of {_listed(lags - shift)} samples: the faults' "
+            f"shortest delays are {_listed(first - shift)} samples.",
             condition="delay",
         )
     return _Window(
         window.observed, window.Th, _stacked(a, c, *noise, window.length), window.G, window.Mf, window.length
     )
+
+
+def _first_lags(th: FloatArray, nh: int, nf: int) -> NDArray[np.int64]:
+    """Return the fewest samples after which a long window shows each fault: rows that the outputs' rows span."""
+    spanned = np.linalg.pinv(th, rcond=WINDOW_RANK_TOLERANCE) @ th
+    missed = np.linalg.norm(spanned - np.eye(len(spanned)), axis=1).reshape(-1, nh)[::-1, :nf]
+    return np.asarray(np.argmax(missed <= WINDOW_IDENTITY, axis=0))
 
 
 def _listed(lags: NDArray[np.int64]) -> str:

@@ -34,7 +34,7 @@ def proved_at_infinity(plant: DescriptorSystem, setting: Setting) -> float | Non
     setting : Setting
         What the filter must do.
     """
-    if plant.is_discrete or setting.reference is None or not has_index_one(plant):
+    if plant.is_discrete or not setting.models or not has_index_one(plant):
         return None
     (bh, dh), (bw, dw) = hidden_and_bounded(plant, setting)
     nx, ny = plant.nx, plant.ny
@@ -48,8 +48,9 @@ def proved_at_infinity(plant: DescriptorSystem, setting: Setting) -> float | Non
         first = 0 if setting.exact else bh.shape[1]
         faults = _rows(inputs, first, first + plant.nf)
         noise = _rows(inputs, bh.shape[1])
-        direct = setting.reference[3]
-        error = flint.acb_mat(len(direct), direct.shape[1], direct.ravel().tolist()) * faults
+        error = faults
+        for *_, direct in setting.models:
+            error = flint.acb_mat(len(direct), direct.shape[1], direct.ravel().tolist()) * error
         try:
             return worst_ratio(error.transpose() * error, noise.transpose() * noise, None)
         except ZeroDivisionError:  # a matrix is singular to these digits

@@ -27,6 +27,8 @@ from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 
+Model = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+
 #: Digits, in bits, that are tried: close points cancel, and more digits do not.
 PRECISION_BITS = (256, 768)
 #: Steps of inverse iteration towards the worst combination: each gains the digits of the distance of the levels, which
@@ -44,11 +46,17 @@ MOST_UNKNOWNS = 120
 
 
 class Setting(NamedTuple):
-    """What the filter must do: ``delay`` in samples, or a reference model; whether the fault map is exact."""
+    """What the filter must do: ``delays`` in samples of each fault, and models that the faults pass one after the other
+    to what is wanted (a reference model, a weight of its error); whether the fault map is exact."""
 
-    delay: int
-    reference: tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None
+    delays: tuple[int, ...]
+    models: tuple[Model, ...]
     exact: bool
+
+    @property
+    def longest(self) -> int:
+        """The longest delay."""
+        return max(self.delays, default=0)
 
 
 def seen_plant(plant: DescriptorSystem, decoupled: Sequence[str]) -> DescriptorSystem:
@@ -95,7 +103,7 @@ def proved_least(
     points : sequence of complex
         Outside the unit circle, or right of the imaginary axis; conjugates are added.
     samples : int
-        Last samples, discrete time, that are free: at least the delay.
+        Last samples, discrete time, that are free: at least the longest delay.
     setting : Setting
         What the filter must do.
     level : float
@@ -103,7 +111,7 @@ def proved_least(
     enough : float, optional
         A bound that is enough, by default the level: a combination in double precision that reaches it is taken.
     """
-    if plant.is_discrete and (samples < max(setting.delay, 1) or not has_index_one(plant)):
+    if plant.is_discrete and (samples < max(setting.longest, 1) or not has_index_one(plant)):
         return None
     for bits in PRECISION_BITS:
         with flint.ctx.workprec(bits):
@@ -124,7 +132,7 @@ def proved_limit(plant: DescriptorSystem, point: complex, setting: Setting) -> f
     for bits in PRECISION_BITS:
         with flint.ctx.workprec(bits):
             try:
-                trajectories = _Trajectories(plant, [point], 0, setting._replace(delay=0), conjugates=False)
+                trajectories = _Trajectories(plant, [point], 0, setting._replace(delays=()), conjugates=False)
                 found = trajectories.bound(None)
             except ZeroDivisionError:
                 continue
@@ -238,11 +246,12 @@ class _Trajectories:
 
     def _energies(self) -> tuple[Any, Any]:
         """Return the energies of error and noise as matrices on the members' coefficients and the last samples'."""
-        (reference, delay), points = (self.setting.reference, self.setting.delay), [m.point for m in self.members]
-        faults, noise, states = self._part("f"), self._part("w"), _zeros(0, len(self.members))
+        points = [m.point for m in self.members]
+        faults, noise, states = self._part("f"), self._part("w"), list[Any]()
         shown = faults
-        if reference is not None:
-            states, shown = _through(reference, faults, points)
+        for model in self.setting.models:
+            inner, shown = _through(model, shown, points)
+            states.append(inner)
         weights = _weights(points, discrete=self.plant.is_discrete)
         energies = [_weighted(part, weights) for part in (shown, noise)]
         if not self.samples:
@@ -263,10 +272,13 @@ class _Trajectories:
         count = len(points) + rest[0].ncols()
         padded = [_padded(part, count) for part in energies]
         seen = [tail[0] for tail in tails]
-        if reference is None:
-            seen = seen[: self.samples - delay]
-        else:
-            seen = _recursion(reference, _beside([states, _zeros(states.nrows(), rest[0].ncols())]), seen)
+        for model, inner in zip(self.setting.models, states, strict=True):
+            seen = _recursion(model, _beside([inner, _zeros(inner.nrows(), rest[0].ncols())]), seen)
+        # Of each fault, what the estimate is late by is still to come.
+        delays = self.setting.delays or (0,) * seen[0].nrows()
+        seen = [
+            _rows(part, [i for i, late in enumerate(delays) if k + late < self.samples]) for k, part in enumerate(seen)
+        ]
         for which, samples in enumerate((seen, [tail[1] for tail in tails])):
             for sample in samples:
                 padded[which] = padded[which] + _adjoint(sample) * sample
@@ -482,7 +494,7 @@ def _padded(matrix: Any, size: int) -> Any:
     return found
 
 
-def _through(model: tuple[FloatArray, ...], faults: Any, points: Sequence[Any]) -> tuple[Any, Any]:
+def _through(model: Model, faults: Any, points: Sequence[Any]) -> tuple[Any, Any]:
     """Return the states and outputs of a reference model whose inputs are the members' faults."""
     a, b, c, d = (_complex(part + 0j) for part in model)
     order, table = a.nrows(), []
@@ -497,7 +509,7 @@ def _through(model: tuple[FloatArray, ...], faults: Any, points: Sequence[Any]) 
     return states, c * states + d * faults
 
 
-def _recursion(model: tuple[FloatArray, ...], states: Any, faults: Sequence[Any]) -> list[Any]:
+def _recursion(model: Model, states: Any, faults: Sequence[Any]) -> list[Any]:
     """Return the outputs of a reference model, as rows on all coefficients, over the last samples."""
     a, b, c, d = (_complex(part + 0j) for part in model)
     found = []

@@ -118,9 +118,9 @@ def _reached_sizes(a: FloatArray, b: FloatArray) -> FloatArray:
 def _lower_bounds(plant: DescriptorSystem, chosen: Designed, claims: dict[str, float]) -> dict[str, FloatArray]:
     """Claim what is proved of every causal filter, and of every delay; return the witnesses."""
     fault_map, best, matrices = chosen.fault_map, 0.0, dict[str, FloatArray]()
-    setting = Setting(fault_map.delay or 0, fault_map.reference, fault_map.exact)
+    setting = fault_map.setting
     block = plant.nx + plant.nf + plant.nd + plant.nw
-    samples = min(setting.delay + MORE_SAMPLES, max(setting.delay, 1) + MOST_UNKNOWNS // block)
+    samples = min(setting.longest + MORE_SAMPLES, max(setting.longest, 1) + MOST_UNKNOWNS // block)
     best_points: list[complex] = []
     for points in _candidates(plant, chosen):
         # In double precision first, which is enough for most.

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import PreconditionError
+from obsynth.methods.optimal_filter.delays import in_words, plain_delays
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
+from obsynth.methods.optimal_filter.fault_maps import FaultMap, designed
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
@@ -138,8 +140,8 @@ def _options_fit(design: ObserverDesign) -> bool:
     reference = _reference(matrices)
     late = observer.fault_delays
     if reference is None:
-        delay = claims.get("delay")
-        timed = options["delay"] == delay and options["reference"] is None and all(one == delay for one in late)
+        timed = bool(late) and options["delay"] == plain_delays(late) and plant.nf == len(late)
+        timed = timed and claims.get("delay") == max(late, default=None) and options["reference"] is None
         timed = timed and plant.is_discrete and options["exact"] is True
     else:
         given = options["reference"]
@@ -176,14 +178,20 @@ def _reference(matrices: Mapping[str, FloatArray]) -> Model | None:
 
 
 def _setting(design: ObserverDesign) -> Setting:
-    delay = int(design.certificate.claims.get("delay", 0))
-    return Setting(delay, _reference(design.certificate.matrices), bool(design.options["exact"]))
+    return _claimed_map(design).setting
+
+
+def _claimed_map(design: ObserverDesign) -> FaultMap:
+    reference = _reference(design.certificate.matrices)
+    delays = design.linear[1].fault_delays if reference is None else None
+    return FaultMap(delays, reference, bool(design.options["exact"]))
 
 
 def _fault_map(design: ObserverDesign, model: ErrorModel) -> Check:
-    reference, delay = _reference(design.certificate.matrices), int(design.certificate.claims.get("delay", 0))
-    missed, count = fault_map_missed(model, reference, delay)
-    late = f"late by {delay} samples" if reference is None else "as by the reference model"
+    fault_map = _claimed_map(design)
+    missed, count = fault_map_missed(model, fault_map)
+    delays = fault_map.delays
+    late = "as by the reference model" if delays is None else f"late by {in_words(delays)} samples"
     return upper_bound_check(
         "fault map",
         f"faults pass exactly, {late}, whatever their time course",
@@ -194,12 +202,13 @@ def _fault_map(design: ObserverDesign, model: ErrorModel) -> Check:
     )
 
 
-def fault_map_missed(model: ErrorModel, reference: Model | None, delay: int) -> tuple[float, int]:
+def fault_map_missed(model: ErrorModel, fault_map: FaultMap) -> tuple[float, int]:
     """Return by which share of its largest entry the transfer from the faults misses the fault map, and the points.
 
     These are more than the difference has states.
     """
-    plant, observer = model.plant, model.observer
+    plant, observer, reference, delay = model.plant, model.observer, fault_map.reference, fault_map.delay or 0
+    late = np.array(fault_map.delays or (0,) * plant.nf)
     c, df, _, _ = model.output(slice(0, len(observer.Cz)))
     own = 0 if reference is None else len(reference[0])
     count = 2 * (observer.order + own + delay) + 3
@@ -211,7 +220,7 @@ def fault_map_missed(model: ErrorModel, reference: Model | None, delay: int) -> 
     worst, largest = 0.0, 0.0
     for point in points:
         found = df - _response((observer.Az, model.fault, c, 0.0 * df), point)
-        wanted = point**-delay * np.eye(plant.nf) if reference is None else _response(reference, point)
+        wanted = np.diag(point**-late) if reference is None else _response(reference, point)
         worst = max(worst, float(np.max(np.abs(found - wanted), initial=0.0)))
         largest = max(largest, float(np.max(np.abs(wanted), initial=0.0)))
     return (worst / largest if largest > 0.0 else worst), count
@@ -296,12 +305,9 @@ def _deviation(channel: ErrorChannel, stated: float, plant: DescriptorSystem) ->
 
 def _least_deviation(design: ObserverDesign, plant: DescriptorSystem) -> Check:
     """Compute the least mean square from the plant again: the filtering Riccati equation is the proof."""
-    from obsynth.methods.optimal_filter.fault_maps import FaultMap, designed
-
-    setting, stated = _setting(design), claimed(design.certificate.claims, "least_deviation")
-    delay = setting.delay if setting.reference is None else None
+    stated = claimed(design.certificate.claims, "least_deviation")
     try:
-        found = designed(plant, FaultMap(delay, setting.reference, setting.exact), "h2").gain
+        found = designed(plant, _claimed_map(design), "h2").gain
     except PreconditionError:
         found = np.nan
     return lower_bound_check(

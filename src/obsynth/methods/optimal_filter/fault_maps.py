@@ -11,6 +11,7 @@ import scipy.linalg
 
 from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import PreconditionError
+from obsynth.methods.optimal_filter.delays import delays_of
 from obsynth.methods.optimal_filter.reference import lag_model, reference_model
 from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
 from obsynth.numerics.decoupling_windows import Channels, EstimationProblem, Model, estimation_problem
@@ -26,7 +27,7 @@ from obsynth.numerics.standard_form import cayley_point, uncayley
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import regularity_of
 from obsynth.plants.plant_units import PlantUnits
-from obsynth.verification.invisible_faults import seen_plant
+from obsynth.verification.invisible_faults import Setting, seen_plant
 
 #: A gain below this share of what the faults do to the error without a filter is zero but for rounding.
 ZERO_GAIN = 1e-9
@@ -39,7 +40,7 @@ class Options(Protocol):
 
     @property
     def delay(self) -> Any:
-        """Samples, or ``"auto"``."""
+        """Samples, ``"auto"``, or one of these for each fault."""
 
     @property
     def reference(self) -> Any:
@@ -54,12 +55,27 @@ class Options(Protocol):
 
 
 class FaultMap(NamedTuple):
-    """What the estimate is of the faults: a delay, of all or ``each`` of them, or a reference model; exact or not."""
+    """What the estimate is of the faults: a delay of each, or a reference model; exact or not."""
 
-    delay: int | None
+    delays: tuple[int, ...] | None
     reference: Model | None
     exact: bool
-    each: tuple[int, ...] | None = None
+
+    @property
+    def delay(self) -> int | None:
+        """The longest delay; ``None`` of a reference model."""
+        return None if self.delays is None else max(self.delays)
+
+    @property
+    def setting(self) -> Setting:
+        """What bounds on every filter are for."""
+        return Setting(self.delays or (), () if self.reference is None else (self.reference,), self.exact)
+
+    def later(self, samples: int = 1, *, which: tuple[bool, ...] | None = None) -> FaultMap:
+        """Return the map with more samples of delay, of all faults or of some."""
+        delays = self.delays or ()
+        more = which or (True,) * len(delays)
+        return self._replace(delays=tuple(late + samples * add for late, add in zip(delays, more, strict=True)))
 
 
 class Units(NamedTuple):
@@ -131,10 +147,10 @@ def first_problem(plant: DescriptorSystem, asked: Options) -> tuple[FaultMap, Es
 def _open_maps(plant: DescriptorSystem, asked: Options) -> Iterator[FaultMap]:
     if asked.reference is not None:
         yield FaultMap(None, reference_model(asked.reference, plant), asked.exact)
-    elif asked.delay != "auto":
-        yield FaultMap(int(asked.delay), None, True)
     elif plant.is_discrete:
-        yield from (FaultMap(delay, None, True) for delay in range(plant.nx + 2))
+        given = delays_of(asked.delay, plant)
+        tried = range(plant.nx + 2 if None in given else 1)
+        yield from (FaultMap(tuple(late if one is None else one for one in given), None, True) for late in tried)
     else:
         width = cayley_point(scipy.linalg.eigvals(plant.A, plant.E))
         yield from (FaultMap(None, lag_model(width, order, plant.nf, 0.0), True) for order in range(1, plant.nx + 2))
@@ -179,7 +195,7 @@ def problem_of(plant: DescriptorSystem, fault_map: FaultMap) -> EstimationProble
     )
     reference = fault_map.reference
     if reference is None:
-        found = estimation_problem(channels, delay=fault_map.each or fault_map.delay, exact=fault_map.exact)
+        found = estimation_problem(channels, delay=fault_map.delays, exact=fault_map.exact)
         weights = (own.faults / units.error)[:, None]
         return replace(found, L=weights * found.L, D1=weights * found.D1, F=weights * found.F)
     a, b, c, d = reference

@@ -14,6 +14,7 @@ import numpy as np
 from obsynth.analysis.existence.wang2015 import examine_fault_filter
 from obsynth.errors import ObsynthError
 from obsynth.methods.fault_estimation_filter.weights import least_gains_by_weight
+from obsynth.methods.optimal_filter.delays import in_words
 from obsynth.methods.optimal_filter.fault_maps import FaultMap, designed
 from obsynth.methods.optimal_filter.realisation import minimal
 from obsynth.methods.registry import method_class
@@ -76,7 +77,7 @@ class LeastPossible(NamedTuple):
 
 
 def _with_delay(delay: tuple[int, ...]) -> str:
-    return f"with delay {', '.join(str(samples) for samples in (delay if len(set(delay)) > 1 else delay[:1]))}"
+    return f"with delay {in_words(delay)}"
 
 
 def _shown(gain: float) -> str:
@@ -168,7 +169,7 @@ def _effect_of_disturbances(model: ErrorModel) -> float:
 
 
 def _map_of(delay: tuple[int, ...], *, more: int = 0) -> FaultMap:
-    return FaultMap(None, None, True, tuple(samples + more for samples in delay))
+    return FaultMap(tuple(samples + more for samples in delay), None, True)
 
 
 def _least(plant: DescriptorSystem, fault_map: FaultMap, norm: str) -> float:

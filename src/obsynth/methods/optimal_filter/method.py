@@ -10,6 +10,7 @@ import numpy as np
 
 from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.methods.optimal_filter.delays import is_auto
 from obsynth.numerics.arguments import OpenUnitInterval, WrittenAs
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
@@ -33,9 +34,10 @@ class OptimalFilterMethod(Method):
     plant : DescriptorSystem or Transformation
         Either time, a regular pencil of any index; ``Bw, Dw`` (or ``sensor_noise``) and ``Bd, Dd`` are what the gain
         is from: signals of unit energy, or white of unit intensity for ``norm="h2"``.
-    delay : int or "auto", optional, samples
-        Discrete time: L of the exact fault map.  By default the first delay whose least gain is within 5 % of that of
-        the later ones; ``trade_off`` has what each delay gives.
+    delay : int, "auto", or one of these for each fault, optional, samples
+        Discrete time: L of the exact fault map, also as a sequence or as a mapping from names of faults.  By default
+        the first delay whose least gain is within 5 % of that of the later ones; ``trade_off`` has what each delay
+        gives.  Where each fault has its own, ``"auto"`` is as short as that gain allows.
     reference : mapping, sequence of matrices or control system, optional
         What the estimate shall be of the faults: ``{"bandwidth": 10}`` in rad/s (a lag for each fault, of ``"order"``
         1), or ``A, B, C, D`` of a stable model with nf inputs, as a mapping, in this order, or as a system of
@@ -100,7 +102,7 @@ class OptimalFilterMethod(Method):
         "non_causal_limit": ClaimMeaning("", "no delay brings the gain below this", "gain at any delay"),
         "deviation": ClaimMeaning("", "root mean square of the error for white noise of unit intensity", "deviation"),
         "least_deviation": ClaimMeaning("", "no causal linear filter with this fault map has less", "least deviation"),
-        "delay": ClaimMeaning("samples", "by which the fault map is late", "fault map"),
+        "delay": ClaimMeaning("samples", "by which the fault map is late, at most", "fault map"),
         "order": ClaimMeaning("", "states of the filter", "order"),
     }
     witnesses: ClassVar[frozenset[str]] = frozenset(
@@ -118,7 +120,7 @@ class OptimalFilterMethod(Method):
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""
-        if self.delay != "auto" and self.reference is not None:
+        if not is_auto(self.delay) and self.reference is not None:
             yield "delay and reference both say what the estimate shall be of the faults: give one."
         if not self.exact and self.reference is None:
             yield "exact is False: model matching needs a reference model."

@@ -91,8 +91,15 @@ class OptimalFilter(ObserverDesign):
 
     @property
     def delay(self) -> int:
-        """Samples by which the estimates lag; 0 with a reference model."""
+        """Samples by which the estimates lag, at most; 0 with a reference model."""
         return int(self.certificate.claims.get("delay", 0))
+
+    @property
+    def delays(self) -> dict[str, int]:
+        """Samples by which the estimate of each fault lags; empty with a reference model."""
+        observer = self.linear[1]
+        late = zip(observer.fault_names, observer.fault_delays, strict=True)
+        return {name: int(samples) for name, samples in late} if "delay" in self.certificate.claims else {}
 
     @property
     def trade_off(self) -> TradeOff:

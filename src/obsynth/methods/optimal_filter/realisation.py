@@ -130,7 +130,9 @@ def followed(plant: DescriptorSystem, filters: Sequence[Model], longest: int) ->
     )
 
 
-def observer_of(plant: DescriptorSystem, found: Followed, names: tuple[str, ...], delay: int) -> LinearObserver:
+def observer_of(
+    plant: DescriptorSystem, found: Followed, names: tuple[str, ...], delays: tuple[int, ...]
+) -> LinearObserver:
     """Return the observer; known inputs enter it as they do the plant."""
     t, t0 = found.T[:, : plant.nx], found.T0[:, : plant.nx]
     named = names == plant.fault_names
@@ -148,7 +150,7 @@ def observer_of(plant: DescriptorSystem, found: Followed, names: tuple[str, ...]
         fault_names=names if named else (),
         residual_names=() if named else names,
         state_delays=(),
-        fault_delays=(delay,) * len(names) if named else (),
+        fault_delays=delays if named else (),
     )
 
 

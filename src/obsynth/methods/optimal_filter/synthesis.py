@@ -14,6 +14,7 @@ from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.method import Synthesis
 from obsynth.methods.optimal_filter.certificate import certified
 from obsynth.methods.optimal_filter.checks import FAULT_MAP_SHARE, fault_map_missed
+from obsynth.methods.optimal_filter.delays import delays_of, in_words, is_auto, plain_delays
 from obsynth.methods.optimal_filter.fault_maps import (
     Designed,
     FaultMap,
@@ -53,7 +54,7 @@ FEWEST_DIGITS, MOST_DIGITS = 4, 8
 
 def synthesise(plant: DescriptorSystem, asked: OptimalFilterMethod, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the filter; see `obsynth.optimal_filter` for the options, results and errors."""
-    if asked.delay != "auto" and not plant.is_discrete:
+    if not is_auto(asked.delay) and not plant.is_discrete:
         raise SpecError(
             "A delay in samples is for discrete time: give a reference model.", path=f"{OPTIONS_PATH}.delay"
         )
@@ -90,7 +91,7 @@ def _made(plant: DescriptorSystem, asked: OptimalFilterMethod, curve: list[_Row]
     if reference is not None:
         matrices |= {f"reference_{name}": part for name, part in zip("ABCD", reference, strict=True)}
     options: dict[str, Any] = {
-        "delay": "auto" if fault_map.delay is None else fault_map.delay,
+        "delay": "auto" if fault_map.delays is None else plain_delays(fault_map.delays),
         "reference": None if reference is None else plain(reference),
         "norm": asked.norm,
         "exact": fault_map.exact,
@@ -116,21 +117,21 @@ def _with_enough_noise(
     """
     more = [noise for noise in ADDED_NOISES if noise > chosen.added_noise and chosen.least is None]
     while True:
-        problem, delay = chosen.problem, chosen.fault_map.delay or 0
+        problem, fault_map = chosen.problem, chosen.fault_map
         try:
             ways = realisations(chosen.filter, discrete=plant.is_discrete)
             found = followed(plant, ways, problem.window + problem.shift)
             rows = len(found.C)
             names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
-            observer = observer_of(plant, found, names, delay)
+            observer = observer_of(plant, found, names, fault_map.delays or (0,) * rows)
             model = ErrorModel(plant, observer, found.T, -found.T0, lag=found.lag, decoupled=True)
-            exact = chosen.fault_map.exact and bool(more)
-            if not exact or fault_map_missed(model, chosen.fault_map.reference, delay)[0] <= EXACT_SHARE:
+            exact = fault_map.exact and bool(more)
+            if not exact or fault_map_missed(model, fault_map)[0] <= EXACT_SHARE:
                 return chosen, found, observer
         except SolverError:
             if not more:
                 raise
-        chosen = designed(plant, chosen.fault_map, norm, more)
+        chosen = designed(plant, fault_map, norm, more)
         more = [noise for noise in more[1:] if noise > chosen.added_noise]
 
 
@@ -150,23 +151,46 @@ def _chosen(plant: DescriptorSystem, asked: OptimalFilterMethod) -> tuple[list[_
     """Return the delays that were looked at, and the filter of the one that is taken; a reference model has none."""
     fault_map, _ = first_problem(plant, asked)
     first = designed(plant, fault_map, asked.norm)
-    if fault_map.delay is None:
+    if fault_map.delays is None:
         return [], first
     curve = [_row(plant, first, asked.norm)]
+    is_open = tuple(late is None for late in delays_of(asked.delay, plant))
     # A delay that was asked for is printed with what one sample more would give.
-    more, most = (MORE_DELAYS, MOST_MORE_DELAYS) if asked.delay == "auto" else (1, 1)
-    for delay in range(fault_map.delay + 1, fault_map.delay + 1 + most):
+    more, most = (MORE_DELAYS, MOST_MORE_DELAYS) if any(is_open) else (1, 1)
+    which = is_open if any(is_open) else None
+    for samples in range(1, 1 + most):
         falling = len(curve) < 2 or DELAY_ROOM * curve[-1].counts < curve[-2].counts
         if curve[-1].found.is_nothing or (len(curve) > more and not falling):
             break
         try:
-            curve.append(_row(plant, designed(plant, FaultMap(delay, None, True), asked.norm), asked.norm))
+            curve.append(_row(plant, designed(plant, fault_map.later(samples, which=which), asked.norm), asked.norm))
         except PreconditionError:
             break
-    if asked.delay != "auto":
+    if not any(is_open):
         return curve, first
     enough = max(DELAY_ROOM * min(row.counts for row in curve), first.nothing)
-    return curve, next(row.found for row in curve if row.found.gain <= enough)
+    chosen = next(row.found for row in curve if row.found.gain <= enough)
+    if is_auto(asked.delay):
+        return curve, chosen
+    return curve, _shortened(plant, chosen, is_open, enough, asked.norm)
+
+
+def _shortened(
+    plant: DescriptorSystem, chosen: Designed, is_open: tuple[bool, ...], enough: float, norm: str
+) -> Designed:
+    """Return the filter with each delay that is open as short as a gain that is enough allows, one after the other."""
+    for i, may_be_shorter in enumerate(is_open):
+        delays = chosen.fault_map.delays or ()
+        for late in range(delays[i] if may_be_shorter else 0):
+            shorter = chosen.fault_map._replace(delays=(*delays[:i], late, *delays[i + 1 :]))
+            try:
+                tried = designed(plant, shorter, norm)
+            except PreconditionError:
+                continue
+            if tried.gain <= enough:
+                chosen = tried
+                break
+    return chosen
 
 
 def _row(plant: DescriptorSystem, found: Designed, norm: str) -> _Row:
@@ -187,7 +211,7 @@ def _notes(
 ) -> list[str]:
     notes = [_statement(curve, chosen, asked, claims)]
     if len(curve) > 1:
-        listed = "; ".join(f"delay {row.found.fault_map.delay}: {row.gain:.6g}, {row.deviation:.6g}" for row in curve)
+        listed = "; ".join(f"delay {_late(row)}: {row.gain:.6g}, {row.deviation:.6g}" for row in curve)
         notes.append(f"Least gain, and least deviation for white noise of unit intensity, by delay: {listed}.")
     if chosen.added_noise:
         notes.append(
@@ -207,10 +231,10 @@ def _statement(curve: list[_Row], chosen: Designed, asked: OptimalFilterMethod, 
     fault_map = chosen.fault_map
     if not fault_map.exact:
         of = "over all causal filters, matching this reference model"
-    elif fault_map.delay is None:
+    elif fault_map.delays is None:
         of = "over all causal filters, linear or not, with this exact fault map"
     else:
-        of = f"over all causal filters, linear or not, with this exact fault map and delay {fault_map.delay}"
+        of = f"over all causal filters, linear or not, with this exact fault map and delay {in_words(fault_map.delays)}"
     if asked.norm == "h2":
         of = of.replace("causal filters, linear or not,", "causal linear filters")
         text = f"Least deviation {of}: {chosen.gain:.8g}, reached by this filter."
@@ -219,15 +243,20 @@ def _statement(curve: list[_Row], chosen: Designed, asked: OptimalFilterMethod, 
     else:
         low, high = bracketed(claims.get("least", 0.0), claims["gain"])
         text = f"Least gain {of}: between {low} and {high}, proved; this filter: {high}."
-    later = next((row for row in curve if row.found.fault_map.delay == (fault_map.delay or 0) + 1), None)
-    if later is not None:
-        text += f" With delay {later.found.fault_map.delay}: {later.counts:.5g}."
-    elif len(curve) > 1 and not chosen.is_nothing:
+    places = [row.found.fault_map.delays for row in curve]
+    place = places.index(fault_map.delays) if fault_map.delays in places else len(curve)
+    if place + 1 < len(curve):
+        text += f" With delay {_late(curve[place + 1])}: {curve[place + 1].counts:.5g}."
+    elif place > 0 and place + 1 == len(curve) and not chosen.is_nothing:
         text += " Longer delays were not tried, and each sample more still lowered it: give a delay to go on."
     if "non_causal_limit" in claims:
         low, _ = bracketed(claims["non_causal_limit"], np.inf)
         text += f" No delay brings it below {low}."
     return text
+
+
+def _late(row: _Row) -> str:
+    return in_words(row.found.fault_map.delays or ())
 
 
 def _gap(plant: DescriptorSystem, chosen: Designed, asked: OptimalFilterMethod, claims: Mapping[str, float]) -> str:

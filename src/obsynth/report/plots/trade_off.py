@@ -149,11 +149,9 @@ def plot_delays(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
     )
     for label, values, marker, style in lines:
         panel.plot(delays, values, color="black", marker=marker, markersize=4, linestyle=style, label=label)
-    gain = next(row.gain for row in table if row.delay == found.delay)
-    deviation = next(row.deviation for row in table if row.delay == found.delay)
     panel.plot(
         found.delay,
-        gain if found.options["norm"] == "hinf" else deviation,
+        found.gain,
         marker="s",
         markersize=9,
         color="tab:red",
