@@ -243,10 +243,9 @@ def test_each_fault_has_its_own_delay() -> None:
     np.testing.assert_allclose(estimates[20:, 1], faults[19:-1, 1], atol=1e-9)
     assert obsynth.optimal_filter(TWO_DELAYS, delay=(2, 1)).gain == design.gain
     # What each fault costs alone is no more than what both do.
-    alone = obsynth.optimal_filter(plant(
-        A=TWO_DELAYS.A, Bf=TWO_DELAYS.Bf[:, :1], Bd=TWO_DELAYS.Bf[:, 1:], Bw=TWO_DELAYS.Bw, C=TWO_DELAYS.C, Dw=TWO_DELAYS.Dw
-    ), delay=2,
-                                   decoupled="d1")  # fmt: skip
+    two = TWO_DELAYS
+    one = plant(A=two.A, Bf=two.Bf[:, :1], Bd=two.Bf[:, 1:], Bw=two.Bw, C=two.C, Dw=two.Dw)
+    alone = obsynth.optimal_filter(one, delay=2, decoupled="d1")
     assert alone.gain == pytest.approx(1.5, rel=1e-7)
     assert alone.gain <= design.gain
     later = changed(design, claims={"delay": 3.0}, options={"delay": [3, 1]},
