@@ -229,6 +229,7 @@ def test_the_least_gain_of_a_filter_is_that_of_its_matrices() -> None:
     assert obsynth.fault_estimation_filter(plant, weight="free", gamma=1.1).certificate.claims["gamma"] <= 1.1
 
 
+@pytest.mark.long
 def test_a_page_and_a_proof_say_for_what_gains_hold(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, design = filtered()
     gains, page, proof = (tmp_path / name for name in ("filter.json", "page.html", "proof.json"))

@@ -52,6 +52,7 @@ def fleet(place: Path, out: Path, **options) -> dict[str, obsynth.FleetRun]:
     return {run.name: run for run in found.runs}
 
 
+@pytest.mark.long
 def test_each_design_has_its_own_thresholds(place: Path, tmp_path: Path):
     found = fleet(place, tmp_path / "o", monitor="learned", normal=place / "normal")
     assert len(found) == 4
@@ -63,6 +64,7 @@ def test_each_design_has_its_own_thresholds(place: Path, tmp_path: Path):
         assert alone.alarms
 
 
+@pytest.mark.long
 def test_a_normal_log_is_learned_from_by_each(place: Path, tmp_path: Path):
     found = fleet(place, tmp_path / "o", monitor="learned", normal=place / "normal.csv", sensor_faults=False)
     assert {run.fault for name, run in found.items() if name.endswith("leak")} == {"leak"}

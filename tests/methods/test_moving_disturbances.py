@@ -192,6 +192,7 @@ def test_the_worst_record_is_no_alarm_no_proof_and_no_interval_without_zero(seed
     assert "held between samples" in proof.statement or not proof.proved
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [4, 6])
 def test_disturbances_of_a_bounded_rate_move_within_a_sample_too(seed: int) -> None:
     plant, dt = plant_of(seed)

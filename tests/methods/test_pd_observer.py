@@ -467,6 +467,7 @@ class TestRefusals:
         )
         assert least_noise_gain(moved) == pytest.approx(expected, rel=1e-9)
 
+    @pytest.mark.long
     def test_no_design_has_less_noise_than_that(self) -> None:
         for plant in (PLANT, rich().replace(Bw=np.zeros((3, 3)), Dw=np.eye(3), noise_names=None)):
             least = least_noise_gain(plant)

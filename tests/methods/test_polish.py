@@ -44,6 +44,7 @@ def test_the_inequality_is_asked_and_nothing_is_lost() -> None:
     assert np.linalg.norm(design.gains["R"]) <= np.linalg.norm(default.gains["R"])
 
 
+@pytest.mark.long
 def test_where_a_bound_is_reached_the_record_says_that_there_is_nothing_to_polish() -> None:
     design = obsynth.fault_estimation_filter(plant(nd=1), weight="paper", engine="lmi")
     last = [run for run in design.solver["runs"] if run["what"] == "least gain"][-1]

@@ -92,6 +92,7 @@ def test_errors_shrink_in_every_step_as_is_proved(design: ObserverDesign) -> Non
     assert model.nx == 3
 
 
+@pytest.mark.long
 def test_estimates_deviate_by_less_than_is_proved(design: ObserverDesign) -> None:
     level = design.certificate.claims["region_deviation"]
     squares = []

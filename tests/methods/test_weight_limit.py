@@ -74,6 +74,7 @@ def plant(seed: int) -> obsynth.DescriptorSystem:
     )
 
 
+@pytest.mark.long
 def test_a_limit_just_above_the_least_weight_is_kept(share: Callable[..., Any]) -> None:
     for seed in share(range(4), 2):
         assert_kept_above_the_least_weight(seed)

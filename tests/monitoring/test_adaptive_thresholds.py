@@ -66,6 +66,7 @@ def plan(design) -> Any:
     return adaptive_plan(design, np.array([0.1]), 1.0, initial_error=None, initial_set=start_set(design))[0]
 
 
+@pytest.mark.long
 def test_exact_plants_of_the_box_never_pass_their_threshold(design, plan) -> None:
     points = drawn_points(len(plan.names), 24, 7, vertices=0.7)
     rows, u, y, _ = exact_records(design, points, 150, 1)
@@ -117,6 +118,7 @@ def test_constants_that_vary_need_the_varying_mode() -> None:
     assert found == {"constant": 2, "varying": 0}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("variation", ["constant", "varying"])
 def test_a_sample_at_a_time_is_the_record(variation) -> None:
     design = obsynth.fault_estimation_filter(drive(variation=variation))

@@ -59,6 +59,7 @@ def event_of(design, learned, log, **options):
     return next(event for event in run.events if event.last_row > BEGIN)
 
 
+@pytest.mark.long
 def test_a_replaced_sensor_is_no_fault_of_the_heater(room):
     event = event_of(*room, room_log(9, air=2.0))
     assert (event.fault, event.ties) == ("sensor Tair", ())
@@ -68,16 +69,19 @@ def test_a_replaced_sensor_is_no_fault_of_the_heater(room):
     assert sum(share for _, share in event.shares) == pytest.approx(1.0)
 
 
+@pytest.mark.long
 def test_without_faults_of_sensors_it_is_named_as_before(room):
     assert event_of(*room, room_log(9, air=2.0), sensor_faults=False).fault == "lost"
 
 
+@pytest.mark.long
 def test_each_is_named_right(room):
     assert event_of(*room, room_log(9, wall=1.0)).fault == "sensor Twall"
     event = event_of(*room, room_log(9, lost=400.0))
     assert (event.fault, event.clear) == ("lost", True)
 
 
+@pytest.mark.long
 def test_a_sensor_that_drifts_is_told_to_drift_and_its_tie_is_told(room):
     event = event_of(*room, room_log(9, drift=0.005))
     # The heater's fault takes what both sensors have in common: how they differ is all that is seen.
@@ -86,6 +90,7 @@ def test_a_sensor_that_drifts_is_told_to_drift_and_its_tie_is_told(room):
     assert "drifts" in alarm_rows([event], str)[0][1][alarm_rows([event], str)[0][0].index("fault")]
 
 
+@pytest.mark.long
 def test_a_run_that_is_resumed_says_the_same(room, tmp_path: Path):
     design, learned = room
     log = room_log(9, air=0.5)
@@ -102,6 +107,7 @@ def test_a_run_that_is_resumed_says_the_same(room, tmp_path: Path):
         obsynth.run_on_data(design, log, monitor=without, state=tmp_path / "s.json")
 
 
+@pytest.mark.long
 def test_a_command_ranks_sensors_unless_it_is_told_not_to(room, tmp_path: Path, capsys):
     design, learned = room
     design.save(tmp_path / "g.json")
@@ -144,6 +150,7 @@ def linear():
     return design, obsynth.learn_thresholds(design, [log(1), log(2)]), log
 
 
+@pytest.mark.long
 def test_sensors_of_linear_designs_are_ranked_by_their_dynamics(linear):
     design, learned, log = linear
     event = event_of(design, learned, log(9, sensor=0, size=0.5))

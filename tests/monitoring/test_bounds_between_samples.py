@@ -196,6 +196,7 @@ def test_no_switching_load_passes_the_threshold_and_some_come_near(dt: float, di
     assert online.rule.irregular[1] >= found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dt", [0.05, 0.4])
 def test_two_loads_at_once_pass_no_threshold_at_any_sample(dt: float):
     """Both switch at their worst, from the first interval on; at any stamps as well as at regular ones."""

@@ -416,6 +416,7 @@ def same_as_c(
     assert isolated == shown
 
 
+@pytest.mark.long
 def test_floats_keep_the_bound_that_their_header_states(shipped: SimpleNamespace, tmp_path: Path) -> None:
     """Against doubles, for signals within one unit; and the bound is not idle."""
     design = shipped.designs["wang2015/spec"]

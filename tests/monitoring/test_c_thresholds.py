@@ -50,6 +50,7 @@ def test_c_gives_the_thresholds_of_python(tmp_path: Path, make, level: str) -> N
         assert total == pytest.approx(python[k], rel=1e-10)
 
 
+@pytest.mark.long
 def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
     design = obsynth.fault_estimation_filter(drive())
     bounds = {"noise_bound": 1.0, "disturbance_bounds": {"load": 0.1}}

@@ -141,6 +141,7 @@ def test_a_product_that_alone_is_seen_is_named_as_a_direction():
         found.box.constants()
 
 
+@pytest.mark.long
 def test_a_process_without_noise_is_given_an_upper_limit_and_never_zero():
     model = first_order()
     found = calibrate(
@@ -166,6 +167,7 @@ def test_missing_samples_and_rows_are_left_out():
     assert any("4 rows are missing" in sentence for sentence in found.verdict)
 
 
+@pytest.mark.long
 def test_a_prior_closes_what_a_log_leaves_open():
     model = first_order()
     found = calibrate(model, record(model), {"k": (0.2, 5.0), "c": (0.2, 5.0)}, noisy=["balance"], input_delay=0,

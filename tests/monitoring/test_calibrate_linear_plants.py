@@ -107,6 +107,7 @@ def varying_log(plant: TimeVaryingDescriptorSystem, theta: float, n: int = 120, 
     return {"time": np.arange(float(n)), "u1": u[:, 0], "u2": u[:, 1], "y1": seen[:, 0], "y2": seen[:, 1]}
 
 
+@pytest.mark.long
 def test_constants_and_parameters_of_a_varying_plant_are_found():
     true = varying(constants={"a": 1.0, "b": 0.8})
     found = calibrate(varying(), varying_log(true, 0.7), {"b": (0.2, 3.0), "theta": (0.1, 2.0)}, noisy=["x2"], **QUICK)
@@ -115,6 +116,7 @@ def test_constants_and_parameters_of_a_varying_plant_are_found():
     assert found.integration == "exact"
 
 
+@pytest.mark.long
 def test_stacks_and_functions_are_as_good_as_expressions():
     n, plant = 60, varying()
     log = varying_log(plant, 0.5, n)
@@ -150,6 +152,7 @@ def test_a_discrete_plant_says_which_direction_a_log_leaves_open():
     assert found.box.low["c"] == pytest.approx(0.75 / most, rel=0.1)
 
 
+@pytest.mark.long
 def test_a_constant_sensor_fault_is_found_and_unknown_inputs_are_told():
     plant = DescriptorSystem(None, [[0.9]], [[1.0]], [[1.0], [2.0]], Df=[[0.0], [1.0]], Bd=[[1.0]], dt=1.0,
                              fault_names=["offset"])  # fmt: skip
@@ -164,6 +167,7 @@ def test_a_constant_sensor_fault_is_found_and_unknown_inputs_are_told():
     assert any("unknown inputs" in sentence for sentence in found.verdict)
 
 
+@pytest.mark.long
 def test_an_unknown_input_that_is_asked_to_walk_does_so():
     """The load walks by 0.05 a sample, and moves the state by a tenth of that."""
     plant = uncertain_system(

@@ -49,6 +49,7 @@ def said(found, text: str) -> bool:
     return any(text in sentence for sentence in found.verdict)
 
 
+@pytest.mark.long
 def test_a_log_that_begins_elsewhere_is_no_fault() -> None:
     found = plain()
     assert found.box.holds(TRUE)
@@ -73,6 +74,7 @@ def test_a_start_that_only_the_first_innovations_show() -> None:
     assert said(found, "does not begin at the nominal state")
 
 
+@pytest.mark.long
 def test_single_samples_that_are_no_measurements_are_told_and_left_out() -> None:
     def wrong(column):
         column[77] += 1e6
@@ -87,6 +89,7 @@ def test_single_samples_that_are_no_measurements_are_told_and_left_out() -> None
     assert found.R["vm"] == pytest.approx(plain().R["vm"], rel=0.1)
 
 
+@pytest.mark.long
 def test_a_sample_that_stands_out_is_named() -> None:
     def wrong(column):
         column[77] += 0.3
@@ -205,6 +208,7 @@ def test_bounds_that_are_none_are_refused(unknown) -> None:
         calibrate(circuit(), circuit_log(), unknown)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("late", [0, 1])
 def test_the_record_of_another_simulator_has_its_own_start_and_no_delay_that_it_lacks(late: int) -> None:
     from scipy.integrate import solve_ivp

@@ -18,6 +18,7 @@ import obsynth
 from obsynth.monitoring.calibration.variance_names import limited_names, variance_names, with_letter
 
 
+@pytest.mark.long
 def test_variances_of_a_plant_with_one_sensor_are_found(share):
     case = CASES["3 states, 1 noise, 1 sensor"]
     found = [calibrated(case, seed) for seed in share(range(5), 2)]

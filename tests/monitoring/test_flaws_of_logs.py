@@ -107,6 +107,7 @@ def motor(name: str) -> obsynth.ObserverDesign:
     return obsynth.design(spec.plant, spec.method, **dict(spec.options))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["spec", "sampled"])
 def test_levels_decide_at_once_after_a_gap_by_what_it_can_have_left(name: str) -> None:
     design, data = motor(name), pd.read_csv("designs/motor/log.csv").iloc[:1100]

@@ -58,6 +58,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
+@pytest.mark.long
 def test_the_offset_of_the_log_and_its_deviation_are_told_and_written(folder: Path) -> None:
     value, deviation = json.loads((folder / "c.json").read_text())["found_offsets"]["y"]
     assert abs(value - OFFSET) <= 3.0 * deviation
@@ -67,6 +68,7 @@ def test_the_offset_of_the_log_and_its_deviation_are_told_and_written(folder: Pa
     assert options["initial_covariance"]["offset_y"] == pytest.approx(deviation**2)
 
 
+@pytest.mark.long
 def test_the_design_takes_the_offset_for_no_fault_of_its_sensor(folder: Path) -> None:
     spec = obsynth.load_spec(folder / "found.yaml")
     design = obsynth.design(spec.plant, spec.method, **dict(spec.options))
@@ -80,6 +82,7 @@ def test_the_design_takes_the_offset_for_no_fault_of_its_sensor(folder: Path) ->
         assert np.abs(table["xhat[offset_y]"] - OFFSET).max() <= 0.005
 
 
+@pytest.mark.long
 def test_another_log_shows_its_own_offset(folder: Path) -> None:
     data = log(9)
     data["y"] += 0.1

@@ -64,6 +64,7 @@ def through_c(design: obsynth.GuaranteedTest, folder: Path, signals: np.ndarray)
     return np.frombuffer(ran.stdout).reshape(len(signals), -1)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", [*SHIPPED, "tanks"])
 def test_c_equals_the_run_on_a_log_with_blanks(name: str, tmp_path: Path) -> None:
     design = tanks() if name == "tanks" else shipped(name)

@@ -26,6 +26,7 @@ def drive() -> obsynth.ObserverDesign:
     return obsynth.design(spec().plant, "guaranteed-test", **spec().options)
 
 
+@pytest.mark.long
 def test_the_step_is_found_and_nothing_before_it() -> None:
     watched = obsynth.monitor(drive(), spec().scenario)
     # Held between samples the load torque allows 0.045456; as it likes, half as much again.
@@ -88,6 +89,7 @@ def three() -> obsynth.GuaranteedTest:
     return obsynth.guaranteed_test(tanks(), isolate=True, **OPTIONS)
 
 
+@pytest.mark.long
 def test_three_levels_isolate_three_faults() -> None:
     bank = three()
     assert bank.report.passed
@@ -137,6 +139,7 @@ def test_a_bank_over_many_runs_is_never_wrong(tmp_path: Path) -> None:
     assert np.all(seen.threshold[11:] == 1.0)
 
 
+@pytest.mark.long
 def test_exact_intervals_over_many_runs() -> None:
     plant, size = drive().linear[0], 0.4
     options = {"course": "constant", "samples": 8, "disturbance_bounds": 1.0, "noise_bound": 3}

@@ -155,6 +155,7 @@ def test_an_offset_within_its_band_raises_no_ratio_and_one_beyond_it_does() -> N
     assert banded.of_rows(3.0 * e)[step].max() == pytest.approx(max(AGES))
 
 
+@pytest.mark.long
 def test_a_step_of_any_of_many_sensors_is_seen() -> None:
     count = 14
     rng, names = np.random.default_rng(0), [f"y{i}" for i in range(count)]

@@ -56,6 +56,7 @@ def run(design, times, u, y, **options):
 INTERVAL = st.floats(0.002, 0.8).map(lambda seconds: round(seconds, 3))
 
 
+@pytest.mark.long
 @given(st.lists(INTERVAL, min_size=12, max_size=60), st.integers(0, 1000))
 @settings(max_examples=20, deadline=None)
 def test_estimates_are_those_of_the_textbook_at_any_times(intervals, seed):
@@ -94,6 +95,7 @@ def test_regular_stamps_are_taken_as_before():
     assert found.table["sd xhat[x1]"].iloc[40] > 1.05 * found.table["sd xhat[x1]"].iloc[39]
 
 
+@pytest.mark.long
 def test_parameters_learn_over_the_interval():
     """Two rows at once are as good as one: what is forgotten in between follows the time."""
     faulty = plant(Bf=[[0.0], [1.0]], fault_names=["leak"])
@@ -123,6 +125,7 @@ def test_a_covariance_that_was_given_grows_with_the_interval():
         assert deviation == pytest.approx(np.sqrt(P[0, 0]), rel=1e-9)
 
 
+@pytest.mark.long
 def test_a_run_goes_on_where_it_stopped(tmp_path):
     rng = np.random.default_rng(7)
     times = np.round(np.cumsum([0.0, *rng.uniform(0.01, 0.3, 60)]), 4)
@@ -149,6 +152,7 @@ def test_what_cannot_is_refused_by_name():
         run(design(), times, u, y, smooth=True)
 
 
+@pytest.mark.long
 def test_unknown_inputs_and_nonlinear_stamps_keep_their_ways():
     unknown = plant(Bd=[[0.0], [1.0]], C=np.eye(2), sensor_noise={"y1": 0.1, "y2": 0.1})
     made = obsynth.design(obsynth.discretise(unknown, DT), "descriptor-kalman")

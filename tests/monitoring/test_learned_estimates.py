@@ -392,6 +392,7 @@ def test_the_stated_rate_is_kept_out_of_sample(memory: float, share: Callable[..
     assert max(rates) <= 1.5
 
 
+@pytest.mark.long
 def test_it_is_told_where_rows_say_too_little_of_faults_for_a_rate() -> None:
     """Of 24 such logs of 2,000 rows with a memory of .9, 4 ring more than 1.5 times as often as stated; of 8,000, 1."""
     for memory, rows, enough in ((0.5, 2_000, True), (0.9, 2_000, False), (0.9, 8_000, True)):

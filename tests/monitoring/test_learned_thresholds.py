@@ -108,6 +108,7 @@ def test_a_heavy_tail_is_recognised() -> None:
     np.testing.assert_allclose(tail.drawn(np.array([1e-3 / 0.1])), [1000.0**0.25], rtol=0.05)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("m", "memory"), [(1, 0.0), (1, 0.9), (2, 0.7)])
 def test_the_stated_rate_is_kept_out_of_sample(m: int, memory: float, share: Callable[..., Any]) -> None:
     every, rates = 500.0, []
@@ -156,6 +157,7 @@ def test_a_part_of_an_alarm_that_normal_rows_may_have_is_used(rows: int, tail: f
     assert 0.84 <= np.mean(rates) <= 1.06
 
 
+@pytest.mark.long
 def test_a_small_fault_in_noise_with_heavy_tails_is_told_as_early_as_its_evidence_allows() -> None:
     """One row alone may be far off: a common level for steps of all ages told this one after 260 rows, of 500 that it
     lasts; levels that are between that and one for each age on its own, after 140."""
@@ -172,6 +174,7 @@ def test_a_small_fault_in_noise_with_heavy_tails_is_told_as_early_as_its_evidenc
     assert np.mean(delays) < 200.0
 
 
+@pytest.mark.long
 def test_many_rows_show_their_rate_themselves() -> None:
     every, rates = 100.0, []
     for seed in range(6):
@@ -292,6 +295,7 @@ def test_normal_rows_are_quiet_and_a_fault_is_named() -> None:
     assert 40.0 <= run.alarms["learned"] <= 42.0
 
 
+@pytest.mark.long
 def test_blank_cells_add_no_evidence_and_take_none_away() -> None:
     monitor = obsynth.online_monitor(heated(), "learned", normal=learned())
     data = log(600, 2, begin=400)
@@ -327,6 +331,7 @@ def test_row_by_row_is_the_same_as_at_once() -> None:
     np.testing.assert_allclose(taken[max(AGES) :], largest[model.order + max(AGES) :], rtol=1e-9)
 
 
+@pytest.mark.long
 def test_too_few_rows_are_told() -> None:
     short = obsynth.learn_thresholds(heated(), log(400, 0), false_alarms="1 per day")
     assert not short.holds
@@ -337,6 +342,7 @@ def test_too_few_rows_are_told() -> None:
         obsynth.learn_thresholds(heated(), log(400, 0) * [1.0, 0.0, 0.0, 0.0])
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("taken_as_verified")
 def test_every_kind_of_design_learns() -> None:
     spec = obsynth.load_spec("designs/threetank/spec.yaml")
@@ -469,6 +475,7 @@ def test_a_row_without_one_sensor_decides_by_the_others(by_sensor: bool) -> None
     assert state.past[0].tolist() == [0.0, 9.0, 0.0]
 
 
+@pytest.mark.long
 def test_files_and_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gains, normal, faulty, file = (tmp_path / name for name in ("g.json", "normal.csv", "faulty.csv", "t.json"))
     heated().save(gains)
@@ -520,6 +527,7 @@ def test_a_file_that_is_nested_too_deeply_is_named(tmp_path: Path) -> None:
         obsynth.load_thresholds(file)
 
 
+@pytest.mark.long
 def test_what_a_followed_fault_leaves_is_told_where_estimates_are_not_watched(tmp_path, capsys) -> None:
     """An observer that expects steps followed a leak of twenty deviations, and the summary said no word of it."""
     spec = obsynth.load_spec(Path(__file__).parents[2] / "docs/examples/battery/spec.yaml")

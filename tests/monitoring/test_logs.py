@@ -241,6 +241,7 @@ def test_residuals_of_unlike_units_have_panels_of_their_own():
     assert drawn == {"residuals (m)": ["r[level]"], "residuals (m3/s)": ["r[flow]"]}
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("zone", "label"), [(None, "time"), ("+02:00", "time (UTC+02:00)"), ("UTC", "time (UTC)")])
 def test_dates_are_drawn_in_the_zone_of_the_log(design, frame, zone, label):
     dates = pd.Timestamp("2026-05-01T06:29:50").tz_localize(zone) + pd.to_timedelta(frame["time"], unit="s")
@@ -274,6 +275,7 @@ def test_the_command_draws_a_file(design, frame, tmp_path, monkeypatch, capsys, 
         assert main([*arguments, "--out", "log.csv"]) == 2
 
 
+@pytest.mark.long
 def test_the_page_shows_one_s_own_data_first(design, frame, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     design.save("tank.gains.json")

@@ -88,6 +88,7 @@ def estimates_of(shipped: RecursiveObserver, innovations: np.ndarray, y: np.ndar
     return dataclasses.replace(found, innovations=padded)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gaps", ["single", "bursts"])
 def test_false_alarms_of_the_glr_with_gaps(gaps: str, share: Callable[..., Any]) -> None:
     """Runs at 5 %: of thirty, more than six alarm with probability 0.0006, and of ten, more than three with 0.001."""

@@ -174,6 +174,7 @@ def test_what_a_stuck_sensor_repeats_is_not_learned_from() -> None:
     assert (len(found.notes), len(wanted.notes)) == (1, 0)
 
 
+@pytest.mark.long
 def test_a_sensor_that_is_stuck_in_a_run_counts_as_not_measured_there_too(tmp_path: Path) -> None:
     """It alarmed, as its repeats were blank in the rows that were learned from and taken for measured in runs."""
     normal = learned(log(1))

@@ -91,6 +91,7 @@ def test_every_run_follows_what_is_stated(kind, stated, tmp_path):
     np.testing.assert_allclose(np.concatenate([states_of(table) for table in tables]), wanted, atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["extended", "nonlinear"])
 def test_c_and_fmu_are_made_from_the_same_rule(kind):
     """Both are written from these texts."""

@@ -112,6 +112,7 @@ def test_a_late_estimate_names_the_time_it_is_of(sampled):
     assert "time of xhat" not in found.columns
 
 
+@pytest.mark.long
 def test_irregular_stamps_are_exact_for_signals_linear_between_rows(continuous):
     times = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.2, size=25))
     table = random_log(continuous, times)
@@ -262,6 +263,7 @@ def test_a_bad_row_never_poisons_the_state(sampled, bad):
     assert np.abs(estimates(found, "xhat")[75:] - states[75:]).max() < 0.05 * np.abs(states).max()
 
 
+@pytest.mark.long
 def test_a_model_that_has_lost_the_plant_is_dropped(continuous):
     """The plant is unstable, 2/3 per second: after 100 s without sensors its model is off by e^66 times any error."""
     times = 0.05 * np.arange(2600)

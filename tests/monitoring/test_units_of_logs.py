@@ -114,6 +114,7 @@ def test_a_linear_design_is_asked_for_its_operating_point():
     assert obsynth.run_on_data(design, data).rows == 30
 
 
+@pytest.mark.long
 def test_a_command_stops_and_goes_on_where_told(vessel, tmp_path: Path, capsys):
     vessel.save(tmp_path / "g.json")
     data = log()

@@ -57,6 +57,7 @@ def test_process_noise_a_hundred_times_too_large_is_named():
     assert any("too large" in sentence for sentence in found.verdict)
 
 
+@pytest.mark.long
 def test_a_sensor_whose_noise_is_eight_times_too_small_is_named():
     found = validate(designed(R={**R, "v3": 2.7e-5 / 8}), LOG, rows="0:56", columns=HELD)
     assert not found.passed

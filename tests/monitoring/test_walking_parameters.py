@@ -27,6 +27,7 @@ def test_covariances_of_walking_parameters_are_honest(form):
     assert 0.7 < errors.mean() < 1.4
 
 
+@pytest.mark.long
 def test_covariances_of_a_linear_walk_are_honest():
     assert 0.7 < linear_errors(12).mean() < 1.4
 

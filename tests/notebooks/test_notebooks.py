@@ -88,6 +88,7 @@ def run_in(kernel: KernelManager, notebook: Any, folder: Path) -> Any:
         client.kc.stop_channels()
 
 
+@pytest.mark.long
 def test_names_of_one_notebook_are_gone_in_the_next(kernel: KernelManager, tmp_path: Path) -> None:
     cells = ["import os; left = os.getcwd(); print(left)", "print('left' in globals(), 'os' in globals())"]
     first, second = (nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell)]) for cell in cells)

@@ -52,6 +52,7 @@ def test_an_unknown_routine_is_an_attribute_error() -> None:
         _ = lapack.no_such_routine
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("first", ["pass", "import scipy.linalg"])
 def test_routines_are_those_of_scipy_whichever_is_imported_first(first: str) -> None:
     code = (

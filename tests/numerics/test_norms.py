@@ -59,6 +59,7 @@ class TestManyStates:
         a *= (1.0 - damping) / np.max(np.abs(np.linalg.eigvals(a)))
         return a, b, c, rng.standard_normal((outputs, inputs))
 
+    @pytest.mark.one_in(3)
     @pytest.mark.parametrize("damping", [0.3, 1e-2, 1e-4])
     def test_against_slicot(self, damping):
         rng = np.random.default_rng(11)
@@ -147,6 +148,7 @@ class TestHinfNorm:
             check_encloses(found, 1.001 / damping, slack=1e-9)
             assert found.frequency == pytest.approx((0.777, 2.222)[int(np.argmax(heights))], abs=1e-6)
 
+    @pytest.mark.long
     def test_a_peak_that_is_not_at_a_pole(self):
         """Random sums and poles far inside: the peak lies where SLICOT's iteration finds it."""
         rng = np.random.default_rng(1)
@@ -182,6 +184,7 @@ class TestHinfNorm:
             check_encloses(scaled, plain.value, slack=2e-9)
             check_encloses(plain, scaled.value, slack=2e-9)
 
+    @pytest.mark.long
     def test_nothing_in_a_fine_grid_exceeds_the_upper_bound(self):
         rng = np.random.default_rng(5)
         for _ in range(100):

@@ -98,6 +98,7 @@ def test_singular_and_rectangular_pencils(right, left, seed):
     assert mismatch(with_conjugates(eigenvalues), zeros.values) < 1e-10
 
 
+@pytest.mark.long
 def test_500_random_planted_pencils():
     rng = np.random.default_rng(2024)
     for trial in range(500):

@@ -61,6 +61,7 @@ def texts_of(tree: ast.Module) -> list[tuple[int, str]]:
     ]
 
 
+@pytest.mark.long
 def test_no_text_of_the_sources_has_one() -> None:
     found = []
     for file in sorted(SOURCE.rglob("*.py")):

@@ -218,6 +218,7 @@ def test_a_digest_alone_fails(files: dict[str, Path], tmp_path: Path) -> None:
         obsynth.verify_certificate(tmp_path / "c.json")
 
 
+@pytest.mark.long
 def test_the_verb_reads_every_kind(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
     for kind in KINDS[:3]:
         assert main(["verify", str(files[kind]), "--json"]) == 0

@@ -30,6 +30,7 @@ def test_a_design_without_tolerances_says_so() -> None:
     assert str(found) == "model: assumes an exact model"
 
 
+@pytest.mark.long
 def test_constants_may_be_given_to_the_design() -> None:
     design = obsynth.fault_estimation_filter(wang().replace(uncertainty=None))
     found = obsynth.robustness(design, constants={"A": "1 %"})
