@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from pathlib import Path
@@ -188,6 +189,29 @@ def test_continuous_poles_have_an_axis_and_no_circle(slow) -> None:
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("real part (1/s)", "imaginary part (1/s)")
     poles = next(line for name, line in lines.items() if name.startswith("observer eigenvalues"))
     assert max(poles.get_xdata()) < 0.0
+
+
+def test_real_poles_leave_room_for_a_damping_grid_that_can_be_read(slow) -> None:
+    _, observer = slow.linear
+    real = observer.Az * 0.0 - np.diag(np.linspace(2.0, 200.0, len(observer.Az)))
+    axes = plot_poles(slow.replace(observer=type(observer)(**{**observer.as_dict(), "Az": real})))
+    bottom, top = axes.get_ylim()
+    assert top == -bottom > 50.0
+    labels = {text.get_text(): text for text in axes.texts}
+    assert {"0.2", "0.4", "0.6", "0.8"} <= labels.keys()
+    boxes = [labels[name].get_window_extent() for name in ("0.8", "0.6", "0.4", "0.2")]
+    assert not any(left.overlaps(right) for left, right in itertools.pairwise(boxes))
+
+
+def test_labels_of_a_damping_grid_that_would_hide_each_other_are_left_out(slow) -> None:
+    _, observer = slow.linear
+    flat = observer.Az * 0.0 - np.diag(np.linspace(400.0, 2000.0, len(observer.Az)))
+    flat[0, 1], flat[1, 0] = 3.0, -3.0
+    flat[1, 1] = flat[0, 0]
+    axes = plot_poles(slow.replace(observer=type(observer)(**{**observer.as_dict(), "Az": flat})))
+    boxes = [text.get_window_extent() for text in axes.texts if text.get_text() in ("0.2", "0.4", "0.6", "0.8")]
+    assert len(boxes) < 4
+    assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
 
 
 def test_the_region_asked_for_is_shaded_where_it_is(slow) -> None:

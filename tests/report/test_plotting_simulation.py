@@ -14,6 +14,7 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 
 import obsynth
+from obsynth.errors import SpecError
 from obsynth.plotting import plot_detection, plot_simulation
 from obsynth.specs.loader import load_spec
 
@@ -97,3 +98,12 @@ def test_a_recursive_simulation_with_its_decision() -> None:
     assert line(panels[1], f"alarm at {decision.alarm.k} s: theta").get_ydata()[0] == decision.alarm.value
     _, grid = plt.subplots(1, 1)
     assert plot_simulation(simulation, axes=[grid]) == [grid]
+
+
+def test_a_simulation_in_which_nothing_is_estimated_is_no_empty_picture() -> None:
+    plant = obsynth.DescriptorSystem(A=[[0.5]], C=[[1.0]], dt=1.0, sensor_noise={"y1": 0.1})
+    simulation = obsynth.simulate(obsynth.descriptor_kalman(plant), obsynth.Scenario(horizon=5))
+    with pytest.raises(SpecError, match="plot_residuals"):
+        plot_simulation(simulation)
+    with pytest.raises(SpecError, match=r"or simulation\.estimates"):
+        obsynth.plotting.plot_states(simulation)

@@ -76,7 +76,7 @@ _WORDS: Mapping[str, str] = {
     "Monitor": "what obsynth.online_monitor returns",
     "DataRun": "what obsynth.run_on_data returns",
     "Simulation": "what obsynth.simulate returns for a design",
-    "Estimates": "the Estimates of a whole run, such as observer.run(y, u)",
+    "Estimates": "the Estimates of a whole run, such as observer.run(y, u), or simulation.estimates",
     "Detection": "what a monitor's watch returns",
     "Decision": "what obsynth.decide returns",
     "ToleranceStudy": "what obsynth.tolerance_study returns",

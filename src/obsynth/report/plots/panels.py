@@ -53,6 +53,9 @@ THRESHOLD_STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#00695C", "linewidth": 1.6, "linestyle": ":"},
 )
 
+#: A line in a legend is this wide at least.
+LEGEND_LINE = 1.2
+
 #: A ring where something happens.
 MARK_STYLE: dict[str, Any] = {
     "markersize": 9,
@@ -212,7 +215,7 @@ def legend_above(panel: Axes) -> None:
     columns = max(len(labels), 1)
     while columns > 1 and _letters(labels, columns) > inches * LETTERS_PER_INCH:
         columns -= 1
-    panel.legend(
+    legend = panel.legend(
         loc="lower left",
         bbox_to_anchor=(0.0, 1.0),
         ncols=columns,
@@ -222,6 +225,10 @@ def legend_above(panel: Axes) -> None:
         columnspacing=1.4,
         handlelength=2.4,
     )
+    for handle in legend.get_lines():
+        # Thin and pale lines that are many fill a band; alone in a legend they could not be seen.
+        if handle.get_linestyle() != "None":
+            handle.set(alpha=1.0, linewidth=max(float(handle.get_linewidth()), LEGEND_LINE))
     names_as_they_are(panel)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from obsynth.errors import SpecError
 from obsynth.numerics.arguments import arguments_checked
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.detection import Decision, Detection
@@ -148,7 +149,7 @@ def plot_simulation(
     Raises
     ------
     SpecError
-        There are too few or too many axes.
+        There are too few or too many axes, or nothing to draw: no fault is estimated and no monitor given.
 
     Examples
     --------
@@ -164,6 +165,12 @@ def plot_simulation(
     """
     dt = float(simulation.time[1]) if len(simulation.time) > 1 else 1.0
     count = len(simulation.estimates.fault_names)
+    if not count + len(detections):
+        raise SpecError(
+            "The simulated design estimates no faults: give what its monitor saw, detections=[...], or draw "
+            "plot_residuals(simulation.estimates) or plot_states(simulation.estimates).",
+            path="simulation",
+        )
     panels = new_panels(axes, count + len(detections))
     true = simulation.faults[:, list(simulation.fault_columns)]
     if simulation.estimates.has_deviations:

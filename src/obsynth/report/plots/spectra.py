@@ -60,6 +60,9 @@ DAMPING_RATIOS = (0.2, 0.4, 0.6, 0.8)
 RATES = np.concatenate([[0.0], np.geomspace(1e-9, 1e9, 400)])
 RATES_PER_SAMPLE = np.linspace(0.0, np.pi, 200)
 
+#: Labels of that grid closer than this share of the axes would hide each other.
+LABELS_APART = 0.04
+
 #: Ticks of a logarithmic axis on both sides of zero.
 MOST_DECADE_TICKS = 7
 
@@ -137,7 +140,9 @@ def _continuous_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> N
         sizes = np.abs(values)
         alive = sizes[sizes > np.finfo(np.float64).eps * np.max(np.abs(shown), initial=0.0)]
         if not alive.size:
-            limits(-1.0, 1.0)
+            # As wide as the other axis: a damping grid in a flat picture would be one line.
+            reach = 0.5 * float(np.max(np.abs(shown), initial=0.0)) or 1.0
+            limits(-reach, reach)
         elif alive.max() > WIDE_RATES * alive.min():
             scale("symlog", linthresh=float(alive.min()))
             axis = axes.xaxis if scale == axes.set_xscale else axes.yaxis
@@ -156,6 +161,7 @@ def _continuous_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> N
 def _damping_grid(axes: Axes, *, sampled: bool) -> None:
     """Draw where poles have the same damping ratio, each line with its ratio, within the limits of the axes."""
     limits = axes.get_xlim(), axes.get_ylim()
+    labelled: list[FloatArray] = []
     for ratio in DAMPING_RATIOS:
         pole = -ratio + 1j * np.sqrt(1.0 - ratio**2)
         line = np.exp(RATES_PER_SAMPLE / pole.imag * pole) if sampled else RATES * pole
@@ -164,6 +170,10 @@ def _damping_grid(axes: Axes, *, sampled: bool) -> None:
         inside = (line.real > limits[0][0]) & (line.real < limits[0][1]) & (line.imag < limits[1][1])
         if inside.any():
             place = line[np.flatnonzero(inside)[len(line) // 3 if sampled else -1]]
+            at = axes.transAxes.inverted().transform(axes.transData.transform((place.real, place.imag)))
+            if any(np.abs(at - other).max() < LABELS_APART for other in labelled):
+                continue
+            labelled.append(at)
             axes.annotate(f"{ratio:g}", (place.real, place.imag), color="0.45", fontsize=7, ha="right", va="top")
     axes.set_xlim(*limits[0])
     axes.set_ylim(*limits[1])
