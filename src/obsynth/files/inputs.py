@@ -84,9 +84,9 @@ def _protect(file: Path | int, name: Path) -> None:
     if inputs is None:
         return
     with suppress(OSError, ValueError):
-        found = os.stat(file)
-        if stat.S_ISREG(found.st_mode):
-            inputs[found.st_dev, found.st_ino] = name
+        status = os.stat(file)
+        if stat.S_ISREG(status.st_mode):
+            inputs[status.st_dev, status.st_ino] = name
 
 
 def protected_as(path: Path) -> Path | None:
@@ -95,10 +95,10 @@ def protected_as(path: Path) -> Path | None:
     if not inputs:
         return None
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except (OSError, ValueError):
         return None
-    return inputs.get((found.st_dev, found.st_ino))
+    return inputs.get((status.st_dev, status.st_ino))
 
 
 def special_kind(path: Path) -> str | None:
@@ -171,12 +171,12 @@ def read_json(
             json.dumps(document, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
         if path.suffix.lower() in (".yaml", ".yml"):
-            told = f"{path} is a spec, not a file that obsynth wrote. Run `obsynth design --system {path}` first."
+            problem = f"{path} is a spec, not a file that obsynth wrote. Run `obsynth design --system {path}` first."
         elif path.suffix.lower() == ".csv":
-            told = f"{path} is a table, not a file that obsynth wrote (JSON)."
+            problem = f"{path} is a table, not a file that obsynth wrote (JSON)."
         else:
-            told = f"{path} is not a JSON document ({error})."
-        raise SpecError(told, path=place) from error
+            problem = f"{path} is not a JSON document ({error})."
+        raise SpecError(problem, path=place) from error
     return document
 
 
@@ -196,12 +196,12 @@ def _ranged_int(text: str) -> int:
 
 
 def _distinct_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
+    mapping = dict(pairs)
+    if len(mapping) != len(pairs):
         keys = [key for key, _ in pairs]
         repeated = next(key for key in keys if keys.count(key) > 1)
         raise ValueError(f"the key {repeated!r} is there twice")
-    return found
+    return mapping
 
 
 def reason(error: BaseException) -> str:

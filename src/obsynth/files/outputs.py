@@ -77,10 +77,10 @@ def check_output(path: str | Path, *, option: str = "") -> Path:
     """Return where to write; refuse a hopeless place, and any file that the running command has read."""
     target = path_of(path)
     where = str(target)
-    wanted = f"give the name of a file{f' to {option}' if option else ''}"
+    advice = f"give the name of a file{f' to {option}' if option else ''}"
     try:
         if target.is_dir():
-            raise SpecError(f"{target} is a folder: {wanted}.", path=where)
+            raise SpecError(f"{target} is a folder: {advice}.", path=where)
         folder = _followed(target).parent
         if not folder.is_dir():
             raise SpecError(f"The folder {folder} does not exist: {target} cannot be written.", path=where)
@@ -93,7 +93,7 @@ def check_output(path: str | Path, *, option: str = "") -> Path:
     except (OSError, ValueError) as error:
         raise SpecError(f"{target} cannot be written: {reason(error)}.", path=where) from error
     if special is not None:
-        raise SpecError(f"{target} is {special}: {wanted}.", path=where)
+        raise SpecError(f"{target} is {special}: {advice}.", path=where)
     read = protected_as(target)
     if read is not None:
         also = "" if str(read) == where else f", as {read}"
@@ -112,27 +112,27 @@ def check_replaceable(target: Path, kind: FileKind | None) -> None:
         if not os.access(target, os.W_OK):
             raise SpecError(f"{target} is read-only: {advice}.", path=str(target))
         if kind is None or not kind.recognises(target):
-            found = "exists" if kind is None else f"exists and is not {kind.name}"
-            raise SpecError(f"{target} {found}: {advice}.", path=str(target))
+            problem = "exists" if kind is None else f"exists and is not {kind.name}"
+            raise SpecError(f"{target} {problem}: {advice}.", path=str(target))
     except OSError as error:
         raise SpecError(f"{target} cannot be read ({reason(error)}): {advice}.", path=str(target)) from error
 
 
 def require_distinct(files: Mapping[str, str | Path | None]) -> None:
     """Raise `SpecError` if two of the files are the same, links followed; they are given by what they are for."""
-    seen: dict[object, str] = {}
+    owners: dict[object, str] = {}
     for name, file in files.items():
         if file is None:
             continue
         path = Path(file)
         try:
-            found = os.stat(path)
-            keys: set[object] = {(found.st_dev, found.st_ino), os.path.realpath(path)}
+            status = os.stat(path)
+            keys: set[object] = {(status.st_dev, status.st_ino), os.path.realpath(path)}
         except (OSError, ValueError):
             keys = {os.path.realpath(path)} if "\0" not in str(path) else set()
         for key in keys:
-            if seen.setdefault(key, name) != name:
-                raise SpecError(f"{name} and {seen[key]} are the same file {path}: give another one.", path=str(path))
+            if owners.setdefault(key, name) != name:
+                raise SpecError(f"{name} and {owners[key]} are the same file {path}: give another one.", path=str(path))
 
 
 @contextmanager
@@ -216,10 +216,10 @@ def _locked_part(place: Path, stack: ExitStack) -> tuple[int, str]:
         if locks is None:
             return handle, temporary
         # Who writes may close the file and open it again by its name.
-        kept = os.dup(handle)
-        stack.callback(os.close, kept)
+        lock = os.dup(handle)
+        stack.callback(os.close, lock)
         with suppress(OSError):  # not every file system has locks
-            locks.flock(kept, locks.LOCK_EX)
+            locks.flock(lock, locks.LOCK_EX)
         if os.path.exists(temporary):
             return handle, temporary
         os.close(handle)  # another process took it for a file that was left
@@ -268,17 +268,17 @@ def _undone_on_failure(target: Path) -> Iterator[None]:
     """Bring back what stood at ``target``, or nothing, if what follows fails."""
     place = _followed(target)
     with ExitStack() as stack:
-        kept = None
+        old = None
         if place.exists():
-            kept = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=place.parent, prefix=".obsynth-"))) / "old"
-            shutil.copy2(place, kept)
+            old = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=place.parent, prefix=".obsynth-"))) / "old"
+            shutil.copy2(place, old)
         try:
             yield
         except BaseException:
-            if kept is None:
+            if old is None:
                 place.unlink(missing_ok=True)
             else:
-                os.replace(kept, place)
+                os.replace(old, place)
             raise
 
 

@@ -60,12 +60,12 @@ def _end(number: int, _: FrameType | None) -> NoReturn:
 
 
 @contextmanager
-def _handlers(wanted: dict[Any, Any]) -> Iterator[None]:
+def _handlers(handlers: dict[Any, Any]) -> Iterator[None]:
     """Set handlers, and the ones from before afterwards; only the main thread may."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, handler) for number, handler in wanted.items()}
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield
     finally:

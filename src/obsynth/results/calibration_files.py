@@ -33,38 +33,38 @@ def calibration_text(data: Mapping[str, Any]) -> str:
 
 def _calibration_in(path: Path, where: str = "") -> dict[str, Any]:
     """Return the content of a calibration file of this version, whatever its digest; `SpecError` for any other."""
-    found, name = read_json(path, where=where or None), path.name
-    if not isinstance(found, dict) or found.get("kind") != CALIBRATION_KIND:
+    content, name = read_json(path, where=where or None), path.name
+    if not isinstance(content, dict) or content.get("kind") != CALIBRATION_KIND:
         raise SpecError(f"{name} is no calibration: write one by obsynth calibrate --out {name}.", path=where or name)
-    version = found.get("schema_version")
+    version = content.get("schema_version")
     if version != CALIBRATION_VERSION:
         raise SpecError(
             f"{name} has the schema version {version!r}, and this obsynth reads {CALIBRATION_VERSION}: calibrate again "
             f"(obsynth calibrate --out {name}).",
             path=where or name,
         )
-    return found
+    return content
 
 
 def read_calibration(path: Path, *, where: str = "") -> dict[str, Any]:
     """Return the content of a calibration file whose digest is right; raise `SpecError` for any other."""
-    found, name = _calibration_in(path, where), path.name
-    if "sha256" not in found:
+    content, name = _calibration_in(path, where), path.name
+    if "sha256" not in content:
         raise SpecError(
             f"{name} holds no digest of itself, as files of older versions: calibrate again (obsynth "
             f"calibrate --out {name}).",
             path=where or name,
         )
-    if not _intact(found):
+    if not _intact(content):
         raise SpecError(f"{name} was changed after it was written: its digest does not match.", path=where or name)
-    wrong = _misfits(found)
+    wrong = _misfits(content)
     if wrong:
         raise SpecError(f"{name} is damaged: {', '.join(wrong)}. Calibrate again.", path=where or name)
-    return found
+    return content
 
 
-def _intact(found: Mapping[str, Any]) -> bool:
-    return bool(found.get("sha256") == digest_of({key: value for key, value in found.items() if key != "sha256"}))
+def _intact(content: Mapping[str, Any]) -> bool:
+    return bool(content.get("sha256") == digest_of({key: value for key, value in content.items() if key != "sha256"}))
 
 
 def verify_calibration(path: str | Path, again: Mapping[str, Any] | None = None) -> VerificationReport:
@@ -87,19 +87,19 @@ def verify_calibration(path: str | Path, again: Mapping[str, Any] | None = None)
     SpecError
         The file is no calibration.
     """
-    found = _calibration_in(Path(path))
+    content = _calibration_in(Path(path))
     rows = [
-        nothing_wrong("digest", "the file is as it was written", [] if _intact(found) else ["sha256"], source=_SOURCE)
+        nothing_wrong("digest", "the file is as it was written", [] if _intact(content) else ["sha256"], source=_SOURCE)
     ]
     rows.append(
         nothing_wrong(
             "box",
             "ranges are finite, hold their nominal values, and the level is a probability, of a log that is named",
-            _misfits(found),
+            _misfits(content),
             source=_SOURCE,
         )
     )
-    log = found.get("log") if isinstance(found.get("log"), dict) else {}
+    log = content.get("log") if isinstance(content.get("log"), dict) else {}
     cited = str(log.get("digest", "")) if isinstance(log, dict) else ""
     if again is None:
         rows.append(
@@ -125,26 +125,26 @@ def verify_calibration(path: str | Path, again: Mapping[str, Any] | None = None)
             nothing_wrong(
                 "ranges",
                 "the same calibration gives the same constants, ranges and level",
-                _differences(found, again),
+                _differences(content, again),
                 source=_SOURCE,
             )
         )
     return VerificationReport.of(rows)
 
 
-def _differences(found: Mapping[str, Any], again: Mapping[str, Any]) -> list[str]:
+def _differences(content: Mapping[str, Any], again: Mapping[str, Any]) -> list[str]:
     """Return what differs from the same calibration done again."""
-    one, two = found.get("constants"), again["constants"]
-    if not isinstance(one, dict) or one.keys() != two.keys():
+    stored, expected = content.get("constants"), again["constants"]
+    if not isinstance(stored, dict) or stored.keys() != expected.keys():
         return ["names"]
-    wrong = [] if found.get("level") == again["level"] else ["level"]
-    return wrong + [name for name, item in two.items() if not _same_range(one[name], item)]
+    wrong = [] if content.get("level") == again["level"] else ["level"]
+    return wrong + [name for name, item in expected.items() if not _same_range(stored[name], item)]
 
 
-def _same_range(one: Any, item: Mapping[str, Any]) -> bool:
+def _same_range(stored: Any, item: Mapping[str, Any]) -> bool:
     """Whether a constant of a file is that of the calibration done again; what is malformed is not."""
-    stated, (low, high) = _stated_range(one), item["range"]
-    if not stated or any(one.get(key) != item[key] for key in ("open", "unit")):
+    stated, (low, high) = _stated_range(stored), item["range"]
+    if not stated or any(stored.get(key) != item[key] for key in ("open", "unit")):
         return False
     slack = SAME_WIDTH * (high - low)
     return all(abs(a - b) <= slack for a, b in zip(stated, (low, item["nominal"], high), strict=True))
@@ -161,13 +161,13 @@ def _stated_range(item: Any) -> list[float]:
     return stated if all(map(is_finite_number, stated)) else []
 
 
-def _misfits(found: Mapping[str, Any]) -> list[str]:
-    level = found.get("level")
+def _misfits(content: Mapping[str, Any]) -> list[str]:
+    level = content.get("level")
     wrong = [] if is_finite_number(level) and 0.0 < float(level or 0.0) < 1.0 else ["level"]
-    log = found.get("log")
+    log = content.get("log")
     wrong += [] if isinstance(log, dict) and isinstance(log.get("digest"), str) else ["log"]
-    wrong += [] if isinstance(found.get("stands"), bool) else ["stands"]
-    constants = found.get("constants")
+    wrong += [] if isinstance(content.get("stands"), bool) else ["stands"]
+    constants = content.get("constants")
     if not isinstance(constants, dict):
         return [*wrong, "constants"]
     stated = {str(name): _stated_range(item) for name, item in constants.items()}
@@ -176,10 +176,10 @@ def _misfits(found: Mapping[str, Any]) -> list[str]:
 
 def box_row(box: Any, path: Path) -> Check:
     """Return the row that a calibrated box is that of a calibration file."""
-    found = read_calibration(path)
-    constants = found["constants"]
-    wrong = [] if box.calibration == found["sha256"] else ["digest of the calibration"]
-    wrong += [] if box.digest == found["log"]["digest"] and box.level == found["level"] else ["log or level"]
+    content = read_calibration(path)
+    constants = content["constants"]
+    wrong = [] if box.calibration == content["sha256"] else ["digest of the calibration"]
+    wrong += [] if box.digest == content["log"]["digest"] and box.level == content["level"] else ["log or level"]
     for name in box.calibrated or box.constants:
         item, stated = box.constants.get(name), constants.get(name)
         if (

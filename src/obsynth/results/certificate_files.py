@@ -83,31 +83,31 @@ def result_text(
     log: Mapping[str, Any] | None = None,
 ) -> str:
     """Return the certificate of a result: what was asked, the figures, the sentence, and every gain set inside."""
-    told = plain({"statement": statement, "asked": asked, "result": result, "log": log})
+    body = plain({"statement": statement, "asked": asked, "result": result, "log": log})
     inside = {name: design_as_dict(design) for name, design in designs.items()}
-    return sealed(kind, RESULT_VERSION, {**told, "gain_sets": inside})
+    return sealed(kind, RESULT_VERSION, {**body, "gain_sets": inside})
 
 
-def differences(stored: Any, found: Any, where: str = "") -> list[str]:
+def differences(stored: Any, again: Any, where: str = "") -> list[str]:
     """Return the places at which two results differ, numbers by more than rounding."""
-    if isinstance(found, Mapping):
-        if not isinstance(stored, Mapping) or stored.keys() != found.keys():
+    if isinstance(again, Mapping):
+        if not isinstance(stored, Mapping) or stored.keys() != again.keys():
             return [where or "names"]
-        items = [(str(name), stored[name], found[name]) for name in found]
-    elif isinstance(found, (list, tuple)):
-        if not isinstance(stored, (list, tuple)) or len(stored) != len(found):
+        items = [(str(name), stored[name], again[name]) for name in again]
+    elif isinstance(again, (list, tuple)):
+        if not isinstance(stored, (list, tuple)) or len(stored) != len(again):
             return [where]
-        items = [(str(i + 1), one, other) for i, (one, other) in enumerate(zip(stored, found, strict=True))]
+        items = [(str(i + 1), before, after) for i, (before, after) in enumerate(zip(stored, again, strict=True))]
     else:
-        return [] if _same_figure(stored, found, 0.0) else [where]
-    numbers = [abs(float(other)) for _, _, other in items if _is_figure(other)]
+        return [] if _same_figure(stored, again, 0.0) else [where]
+    numbers = [abs(float(after)) for _, _, after in items if _is_figure(after)]
     rounding = FIGURE_ROUNDING_SHARE * max((size for size in numbers if size < float("inf")), default=0.0)
     wrong = []
-    for name, one, other in items:
+    for name, before, after in items:
         place = f"{where}, {name}" if where else name
-        if not _is_figure(other):
-            wrong += differences(one, other, place)
-        elif not _same_figure(one, other, rounding):
+        if not _is_figure(after):
+            wrong += differences(before, after, place)
+        elif not _same_figure(before, after, rounding):
             wrong.append(place)
     return wrong
 
@@ -116,27 +116,27 @@ def _is_figure(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _same_figure(one: Any, other: Any, rounding: float) -> bool:
-    if not (_is_figure(one) and _is_figure(other)):
-        return bool(type(one) is type(other) and one == other)
-    if one == other or (one != one and other != other):
+def _same_figure(before: Any, after: Any, rounding: float) -> bool:
+    if not (_is_figure(before) and _is_figure(after)):
+        return bool(type(before) is type(after) and before == after)
+    if before == after or (before != before and after != after):
         return True
-    if not (np.isfinite(one) and np.isfinite(other)):
+    if not (np.isfinite(before) and np.isfinite(after)):
         return False
-    return bool(abs(one - other) <= max(SAME_FIGURE * abs(other), rounding))
+    return bool(abs(before - after) <= max(SAME_FIGURE * abs(after), rounding))
 
 
 def body_of(body: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a certificate of a result holds beside its gain sets, as it was before it was written."""
-    found: dict[str, Any] = restored({name: value for name, value in body.items() if name != "gain_sets"})
-    return found
+    content: dict[str, Any] = restored({name: value for name, value in body.items() if name != "gain_sets"})
+    return content
 
 
 def kind_of_file(path: Path) -> str:
     """Return what a file that obsynth wrote says it is; empty where it says nothing."""
     try:
         with path.open("rb") as stream:
-            found = re.match(rb'\s*\{\s*"kind":\s*"([a-z ]+)"', stream.read(_CERTIFICATE_HEAD_BYTES))
+            match = re.match(rb'\s*\{\s*"kind":\s*"([a-z ]+)"', stream.read(_CERTIFICATE_HEAD_BYTES))
     except (OSError, ValueError):  # there is no such file, or no file can have this name
         return ""
-    return "" if found is None else found.group(1).decode()
+    return "" if match is None else match.group(1).decode()

@@ -132,14 +132,14 @@ def _body_of(design: Any) -> dict[str, Any]:
 
 def types_of(kind: str | None) -> tuple[Any, Any]:
     """Return the types of plant and observer of a kind."""
-    others: dict[str | None, tuple[Any, Any]] = {
+    types: dict[str | None, tuple[Any, Any]] = {
         "recursive": (TimeVaryingDescriptorSystem, RecursiveObserver),
         "window": (TimeVaryingDescriptorSystem, WindowObserver),
         "dae": (DAEModel, DAEObserver),
         "scheduled": (PolytopicSystem, ScheduledObserver),
         "region": (DAEModel, RegionObserver),
     }
-    return others.get(kind, (DescriptorSystem, LinearObserver))
+    return types.get(kind, (DescriptorSystem, LinearObserver))
 
 
 def _fields_of(record: StateRecovery) -> dict[str, Any]:

@@ -55,8 +55,8 @@ def written_for(gains: Path) -> str | None:
     if not gains.is_file():  # a pipe would keep us waiting
         return None
     with gains.open("rb") as stream:
-        found = re.search(rb'"written_for":\s*"([0-9a-f]+)"', stream.read(_HEAD_BYTES))
-    return None if found is None else found.group(1).decode()
+        match = re.search(rb'"written_for":\s*"([0-9a-f]+)"', stream.read(_HEAD_BYTES))
+    return None if match is None else match.group(1).decode()
 
 
 @arguments_checked
@@ -189,18 +189,18 @@ def _recovery_from(plant: Any, data: dict[str, Any]) -> StateRecovery:
         if operator.dynamic.shape[0] != len(names):
             raise SpecError(f"it has {len(names)} names for {operator.dynamic.shape[0]} states")
         return StateRecovery.from_operator(names, operator, data["noise_kept"], data["operating_point"])
-    found = StateRecovery(**{**data, "names": names})
+    recovery = StateRecovery(**{**data, "names": names})
     columns = {"state": plant.nx, "input": plant.nu}
     # A plant that changes with k has parameters and Q instead.
     if isinstance(plant, DescriptorSystem):
         columns |= {"fault": plant.nf, "disturbance": plant.nd, "noise": plant.nw}
     for signal, count in columns.items():
-        rows, own = getattr(found, f"from_{signal}").shape
+        rows, own = getattr(recovery, f"from_{signal}").shape
         if (rows, own) != (len(names), count):
             raise SpecError(f"from_{signal} is {rows} by {own}, but {len(names)} by {count} is needed")
-    if "noise" in columns and found.noise_kept.shape[1] != plant.nw:
-        raise SpecError(f"noise_kept has {found.noise_kept.shape[1]} columns, but {plant.nw} are needed")
-    return found
+    if "noise" in columns and recovery.noise_kept.shape[1] != plant.nw:
+        raise SpecError(f"noise_kept has {recovery.noise_kept.shape[1]} columns, but {plant.nw} are needed")
+    return recovery
 
 
 def _design_from(data: dict[str, Any]) -> ObserverDesign:
@@ -246,12 +246,12 @@ def _checked_parts(body: Any) -> dict[str, Any]:
     """Return the content of a gain set if it has every part, each of its type; raise `SpecError` for the first."""
     if not isinstance(body, dict):
         raise SpecError("it holds no design")
-    for name, (wanted, fits) in _TYPES.items():
+    for name, (expected, fits) in _TYPES.items():
         if name not in body:
             raise SpecError(f"{name!r} is missing")
         if not fits(body[name]):
-            shown = f"{name} is {body[name]!r}, not" if name in ("name", "method") else f"its {name} must be"
-            raise SpecError(f"{shown} {wanted}")
+            subject = f"{name} is {body[name]!r}, not" if name in ("name", "method") else f"its {name} must be"
+            raise SpecError(f"{subject} {expected}")
     return body
 
 

@@ -91,19 +91,19 @@ def duration(seconds: float, *, digits: int = 3) -> str:
 def complex_numbers(values: Iterable[complex]) -> str:
     """Return several values as text, largest first; conjugate pairs once, as ``a +- bj``; long lists are cut."""
     waiting = sorted((complex(value) for value in values), key=lambda value: (-abs(value), -value.real, -value.imag))
-    shown: list[str] = []
+    texts: list[str] = []
     while waiting:
         value = waiting.pop(0)
         partner = next((w for w in waiting if abs(w - value.conjugate()) <= SAME_NUMBER * max(1.0, abs(value))), None)
         real, size = number(value.real), number(abs(value.imag))
         if value.imag == 0.0:
-            shown.append(real)
+            texts.append(real)
         elif partner is None:
-            shown.append(f"{real} {'+' if value.imag > 0 else '-'} {size}j")
+            texts.append(f"{real} {'+' if value.imag > 0 else '-'} {size}j")
         else:
             waiting.remove(partner)
-            shown.append(f"{real} +- {size}j")
-    return name_list(shown, limit=MOST_LISTED_VALUES)
+            texts.append(f"{real} +- {size}j")
+    return name_list(texts, limit=MOST_LISTED_VALUES)
 
 
 def name_list(names: Sequence[str], *, limit: int = 6) -> str:
@@ -186,12 +186,12 @@ def _stacked(checks: Sequence[Check], width: int) -> Iterable[RenderableType]:
 
 def _grid(width: int, *, with_claim: bool) -> Table:
     grid = Table.grid(padding=(0, 1, 0, 0))
-    others = 3 * (_NUMBER_WIDTH + 1) + 8 + _KIND_WIDTH
+    fixed_width = 3 * (_NUMBER_WIDTH + 1) + 8 + _KIND_WIDTH
     if with_claim:
         grid.add_column(width=26, overflow="fold")
-        grid.add_column(width=max(width - others - 28, 20), overflow="fold")
+        grid.add_column(width=max(width - fixed_width - 28, 20), overflow="fold")
     else:
-        grid.add_column(width=max(width - others - 1, 16), overflow="fold")
+        grid.add_column(width=max(width - fixed_width - 1, 16), overflow="fold")
     for _ in range(3):
         grid.add_column(width=_NUMBER_WIDTH, justify="right", no_wrap=True)
     grid.add_column(width=7, no_wrap=True)
@@ -236,8 +236,8 @@ def verdict_line(checks: Sequence[Check]) -> Text:
     if not real:
         return Text("FAILS: the report is empty, so nothing is verified.", style="bold red")
     failed = [check.name for check in checks if not check.passed]
-    told = f"FAILS: {len(failed)} of {len(real)} checks do not hold: {', '.join(failed)}."
-    return Text(told, style="bold red")
+    text = f"FAILS: {len(failed)} of {len(real)} checks do not hold: {', '.join(failed)}."
+    return Text(text, style="bold red")
 
 
 def report_text(checks: Sequence[Check]) -> str:

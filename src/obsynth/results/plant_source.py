@@ -41,8 +41,8 @@ class PlantSource:
         values = self.plant.as_dict()
         values.pop("uncertainty", None)
         matrices = {name: _entries(value) for name, value in values.items() if isinstance(value, np.ndarray)}
-        others = {name: value for name, value in values.items() if name not in matrices}
-        return {"matrices": matrices, "signals": others, "sample_time": self.sample_time}
+        signals = {name: value for name, value in values.items() if name not in matrices}
+        return {"matrices": matrices, "signals": signals, "sample_time": self.sample_time}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> PlantSource:
@@ -63,9 +63,9 @@ def _entries(matrix: FloatArray) -> dict[str, Any]:
 
 
 def _matrix(entries: Mapping[str, Any]) -> FloatArray:
-    found = np.zeros([int(size) for size in entries["size"]])
-    found[np.array(entries["rows"], dtype=np.int64), np.array(entries["columns"], dtype=np.int64)] = entries["values"]
-    return found
+    matrix = np.zeros([int(size) for size in entries["size"]])
+    matrix[np.array(entries["rows"], dtype=np.int64), np.array(entries["columns"], dtype=np.int64)] = entries["values"]
+    return matrix
 
 
 def source_of(plant: Any) -> PlantSource | None:

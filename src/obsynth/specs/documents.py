@@ -134,8 +134,8 @@ def _quoted(error: Exception, text: str) -> str:
     number = str(mark.line + 1)
     line, column = lines[mark.line].expandtabs(1), mark.column
     start = max(column - SHOWN_COLUMNS // 2, 0) if len(line) > SHOWN_COLUMNS else 0
-    shown = line[start : start + SHOWN_COLUMNS]
-    return f"\n  {number} | {shown}\n  {' ' * len(number)} | {' ' * (column - start)}^"
+    excerpt = line[start : start + SHOWN_COLUMNS]
+    return f"\n  {number} | {excerpt}\n  {' ' * len(number)} | {' ' * (column - start)}^"
 
 
 def _one_line(error: Exception) -> str:
@@ -155,22 +155,22 @@ class DocumentProblems:
 
     source: Path
     what: str
-    found: list[tuple[str, str]] = field(default_factory=list)
+    noted: list[tuple[str, str]] = field(default_factory=list)
 
     def add(self, path: str, text: str) -> None:
         """Note that ``text`` is wrong at ``path``."""
-        if (path, text) not in self.found:
-            self.found.append((path, text))
+        if (path, text) not in self.noted:
+            self.noted.append((path, text))
 
     def raise_if_any(self) -> None:
         """Raise one `SpecError` with everything noted, if anything was."""
-        if not self.found:
+        if not self.noted:
             return
-        lines = [f"{path}: {text}" if path else text for path, text in self.found]
+        lines = [f"{path}: {text}" if path else text for path, text in self.noted]
         if len(lines) > MAXIMUM_PROBLEMS:
             lines = [*lines[:MAXIMUM_PROBLEMS], f"and {len(lines) - MAXIMUM_PROBLEMS} more"]
         head = f"{self.source} is not a valid {self.what}:"
-        raise SpecError(head, path=self.found[0][0] or str(self.source), problems=lines)
+        raise SpecError(head, path=self.noted[0][0] or str(self.source), problems=lines)
 
 
 def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocument, dict[str, Any]]:
@@ -214,26 +214,26 @@ def _checked_sections(document: Mapping[str, Any], problems: DocumentProblems) -
             sections[name] = _validated(section_of(name, value), value, problems, prefix=name)
     # As if all had been checked at once: in the order of the keys of a spec, unknown ones last.
     order = list(SpecDocument.model_fields)
-    problems.found.sort(key=lambda problem: (*order, key := problem[0].partition(".")[0]).index(key))
+    problems.noted.sort(key=lambda problem: (*order, key := problem[0].partition(".")[0]).index(key))
     if checked is None or None in sections.values():
         return None
     return checked.model_copy(update=sections)
 
 
-def _options_of_any(given: dict[str, Any], source: Path) -> dict[str, Any]:
+def _options_of_any(raw_options: dict[str, Any], source: Path) -> dict[str, Any]:
     """Return options as the first method reads them that has them all; `auto` decides between those that do."""
     from obsynth.specs.schema_values import options_schema
 
-    if not given:
+    if not raw_options:
         return {}
     for method in REGISTRY:
         problems = DocumentProblems(source, what="spec")
-        found = _validated(options_schema(method), given, problems, prefix="method.options")
-        if not problems.found and found is not None:
-            return {name: getattr(found, name) for name in found.model_fields_set}
+        options = _validated(options_schema(method), raw_options, problems, prefix="method.options")
+        if not problems.noted and options is not None:
+            return {name: getattr(options, name) for name in options.model_fields_set}
     raise SpecError(
-        f"{source}: no single method has the options {', '.join(sorted(given))} with these values: name the method "
-        "that they are for.",
+        f"{source}: no single method has the options {', '.join(sorted(raw_options))} with these values: "
+        "name the method that they are for.",
         path="method.options",
     )
 
@@ -248,8 +248,8 @@ def checked_plant(document: Mapping[str, Any], source: Path) -> PlantSection | T
     known = plant_document(kind if kind in RARE_KINDS else None)
     checked: Any = _validated(known, document, problems)
     problems.raise_if_any()
-    found: PlantSection | TimeVaryingSection | DAESection = checked
-    return found
+    section: PlantSection | TimeVaryingSection | DAESection = checked
+    return section
 
 
 def _check_version(document: Mapping[str, Any], problems: DocumentProblems) -> None:
@@ -261,8 +261,8 @@ def _check_version(document: Mapping[str, Any], problems: DocumentProblems) -> N
         problems.add("", "This is a gain set: give the spec that it was made from.")
         problems.raise_if_any()
     if is_whole(version) and version != SPEC_VERSION:
-        told = f"version {version} is unknown; this obsynth reads version {SPEC_VERSION}."
-        problems.add("schema_version", told)
+        text = f"version {version} is unknown; this obsynth reads version {SPEC_VERSION}."
+        problems.add("schema_version", text)
         problems.raise_if_any()
 
 
@@ -280,25 +280,27 @@ def _validated(model: type[Model], document: Any, problems: DocumentProblems, *,
 def _of_likely_kinds(items: Sequence[Any], document: Any) -> list[Any]:
     """Return pydantic's errors without those of kinds that a value was not meant to be: of a value that may be of
     several, a number or a mapping, each kind adds its own errors, below a name of this kind that no document has."""
-    kept, groups = [], dict[tuple[Any, ...], dict[str, list[Any]]]()
+    likely_errors, groups = [], dict[tuple[Any, ...], dict[str, list[Any]]]()
     for item in items:
         loc = item["loc"]
         place = _kind_in(loc, document, item["type"])
         if place is None:
-            kept.append(item)
+            likely_errors.append(item)
         else:
             inner = {**item, "loc": (*loc[:place], *loc[place + 1 :])}
             groups.setdefault(loc[:place], {}).setdefault(str(loc[place]), []).append(inner)
     for path, kinds in groups.items():
-        whole = [_of_likely_kinds(found, document) for found in kinds.values()]
-        least = min(_strange(found, path) for found in whole)
-        likely = [found for found in whole if _strange(found, path) == least]
-        if len(likely) > 1 and all(len(found) == 1 for found in likely):
-            wanted = list(dict.fromkeys(_kind_wanted(found[0]) for found in likely))
-            kept.append({**likely[0][0], "loc": path, "type": "kinds", "ctx": {"wanted": ", or ".join(wanted)}})
+        by_kind = [_of_likely_kinds(errors, document) for errors in kinds.values()]
+        least = min(_strange(errors, path) for errors in by_kind)
+        likely = [errors for errors in by_kind if _strange(errors, path) == least]
+        if len(likely) > 1 and all(len(errors) == 1 for errors in likely):
+            kinds_wanted = list(dict.fromkeys(_kind_wanted(errors[0]) for errors in likely))
+            likely_errors.append(
+                {**likely[0][0], "loc": path, "type": "kinds", "ctx": {"wanted": ", or ".join(kinds_wanted)}}
+            )
         else:
-            kept.extend(likely[0])
-    return kept
+            likely_errors.extend(likely[0])
+    return likely_errors
 
 
 def _kind_in(loc: Sequence[Any], document: Any, problem: str) -> int | None:
@@ -359,10 +361,10 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
     elif kind == "string_pattern_mismatch":
         text = f"use letters, digits, '.', '_' and '-' only (at most 100), not {described(value)}."
     else:
-        wanted = "a list of numbers" if in_rows and kind in ("list_type", "too_short") else _wanted(kind, context)
-        wanted = "a list of rows, such as [[1, 0], [0, 1]]" if in_rows and not numbers else wanted
-        found = "an empty one" if kind in ("too_short", "string_too_short") else described(value)
-        text = f"must be {wanted}, not {found}."
+        expected = "a list of numbers" if in_rows and kind in ("list_type", "too_short") else _wanted(kind, context)
+        expected = "a list of rows, such as [[1, 0], [0, 1]]" if in_rows and not numbers else expected
+        actual = "an empty one" if kind in ("too_short", "string_too_short") else described(value)
+        text = f"must be {expected}, not {actual}."
     words = ("matrix", "row", "column") if in_stack else ("row", "column") if in_rows else ("entry",)
     place = ", ".join(f"{word} {number}" for word, number in zip(words, numbers, strict=False))
     return ".".join([*([prefix] if prefix else []), *names]), f"{place} {text}" if place else text

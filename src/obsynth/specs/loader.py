@@ -100,12 +100,12 @@ class Spec:
         if self.inputs is not None:
             hold = self.inputs["hold"] or _takes_inputs(self.plant)
             return int(self.inputs["delay"]) + (hold == "begins") - (own == "begins")
-        found = (self.calibrate or {}).get("input_delay")
-        if not isinstance(found, int):
+        delay = (self.calibrate or {}).get("input_delay")
+        if not isinstance(delay, int):
             return None
         # What a calibration of a nonlinear plant found is by the convention of that plant.
         sampled = isinstance(plant, DescriptorSystem) and plant.is_discrete and self.model is not None
-        return found - int(sampled)
+        return delay - int(sampled)
 
 
 def _takes_inputs(plant: Any) -> str:
@@ -190,7 +190,7 @@ def design_of_spec(
     from obsynth.methods.designing import design
 
     done, late = spec.transformation, spec.input_delay(spec.plant)
-    found = design(
+    designed = design(
         spec.plant,
         spec.method,
         name=name or spec.name,
@@ -200,7 +200,7 @@ def design_of_spec(
         **dict(spec.options),
     )
     notes = () if done is None else done.notes
-    return found.replace(notes=(*notes, *found.notes), input_delay=late or found.input_delay)
+    return designed.replace(notes=(*notes, *designed.notes), input_delay=late or designed.input_delay)
 
 
 def spec_of(
@@ -225,20 +225,20 @@ def spec_of(
     problems.raise_if_any()
     plant, transformation = built_plant(section, plant_source, prefix) if from_mat is None else from_mat, None
     # A plant may serve several methods: the spec's own transform takes the place of the plant's.
-    asked: tuple[TransformSection | None, Path, str] = (getattr(section, "transform", None), plant_source, prefix)
+    transform: tuple[TransformSection | None, Path, str] = (getattr(section, "transform", None), plant_source, prefix)
     if reference is not None and reference.transform is not None:
-        asked = (reference.transform, source, "plant")
+        transform = (reference.transform, source, "plant")
     model = plant if isinstance(plant, DAEModel) else None
     noise = noise_model_of(section)
     states = with_states and noise_needs_states(noise)
     if model is not None:
-        linear = _linearised(asked[0], model, section, plant_source.parent, noise if states else {}, *asked[1:])
+        linear = _linearised(transform[0], model, section, plant_source.parent, noise if states else {}, *transform[1:])
         if linear is None and with_states and (noise or section.process_noise):
             plant, options = _noisy_model(model, section, noise, checked.method.id, options, plant_source, prefix)
         plant = plant if linear is None else linear
-    elif asked[0] is not None and asked[0].linearise is not None:
+    elif transform[0] is not None and transform[0].linearise is not None:
         raise SpecError(
-            f"{asked[1]}: transform.linearise is for nonlinear plants (kind: dae): remove it.",
+            f"{transform[1]}: transform.linearise is for nonlinear plants (kind: dae): remove it.",
             path="plant.transform.linearise",
         )
     if isinstance(plant, DescriptorSystem):
@@ -246,9 +246,9 @@ def spec_of(
         if states and model is None:
             noisy, more = _placed_noise(plant, noise, plant_source, prefix)
             transformation, plant = noisy, noisy.plant
-        if asked[0] is not None or plant.delays:
+        if transform[0] is not None or plant.delays:
             with one_thread_if_small(plant.nx):
-                later = _transformed(asked[0], plant, *asked[1:])
+                later = _transformed(transform[0], plant, *transform[1:])
             if later is not None:
                 transformation = later if transformation is None else transformation.then(later)
         plant = plant if transformation is None else transformation.plant
@@ -318,27 +318,27 @@ def _noisy_model(
 ) -> tuple[DAEModel, dict[str, Any]]:
     """Return a nonlinear plant with states for its noise, and the options of its method with variances from it."""
     steps = {"integration": options["integration"]} if options.get("integration") == "radau" else {}
-    given = {"process_noise": section.process_noise, "dt": options.get("dt"), **steps}
-    made, more = _placed_noise(model, noise, source, prefix, **given)
+    arguments = {"process_noise": section.process_noise, "dt": options.get("dt"), **steps}
+    made, more = _placed_noise(model, noise, source, prefix, **arguments)
     return made, _with_options(options, more, method)
 
 
 def _with_options(options: Mapping[str, Any], more: Mapping[str, Any], method: str) -> dict[str, Any]:
     """Return options with others that the method has, where they are not given; of those by name, what is missing."""
     known = {field.name for field in fields(method_class(method))} if method in REGISTRY else set()
-    found = dict(options)
+    merged = dict(options)
     for name, value in more.items():
         if name not in known:
             continue
-        if name not in found:
-            found[name] = value
-        elif isinstance(value, dict) and isinstance(found[name], dict):
-            found[name] = {**value, **found[name]}
-    return found
+        if name not in merged:
+            merged[name] = value
+        elif isinstance(value, dict) and isinstance(merged[name], dict):
+            merged[name] = {**value, **merged[name]}
+    return merged
 
 
 def _linearised(
-    wanted: TransformSection | None,
+    transform: TransformSection | None,
     model: DAEModel,
     section: DAESection,
     folder: Path,
@@ -349,7 +349,7 @@ def _linearised(
     """Return the linear model of a nonlinear plant where a spec asks for one; ``folder``: of the plant's file."""
     constants, box = boxed_constants(section, folder)
     tolerances = {name: item for name, item in constants.items() if not isinstance(item, (int, float))}
-    if wanted is None:
+    if transform is None:
         if tolerances or section.variation is not None or section.box is not None:
             raise SpecError(
                 f"{source}: {joined(prefix, 'constants')}: tolerances are for the linear model of a nonlinear plant: "
@@ -358,7 +358,7 @@ def _linearised(
             )
         return None
     where = joined(prefix, "transform")
-    if wanted.linearise is None:
+    if transform.linearise is None:
         raise SpecError(
             f"{source}: {where} is for linear plants: say where this one is linearised, such as linearise: {{at: "
             "equilibrium}, or remove it.",
@@ -367,7 +367,7 @@ def _linearised(
     from obsynth.plants.transformations.entries_in_constants import box_of_model
     from obsynth.plants.transformations.linearisation import linearise
 
-    arguments = wanted.linearise.model_dump(exclude_none=True)
+    arguments = transform.linearise.model_dump(exclude_none=True)
     if noise:
         model, more = _placed_noise(model, noise, source, prefix, process_noise=section.process_noise)
     else:
@@ -383,43 +383,45 @@ def _linearised(
         )
     try:
         if tolerances:
-            given = arguments.get("given", {})
-            arguments["constants"] = box_of_model(model, tolerances, given, variation=section.variation, **box)
-        found: DescriptorSystem = linearise(model, **arguments)
-        return found
+            point = arguments.get("given", {})
+            arguments["constants"] = box_of_model(model, tolerances, point, variation=section.variation, **box)
+        linear: DescriptorSystem = linearise(model, **arguments)
+        return linear
     except SpecError as error:
         raise SpecError(f"{source}: {where}.linearise: {error}", path=f"{where}.linearise") from error
 
 
 def _transformed(
-    wanted: TransformSection | None, plant: DescriptorSystem, source: Path, prefix: str
+    transform: TransformSection | None, plant: DescriptorSystem, source: Path, prefix: str
 ) -> Transformation | None:
     """Return a plant without its algebraic states, sampled, or both, as asked; ``None`` where nothing is."""
     late = plant.is_discrete and bool(plant.delays)
-    if wanted is None or not (wanted.eliminate_algebraic_states or wanted.sample_time is not None or wanted.pade):
+    if transform is None or not (
+        transform.eliminate_algebraic_states or transform.sample_time is not None or transform.pade
+    ):
         return absorb_delays(plant) if late else None
     where = joined(prefix, "transform")
-    if wanted.sample_time is not None and plant.is_discrete:
+    if transform.sample_time is not None and plant.is_discrete:
         raise SpecError(
             f"{source}: {where}.sample_time is given, but the plant is discrete in time already "
             f"(dt = {plant.dt:g} s): remove it, or set dt to 0.",
             path=f"{where}.sample_time",
         )
 
-    if wanted.pade and (wanted.sample_time is not None or not plant.delays):
+    if transform.pade and (transform.sample_time is not None or not plant.delays):
         why = "the delays of a plant on samples are exact" if plant.delays else "the plant has no delays"
         raise SpecError(f"{source}: {where}.pade is given, but {why}: remove it.", path=f"{where}.pade")
     try:
         if late:
-            return absorb_delays(plant, wanted.pade)
-        if wanted.pade:
-            made = absorb_delays(plant, wanted.pade)
-            return eliminate_algebraic_states(made) if wanted.eliminate_algebraic_states else made
-        if wanted.sample_time is None:
+            return absorb_delays(plant, transform.pade)
+        if transform.pade:
+            made = absorb_delays(plant, transform.pade)
+            return eliminate_algebraic_states(made) if transform.eliminate_algebraic_states else made
+        if transform.sample_time is None:
             return eliminate_algebraic_states(plant)
-        if not wanted.eliminate_algebraic_states:
-            return discretise(plant, wanted.sample_time)
-        return discretise(eliminate_algebraic_states(plant), wanted.sample_time)
+        if not transform.eliminate_algebraic_states:
+            return discretise(plant, transform.sample_time)
+        return discretise(eliminate_algebraic_states(plant), transform.sample_time)
     except SpecError as error:
         raise SpecError(f"{source}: {where}: {error}", path=where) from error
 
@@ -428,12 +430,12 @@ def changed_document(document: Mapping[str, Any], changes: Mapping[str, Any]) ->
     """Return a document with values at dotted paths put in place of those there; mappings on the way are made."""
     changed = dict(document)
     for path, value in changes.items():
-        first, _, rest = path.partition(".")
-        if not rest:
+        first, _, below = path.partition(".")
+        if not below:
             changed[first] = value
             continue
         inner = changed.get(first)
         if inner is not None and not isinstance(inner, Mapping):
             raise SpecError(f"{path} cannot be set: {first} is no section with entries of its own.", path=path)
-        changed[first] = changed_document(inner or {}, {rest: value})
+        changed[first] = changed_document(inner or {}, {below: value})
     return changed

@@ -36,9 +36,9 @@ def read_matrix(path: Path, *, variable: str | None = None, where: str, keep_spa
     return _checked(_read_array(path, variable=variable, where=where, keep_sparse=keep_sparse), path.name, where)
 
 
-def _checked(given: Any, name: str, where: str) -> Any:
+def _checked(raw: Any, name: str, where: str) -> Any:
     try:
-        matrix = as_sparse_matrix(given, name) if is_sparse(given) else as_matrix(given, name)
+        matrix = as_sparse_matrix(raw, name) if is_sparse(raw) else as_matrix(raw, name)
     except SpecError as error:
         raise SpecError(str(error), path=where) from error
     if 0 in matrix.shape:
@@ -208,8 +208,8 @@ def _from_coordinates(tokens: list[str], size: tuple[int, int, int], field: str,
     # Entries that are given twice are added, as the format says.
     from scipy.sparse import coo_array
 
-    found = coo_array((values, (positions[0], positions[1])), shape=(rows, columns))
-    return found.tocsr() if sparse else found.toarray()
+    matrix = coo_array((values, (positions[0], positions[1])), shape=(rows, columns))
+    return matrix.tocsr() if sparse else matrix.toarray()
 
 
 def _both_triangles(positions: list[Any], values: FloatArray, symmetry: str) -> tuple[list[Any], FloatArray]:
@@ -257,6 +257,6 @@ def _whole(token: str, what: str) -> int:
     return int(token)
 
 
-def _require_count(found: int, expected: int) -> None:
-    if found != expected:
-        raise ValueError(f"it has {found} numbers after the sizes, but {expected} are needed")
+def _require_count(actual: int, expected: int) -> None:
+    if actual != expected:
+        raise ValueError(f"it has {actual} numbers after the sizes, but {expected} are needed")

@@ -111,7 +111,7 @@ def _read(
     section: Any,
     source: Path,
     prefix: str,
-    kept: Sequence[str],
+    plain: Sequence[str],
     matrices: Sequence[str],
     names: Sequence[str],
     *,
@@ -119,7 +119,7 @@ def _read(
 ) -> dict[str, Any]:
     """Return entries of a section by name: some as they are, matrices and lists of names with their files read."""
     problems = DocumentProblems(source, what="plant" if not prefix else "spec")
-    arguments: dict[str, Any] = {name: getattr(section, name) for name in kept}
+    arguments: dict[str, Any] = {name: getattr(section, name) for name in plain}
     for name in (*matrices, *names):
         value, where = getattr(section, name), joined(prefix, name)
         # A list without names is no matrix.
@@ -143,12 +143,12 @@ def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> Ti
 
 def noise_model_of(section: Any) -> dict[str, Any]:
     """Return what a section says of noise that needs states, as `with_noise` takes it; white noise of others too."""
-    found = {name: getattr(section, name, None) or {} for name in _NOISE_MODEL}
-    found["sensor_noise"] = {
+    noise = {name: getattr(section, name, None) or {} for name in _NOISE_MODEL}
+    noise["sensor_noise"] = {
         name: item if isinstance(item, (int, float)) else item.model_dump(exclude_none=True)
-        for name, item in found["sensor_noise"].items()
+        for name, item in noise["sensor_noise"].items()
     }
-    return {name: dict(value) for name, value in found.items() if value}
+    return {name: dict(value) for name, value in noise.items() if value}
 
 
 def noise_needs_states(noise: Mapping[str, Any]) -> bool:
@@ -164,10 +164,10 @@ def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel
     def made() -> DAEModel:
         units = arguments.get("units")
         for name, item in boxed_constants(section, source.parent)[0].items():
-            found = constant_of(name, item)
-            arguments["constants"][name] = found.nominal
-            if found.unit and units is not None:
-                units.setdefault(name, found.unit)
+            constant = constant_of(name, item)
+            arguments["constants"][name] = constant.nominal
+            if constant.unit and units is not None:
+                units.setdefault(name, constant.unit)
         return DAEModel(**arguments)
 
     return _placed(made, source, prefix)
@@ -186,19 +186,19 @@ def _polytopic_plant(section: PlantSection, source: Path, prefix: str) -> Polyto
         )
 
     def made() -> PolytopicSystem:
-        given = {name: value for name, value in arguments.items() if value is not None}
+        values = {name: value for name, value in arguments.items() if value is not None}
         for matrix, names in _SIGNAL_OF_PICK.items():
             if isinstance(arguments[matrix], list) and arguments[names] is None:
-                given[names] = arguments[matrix]
-        base = DescriptorSystem(**given)
+                values[names] = arguments[matrix]
+        base = DescriptorSystem(**values)
         for name, entries in (section.entries or {}).items():
             places = [_entry(base, name, item) for item in entries]
             rows = getattr(base, name).tolist()
             for row, column, text in places:
                 rows[row][column] = text
-            given[name] = rows
+            values[name] = rows
         scheduling = {name: item.model_dump(exclude_none=True) for name, item in (section.scheduling or {}).items()}
-        return PolytopicSystem(plant=given, scheduling=scheduling, constants=section.constants)
+        return PolytopicSystem(plant=values, scheduling=scheduling, constants=section.constants)
 
     return _placed(made, source, prefix)
 
@@ -256,7 +256,7 @@ def with_constants(plant: DescriptorSystem, section: PlantSection, folder: Path)
                 raise SpecError(f"{name} is for a plant with constants: give constants, or tolerance.", path=name)
         return plant
     constants, box = boxed_constants(section, folder)
-    entries = {name: [_entry(plant, name, item) for item in found] for name, found in (section.entries or {}).items()}
+    entries = {name: [_entry(plant, name, item) for item in items] for name, items in (section.entries or {}).items()}
     return with_expressions(plant, entries, constants, tolerance=section.tolerance, variation=section.variation, **box)
 
 
@@ -276,17 +276,17 @@ def boxed_constants(section: PlantSection | DAESection, folder: Path) -> tuple[d
         return constants, box
     if box:
         raise SpecError("box has a file, which says where it comes from: remove source, level and digest.", path="box")
-    found = read_calibration(folder / file, where="box.file")
-    if not found["stands"]:
-        raise SpecError(f"{file}: {does_not_stand(found['level'])}", path="box.file")
+    calibration = read_calibration(folder / file, where="box.file")
+    if not calibration["stands"]:
+        raise SpecError(f"{file}: {does_not_stand(calibration['level'])}", path="box.file")
     options = {
         "source": "calibrated",
-        "level": found["level"],
-        "digest": found["log"]["digest"],
-        "calibration": found["sha256"],
+        "level": calibration["level"],
+        "digest": calibration["log"]["digest"],
+        "calibration": calibration["sha256"],
     }
     calibrated = {}
-    for name, item in found["constants"].items():
+    for name, item in calibration["constants"].items():
         stated = constants.get(name)
         if isinstance(stated, dict) and ("range" in stated or "tolerance" in stated):
             raise SpecError(

@@ -31,9 +31,9 @@ def built_scenario(
     if section is None:
         return None
     problems = DocumentProblems(source, what="spec")
-    given: dict[str, Any] = {name: getattr(section, name) for name in section.model_fields_set}
+    arguments: dict[str, Any] = {name: getattr(section, name) for name in section.model_fields_set}
     for group in _SCENARIO_GROUPS:
-        given[group] = {
+        arguments[group] = {
             name: [
                 _profile(item, f"scenario.{group}.{name}", problems)
                 for item in (value if isinstance(value, list) else [value])
@@ -42,7 +42,7 @@ def built_scenario(
         }
     problems.raise_if_any()
     try:
-        scenario = Scenario(**given)
+        scenario = Scenario(**arguments)
         if isinstance(plant, (DescriptorSystem, PolytopicSystem)):
             scenario.check_names(plant)
             scenario.step_of(plant)
@@ -57,17 +57,17 @@ def built_scenario(
 def _profile(section: Any, where: str, problems: DocumentProblems) -> Profile | None:
     """Return the profile; note what is wrong with it."""
     kind = PROFILE_KINDS[section.kind]
-    given = {name: getattr(section, name) for name in section.model_fields_set - {"kind"}}
+    arguments = {name: getattr(section, name) for name in section.model_fields_set - {"kind"}}
     known = {field.name: field.default is MISSING for field in fields(kind)}
-    for name in sorted(given.keys() - known.keys()):
+    for name in sorted(arguments.keys() - known.keys()):
         problems.add(f"{where}.{name}", f"a {section.kind} has no {name}: it takes {', '.join(known)}.")
-    missing = [name for name, needed in known.items() if needed and name not in given]
+    missing = [name for name, needed in known.items() if needed and name not in arguments]
     for name in missing:
         problems.add(f"{where}.{name}", f"a {section.kind} needs this key.")
-    if missing or given.keys() - known.keys():
+    if missing or arguments.keys() - known.keys():
         return None
     try:
-        return kind(**given)
+        return kind(**arguments)
     except SpecError as error:
         problems.add(f"{where}.{error.path}", str(error))
         return None

@@ -97,7 +97,7 @@ class SpecDocument(Section):
 def section_of(name: str, value: Any) -> type[Section]:
     """Return the schema of one of `CHECKED_APART`."""
     if name == "plant":
-        given = value if isinstance(value, dict) else {}
-        kind = given.get("kind")
-        return PlantReference if "file" in given and kind not in RARE_KINDS else plant_section(kind)
+        keys = value if isinstance(value, dict) else {}
+        kind = keys.get("kind")
+        return PlantReference if "file" in keys and kind not in RARE_KINDS else plant_section(kind)
     return ScenarioSection if name == "scenario" else InputsSection if name == "inputs" else CalibrateSection

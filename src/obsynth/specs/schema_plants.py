@@ -160,17 +160,17 @@ class PlantSection(Section):
         known = isinstance(data, dict) and any(isinstance(data.get(name), dict) for name in ("constants", "scheduling"))
         if not isinstance(data, dict) or not known:
             return data
-        found, entries = dict(data), data.get("entries")
+        section, entries = dict(data), data.get("entries")
         entries = dict(entries) if isinstance(entries, dict) else entries
         for name in UNCERTAIN_MATRICES:
-            rows, texts = expressions_in(found.get(name))
+            rows, texts = expressions_in(section.get(name))
             if texts and (entries is None or isinstance(entries, dict)):
-                found[name] = rows
+                section[name] = rows
                 more = [{"row": i + 1, "column": j + 1, "value": text} for i, j, text in texts]
                 entries = {**(entries or {}), name: [*(entries or {}).get(name, []), *more]}
         if entries is not None:
-            found["entries"] = entries
-        return found
+            section["entries"] = entries
+        return section
 
 
 class PlantReference(Section):

@@ -73,10 +73,10 @@ _SECONDS = {
 
 def _in_seconds(value: Any) -> Any:
     """Return a text such as ``10 ms`` in seconds, anything else as it is."""
-    found = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
-    if found is None:
+    match = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
+    if match is None:
         return value
-    number, unit = found.groups()
+    number, unit = match.groups()
     if unit not in _SECONDS:
         raise PydanticCustomError("time", "must be a number of seconds, or a time in us, ms, s, min or h")
     times, over = _SECONDS[unit]
@@ -103,12 +103,12 @@ def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
         "row {row} has {found} entries, but row {first} has {expected}",
         {"row": ragged[0], "found": ragged[1], "first": listed[0][0], "expected": listed[0][1]},
     )
-    others: list[InitErrorDetails] = []
+    entry_problems: list[InitErrorDetails] = []
     own: Any = get_args(ErrorType)
     try:
         check_entries(rows)
     except ValidationError as error:
-        others = [
+        entry_problems = [
             InitErrorDetails(
                 # Kinds of our own are unknown to pydantic by name.
                 type=item["type"] if item["type"] in own else PydanticCustomError(item["type"], item["msg"]),
@@ -118,7 +118,7 @@ def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
             )
             for item in error.errors()
         ]
-    raise ValidationError.from_exception_data("matrix", [*others, InitErrorDetails(type=problem, input=None)])
+    raise ValidationError.from_exception_data("matrix", [*entry_problems, InitErrorDetails(type=problem, input=None)])
 
 
 def kind_of_matrix(value: Any) -> str:
