@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,17 @@ from obsynth.verification.over_tolerances.subdivision import (
 #: Boxes for stability after which it is left open where most states are algebraic: each elimination takes long.
 FEW_BOXES = 40
 
+#: What is reported of the loop where nothing is known of it.
+_NO_LOOP: Mapping[str, Any] = {
+    "loop_radius": None,
+    "largest_factor": None,
+    "blame": {},
+    "rows": {},
+    "error_per_unit": {},
+    "vertex_gains": {},
+    "reason": "",
+}
+
 
 @arguments_checked
 def robustness(
@@ -101,77 +112,77 @@ def robustness(
     report_stage = progress or (lambda text: None)
     uncertain = plant.uncertainty
     if uncertain is None or not uncertain.box.names:
-        empty = ConstantsBox({}) if uncertain is None else uncertain.box
-        return Robustness(
-            box=empty,
-            assumes_exact_model=True,
-            regular="open",
-            breaking={},
-            loop_radius=None,
-            largest_factor=None,
-            blame={},
-            rows={},
-            error_per_unit={},
-            vertex_gains={},
-            stable="open",
-            boxes=0,
-            reason=EXACT_MODEL,
-        )
+        return _of_the_exact_model(ConstantsBox({}) if uncertain is None else uncertain.box)
     report_stage("regularity over the box")
     regular = index_one_on_box(plant)
-    reason = ""
+    loop: dict[str, Any] = dict(_NO_LOOP)
     try:
         affine = affine_plant(plant)
         report_stage("stability over the box")
         stable, untouched = _stability(plant, affine)
+        loop |= _loop(design, plant, affine, report_stage)
     except PreconditionError as error:
-        affine, stable, untouched, reason = None, BoxVerdict("open", 0), (), str(error)
+        stable, untouched = BoxVerdict("open", 0), ()
+        loop["reason"] = str(error)
     broken = regular if regular.verdict == "refuted" else stable
-    breaking = {} if broken.at is None or broken.verdict != "refuted" else values_at(uncertain.box, broken.at)
-    radius = factor = None
-    shares, rows, gains, errors = dict[str, float](), dict[str, float](), dict[str, float](), dict[str, Any]()
-    if affine is not None:
-        try:
-            report_stage("loop over the box")
-            tracking = tracking_of(design, affine)
-            responses = responses_of(structure_of(design, affine, tracking))
-            radius = loop_radius(responses)
-            try:
-                same_sample_inverse(responses)
-            except PreconditionError as error:
-                # No bound holds at a sample; all else is reported.
-                reason = str(error)
-            report_stage("largest tolerances")
-            factor = largest_factor(
-                lambda t: structure_of(design, affine_plant(plant, uncertain.box.scaled(t)), tracking), radius
-            )
-            shares = _named((*uncertain.box.names, "remainders"), blame(responses))
-            parts = (affine.E.parts, affine.A.parts)
-            rows = _named(plant.state_names, blamed_rows(responses, tracking.T, parts))
-            errors = _error_per_unit(design, responses, affine)
-            report_stage("gains at the vertices")
-            gains = vertex_gains(design, plant, affine, tracking)
-        except PreconditionError as error:
-            reason = str(error)
     return Robustness(
         box=uncertain.box,
         assumes_exact_model=False,
         regular=regular.verdict,
-        breaking=breaking,
-        loop_radius=radius,
-        largest_factor=factor,
-        blame=shares,
-        rows=rows,
-        error_per_unit=errors,
-        vertex_gains=gains,
+        breaking={} if broken.at is None or broken.verdict != "refuted" else values_at(uncertain.box, broken.at),
         stable=stable.verdict,
         boxes=stable.boxes,
-        reason=reason,
         sharing=acting_like_faults(plant),
         untouched=untouched,
         not_covered=uncertain.not_covered,
         design=design,
+        **loop,
     )
+
+
+def _of_the_exact_model(box: ConstantsBox) -> Robustness:
+    """Return what is known where no constant has a tolerance: nothing about another plant."""
+    return Robustness(
+        box=box,
+        assumes_exact_model=True,
+        regular="open",
+        breaking={},
+        stable="open",
+        boxes=0,
+        **{**_NO_LOOP, "reason": EXACT_MODEL},
+    )
+
+
+def _loop(
+    design: ObserverDesign, plant: DescriptorSystem, affine: AffinePlant, report_stage: Callable[[str], None]
+) -> dict[str, Any]:
+    """Return the fields of `Robustness` about what the error adds to itself; where one does not exist those before it
+    stay, with the reason."""
+    box = affine.box
+    loop: dict[str, Any] = {}
+    try:
+        report_stage("loop over the box")
+        tracking = tracking_of(design, affine)
+        responses = responses_of(structure_of(design, affine, tracking))
+        radius = loop["loop_radius"] = loop_radius(responses)
+        try:
+            same_sample_inverse(responses)
+        except PreconditionError as error:
+            # No bound holds at a sample; all else is reported.
+            loop["reason"] = str(error)
+        report_stage("largest tolerances")
+        loop["largest_factor"] = largest_factor(
+            lambda t: structure_of(design, affine_plant(plant, box.scaled(t)), tracking), radius
+        )
+        loop["blame"] = _named((*box.names, "remainders"), blame(responses))
+        parts = (affine.E.parts, affine.A.parts)
+        loop["rows"] = _named(plant.state_names, blamed_rows(responses, tracking.T, parts))
+        loop["error_per_unit"] = _error_per_unit(design, responses, affine)
+        report_stage("gains at the vertices")
+        loop["vertex_gains"] = vertex_gains(design, plant, affine, tracking)
+    except PreconditionError as error:
+        loop["reason"] = str(error)
+    return loop
 
 
 def _named(names: tuple[str, ...], shares: FloatArray) -> dict[str, float]:
