@@ -57,13 +57,13 @@ def test_a_continuous_plant_agrees_with_an_integrator() -> None:
         scheduling={"k": obsynth.Ramp(rate=0.1, start=1.0)},
         initial_state={"x1": 1.0},
     )
-    from obsynth.simulation.over_region import courses_of, region_runs
+    from obsynth.simulation.over_region import region_runs, scheduled_parameters
     from obsynth.simulation.signals import resolve
 
     drive = resolve(plant, scenario)
-    courses = courses_of(plant, scenario, drive.steps, drive.dt)
+    parameters = scheduled_parameters(plant, scenario, drive.steps, drive.dt)
     states, _ = region_runs(
-        plant, courses, drive.left[:, None], drive.right[:, None], np.zeros((drive.steps, 1, 0)),
+        plant, parameters, drive.left[:, None], drive.right[:, None], np.zeros((drive.steps, 1, 0)),
         np.array([1.0, 0, 0]), drive.dt,
     )  # fmt: skip
 

@@ -34,8 +34,8 @@ def run_design(options: argparse.Namespace) -> int:
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
         spec = obsynth.load_spec(options.system)
-        wanted = default_gains(spec) if options.output is None else options.output
-        target = spec_output(wanted, GAIN_SET, spec, options, option="--output")
+        gains_file = default_gains(spec) if options.output is None else options.output
+        target = spec_output(gains_file, GAIN_SET, spec, options, option="--output")
         _ask(spec)
         design = design_of_spec(spec, progress=report_stage)
         file = write_atomically(target, gain_set_bytes(design, spec=spec.path))
@@ -127,7 +127,9 @@ def run_check(options: argparse.Namespace) -> int:
             "passed": passed,
             "transformation": done,
             "diagnosis": None if diagnosis is None else diagnosis.to_dict(),
-            "structure": {name.replace(" ", "_"): _structure_as_dict(found) for name, found in structures.items()},
+            "structure": {
+                name.replace(" ", "_"): _structure_as_dict(structure) for name, structure in structures.items()
+            },
             "methods": {name: report.as_dict() for name, report in methods.items()},
         },
         reported,
@@ -165,15 +167,15 @@ def run_verify(options: argparse.Namespace) -> int:
     if options.independent:
         return _verify_independently(options)
     # A pipe would keep us waiting; who reads a gain set says what is wrong with it.
-    found = kind_of_file(options.gains) if options.gains.is_file() else ""
-    kind = {ALARM_KIND: "alarm", CALIBRATION_KIND: "calibration"}.get(found, found.removeprefix("obsynth "))
-    if found not in (ALARM_KIND, CALIBRATION_KIND, *RESULTS):
+    file_kind = kind_of_file(options.gains) if options.gains.is_file() else ""
+    kind = {ALARM_KIND: "alarm", CALIBRATION_KIND: "calibration"}.get(file_kind, file_kind.removeprefix("obsynth "))
+    if file_kind not in (ALARM_KIND, CALIBRATION_KIND, *RESULTS):
         _require_fitting(options, "gain set")
         return _verify_gain_set(options)
     _require_fitting(options, kind)
     from obsynth.results.layout import print_checks
 
-    if found == CALIBRATION_KIND:
+    if file_kind == CALIBRATION_KIND:
         report = verify_calibration(options.gains, None if options.data is None else _calibrated_again(options))
     else:
         from obsynth.studies.certificates import verify_certificate
@@ -201,13 +203,13 @@ def run_verify(options: argparse.Namespace) -> int:
 
 def _require_fitting(options: argparse.Namespace, kind: str) -> None:
     """Refuse options that do nothing for a kind of certificate."""
-    meant = {
+    kinds_of_option = {
         "data": ("alarm", "comparison", "calibration"),
         "calibration": ("gain set", "alarm", "robustness"),
         "system": ("calibration",),
         "printed_digits": ("gain set",),
     }
-    for name, kinds in meant.items():
+    for name, kinds in kinds_of_option.items():
         if getattr(options, name) is not None and kind not in kinds:
             option = f"--{name.replace('_', '-')}"
             raise SpecError(
@@ -223,12 +225,12 @@ def _require_fitting(options: argparse.Namespace, kind: str) -> None:
 def _calibrated_again(options: argparse.Namespace) -> dict[str, Any]:
     """Return what the same calibration of the given plant and log comes to."""
     plant, _ = load_plant(options.system)
-    asked = read_json(options.gains).get("asked")
-    if not isinstance(asked, dict):
+    calibration_options = read_json(options.gains).get("asked")
+    if not isinstance(calibration_options, dict):
         raise SpecError(
             f"{options.gains} does not hold the options of its calibration: calibrate again.", path=str(options.gains)
         )
-    return obsynth.calibrate(plant, options.data, **restored(asked)).to_dict()
+    return obsynth.calibrate(plant, options.data, **restored(calibration_options)).to_dict()
 
 
 def _with_calibration(
@@ -259,13 +261,13 @@ def _verify_independently(options: argparse.Namespace) -> int:
     with file.open("rb") as stream:
         is_proof = is_proof_file(stream.read(HEAD_BYTES))
     if is_proof:
-        found = check_independently(file)
+        outcome = check_independently(file)
     elif kind_of_file(options.gains) == ALARM_KIND:
-        found = check_alarm_independently(read_json(options.gains))
+        outcome = check_alarm_independently(read_json(options.gains))
     else:
-        found = check_design_independently(obsynth.load(options.gains))
-    emit(options, {"file": str(options.gains), "passed": found.passed, "text": found.text}, found.text)
-    return 0 if found.passed else VerificationError.exit_code
+        outcome = check_design_independently(obsynth.load(options.gains))
+    emit(options, {"file": str(options.gains), "passed": outcome.passed, "text": outcome.text}, outcome.text)
+    return 0 if outcome.passed else VerificationError.exit_code
 
 
 def _verify_gain_set(options: argparse.Namespace) -> int:
@@ -294,16 +296,18 @@ def run_simulate(options: argparse.Namespace) -> int:
 
         spec, scenario, target, design = prepared(options, report_stage, SIMULATED_SIGNALS)
         report_stage("simulating")
-        found = simulate(design, scenario)
+        simulation = simulate(design, scenario)
         # A log as run reads it; a bias of a sensor is a deviation of its own.
         point = {**getattr(design.plant, "operating_point", {})}
         point = {name: value for name, value in point.items() if name not in getattr(design.plant, "sensor_faults", ())}
-        written = None if target is None else str(found.write_csv(target, operating_point=point))
+        written = None if target is None else str(simulation.write_csv(target, operating_point=point))
     from obsynth.report.scenarios import simulation_report
 
     emit(
         options,
-        {"spec": spec.path, "file": written, **found.summary()},
-        lambda: simulation_report(design.name, found, console=stdout_console(), units=design.plant.units, file=written),
+        {"spec": spec.path, "file": written, **simulation.summary()},
+        lambda: simulation_report(
+            design.name, simulation, console=stdout_console(), units=design.plant.units, file=written
+        ),
     )
     return 0

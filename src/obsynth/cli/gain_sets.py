@@ -95,8 +95,8 @@ def _run_robustness(options: argparse.Namespace) -> int:
     )
     output_file(options.out, RESULT_FILE, options)
     design, _ = gains_to_hand_on(options.gains, unverified=False)
-    found = obsynth.robustness(design)
-    file = found.save(options.out)
-    told = {"gains": options.gains, "file": file, "statement": found.statement, **found.as_dict()}
-    emit(options, told, found.statement)
+    result = obsynth.robustness(design)
+    file = result.save(options.out)
+    payload = {"gains": options.gains, "file": file, "statement": result.statement, **result.as_dict()}
+    emit(options, payload, result.statement)
     return 0

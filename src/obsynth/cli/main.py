@@ -61,28 +61,28 @@ NEW_OBJECTS = 100_000
 
 def _all_verbs() -> dict[str, Verb]:
     """Return the verbs of designs, and those of the packages above them that are installed, in the order of help."""
-    found, added = dict(DESIGN_VERBS), dict[str, tuple[Argument | Group | Settings, ...]]()
+    verbs, added = dict(DESIGN_VERBS), dict[str, tuple[Argument | Group | Settings, ...]]()
     if find_spec("obsynth.monitoring") is not None:
         from obsynth.monitoring.verbs.table import ADDED
         from obsynth.monitoring.verbs.table import VERBS as OF_LOGS
 
-        found |= OF_LOGS
+        verbs |= OF_LOGS
         added = ADDED
     if find_spec("obsynth.studies") is not None:
         from obsynth.studies.verbs.table import VERBS as OF_STUDIES
 
-        found |= OF_STUDIES
+        verbs |= OF_STUDIES
     for name, more in added.items():
-        found[name] = found[name]._replace(arguments=(*found[name].arguments, *more))
-    return {name: found[name] for name in EXAMPLES if name in found}
+        verbs[name] = verbs[name]._replace(arguments=(*verbs[name].arguments, *more))
+    return {name: verbs[name] for name in EXAMPLES if name in verbs}
 
 
 #: The verbs by name.
 VERBS = _all_verbs()
 
 
-def obsynth_parser(asked: Collection[str] | None = None) -> argparse.ArgumentParser:
-    """Return the parser of ``obsynth`` with all its verbs; only those among the words ``asked`` have arguments."""
+def obsynth_parser(words: Collection[str] | None = None) -> argparse.ArgumentParser:
+    """Return the parser of ``obsynth`` with all its verbs; only those among ``words`` have arguments."""
     parser = _parser("obsynth", "Design, verify and run observers and fault-estimation filters for descriptor systems.")
     parser.add_argument(
         "--print-completion",
@@ -95,20 +95,20 @@ def obsynth_parser(asked: Collection[str] | None = None) -> argparse.ArgumentPar
         own = verbs.add_parser(
             name,
             help=verb.told,
-            add_help=asked is None or name in asked,
+            add_help=words is None or name in words,
             description=fill(verb.told, width=78),
             epilog=verb.epilog,
             formatter_class=Folded if verb.epilog else argparse.HelpFormatter,
         )
-        if asked is None or name in asked:
+        if words is None or name in words:
             _fill(name, own)
     return parser
 
 
-def _parser(name: str, told: str) -> argparse.ArgumentParser:
+def _parser(name: str, description: str) -> argparse.ArgumentParser:
     parser = Parser(
         prog=name,
-        description=fill(told, width=78),
+        description=fill(description, width=78),
         epilog=EXIT_CODES,
         formatter_class=Folded,
     )
@@ -134,8 +134,8 @@ def _help_with_methods(parser: argparse.ArgumentParser) -> str:
     """Return the help of a parser with the ids of the methods."""
     from obsynth.methods.installed import REGISTRY
 
-    told = fill(", ".join([*REGISTRY, "auto"]), width=78, initial_indent="  ", subsequent_indent="  ")
-    return f"{argparse.ArgumentParser.format_help(parser)}\nmethods:\n{told}\n"
+    methods = fill(", ".join([*REGISTRY, "auto"]), width=78, initial_indent="  ", subsequent_indent="  ")
+    return f"{argparse.ArgumentParser.format_help(parser)}\nmethods:\n{methods}\n"
 
 
 @contextmanager
@@ -227,21 +227,24 @@ def _collected_rarely() -> Iterator[None]:
 def _options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
     """Return the arguments of a command line, settings among them."""
     words = sys.argv[1:] if arguments is None else list(arguments)
-    options, rest = parser.parse_known_args(words)
+    options, unknown = parser.parse_known_args(words)
     options.command = shlex.join([parser.prog, *words])
-    rest = read_settings(f"{parser.prog} {options.verb}", VERBS[options.verb].arguments, options, rest)
-    if rest:
-        _refuse_words(parser.prog, options.verb, rest)
+    unknown = read_settings(f"{parser.prog} {options.verb}", VERBS[options.verb].arguments, options, unknown)
+    if unknown:
+        _refuse_words(parser.prog, options.verb, unknown)
     return options
 
 
-def _refuse_words(prog: str, verb: str, rest: Sequence[str]) -> NoReturn:
+def _refuse_words(prog: str, verb: str, unknown: Sequence[str]) -> NoReturn:
     """End the program as words that a verb does not take do: with its usage, and what may be meant."""
     own = _fill(verb, Parser(prog=prog if prog == verb else f"{prog} {verb}"))
-    known = [*own._option_string_actions, *(name for one in settings_of(VERBS[verb].arguments) for name in one.names)]
-    wrong = [word.partition("=")[0] for word in rest if word.startswith("-") and word != "-"]
+    known = [
+        *own._option_string_actions,
+        *(name for setting in settings_of(VERBS[verb].arguments) for name in setting.names),
+    ]
+    wrong = [word.partition("=")[0] for word in unknown if word.startswith("-") and word != "-"]
     if not wrong:
-        own.error(f"it does not take {' '.join(map(repr, rest))}: see {own.prog} --help.")
+        own.error(f"it does not take {' '.join(map(repr, unknown))}: see {own.prog} --help.")
     own.error(f"there is no option {wrong[0]}.{meant(wrong[0], known)} See {own.prog} --help.")
 
 
@@ -254,14 +257,14 @@ def _outcome(options: argparse.Namespace) -> int:
             raise SpecError("--force replaces a file, and none is written here: give --out.", path="--force")
         return VERBS[options.verb].run(options)
     except ObsynthError as error:
-        told = error
+        failure = error
     except (ImportError, MemoryError, RecursionError, ArithmeticError, ValueError) as error:
         # LAPACK's errors are among the last.
-        found = reported_error(error)
-        if found is None:
+        reported = reported_error(error)
+        if reported is None:
             raise
-        told = found
+        failure = reported
     if options.json:
-        print_json(told.as_dict())
-    print_error(told)
-    return told.exit_code
+        print_json(failure.as_dict())
+    print_error(failure)
+    return failure.exit_code

@@ -39,7 +39,9 @@ class Parser(argparse.ArgumentParser):
             known = list(self._option_string_actions)
             wrong = [word.partition("=")[0] for word in self._words if word.startswith("--")]
             close = [(word, meant(word, known)) for word in wrong if word not in known]
-            message += "".join(f". There is no option {word}.{told}" for word, told in close if told).rstrip(".")
+            message += "".join(
+                f". There is no option {word}.{suggestion}" for word, suggestion in close if suggestion
+            ).rstrip(".")
             message += self._meant_file(message)
         super().error(message)
 

@@ -27,7 +27,7 @@ from obsynth.plants.signal_names import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae
 from obsynth.simulation.linear import PlantRuns, scenario_runs, scenario_stepper, varying_runs
-from obsynth.simulation.over_region import courses_of, scenario_runs_over_region
+from obsynth.simulation.over_region import scenario_runs_over_region, scheduled_parameters
 from obsynth.simulation.scenario import Scenario, observer_start
 from obsynth.simulation.signals import ScenarioSignals, resolve, resolve_parameters
 from obsynth.verification.over_tolerances.plants_of_the_box import drawn_points, plant_at
@@ -67,13 +67,13 @@ class Runs:
     disturbances: FloatArray
     rows: FloatArray  # the observer's states, faults, residuals
     observer: BenchObserver
-    kept: tuple[Estimates, ...] = ()  # estimates that say more than rows
+    estimates_of_runs: tuple[Estimates, ...] = ()  # of an observer whose estimates say more than rows
 
     @property
     def estimates(self) -> tuple[Estimates, ...]:
         """What the observer says, one per run."""
         if not isinstance(self.observer, LinearObserver):
-            return self.kept
+            return self.estimates_of_runs
         return tuple(self.observer.split(self.rows[:, run]) for run in range(self.rows.shape[1]))
 
 
@@ -96,8 +96,8 @@ class Bench:
     def run(self, seeds: Sequence[int]) -> Runs:
         """Run the plant and the observer, once for each seed."""
         states, outputs, inputs, faults, disturbances = self.simulated(seeds)
-        rows, kept = self.observed(outputs, inputs)
-        return Runs(states, outputs, inputs, faults, disturbances, rows, self.observer, kept)
+        rows, estimates = self.observed(outputs, inputs)
+        return Runs(states, outputs, inputs, faults, disturbances, rows, self.observer, estimates)
 
     @property
     def onset(self) -> int | None:
@@ -119,13 +119,13 @@ class Bench:
             return 0, 0
 
         def end(rows: slice, delays: tuple[int, ...]) -> int | None:
-            shown, sizes = observer.Cz[rows], np.zeros(steps)
+            outputs, sizes = observer.Cz[rows], np.zeros(steps)
             for k in range(steps):
-                sizes[k] = np.linalg.norm(shown)
-                shown = shown @ observer.Az
+                sizes[k] = np.linalg.norm(outputs)
+                outputs = outputs @ observer.Az
             late = np.flatnonzero(sizes > WARM_UP_SHARE * np.max(sizes))
-            found = max(int(late[-1]) + 1 if late.size else 0, *delays, 0)
-            return found if found < steps else None
+            first_free = max(int(late[-1]) + 1 if late.size else 0, *delays, 0)
+            return first_free if first_free < steps else None
 
         return end(observer.state_rows, observer.state_delays), end(observer.fault_rows, observer.fault_delays)
 
@@ -140,14 +140,14 @@ def make_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
     if observer.dt <= 0.0:
         ramp = first_order_hold(observer.Az, np.hstack([observer.Bu, observer.By]), drive.dt)[2]
         observer = sample_observer(observer, drive.dt)
-    said = ((not plant.is_discrete, INPUTS_BETWEEN_SAMPLES), (stepper.feedback is not None, STABILISED))
+    notes = ((not plant.is_discrete, INPUTS_BETWEEN_SAMPLES), (stepper.feedback is not None, STABILISED))
     return Bench(
         drive,
         observer,
         start,
         slice(plant.nu, plant.nu + plant.nf),
         tuple(index_of(name, plant.fault_names, what="The plant") for name in observer.fault_names),
-        tuple(text for holds, text in said if holds),
+        tuple(text for holds, text in notes if holds),
         partial(scenario_runs, drive, stepper, (plant.nu, plant.nu + plant.nf)),
         partial(_linear_rows, observer, begin, ramp),
         _some_states(observer, plant),
@@ -240,7 +240,7 @@ def _scheduled_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
         if getattr(scenario, group):
             raise SpecError(why, path=group)
     drive = resolve(plant, scenario)
-    courses = courses_of(plant, scenario, drive.steps, drive.dt)
+    parameters = scheduled_parameters(plant, scenario, drive.steps, drive.dt)
     start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])
     return Bench(
         drive,
@@ -249,7 +249,7 @@ def _scheduled_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
         slice(plant.nu, plant.nu + plant.nf),
         tuple(index_of(name, plant.fault_names, what="The plant") for name in observer.fault_names),
         () if plant.is_discrete else (INPUTS_OVER_REGION,),
-        partial(scenario_runs_over_region, plant, drive, courses, start),
+        partial(scenario_runs_over_region, plant, drive, parameters, start),
         partial(_scheduled_rows, observer, None if observer.dt else drive.dt),
     )
 
@@ -258,10 +258,10 @@ def _scheduled_rows(
     observer: ScheduledObserver, sample_time: float | None, outputs: FloatArray, inputs: FloatArray
 ) -> tuple[FloatArray, tuple[Estimates, ...]]:
     """Return rows and estimates of a scheduled observer."""
-    found = [
+    rows = [
         observer.record(outputs[:, run], inputs[:, run], sample_time=sample_time)[0] for run in range(outputs.shape[1])
     ]
-    return np.stack(found, axis=1), tuple(map(observer.split, found))
+    return np.stack(rows, axis=1), tuple(map(observer.split, rows))
 
 
 def rows_without_claim(bench: Bench, runs: Runs) -> int:
@@ -326,8 +326,8 @@ def _region_rows(
     observer: RegionObserver, outputs: FloatArray, inputs: FloatArray
 ) -> tuple[FloatArray, tuple[Estimates, ...]]:
     """Return rows and estimates of an observer over a region."""
-    found = [observer.record(outputs[:, run], inputs[:, run])[0] for run in range(outputs.shape[1])]
-    return np.stack(found, axis=1), tuple(map(observer.split, found))
+    rows = [observer.record(outputs[:, run], inputs[:, run])[0] for run in range(outputs.shape[1])]
+    return np.stack(rows, axis=1), tuple(map(observer.split, rows))
 
 
 def _varying_plant(
@@ -408,7 +408,9 @@ def _rows_of(
         estimates = _recursive_estimates(observer, outputs, inputs[:, 0])
     else:
         estimates = tuple(observer.run(outputs[:, run], inputs[:, 0]) for run in range(outputs.shape[1]))
-    rows = np.stack([np.hstack([found.states, found.faults, found.residuals]) for found in estimates], axis=1)
+    rows = np.stack(
+        [np.hstack([estimate.states, estimate.faults, estimate.residuals]) for estimate in estimates], axis=1
+    )
     return rows, estimates
 
 
@@ -419,14 +421,14 @@ def _recursive_estimates(observer: RecursiveObserver, outputs: FloatArray, input
     if runs == 1 or resets or not observer.is_plain:
         return tuple(observer.run(outputs[:, run], inputs, compiled=False) for run in range(runs))
     first = observer.run(outputs[:, 0], inputs, compiled=False)
-    others = run_batch(observer, np.swapaxes(outputs[:, 1:], 0, 1), inputs)
+    batch = run_batch(observer, np.swapaxes(outputs[:, 1:], 0, 1), inputs)
     width = first.innovations.shape[1]
-    found = [first]
-    for states, parameters, innovations in zip(others.states, others.faults, others.innovations, strict=True):
-        seen = read_only(innovations[:, :width])
-        nis = read_only(_squares(seen, first.regressors, parameters))
-        found.append(replace(first, states=states, faults=parameters, innovations=seen, nis=nis))
-    return tuple(found)
+    estimates = [first]
+    for states, parameters, innovations in zip(batch.states, batch.faults, batch.innovations, strict=True):
+        own_innovations = read_only(innovations[:, :width])
+        nis = read_only(_squares(own_innovations, first.regressors, parameters))
+        estimates.append(replace(first, states=states, faults=parameters, innovations=own_innovations, nis=nis))
+    return tuple(estimates)
 
 
 def _factors(covariances: MatrixSequence, steps: int) -> FloatArray:

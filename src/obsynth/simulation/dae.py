@@ -121,9 +121,9 @@ def _recorded(
     states, outputs = np.zeros((samples, functions.model.nx)), np.zeros((samples, functions.model.ny))
     residuals, calls = np.zeros(samples), dict[int, Compiled]()
 
-    def note(kept: slice, found: FloatArray, left: FloatArray | float = 0.0) -> None:
-        states[kept], residuals[kept] = found, left
-        for k in range(kept.start, kept.stop):
+    def note(span: slice, solved_states: FloatArray, misses: FloatArray | float = 0.0) -> None:
+        states[span], residuals[span] = solved_states, misses
+        for k in range(span.start, span.stop):
             outputs[k] = functions.outputs(states[k], theta[k])[0]
 
     def together(k: int, length: int) -> int:
@@ -133,13 +133,13 @@ def _recorded(
             if key not in graphs:
                 graphs[key] = _simulated(step).mapaccum(length)
             calls[length] = Compiled(graphs[key])
-        kept = slice(k, k + length)
-        arriving = np.hstack([inputs[kept], theta[kept], pushed[kept]])
-        after, said = (found.T for found in calls[length](states[k - 1], arriving.ravel()))
-        good = (said[:, 1] == 1.0) & np.isfinite(after).all(axis=1)
-        taken = length if good.all() else int(np.argmin(good))
-        note(slice(k, k + taken), after[:taken], said[:taken, 0])
-        return taken
+        span = slice(k, k + length)
+        arriving = np.hstack([inputs[span], theta[span], pushed[span]])
+        after, verdicts = (part.T for part in calls[length](states[k - 1], arriving.ravel()))
+        good = (verdicts[:, 1] == 1.0) & np.isfinite(after).all(axis=1)
+        count = length if good.all() else int(np.argmin(good))
+        note(slice(k, k + count), after[:count], verdicts[:count, 0])
+        return count
 
     def alone(k: int) -> None:
         """Take one step that needs care."""

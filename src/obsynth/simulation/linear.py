@@ -52,8 +52,8 @@ def simulate_plant(
         )
     steps = whole_number(steps, "steps", "a whole number of samples")
     sizes = {"u": plant.nu, "f": plant.nf, "d": plant.nd, "w": plant.nw}
-    given = {"u": u, "f": f, "d": d, "w": w}
-    signals = {name: signal_of(given[name], name, (steps, size)) for name, size in sizes.items()}
+    arrays = {"u": u, "f": f, "d": d, "w": w}
+    signals = {name: signal_of(arrays[name], name, (steps, size)) for name, size in sizes.items()}
     start = np.zeros(plant.nx) if initial_state is None else real_vector(initial_state, plant.nx, "initial_state")
     if plant.delays:
         return _with_delays(plant, steps, signals, start)
@@ -82,19 +82,24 @@ def _with_delays(plant: DescriptorSystem, steps: int, signals: dict[str, FloatAr
     """Return what a plant with delays does; nothing is on its way at the start."""
     absorbed, elimination = absorb_delays(plant), eliminate_algebraic_states(plant)
     moving = dynamic_part(plant, elimination.recovery, start)
-    whole, way = absorbed.plant, absorbed.recovery
-    first = np.concatenate([moving, np.zeros(whole.nx - len(moving))])
-    run = simulate_plant(whole, steps=steps, initial_state=first, **signals)
-    following = {"u": way.from_input, "f": way.from_fault, "d": way.from_disturbance, "w": way.from_noise}
-    states = run.states @ way.from_state.T + _sum_of(signals, following)
+    augmented, recovery = absorbed.plant, absorbed.recovery
+    first = np.concatenate([moving, np.zeros(augmented.nx - len(moving))])
+    run = simulate_plant(augmented, steps=steps, initial_state=first, **signals)
+    following = {
+        "u": recovery.from_input,
+        "f": recovery.from_fault,
+        "d": recovery.from_disturbance,
+        "w": recovery.from_noise,
+    }
+    states = run.states @ recovery.from_state.T + _sum_of(signals, following)
     inconsistency = float(np.linalg.norm(states[0] - start)) if np.any(start) else 0.0
     return replace(run, states=states, inconsistency=inconsistency)
 
 
 def _sum_of(signals: dict[str, FloatArray], matrices: dict[str, FloatArray]) -> FloatArray:
     """Return the sum of ``signal @ matrix.T`` over all signals."""
-    first, *others = (np.asarray(signals[name] @ matrix.T) for name, matrix in matrices.items())
-    return sum(others, start=first)
+    first, *more = (np.asarray(signals[name] @ matrix.T) for name, matrix in matrices.items())
+    return sum(more, start=first)
 
 
 def dynamic_part(plant: DescriptorSystem, recovery: StateRecovery, state: FloatArray) -> FloatArray:
@@ -159,17 +164,17 @@ def make_stepper(
     if plant.is_discrete:
         transition, held, ramped = a, inputs, np.zeros_like(inputs)
         noisy, measurement_noise = reduced.Bw, reduced.Dw
-        shown = recovery.from_noise
+        state_noise = recovery.from_noise
     else:
         transition, held, ramped = first_order_hold(a, inputs, drive.dt)
-        noisy, measurement_noise, shown = _sampled_noise(reduced, recovery, a, drive)
+        noisy, measurement_noise, state_noise = _sampled_noise(reduced, recovery, a, drive)
     direct = np.hstack([recovery.from_input, recovery.from_fault, recovery.from_disturbance])
     return Stepper(
         transition,
         held,
         ramped,
         noisy,
-        (recovery.from_state - recovery.from_input @ closing, direct, shown),
+        (recovery.from_state - recovery.from_input @ closing, direct, state_noise),
         (reduced.C - reduced.D @ closing, np.hstack([reduced.D, reduced.Df, reduced.Dd]), measurement_noise),
         start,
         gain,
@@ -285,9 +290,9 @@ def simulate_time_varying(
     (50, 1)
     """
     nq, samples = plant.nq, whole_number(samples, "samples", "the length of the record")
-    given = np.zeros(nq) if parameters is None else real_array(parameters, "parameters")
-    whole = np.broadcast_to(given, (samples, nq)) if given.shape == (nq,) else given
-    theta = signal_of(whole, "parameters", (samples, nq))
+    values = np.zeros(nq) if parameters is None else real_array(parameters, "parameters")
+    record = np.broadcast_to(values, (samples, nq)) if values.shape == (nq,) else values
+    theta = signal_of(record, "parameters", (samples, nq))
     inputs = signal_of(u, "u", (samples, plant.nu))
     mu = signal_of(equation_noise, "equation_noise", (samples, plant.ne))
     nu = signal_of(output_noise, "output_noise", (samples - 1, plant.ny))
@@ -317,8 +322,8 @@ def varying_runs(
     if plant.ne != plant.nx:
         raise SpecError(f"{plant.ne} equations do not determine {plant.nx} states.", path="E")
     samples, runs = equation_noise.shape[:2]
-    late = algebraic_rows(plant, plant.horizon or samples)
-    others = np.setdiff1d(np.arange(plant.ne), late)
+    algebraic = algebraic_rows(plant, plant.horizon or samples)
+    dynamic_rows = np.setdiff1d(np.arange(plant.ne), algebraic)
 
     def drive(k: int) -> FloatArray:
         """Return ``B u + Phi theta + mu``, ``(ne, runs)``."""
@@ -326,16 +331,16 @@ def varying_runs(
         return np.asarray(known[:, None] + equation_noise[k].T)
 
     x = np.repeat(initial_state[:, None], runs, axis=1)
-    if late.size:
-        constraint = plant.A.at(0)[late]
-        x = x - np.linalg.pinv(constraint) @ (constraint @ x + drive(0)[late])
+    if algebraic.size:
+        constraint = plant.A.at(0)[algebraic]
+        x = x - np.linalg.pinv(constraint) @ (constraint @ x + drive(0)[algebraic])
     states, outputs = np.empty((samples, runs, plant.nx)), np.full((samples, runs, plant.ny), np.nan)
     states[0] = x.T
     for k in range(samples - 1):
-        matrix, value = plant.E.at(k + 1)[others], (plant.A.at(k) @ x + drive(k))[others]
-        if late.size:
-            matrix = np.vstack([matrix, plant.A.at(k + 1)[late]])
-            value = np.concatenate([value, -drive(k + 1)[late]])
+        matrix, value = plant.E.at(k + 1)[dynamic_rows], (plant.A.at(k) @ x + drive(k))[dynamic_rows]
+        if algebraic.size:
+            matrix = np.vstack([matrix, plant.A.at(k + 1)[algebraic]])
+            value = np.concatenate([value, -drive(k + 1)[algebraic]])
         decision = decide_rank(matrix)
         if not decision.full:
             raise PreconditionError(

@@ -26,7 +26,7 @@ from obsynth.simulation.signals import ScenarioSignals, Trajectory, signal_of
 
 #: Parts of an interval in which parameters move: the error of each falls with the cube of its length.
 PARTS = 8
-#: Rounding of a course that ends at the edge of its range.
+#: Rounding of a parameter at the edge of its range, relative to it.
 EDGE_SLACK = 1e-12
 
 
@@ -76,23 +76,23 @@ def simulate_polytopic(
     >>> obsynth.simulate(plant, scheduling=[[0.5], [0.5], [0.0]], initial_state=[1.0]).outputs.ravel().tolist()
     [1.0, 0.5, 0.25]
     """
-    course = real_array(scheduling, "scheduling")
-    course = course.reshape(-1, 1) if course.ndim == 1 and len(plant.scheduling.names) == 1 else course
-    if course.ndim != 2 or course.shape[1] != len(plant.scheduling.names):
+    parameters = real_array(scheduling, "scheduling")
+    parameters = parameters.reshape(-1, 1) if parameters.ndim == 1 and len(plant.scheduling.names) == 1 else parameters
+    if parameters.ndim != 2 or parameters.shape[1] != len(plant.scheduling.names):
         raise SpecError(
-            f"scheduling is {course.shape}: give (samples, {len(plant.scheduling.names)}), the columns those of "
+            f"scheduling is {parameters.shape}: give (samples, {len(plant.scheduling.names)}), the columns those of "
             f"{', '.join(plant.scheduling.names)}.",
             path="scheduling",
         )
     dt = _sample_time(plant, sample_time)
-    require_inside(plant, course, dt)
-    steps = len(course)
+    require_inside(plant, parameters, dt)
+    steps = len(parameters)
     sizes = {"u": plant.nu, "f": plant.nf, "d": plant.nd, "w": plant.nw}
-    given = {"u": u, "f": f, "d": d, "w": w}
-    signals = {name: signal_of(given[name], name, (steps, size)) for name, size in sizes.items()}
+    arrays = {"u": u, "f": f, "d": d, "w": w}
+    signals = {name: signal_of(arrays[name], name, (steps, size)) for name, size in sizes.items()}
     start = np.zeros(plant.nx) if initial_state is None else real_vector(initial_state, plant.nx, "initial_state")
-    held = np.hstack([signals["u"], signals["f"], signals["d"]])[:, None]
-    states, outputs = region_runs(plant, (course, course), held, held, signals["w"][:, None], start, dt)
+    drive = np.hstack([signals["u"], signals["f"], signals["d"]])[:, None]
+    states, outputs = region_runs(plant, (parameters, parameters), drive, drive, signals["w"][:, None], start, dt)
     return Trajectory(
         states[:, 0],
         outputs[:, 0],
@@ -118,47 +118,51 @@ def _sample_time(plant: PolytopicSystem, sample_time: float | None) -> float:
     return float(sample_time)
 
 
-def courses_of(plant: PolytopicSystem, scenario: Scenario, steps: int, dt: float) -> tuple[FloatArray, FloatArray]:
+def scheduled_parameters(
+    plant: PolytopicSystem, scenario: Scenario, steps: int, dt: float
+) -> tuple[FloatArray, FloatArray]:
     """Return the parameters ``(steps, p)`` where each interval begins and where it ends: the middle and profiles."""
-    names, held = plant.scheduling.names, plant.scheduling
-    middle = np.full(len(names), 1.0 / len(names)) if held.gives_weights else 0.5 * (held.low + held.high)
-    left, right = np.tile(middle, (steps, 1)), np.tile(middle, (steps, 1))
+    names, scheduling = plant.scheduling.names, plant.scheduling
+    middle = (
+        np.full(len(names), 1.0 / len(names)) if scheduling.gives_weights else 0.5 * (scheduling.low + scheduling.high)
+    )
+    begin, end = np.tile(middle, (steps, 1)), np.tile(middle, (steps, 1))
     for name, profile in profiles_of(scenario, "scheduling"):
         if not isinstance(profile, Additive):
             raise SpecError(f"A scheduling signal is no {type(profile).__name__.lower()}.", path=f"scheduling.{name}")
         place = names.index(name)
-        for ends, values in zip((left, right), profile.sampled(steps, dt), strict=True):
+        for ends, values in zip((begin, end), profile.sampled(steps, dt), strict=True):
             ends[:, place] += values
     if plant.is_discrete:
-        right = left
-    for ends in (left, right):
+        end = begin
+    for ends in (begin, end):
         require_inside(plant, ends, dt)
-        if not held.gives_weights:
-            np.clip(ends, held.low, held.high, out=ends)
-    return left, right
+        if not scheduling.gives_weights:
+            np.clip(ends, scheduling.low, scheduling.high, out=ends)
+    return begin, end
 
 
-def require_inside(plant: PolytopicSystem, course: FloatArray, dt: float) -> None:
+def require_inside(plant: PolytopicSystem, parameters: FloatArray, dt: float) -> None:
     """Raise `SpecError` where parameters ``(steps, p)`` leave the region, outside which the plant is not known."""
-    held = plant.scheduling
-    room = EDGE_SLACK * np.maximum(np.abs(held.low), np.abs(held.high))
-    outside = ~((course >= held.low - room) & (course <= held.high + room))
+    scheduling = plant.scheduling
+    room = EDGE_SLACK * np.maximum(np.abs(scheduling.low), np.abs(scheduling.high))
+    outside = ~((parameters >= scheduling.low - room) & (parameters <= scheduling.high + room))
     if outside.any():
-        k, place = (int(found[0]) for found in np.nonzero(outside))
-        name = held.names[place]
+        k, place = (int(index[0]) for index in np.nonzero(outside))
+        name = scheduling.names[place]
         raise SpecError(
-            f"{name} is {course[k, place]:.6g} at {k * dt:.6g} s: the plant is known for {held.sentence()}. Profiles "
-            "of a parameter are added to the middle of its range.",
+            f"{name} is {parameters[k, place]:.6g} at {k * dt:.6g} s: the plant is known for {scheduling.sentence()}. "
+            "Profiles of a parameter are added to the middle of its range.",
             path=f"scheduling.{name}",
         )
-    if held.gives_weights and len(course) and not all(map(held.is_inside, course)):
+    if scheduling.gives_weights and len(parameters) and not all(map(scheduling.is_inside, parameters)):
         raise SpecError("The weights of the vertices must sum to one at every sample.", path="scheduling")
 
 
 def scenario_runs_over_region(
     plant: PolytopicSystem,
     drive: ScenarioSignals,
-    courses: tuple[FloatArray, FloatArray],
+    parameters: tuple[FloatArray, FloatArray],
     start: FloatArray,
     seeds: Sequence[int],
 ) -> PlantRuns:
@@ -171,15 +175,21 @@ def scenario_runs_over_region(
         )
     drawn, noise, sensor_noise = drive.drawn(seeds, plant.nw)
     left, right = drive.left[:, None] + drawn, drive.right[:, None] + drawn
-    states, clean = region_runs(plant, courses, left, right, noise, start, drive.dt)
+    states, clean = region_runs(plant, parameters, left, right, noise, start, drive.dt)
     u, faults, disturbances = np.split(left, (plant.nu, plant.nu + plant.nf), axis=2)
-    parameters = np.broadcast_to(courses[0][:, None], (*left.shape[:2], courses[0].shape[1]))
-    return states, drive.measured(clean + sensor_noise), np.concatenate([u, parameters], axis=2), faults, disturbances
+    shared = np.broadcast_to(parameters[0][:, None], (*left.shape[:2], parameters[0].shape[1]))
+    return (
+        states,
+        drive.measured(clean + sensor_noise),
+        np.concatenate([u, shared], axis=2),
+        faults,
+        disturbances,
+    )
 
 
 def region_runs(
     plant: PolytopicSystem,
-    courses: tuple[FloatArray, FloatArray],
+    parameters: tuple[FloatArray, FloatArray],
     left: FloatArray,
     right: FloatArray,
     noise: FloatArray,
@@ -193,8 +203,8 @@ def region_runs(
     v = np.repeat((moving.E1 @ start)[:, None], runs, axis=1)
     for k in range(steps):
         # A point that stays is not evaluated again.
-        if k == 0 or not np.array_equal(courses[0][k - 1], courses[0][k]):
-            at = moving.at(courses[0][k])
+        if k == 0 or not np.array_equal(parameters[0][k - 1], parameters[0][k]):
+            at = moving.at(parameters[0][k])
         s, w = left[k].T, noise[k].T
         x = at.state(v, s, w)
         states[k] = x.T
@@ -202,7 +212,7 @@ def region_runs(
         if plant.is_discrete:
             v = moving.U1.T @ (at.A @ x + at.S @ s + at.Bw @ w)
         else:
-            v = moving.moved(v, courses[0][k], courses[1][k], left[k].T, right[k].T, dt)
+            v = moving.moved(v, parameters[0][k], parameters[1][k], left[k].T, right[k].T, dt)
     finite = np.isfinite(states).reshape(steps, -1).all(axis=1)
     if not finite.all():
         raise SpecError(
@@ -243,8 +253,8 @@ class _Moving:
 
     @classmethod
     def of(cls, plant: PolytopicSystem) -> _Moving:
-        left, rank = np.linalg.svd(plant.E)[0], decide_rank(plant.E).rank
-        U1, U2 = left[:, :rank], left[:, rank:]
+        basis, rank = np.linalg.svd(plant.E)[0], decide_rank(plant.E).rank
+        U1, U2 = basis[:, :rank], basis[:, rank:]
 
         def stacked(*names: str) -> FloatArray:
             return np.array([np.hstack([getattr(vertex, name) for name in names]) for vertex in plant.vertices])
@@ -258,9 +268,9 @@ class _Moving:
     def at(self, parameters: FloatArray) -> _Point:
         """Return the matrices at parameters."""
         weights = self.plant.scheduling.weights(parameters)
-        found = {name: np.tensordot(weights, matrix, 1) for name, matrix in self.vertices.items()}
-        whole = np.vstack([self.E1, self.U2.T @ found["A"]])
-        decision = decide_rank(whole)
+        matrices = {name: np.tensordot(weights, matrix, 1) for name, matrix in self.vertices.items()}
+        stacked = np.vstack([self.E1, self.U2.T @ matrices["A"]])
+        decision = decide_rank(stacked)
         if not decision.full:
             point = ", ".join(
                 f"{name} = {value:.6g}" for name, value in zip(self.plant.scheduling.names, parameters, strict=True)
@@ -270,7 +280,7 @@ class _Moving:
                 "there.",
                 condition="index one",
             )
-        return _Point(**found, solve=np.linalg.inv(whole), algebraic=self.U2)
+        return _Point(**matrices, solve=np.linalg.inv(stacked), algebraic=self.U2)
 
     def moved(
         self, v: FloatArray, begin: FloatArray, end: FloatArray, left: FloatArray, right: FloatArray, dt: float
@@ -283,7 +293,7 @@ class _Moving:
             r = len(self.E1)
             a = self.U1.T @ at.A @ at.solve[:, :r]
             b = self.U1.T @ (at.S - at.A @ at.solve[:, r:] @ self.U2.T @ at.S)
-            one, other = (left + (part + edge) / parts * (right - left) for edge in (0, 1))
+            first, last = (left + (part + edge) / parts * (right - left) for edge in (0, 1))
             transition, held, ramped = first_order_hold(a, b, dt / parts)
-            v = transition @ v + held @ one + ramped @ (other - one)
+            v = transition @ v + held @ first + ramped @ (last - first)
         return v

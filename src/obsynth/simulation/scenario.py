@@ -149,10 +149,10 @@ class Scenario:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what makes it again in another process: read-only mappings do not travel."""
-        given: dict[str, Any] = {
+        arguments: dict[str, Any] = {
             name: dict(value) if isinstance(value, Mapping) else value for name, value in vars(self).items()
         }
-        return partial(Scenario, **given), ()
+        return partial(Scenario, **arguments), ()
 
     def replace(self, **changes: Any) -> Scenario:
         """Return the scenario with some fields changed, such as its seed.
@@ -167,13 +167,13 @@ class Scenario:
     def as_dict(self) -> dict[str, Any]:
         """Return the scenario as plain data, as `scenario_from` reads it."""
         kinds = {kind: name for name, kind in PROFILE_KINDS.items()}
-        found = dict(vars(self))
+        data = dict(vars(self))
         for group in _ALLOWED:
-            found[group] = {
+            data[group] = {
                 name: [{"kind": kinds[type(profile)], **vars(profile)} for profile in profiles]
                 for name, profiles in getattr(self, group).items()
             }
-        return {name: dict(value) if isinstance(value, Mapping) else value for name, value in found.items()}
+        return {name: dict(value) if isinstance(value, Mapping) else value for name, value in data.items()}
 
     def step_of(self, plant: DescriptorSystem | PolytopicSystem) -> float:
         """Return the seconds between samples.
@@ -237,16 +237,16 @@ class Scenario:
 
 def scenario_from(data: Mapping[str, Any]) -> Scenario:
     """Return the scenario that `Scenario.as_dict` described."""
-    given = dict(data)
+    arguments = dict(data)
     for group in _ALLOWED:
-        given[group] = {
+        arguments[group] = {
             name: [
                 PROFILE_KINDS[item["kind"]](**{key: value for key, value in item.items() if key != "kind"})
                 for item in profiles
             ]
-            for name, profiles in given.get(group, {}).items()
+            for name, profiles in arguments.get(group, {}).items()
         }
-    return Scenario(**given)
+    return Scenario(**arguments)
 
 
 def profiles_of(scenario: Scenario, group: str) -> list[tuple[str, Profile]]:
@@ -256,16 +256,18 @@ def profiles_of(scenario: Scenario, group: str) -> list[tuple[str, Profile]]:
 
 def observer_start(scenario: Scenario, order: int) -> FloatArray:
     """Return ``z(0)`` of an observer ``(order,)``."""
-    given = scenario.observer_state
-    if given is not None and len(given) != order:
-        raise SpecError(f"observer_state needs {order} numbers, not {len(given)}.", path="observer_state")
-    return np.zeros(order) if given is None else np.array(given)
+    state = scenario.observer_state
+    if state is not None and len(state) != order:
+        raise SpecError(f"observer_state needs {order} numbers, not {len(state)}.", path="observer_state")
+    return np.zeros(order) if state is None else np.array(state)
 
 
-def _checked_profiles(given: Any, group: str, kinds: tuple[type[Profile], ...]) -> dict[str, tuple[Profile, ...]]:
-    require_kind(given, Mapping, group, "profiles by the names of signals")
-    found = {}
-    for name, value in given.items():
+def _checked_profiles(
+    profiles_by_signal: Any, group: str, kinds: tuple[type[Profile], ...]
+) -> dict[str, tuple[Profile, ...]]:
+    require_kind(profiles_by_signal, Mapping, group, "profiles by the names of signals")
+    checked = {}
+    for name, value in profiles_by_signal.items():
         profiles = (value,) if isinstance(value, Profile) else tuple(value) if isinstance(value, (list, tuple)) else ()
         where = f"{group}.{name}"
         if not profiles or not all(isinstance(profile, Profile) for profile in profiles):
@@ -279,13 +281,13 @@ def _checked_profiles(given: Any, group: str, kinds: tuple[type[Profile], ...]) 
                 )
         if len(profiles) > 1 and any(isinstance(profile, FAILURES) for profile in profiles):
             raise SpecError("Stuck and LostEffectiveness must be a signal's only profile.", path=where)
-        found[str(name)] = profiles
-    return found
+        checked[str(name)] = profiles
+    return checked
 
 
-def _checked_numbers(given: Any, name: str) -> dict[str, float]:
-    require_kind(given, Mapping, name, "numbers by the names of signals")
-    for key, value in given.items():
+def _checked_numbers(numbers: Any, name: str) -> dict[str, float]:
+    require_kind(numbers, Mapping, name, "numbers by the names of signals")
+    for key, value in numbers.items():
         real_number(value, repr(key), "a finite number", path=f"{name}.{key}")
         require_no_overflow(value, f"{name}[{key!r}]", f"{name}.{key}")
-    return {str(key): float(value) for key, value in given.items()}
+    return {str(key): float(value) for key, value in numbers.items()}

@@ -56,17 +56,17 @@ class ScenarioSignals:
 
     def measured(self, outputs: FloatArray) -> FloatArray:
         """Return outputs ``(steps, runs, ny)`` as the faulty sensors show them."""
-        shown = outputs.copy()
+        measurements = outputs.copy()
         for column, profile in self.sensors:
             acts = profile.active(self.steps, self.dt)
             if isinstance(profile, LostEffectiveness):
-                shown[acts, :, column] *= 1.0 - profile.share
+                measurements[acts, :, column] *= 1.0 - profile.share
             elif isinstance(profile, Stuck) and acts.any():
-                first = shown[int(np.argmax(acts)), :, column] if profile.value is None else profile.value
-                shown[acts, :, column] = first
+                first = measurements[int(np.argmax(acts)), :, column] if profile.value is None else profile.value
+                measurements[acts, :, column] = first
             elif isinstance(profile, Additive):
-                shown[:, :, column] += profile.sampled(self.steps, self.dt)[0][:, None]
-        return shown
+                measurements[:, :, column] += profile.sampled(self.steps, self.dt)[0][:, None]
+        return measurements
 
     def first_fault(self, faults: slice) -> int | None:
         """Return the first sample at which a fault or a faulty sensor acts; `None` if there is none."""
@@ -186,14 +186,14 @@ def _actuator(plant: DescriptorSystem | PolytopicSystem, fault: str, scenario: S
     everywhere = plant.vertices if isinstance(plant, PolytopicSystem) else (plant,)
     of_fault = np.concatenate([part for at in everywhere for part in (at.Bf[:, column], at.Df[:, column])])
     of_inputs = np.vstack([part for at in everywhere for part in (at.B, at.D)])
-    found = [i for i in range(plant.nu) if np.array_equal(of_inputs[:, i], of_fault)]
-    if len(found) != 1:
+    inputs = [i for i in range(plant.nu) if np.array_equal(of_inputs[:, i], of_fault)]
+    if len(inputs) != 1:
         raise SpecError(
             f"Fault {fault!r} must enter exactly where one input does to be a failing actuator, but "
-            f"{len(found)} inputs have its columns.",
+            f"{len(inputs)} inputs have its columns.",
             path=where,
         )
-    return found[0]
+    return inputs[0]
 
 
 def _none() -> FloatArray:

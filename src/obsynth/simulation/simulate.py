@@ -131,13 +131,13 @@ class Simulation:
         truth lies in the 95 % band of its estimate (``within_band``); those of others come after warm-up, with the time
         at which that ended.
         """
-        shown, table = self.estimates, dict[str, Any]()
+        estimates, table = self.estimates, dict[str, Any]()
         for kind, names, errors, deviations, warm_up in (
-            ("faults", shown.fault_names, self.fault_errors, shown.fault_deviations, self.fault_warm_up),
-            ("states", shown.state_names, self.state_errors, shown.state_deviations, self.state_warm_up),
+            ("faults", estimates.fault_names, self.fault_errors, estimates.fault_deviations, self.fault_warm_up),
+            ("states", estimates.state_names, self.state_errors, estimates.state_deviations, self.state_warm_up),
         ):
             table[kind] = {name: _sizes(errors[warm_up:, i]) for i, name in enumerate(names)}
-            if shown.has_deviations:
+            if estimates.has_deviations:
                 for i, row in enumerate(table[kind].values()):
                     row["within_band"] = float(np.mean(np.abs(errors[:, i]) <= BAND_WIDTH * deviations[:, i]))
             else:
@@ -150,25 +150,27 @@ class Simulation:
         An output with the name of an input is ``y[..]``.  Estimates ``xhat[..]``, ``fhat[..]``, standard deviations
         ``sd xhat[..]``, ``sd fhat[..]`` and residuals ``r[..]`` stand where the observer gave them.
         """
-        shown, spread = self.estimates, self.estimates.has_deviations
-        x, f = shown.state_names, shown.fault_names
-        found = {"time": self.time}
+        estimates, spread = self.estimates, self.estimates.has_deviations
+        x, f = estimates.state_names, estimates.fault_names
+        columns = {"time": self.time}
         for form, names, values in (
             ("u[{}]", self.input_names, self.inputs),
             ("y[{}]", self.output_names, self.outputs),
             ("x[{}]", x, self.states),
             ("f[{}]", f, self.faults[:, list(self.fault_columns)]),
             ("d[{}]", self.disturbance_names, self.disturbances),
-            ("xhat[{}]", x, shown.states),
-            *([("sd xhat[{}]", x, shown.state_deviations)] if spread else []),
-            ("fhat[{}]", f, shown.faults),
-            ("sd fhat[{}]", f, shown.fault_deviations) if spread else ("r[{}]", shown.residual_names, shown.residuals),
+            ("xhat[{}]", x, estimates.states),
+            *([("sd xhat[{}]", x, estimates.state_deviations)] if spread else []),
+            ("fhat[{}]", f, estimates.faults),
+            ("sd fhat[{}]", f, estimates.fault_deviations)
+            if spread
+            else ("r[{}]", estimates.residual_names, estimates.residuals),
         ):
             for i, name in enumerate(names):
                 # Inputs and outputs go by their own names, unless those are taken.
-                plain = form[0] in "uy" and name not in found
-                found[name if plain else form.format(name)] = values[:, i]
-        return found
+                plain = form[0] in "uy" and name not in columns
+                columns[name if plain else form.format(name)] = values[:, i]
+        return columns
 
     def write_csv(self, path: str | Path, *, operating_point: Mapping[str, float] = MappingProxyType({})) -> Path:
         """Write `columns` as comma-separated text, atomically, floats with all their digits.
@@ -266,8 +268,8 @@ def simulate(
     design = design.plant if isinstance(design, Transformation) else design
     for kind, plant_alone in _PLANT_SIMULATIONS.items():
         if isinstance(design, kind) and scenario is None:
-            found: Trajectory = plant_alone(design, **signals)
-            return found
+            trajectory: Trajectory = plant_alone(design, **signals)
+            return trajectory
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
     if signals:
