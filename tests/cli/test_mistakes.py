@@ -129,3 +129,51 @@ def test_a_threshold_for_a_signal_and_a_misspelt_monitor_are_asked_about() -> No
         obsynth.run_on_data(design, log, thresholds={"leak": 1.0})
     with pytest.raises(obsynth.SpecError, match=r"Did you mean 'chi-square'\?"):
         obsynth.online_monitor(design, "chisquare")
+
+
+def test_a_missing_colon_is_asked_about(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = THERMAL.read_text(encoding="utf-8")
+    path = tmp_path / "spec.yaml"
+    path.write_text(text.replace("  dt: 0 ", "  dt 0 ", 1), encoding="utf-8")
+    assert main(["check", "--system", str(path)]) == 2
+    number = next(i for i, line in enumerate(text.splitlines(), 1) if line.startswith("  dt: 0"))
+    assert capsys.readouterr().err.rstrip().endswith(f"Is a colon missing in line {number}: 'dt 0'?")
+
+
+def test_a_transposed_matrix_is_asked_about_before_the_names_that_it_takes_away(tmp_path: Path) -> None:
+    text = THERMAL.read_text(encoding="utf-8")
+    outputs = "{outputs: [heater, air, wall]}"
+    assert outputs in text
+    path = tmp_path / "spec.yaml"
+    path.write_text(text.replace(outputs, "[[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0]]"), encoding="utf-8")
+    with pytest.raises(obsynth.SpecError) as raised:
+        obsynth.load_spec(path)
+    assert "C is 4 by 3, but 4 by 4 is needed. Is it transposed?" in raised.value.problems[0]
+
+
+def test_what_is_given_instead_of_a_plant_or_a_method_is_named() -> None:
+    spec = obsynth.load_spec(WANG)
+    with pytest.raises(obsynth.SpecError, match=r"obsynth\.load_spec\('spec\.yaml'\)\.plant"):
+        obsynth.check("spec.yaml")  # type: ignore[arg-type]
+    with pytest.raises(obsynth.SpecError, match=r"The plant of a spec is spec\.plant"):
+        obsynth.fault_estimation_filter(spec)  # type: ignore[arg-type]
+    with pytest.raises(obsynth.SpecError, match="Did you mean 'ui-pi-observer'"):
+        obsynth.design(spec.plant, obsynth.ui_pi_observer)  # type: ignore[arg-type]
+    with pytest.raises(obsynth.SpecError, match="Did you mean 'ui-pi-observer'"):
+        obsynth.design(spec.plant, "ui-pi")
+    with pytest.raises(obsynth.SpecError, match="install the package that provides hinf"):
+        obsynth.design(spec.plant, "hinf")
+
+
+def test_a_misspelt_function_is_asked_about() -> None:
+    with pytest.raises(AttributeError, match="Did you mean 'fault_estimation_filter'"):
+        _ = obsynth.fault_estimation_filer
+    with pytest.raises(AttributeError, match=r"no attribute 'zzz'$"):
+        _ = obsynth.zzz
+
+
+def test_two_options_that_are_misspelt_are_two_sentences(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["export", "--gians", "g.json", "--ot", "x.c"])
+    told = capsys.readouterr().err
+    assert "There is no option --gians. Did you mean --gains? There is no option --ot. Did you mean --to or " in told

@@ -39,10 +39,9 @@ class Parser(argparse.ArgumentParser):
             known = list(self._option_string_actions)
             wrong = [word.partition("=")[0] for word in self._words if word.startswith("--")]
             close = [(word, meant(word, known)) for word in wrong if word not in known]
-            message += "".join(
-                f". There is no option {word}.{suggestion}" for word, suggestion in close if suggestion
-            ).rstrip(".")
-            message += self._meant_file(message)
+            questions = "".join(f" There is no option {word}.{question}" for word, question in close if question)
+            questions += self._meant_file(message)
+            message += f".{questions}" if questions else ""
         super().error(message)
 
     def _meant_file(self, message: str) -> str:
@@ -50,7 +49,7 @@ class Parser(argparse.ArgumentParser):
         needed = message.partition(": ")[2].split(",")[0].split("/")[0].strip()
         loose = [word for word in self._words if Path(word).suffix and not word.startswith("-")]
         plain = [word for word in loose if self._words.index(word) == 0]
-        return f". Did you mean {needed} {plain[0]}?" if needed.startswith("--") and plain else ""
+        return f" Did you mean {needed} {plain[0]}?" if needed.startswith("--") and plain else ""
 
 
 class PrintCompletion(argparse.Action):

@@ -13,6 +13,7 @@ from obsynth.methods.method import Method, PlantKind
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.plants.signal_names import suggestion
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
@@ -45,8 +46,8 @@ def method_class(method: str) -> type[Method]:
     """Return the class of a method; raise `SpecError` listing the known ones where there is none."""
     if method not in REGISTRY:
         raise SpecError(
-            f"There is no method {method!r}; there are: {', '.join(REGISTRY)}. If a plug-in has it, install the "
-            f"package that provides {method}.",
+            f"There is no method {method!r}; there are: {', '.join(REGISTRY)}."
+            f"{suggestion(method, REGISTRY) or f' If a plug-in has it, install the package that provides {method}.'}",
             path="method",
         )
     module, _, name = REGISTRY[method].partition(":")

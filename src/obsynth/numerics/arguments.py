@@ -131,7 +131,8 @@ def shape_problem(actual: tuple[int, ...], needed: tuple[int, ...], name: str) -
     """Return what is wrong with the shape of an array, as a sentence; ``None`` where nothing is."""
     if actual == needed:
         return None
-    transposed = len(actual) == len(needed) == 2 and actual[1] == needed[0] != actual[0]
+    matrices = len(actual) == len(needed) == 2
+    transposed = matrices and (actual[1] == needed[0] != actual[0] or actual[0] == needed[1] != actual[1])
     hint = " Is it transposed?" if transposed or actual == needed[::-1] else ""
     sides = [" by ".join(map(str, shape)) or "a single number" for shape in (actual, needed)]
     return f"{name} is {sides[0]}, but {sides[1]} is needed.{hint}"
@@ -290,7 +291,19 @@ def _problem_with_kind(value: Any, name: str, kind: Any) -> str | None:
             expected.append("a list of names")
         elif plain != "NoneType" and not (option is str and Path in options):
             expected.append(_WORDS.get(plain, f"an obsynth.{plain}"))
-    return f"{name} is {a_kind(value)}: give {' or '.join(dict.fromkeys(expected))}."
+    hint = _instead(value, [(get_origin(option) or option).__name__ for option in options])
+    return f"{name} is {a_kind(value)}: give {' or '.join(dict.fromkeys(expected))}.{hint}"
+
+
+def _instead(value: Any, expected: Sequence[str]) -> str:
+    """Return what may have been meant by a value of another kind, as a sentence after a blank; or nothing."""
+    if "DescriptorSystem" in expected and isinstance(value, (str, Path)):
+        return f" The plant of a spec is obsynth.load_spec({str(value)!r}).plant."
+    if "DescriptorSystem" in expected and type(value).__name__ == "Spec":
+        return " The plant of a spec is spec.plant."
+    if expected == ["str"] and hasattr(value, "__name__"):
+        return f" Did you mean {value.__name__.replace('_', '-')!r}?"
+    return ""
 
 
 def problem_with(value: Any, name: str, kind: Any) -> str | None:

@@ -22,6 +22,7 @@ class Problems:
 
     def __init__(self) -> None:
         self.messages: list[str] = []
+        self._shapes = 0
         self.first_path: str | None = None
 
     def collect(self, make: Callable[[], Any]) -> Any:
@@ -44,7 +45,10 @@ class Problems:
         """Note a wrong shape."""
         problem = shape_problem(found, shape, name)
         if problem:
-            self.note(problem, name)
+            # Before the others: names of signals that are missing follow from matrices of the wrong size.
+            self.messages.insert(self._shapes, problem)
+            self.first_path = name if self._shapes == 0 else self.first_path
+            self._shapes += 1
 
     def raise_if_any(self) -> None:
         """Raise one `SpecError` with all problems noted so far."""

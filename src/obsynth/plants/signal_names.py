@@ -20,6 +20,9 @@ MOST_NAMES = 4
 #: Control characters, halves of pairs, separators of lines and paragraphs: no table can hold them in a name.
 _UNWRITABLE = frozenset({"Cc", "Cs", "Zl", "Zp"})
 
+#: So many letters of a name are taken as its beginning.
+LEAST_BEGINNING = 3
+
 
 def leading_names(shares: FloatArray, names: Sequence[str], *, most: int | None = None) -> tuple[str, ...]:
     """Return the names whose share ``(n,)`` is not small beside the largest: the ``most`` largest, in given order."""
@@ -75,7 +78,10 @@ def listed(texts: Sequence[str], *, most: int = 6) -> str:
 
 def suggestion(name: str, names: Iterable[str]) -> str:
     """Return a question with the names closest to a wrong one, beginning with a space; empty where none is close."""
-    close = difflib.get_close_matches(str(name), list(names), n=3)
+    known = list(names)
+    close = difflib.get_close_matches(str(name), known, n=3)
+    if not close and len(str(name)) >= LEAST_BEGINNING:
+        close = [other for other in known if other.startswith(str(name))][:3]
     return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
 
 

@@ -135,7 +135,19 @@ def _quoted(error: Exception, text: str) -> str:
     line, column = lines[mark.line].expandtabs(1), mark.column
     start = max(column - SHOWN_COLUMNS // 2, 0) if len(line) > SHOWN_COLUMNS else 0
     excerpt = line[start : start + SHOWN_COLUMNS]
-    return f"\n  {number} | {excerpt}\n  {' ' * len(number)} | {' ' * (column - start)}^"
+    quoted = f"\n  {number} | {excerpt}\n  {' ' * len(number)} | {' ' * (column - start)}^"
+    return quoted + _missing_colon(lines, mark.line)
+
+
+def _missing_colon(lines: Sequence[str], stop: int) -> str:
+    """Return a question about the line before the one at which the YAML reader stopped, where it is a key without a
+    colon."""
+    before = next((i for i in range(stop - 1, -1, -1) if lines[i].partition("#")[0].strip()), None)
+    if before is None:
+        return ""
+    text = lines[before].partition("#")[0].strip()
+    is_key = re.match(r"[A-Za-z_]\w*( |$)", text) and ":" not in text
+    return f"\nIs a colon missing in line {before + 1}: {text!r}?" if is_key else ""
 
 
 def _one_line(error: Exception) -> str:
