@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from obsynth.errors import SpecError, a_kind
 from obsynth.files.inputs import input_file
@@ -22,11 +22,6 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import plain
 from obsynth.specs.documents import read_yaml
 from obsynth.specs.loader import changed_document, design_of_spec, spec_of
-
-if TYPE_CHECKING:
-    pass
-
-
 from obsynth.studies.work import Work
 
 #: Keys of a spec; a parameter that begins with none of them is an option of the method.
@@ -131,18 +126,18 @@ def _sorted_out(document: Mapping[str, Any], chosen: Mapping[str, Any]) -> tuple
 
 def _digest(version: str, document: Mapping[str, Any], plant_changes: Mapping[str, Any], source: Path) -> str:
     """Return the digest of a changed spec and of every file that it refers to."""
-    found = hashlib.sha256(version.encode())
+    digest = hashlib.sha256(version.encode())
 
     def read(part: Any, folder: Path) -> None:
-        found.update(json.dumps(part, sort_keys=True, default=str).encode())
+        digest.update(json.dumps(part, sort_keys=True, default=str).encode())
         for name in _files_in(part):
             file = folder / name
-            found.update(input_file(file, where=name).read_bytes())
+            digest.update(input_file(file, where=name).read_bytes())
             if file.suffix.lower() in (".yaml", ".yml"):
                 read(changed_document(read_yaml(file), plant_changes), file.parent)
 
     read([document, plant_changes], source.parent)
-    return found.hexdigest()
+    return digest.hexdigest()
 
 
 def _files_in(part: Any) -> Iterator[str]:
@@ -158,8 +153,8 @@ def _files_in(part: Any) -> Iterator[str]:
 
 
 def _named(stem: str, chosen: Mapping[str, Any]) -> str:
-    said = [f"{path.rpartition('.')[2]} = {_cell_text(value)}" for path, value in chosen.items()]
-    return ", ".join([stem, *said])
+    values = [f"{path.rpartition('.')[2]} = {_cell_text(value)}" for path, value in chosen.items()]
+    return ", ".join([stem, *values])
 
 
 def _cell_text(value: Any) -> str:

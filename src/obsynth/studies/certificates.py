@@ -87,7 +87,7 @@ def designs_inside(path: Path) -> list[ObserverDesign]:
     """Return the designs inside a certificate."""
     body = read_json(path)["certificate"]
     inside = body.get("gain_sets") or {"gain set": body["gain_set"]}
-    return [loaded(json.dumps(one).encode(), f"the {name}") for name, one in inside.items()]
+    return [loaded(json.dumps(gain_set).encode(), f"the {name}") for name, gain_set in inside.items()]
 
 
 def _verified_result(path: str | Path, data: str | Path | None) -> VerificationReport:
@@ -163,10 +163,10 @@ def _robustness(body: Mapping[str, Any], designs: Mapping[str, ObserverDesign], 
 
 
 def _study(body: Mapping[str, Any], designs: Mapping[str, ObserverDesign], _: Path | None) -> Again:
-    asked = dict(body["asked"])
-    found = tolerance_study(designs["design"], scenario_from(asked.pop("scenario")), **asked)
+    options = dict(body["asked"])
+    study = tolerance_study(designs["design"], scenario_from(options.pop("scenario")), **options)
     digest = body["gain_sets"]["design"]["sha256"]
-    return found.as_dict(), study_statement(body["result"], found.asked, digest), []
+    return study.as_dict(), study_statement(body["result"], study.asked, digest), []
 
 
 _AGAIN: Mapping[str, Callable[[Mapping[str, Any], Mapping[str, ObserverDesign], Path | None], Again]] = {

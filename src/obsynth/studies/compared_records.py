@@ -61,19 +61,19 @@ def drawn_runs(
     random, noise, sensors = drive.drawn(seeds, sampled.nw)
     scales = rng.uniform(-1.0, 1.0, size=(runs, sampled.nd))
     faults = drive.left[:, nu : nu + nf]
-    found: list[tuple[list[FloatArray], list[FloatArray]]] = [([], []), ([], [])]
+    records: list[tuple[list[FloatArray], list[FloatArray]]] = [([], []), ([], [])]
     off = tolerance > 0.0 or source.uncertainty is not None
     for run in range(runs):
         plant = on_the_clock(_drawn(source, tolerance, rng), sampled.dt) if off else sampled
         signals = drive.left + random[:, run]
         d = signals[:, nu + nf :] * scales[run]
         shaken = noise[:, run] if noise.shape[2] == plant.nw else np.zeros((drive.steps, plant.nw))
-        for (inputs, outputs), f in zip(found, (signals[:, nu : nu + nf], np.zeros((drive.steps, nf))), strict=True):
+        for (inputs, outputs), f in zip(records, (signals[:, nu : nu + nf], np.zeros((drive.steps, nf))), strict=True):
             measured, known = _outputs(plant, signals[:, :nu], d, f, shaken, feedback)
             inputs.append(known)
             outputs.append(measured + sensors[:, run])
     times = _clock(drive.steps, drive.dt)
-    (u, y), (healthy_u, healthy_y) = ((np.array(inputs), np.array(outputs)) for inputs, outputs in found)
+    (u, y), (healthy_u, healthy_y) = ((np.array(inputs), np.array(outputs)) for inputs, outputs in records)
     return Record(times, u, y, faults), Record(times, healthy_u, healthy_y, np.zeros_like(faults))
 
 
@@ -102,14 +102,14 @@ class ComparedLog:
             data = as_frame(data)
             require_kind(data, pd.DataFrame, "data", "a file name or a pandas.DataFrame")
         measured = (*plant.input_names, *plant.output_names)
-        wanted = {name: (columns or {}).get(name, name) for name in (*measured, *plant.fault_names)}
-        table, _, said = log_table(data, list(wanted.values()), (columns or {}).get(TIME_HEADER, TIME_HEADER))
-        frame = {name: table[column] for name, column in wanted.items() if column in table}
+        column_of = {name: (columns or {}).get(name, name) for name in (*measured, *plant.fault_names)}
+        table, _, remarks = log_table(data, list(column_of.values()), (columns or {}).get(TIME_HEADER, TIME_HEADER))
+        frame = {name: table[column] for name, column in column_of.items() if column in table}
         shift = None if plant.uncertainty is None else plant.uncertainty.shift
         if shift and frame:
             # The input of a linearised plant that is one in every row has no column.
             frame[shift] = np.ones(max(map(len, frame.values())))
-        missing = [wanted[name] for name in measured if name not in frame]
+        missing = [column_of[name] for name in measured if name not in frame]
         if missing:
             raise SpecError(f"The log has no column {', '.join(map(repr, missing))}.", path="data")
         count = max(map(len, frame.values()), default=0)
@@ -118,7 +118,7 @@ class ComparedLog:
         for name in (*plant.input_names, *plant.output_names):
             if not np.isfinite(frame[name]).any():
                 raise SpecError(
-                    f"The column {wanted[name]!r} holds no number: {name!r} is never measured.", path="data"
+                    f"The column {column_of[name]!r} holds no number: {name!r} is never measured.", path="data"
                 )
 
         def signals(names: Sequence[str]) -> FloatArray:
@@ -127,16 +127,16 @@ class ComparedLog:
             values = np.column_stack([frame[name] for name in names]) if names else np.zeros((count, 0))
             return np.asarray(values * factors - offsets)
 
-        there = [name for name in plant.fault_names if name in frame]
+        known_faults = [name for name in plant.fault_names if name in frame]
         truth = np.zeros((count, plant.nf))
-        for name in there:
+        for name in known_faults:
             truth[:, plant.fault_names.index(name)] = frame[name]
         u, y = signals(plant.input_names), signals(plant.output_names)
         u = u[np.clip(np.arange(count) - input_delay, 0, count - 1)]
         stamps = table.get((columns or {}).get(TIME_HEADER, TIME_HEADER))
         stuck = {name: stuck_rows(values) for name, values in zip(plant.output_names, y.T, strict=True)}
         times = _clock(count, plant.dt) if stamps is None else stamps
-        return Record(times, u, y, truth, tuple(there), (*said, *stuck_texts(stuck)))
+        return Record(times, u, y, truth, tuple(known_faults), (*remarks, *stuck_texts(stuck)))
 
 
 def _outputs(
@@ -145,9 +145,9 @@ def _outputs(
     """Return outputs and known inputs ``(steps, ..)`` of a plant at rest, with ``u - feedback x`` as its input."""
     into = u @ plant.B.T + d @ plant.Bd.T + f @ plant.Bf.T + w @ plant.Bw.T
     direct = u @ plant.D.T + d @ plant.Dd.T + f @ plant.Df.T + w @ plant.Dw.T
-    closed, seen = plant.A - plant.B @ feedback, plant.C - plant.D @ feedback
+    closed, measured = plant.A - plant.B @ feedback, plant.C - plant.D @ feedback
     states = driven(closed, np.zeros(plant.nx), into)
-    return np.asarray(states @ seen.T + direct), np.asarray(u - states @ feedback.T)
+    return np.asarray(states @ measured.T + direct), np.asarray(u - states @ feedback.T)
 
 
 def _drawn(plant: DescriptorSystem, tolerance: float, rng: np.random.Generator) -> DescriptorSystem:

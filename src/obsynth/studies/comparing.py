@@ -98,13 +98,13 @@ class DesignSource:
         self, plant: DescriptorSystem, sampled: DescriptorSystem, steps: int, report_stage: Callable[[str], None]
     ) -> list[Candidate]:
         """Return the design of each method on the clock of the comparison, or why there is none."""
-        found = []
+        designs = []
         for method in self.methods:
             report_stage(f"designing by {method}")
             own = self.options.get(method, {})
             in_own_time = bool(own) and not self.of_samples and method_class(method).time == "both"
-            found.append(candidate(method, plant, sampled, steps, self.maker, own, continuous=in_own_time))
-        return found
+            designs.append(candidate(method, plant, sampled, steps, self.maker, own, continuous=in_own_time))
+        return designs
 
 
 def estimates(observer: LinearObserver, runs: Record) -> FloatArray:
@@ -112,27 +112,27 @@ def estimates(observer: LinearObserver, runs: Record) -> FloatArray:
     rows, y, known = observer.fault_rows, runs.y.swapaxes(0, 1), runs.u.swapaxes(0, 1)
     z = driven(observer.Az, np.zeros(observer.order), y @ observer.By.T + known @ observer.Bu.T)
     with np.errstate(over="ignore", invalid="ignore"):
-        found = z @ observer.Cz[rows].T + y @ observer.Dy[rows].T + known @ observer.Du[rows].T + observer.added[rows]
-    return np.ascontiguousarray(found.swapaxes(0, 1))
+        values = z @ observer.Cz[rows].T + y @ observer.Dy[rows].T + known @ observer.Du[rows].T + observer.added[rows]
+    return np.ascontiguousarray(values.swapaxes(0, 1))
 
 
 def alarms(
-    found: FloatArray, quiet: FloatArray, fault: FloatArray, response: FloatArray, false_alarms: float, dt: float
+    with_fault: FloatArray, quiet: FloatArray, fault: FloatArray, response: FloatArray, false_alarms: float, dt: float
 ) -> tuple[float, float, float]:
     """Return threshold (passed in a share of the fault-free runs), median detection delay (s) and smallest fault found.
-    ``found, quiet (runs, steps)``: estimates with and without the fault; ``response (steps,)``: to a unit step."""
+    ``with_fault, quiet (runs, steps)``: estimates with and without the fault; ``response (steps,)``: to a unit step."""
     level = float(np.quantile(np.max(np.abs(quiet), axis=1), 1.0 - false_alarms))
     acts = np.flatnonzero(fault)
     if not acts.size:
         return level, float("nan"), float("nan")
     first = int(acts[0])
-    above = np.abs(found[:, first:]) > level
+    above = np.abs(with_fault[:, first:]) > level
     delays = np.where(above.any(axis=1), np.argmax(above, axis=1) * dt, np.inf)
     # The response is computed as far as a step is followed, which may be less than the record.
     length = min(len(fault) - first, len(response))
-    shown = np.maximum(response[:length], 0.0)
+    growth = np.maximum(response[:length], 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        needed = np.where(shown > 0.0, (level - quiet[:, first : first + length]) / shown, np.inf)
+        needed = np.where(growth > 0.0, (level - quiet[:, first : first + length]) / growth, np.inf)
     smallest = np.maximum(np.min(needed, axis=1), 0.0)
     return level, float(np.median(delays)), float(np.median(smallest))
 
@@ -231,7 +231,7 @@ def compare(
     sample_time = clock if sample_time is None else sample_time
     if plant.nf == 0:
         raise SpecError("The plant has no faults, so there are no fault estimates to compare.", path="plant")
-    unused = sorted(name for name, given in (("columns", columns), ("scales", scales)) if given and data is None)
+    unused = sorted(name for name, argument in (("columns", columns), ("scales", scales)) if argument and data is None)
     if unused:
         raise SpecError(f"{unused[0]} is for a log: give data.", path=unused[0])
     if scenario is not None and disturbance != 1.0:
@@ -251,7 +251,7 @@ def compare(
     settings = ComparisonSettings(
         sample_time, within, float(tolerance), float(disturbance), int(runs), float(false_alarms), int(input_delay)
     )
-    source = DesignSource(ids, lambda given, method, own: design(given, method, **own), options or {}, made.dt > 0.0)
+    source = DesignSource(ids, lambda target, method, own: design(target, method, **own), options or {}, made.dt > 0.0)
     log = None if data is None else ComparedLog(data, columns, scales)
     return side_by_side(plant, scenario, source, settings, log=log, progress=progress)
 
@@ -267,7 +267,7 @@ def side_by_side(
 ) -> Comparison:
     """Return designs side by side, on one clock and on the same draws."""
     report_stage = progress or (lambda _: None)
-    asked = {
+    options = {
         "plant": plant.as_dict(),
         "scenario": None if scenario is None else scenario.as_dict(),
         **settings.as_dict(),
@@ -281,7 +281,7 @@ def side_by_side(
     followed, feedback = held(sampled, steps)
     if followed < steps:
         steps, happening = followed, happening.replace(horizon=followed * dt)
-    found = source.candidates(plant, sampled, steps, report_stage)
+    candidates = source.candidates(plant, sampled, steps, report_stage)
     report_stage("running the scenario")
     faulty, healthy = drawn_runs(
         plant,
@@ -295,22 +295,22 @@ def side_by_side(
     logged = None if log is None else log.record(sampled, settings.input_delay)
     limit = settings.within if settings.within is not None else settling_time(plant)
     bounds = largest_disturbances(happening, sampled.disturbance_names, followed, dt)
-    kept = followed, feedback
+    loop = followed, feedback
     compared = _sized(
         [
-            _compared(entry, sampled, faulty, healthy, logged, kept, limit, settings.false_alarms, bounds)
-            for entry in found
+            _compared(entry, sampled, faulty, healthy, logged, loop, limit, settings.false_alarms, bounds)
+            for entry in candidates
         ]
     )
     compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.relative_error))
     setting = settings.in_words(plant, dt, happening.horizon, limit, stabilised=bool(feedback.any()))
-    shown, truth = (faulty, faulty.truth) if logged is None else (logged, np.array(logged.truth))
+    record, truth = (faulty, faulty.truth) if logged is None else (logged, np.array(logged.truth))
     if logged is not None:
         # Nobody says what these faults were in the log: zero would be drawn as the truth.
         truth[:, [name not in logged.known for name in plant.fault_names]] = np.nan
     best = next((entry for entry in compared if not entry.refused), None)
     settling = settling_time(plant)
-    among = [entry for entry in found if entry.figures and "faults" in method_class(entry.method).purposes]
+    among = [entry for entry in candidates if entry.figures and "faults" in method_class(entry.method).purposes]
     usual = min(among, key=lambda entry: entry.rank(sampled.nd > 0, settling), default=None)
     reference = None if log is None else log.reference
     return Comparison(
@@ -318,11 +318,11 @@ def side_by_side(
         recommended="" if best is None else best.method,
         reason=_reason(best, compared, sampled, "" if usual is None else usual.method),
         sample_time=dt,
-        times=read_only(shown.times),
+        times=read_only(record.times),
         truth=read_only(truth),
         fault_names=plant.fault_names,
         setting=setting,
-        asked=asked if log is None or reference is not None else {},
+        asked=options if log is None or reference is not None else {},
         log=reference,
         notes=() if logged is None else logged.notes,
     )
@@ -332,40 +332,42 @@ def compared_again(
     body: Mapping[str, Any], designs: Mapping[str, ObserverDesign], log: Path | None
 ) -> tuple[dict[str, Any], str, list[str]]:
     """Return figures and sentence of a certificate made again from its plant and gain sets, and designs of others."""
-    asked = dict(body["asked"])
-    plant = DescriptorSystem(**asked.pop("plant"))
-    scenario = asked.pop("scenario")
+    options = dict(body["asked"])
+    plant = DescriptorSystem(**options.pop("plant"))
+    scenario = options.pop("scenario")
     source = DesignSource(sorted(designs), lambda _, method, __: designs[method], {})
-    found = side_by_side(
+    comparison = side_by_side(
         plant,
         None if scenario is None else scenario_from(scenario),
         source,
-        ComparisonSettings(**asked),
+        ComparisonSettings(**options),
         log=None if log is None else ComparedLog(log, body["log"]["columns"], body["log"]["scales"]),
     )
-    result = found.claims()
+    result = comparison.claims()
     if log is None and body["log"] is not None:
         # The errors on a log that is not given are assumed.
         for name, entry in result["methods"].items():
             for fault, stored in zip(entry["faults"], body["result"]["methods"][name]["faults"], strict=True):
                 fault |= {name: float(stored[name]) for name in ("rms", "size")}
             entry["relative_error"] = relative_error(entry["faults"])
-    sampled = on_the_clock(plant, found.sample_time)
-    others = [f"plant of {name}" for name, one in designs.items() if not _is_of(one, (plant, sampled))]
+    sampled = on_the_clock(plant, comparison.sample_time)
+    foreign = [f"plant of {name}" for name, design in designs.items() if not _is_of(design, (plant, sampled))]
     digests = {name: inside["sha256"] for name, inside in body["gain_sets"].items()}
-    return result, comparison_statement(body["result"], digests, body["log"]), others
+    return result, comparison_statement(body["result"], digests, body["log"]), foreign
 
 
 def _is_of(made: ObserverDesign, plants: Sequence[DescriptorSystem]) -> bool:
     """Whether a design is for one of some plants, as it was written or transformed."""
     own = [made.plant] if made.source is None else [made.source.plant, made.plant]
-    return any(isinstance(one, DescriptorSystem) and agree(one.dense(), other) for one in own for other in plants)
+    return any(
+        isinstance(variant, DescriptorSystem) and agree(variant.dense(), other) for variant in own for other in plants
+    )
 
 
-def _scenario(plant: DescriptorSystem, given: Scenario | None, dt: float, disturbance: float) -> Scenario:
+def _scenario(plant: DescriptorSystem, scenario: Scenario | None, dt: float, disturbance: float) -> Scenario:
     """Return what happens: the scenario given, with at least the sensors' own noise, or each fault in turn."""
-    if given is not None:
-        clocked = given if plant.dt or given.sample_time == dt else given.replace(sample_time=dt)
+    if scenario is not None:
+        clocked = scenario if plant.dt or scenario.sample_time == dt else scenario.replace(sample_time=dt)
         # All runs begin at rest; a state that is given may be one that the sampled plant does not have any more.
         return clocked.replace(observer_state=None, initial_state={}, stabilise=False)
     settle = max(settling_time(plant), 4.0 * dt)
@@ -392,7 +394,7 @@ def _compared(
     faulty: Record,
     healthy: Record,
     log: Record | None,
-    kept: tuple[int, FloatArray],
+    loop: tuple[int, FloatArray],
     limit: float,
     false_alarms: float,
     bounds: FloatArray,
@@ -401,24 +403,24 @@ def _compared(
     if entry.observer is None:
         return ComparedMethod(entry.method, entry.refused, None, 0, entry.milliseconds, (), False, nothing, nothing)
     observer = entry.observer
-    impulses, responses = step_responses(plant, observer, *kept)
+    impulses, responses = step_responses(plant, observer, *loop)
     names = [figures.fault for figures in entry.figures]
     beside = thresholds_beside_least(plant, impulses, names, bounds)
-    found, quiet = estimates(observer, faulty), estimates(observer, healthy)
+    estimated, quiet = estimates(observer, faulty), estimates(observer, healthy)
     replayed = None if log is None or entry.design is None else faults_on_rows(entry.design, log.times, log.u, log.y)
     rows = []
     for row, figures in enumerate(entry.figures):
         column = plant.fault_names.index(figures.fault)
         fault = faulty.truth[:, column]
         response = responses[:, row, column]
-        level, delay, smallest = alarms(found[:, :, row], quiet[:, :, row], fault, response, false_alarms, plant.dt)
-        error, truth = found[:, :, row] - fault, fault
+        level, delay, smallest = alarms(estimated[:, :, row], quiet[:, :, row], fault, response, false_alarms, plant.dt)
+        error, truth = estimated[:, :, row] - fault, fault
         if replayed is not None and log is not None and figures.fault in log.known:
             truth = log.truth[:, column]
             error = replayed[:, row] - truth
         bias = float(np.max(np.abs(np.mean(quiet[:, :, row], axis=1)), initial=0.0))
         rows.append(FaultComparison(figures, rms(error), rms(truth), bias, level, delay, smallest, *beside[row]))
-    shown = found[0] if replayed is None else replayed
+    drawn = estimated[0] if replayed is None else replayed
     fast = all(fault.figures.reaches and fault.figures.most <= limit for fault in rows)
     least = None if entry.design is None else least_possible(entry.design, later=True)
     own = np.column_stack([responses[:, i, plant.fault_names.index(f.fault)] for i, f in enumerate(entry.figures)])
@@ -431,7 +433,7 @@ def _compared(
         tuple(rows),
         fast,
         read_only(own),
-        read_only(shown),
+        read_only(drawn),
         least,
     )
 
@@ -452,16 +454,16 @@ def _reason(
 ) -> str:
     if best is None:
         return compared[0].refused if compared else "no method was asked for"
-    others = [entry for entry in compared if not entry.refused and entry is not best]
+    other_designs = [entry for entry in compared if not entry.refused and entry is not best]
     words = [f"rms error {best.relative_error:.3g} of the size of the faults"]
-    if others and is_finite_number(others[0].relative_error):
-        words[0] += f" against {others[0].relative_error:.3g} by {others[0].method}"
+    if other_designs and is_finite_number(other_designs[0].relative_error):
+        words[0] += f" against {other_designs[0].relative_error:.3g} by {other_designs[0].method}"
     gain = max(fault.figures.unknown_input_gain for fault in best.faults)
     if plant.nd:
         words.append("decoupled from unknown inputs" if gain <= DECOUPLED else f"gain from unknown inputs {gain:.2g}")
     if not best.fast_enough:
         words.append("though none reaches 90 % of a step within the time asked for")
-    slow = [entry.method for entry in others if not entry.fast_enough] if best.fast_enough else []
+    slow = [entry.method for entry in other_designs if not entry.fast_enough] if best.fast_enough else []
     if slow:
         words.append(f"90 % of a step is reached too late or never: {', '.join(slow)}")
     if by_default not in ("", best.method):

@@ -196,13 +196,13 @@ class ComparedMethod:
     @property
     def shares(self) -> tuple[float, float]:
         """Gain and deviation in times the least possible; NaN where that is not known."""
-        found = self.beside
-        return (np.nan, np.nan) if found is None else (found.gain_share, found.deviation_share)
+        beside = self.beside
+        return (np.nan, np.nan) if beside is None else (beside.gain_share, beside.deviation_share)
 
     @property
     def relative_error(self) -> float:
         """Root mean square over all faults of each one's error, as a share of its size: the same in all units."""
-        return relative_error([vars(found) for found in self.faults])
+        return relative_error([vars(fault) for fault in self.faults])
 
 
 def relative_error(faults: Sequence[Mapping[str, Any]]) -> float:
@@ -254,10 +254,10 @@ class Comparison:
     notes: tuple[str, ...] = ()
 
     def __getitem__(self, method: str) -> ComparedMethod:
-        for found in self.methods:
-            if found.method == method:
-                return found
-        raise KeyError(f"no method {method!r}; there are: {', '.join(found.method for found in self.methods)}")
+        for entry in self.methods:
+            if entry.method == method:
+                return entry
+        raise KeyError(f"no method {method!r}; there are: {', '.join(entry.method for entry in self.methods)}")
 
     def rows(self) -> tuple[tuple[str, ...], ...]:
         """Return the table as texts: the header, then a row for each method and fault."""
@@ -309,14 +309,14 @@ class Comparison:
         str
             Each header with its meaning.
         """
-        told = [f"{name}: {_FIGURE_MEANINGS[name]}" for name in columns if name in _FIGURE_MEANINGS]
-        return "; ".join(told) + f". {_OF_THE_EXACT_MODEL}"
+        texts = [f"{name}: {_FIGURE_MEANINGS[name]}" for name in columns if name in _FIGURE_MEANINGS]
+        return "; ".join(texts) + f". {_OF_THE_EXACT_MODEL}"
 
     @property
     def beside_the_least(self) -> tuple[str, ...]:
         """How near each method is to the least that any causal filter lets through, in one line each."""
-        found = ((entry.method, "" if entry.beside is None else entry.beside.sentence()) for entry in self.methods)
-        return tuple(f"{method}: {text}" for method, text in found if text)
+        sentences = ((entry.method, "" if entry.beside is None else entry.beside.sentence()) for entry in self.methods)
+        return tuple(f"{method}: {text}" for method, text in sentences if text)
 
     @property
     def refusals(self) -> tuple[str, ...]:
@@ -395,15 +395,15 @@ class Comparison:
         return self._drawn(plt.figure)
 
     def _drawn(self, new_figure: Callable[..., Figure]) -> Figure:
-        shown = [entry for entry in self.methods if entry.faults]
+        drawn = [entry for entry in self.methods if entry.faults]
         count = len(self.fault_names)
-        far = [self._far_noisier(shown, row) for row in range(count)]
+        far = [self._far_noisier(drawn, row) for row in range(count)]
         columns = 3 if any(far) else 2
         figure = new_figure(figsize=(3.5 + 3.75 * (columns - 1), 2.8 * count), layout="constrained")
         axes = figure.subplots(count, columns, squeeze=False)
         for row, name in enumerate(self.fault_names):
-            left, *panels = axes[row]
-            sets = ([entry for entry in shown if entry not in far[row]], far[row])
+            left_panel, *panels = axes[row]
+            sets = ([entry for entry in drawn if entry not in far[row]], far[row])
             for panel, entries in zip(panels, sets, strict=False):
                 if not entries:
                     panel.set_visible(False)
@@ -413,24 +413,24 @@ class Comparison:
                     panel.plot(self.times, self.truth[:, row], label="fault", **over, **TRUE_STYLE)
                 panel.set_ylim(*self._range(entries, row))
                 panel.set_ylabel(with_unit(name, self._units))
-            left.axhline(1.0, color="0.8", linewidth=0.8)
-            for rank, entry in enumerate(shown):
+            left_panel.axhline(1.0, color="0.8", linewidth=0.8)
+            for rank, entry in enumerate(drawn):
                 names = [fault.figures.fault for fault in entry.faults]
                 if name not in names:
                     continue
                 column, colour = names.index(name), LINE_COLOURS[rank % len(LINE_COLOURS)]
                 # The best lies on top.
-                style: dict[str, Any] = {"color": colour, "zorder": 3.0 + len(shown) - rank}
+                style: dict[str, Any] = {"color": colour, "zorder": 3.0 + len(drawn) - rank}
                 response, estimate = np.clip(entry.responses[:, column], -1.0, 3.0), entry.estimates[:, column]
-                left.plot(np.arange(len(response)) * self.sample_time, response, label=entry.method, **style)
+                left_panel.plot(np.arange(len(response)) * self.sample_time, response, label=entry.method, **style)
                 noisy = entry in far[row]
                 label = {"label": f"{entry.method}, far noisier"} if noisy else {}
                 panels[int(noisy)].plot(self.times, estimate, **style, **label, linewidth=0.4 if noisy else 0.8)
-            times = [f.figures.most for entry in shown for f in entry.faults if np.isfinite(f.figures.most)]
-            length = max((len(entry.responses) for entry in shown), default=2) * self.sample_time
-            left.set_xlim(0.0, min(max([3.0 * max(times, default=length), 10.0 * self.sample_time]), length))
-            left.set_ylabel(f"estimate of a unit step\nof {name}")
-            for panel in (left, *panels):
+            times = [f.figures.most for entry in drawn for f in entry.faults if np.isfinite(f.figures.most)]
+            length = max((len(entry.responses) for entry in drawn), default=2) * self.sample_time
+            left_panel.set_xlim(0.0, min(max([3.0 * max(times, default=length), 10.0 * self.sample_time]), length))
+            left_panel.set_ylabel(f"estimate of a unit step\nof {name}")
+            for panel in (left_panel, *panels):
                 label_time(panel)
                 tidy(panel)
             for panel in panels if row == 0 else panels[1:]:
@@ -439,10 +439,10 @@ class Comparison:
         legend_above(axes[0, 0])
         return figure
 
-    def _far_noisier(self, shown: Sequence[ComparedMethod], row: int) -> list[ComparedMethod]:
+    def _far_noisier(self, entries: Sequence[ComparedMethod], row: int) -> list[ComparedMethod]:
         """Return the methods whose estimate of a fault would hide the others in one panel; the first is none."""
         name, reaches = self.fault_names[row], list[tuple[ComparedMethod, float]]()
-        for entry in shown:
+        for entry in entries:
             names = [fault.figures.fault for fault in entry.faults]
             if name in names:
                 reaches.append((entry, _reach(entry.estimates[:, names.index(name)])))
@@ -451,11 +451,11 @@ class Comparison:
         most = NOISIER * max(_reach(self.truth[:, row]), reaches[0][1])
         return [entry for entry, reach in reaches[1:] if reach > most]
 
-    def _range(self, shown: Sequence[ComparedMethod], row: int) -> tuple[float, float]:
+    def _range(self, entries: Sequence[ComparedMethod], row: int) -> tuple[float, float]:
         """Return the ends of the panel of a fault: all of the truth, and of every estimate."""
         known = self.truth[np.isfinite(self.truth[:, row]), row]
         low, high = float(np.min(known, initial=0.0)), float(np.max(known, initial=0.0))
-        for entry in shown:
+        for entry in entries:
             names = [fault.figures.fault for fault in entry.faults]
             if self.fault_names[row] in names:
                 estimate = entry.estimates[:, names.index(self.fault_names[row])]
@@ -491,7 +491,7 @@ class Comparison:
         refused = "".join(f"<li>{escape(text)}</li>" for text in self.refusals)
         head, *rows = self.rows()
         # With the unit of each fault, in which its figures are.
-        table = (head, *((method, with_unit(fault, self._units), *others) for method, fault, *others in rows))
+        table = (head, *((method, with_unit(fault, self._units), *cells) for method, fault, *cells in rows))
         body = [
             f'<p class="verdict {"holds" if self.recommended else "fails"}">{escape(self.advice)}</p>',
             f"<p>{escape(self.setting)}</p>",
@@ -510,14 +510,14 @@ def comparison_statement(claims: Mapping[str, Any], digests: Mapping[str, str], 
     methods = claims["methods"]
     errors = {name: relative_error(entry["faults"]) for name, entry in methods.items()}
     best = min(methods, key=lambda name: (not methods[name]["fast_enough"], errors[name]))
-    others = ", ".join(f"{errors[name]:.4g} of {name}" for name in methods if name != best)
+    other_errors = ", ".join(f"{errors[name]:.4g} of {name}" for name in methods if name != best)
     fast = "" if methods[best]["fast_enough"] else ", though none reaches 90 % of a step within the time asked for"
     where = "" if log is None else f", errors on {log['name']} (sha256 {log['sha256'][:SHOWN_DIGITS]})"
-    kept = ", ".join(f"{name} {digest[:SHOWN_DIGITS]}" for name, digest in digests.items())
-    against = f" against {others}" if others else ""
+    gain_sets = ", ".join(f"{name} {digest[:SHOWN_DIGITS]}" for name, digest in digests.items())
+    against = f" against {other_errors}" if other_errors else ""
     return (
         f"Of the methods that exist, {best} has the least rms error of the fault estimates, as a share of each fault's "
-        f"size ({errors[best]:.4g}{against}){fast}: {claims['setting']}{where}. Gain sets: {kept}."
+        f"size ({errors[best]:.4g}{against}){fast}: {claims['setting']}{where}. Gain sets: {gain_sets}."
     )
 
 

@@ -111,13 +111,13 @@ class Evaluation:
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        found: dict[str, Any] = {}
+        data: dict[str, Any] = {}
         for name, value in vars(self).items():
             if isinstance(value, Mapping):
-                found[name] = {signal: asdict(item) for signal, item in value.items()}
+                data[name] = {signal: asdict(item) for signal, item in value.items()}
             else:
-                found[name] = asdict(value) if isinstance(value, Interval) else value
-        return found
+                data[name] = asdict(value) if isinstance(value, Interval) else value
+        return data
 
 
 def _run(
@@ -131,7 +131,7 @@ def _run(
     ``fault_names`` are those of the plant."""
     bench, seeds = task
     runs, observer = bench.run(seeds), bench.observer
-    found, nx = dict[str, FloatArray](), len(observer.state_names)
+    rmse, nx = dict[str, FloatArray](), len(observer.state_names)
     for name, rows, truth, delays, warm_up in (
         ("states", slice(0, nx), bench.true_states(runs.states), observer.state_delays, warm_ups[0]),
         (
@@ -144,14 +144,14 @@ def _run(
     ):
         errors = aligned_errors(runs.rows[:, :, rows], truth, delays)[max(warm_up, *delays, 0) :]
         # A record no longer than the delays has no error to speak of.
-        found[name] = np.sqrt(np.mean(errors**2, axis=0)) if len(errors) else np.full(errors.shape[1:], np.nan)
+        rmse[name] = np.sqrt(np.mean(errors**2, axis=0)) if len(errors) else np.full(errors.shape[1:], np.nan)
     judged = np.full((3, len(seeds)), np.nan)
     if isinstance(watched, Monitor):
         judged = _judged_residuals(watched, bench, runs, fault_names)
     elif watched is not None:
         decided = [_judged_parameters(watched, bench, estimates) for estimates in runs.estimates]
         judged = np.array(decided).T
-    return {**found, "false": judged[0], "found": judged[1], "wrong": judged[2]}
+    return {**rmse, "false": judged[0], "alarm": judged[1], "wrong": judged[2]}
 
 
 @arguments_checked
@@ -222,23 +222,23 @@ def evaluate(
     bench = bench_of(design, scenario)
     _require_fit(design, bench, monitor, plants)
     designs = [] if plants is None else drawn_designs(design, plants, scenario.seed)
-    benches = [make_bench(one, scenario) for one in designs] or [bench]
+    benches = [make_bench(variant, scenario) for variant in designs] or [bench]
     size = max(1, BATCH_SAMPLES // bench.signals.steps)
     # The first row of a plant with parameters is what was known before: no sample has been used.
     states, faults = ((end or 0) if isinstance(bench.observer, LinearObserver) else 1 for end in bench.warm_ups())
     names = design.linear[0].fault_names if isinstance(bench.observer, LinearObserver) else ()
     tasks = [
-        (one, tuple(seeds[i] for i in part[begin : begin + size]))
-        for one, part in zip(benches, np.array_split(np.arange(runs), len(benches)), strict=True)
+        (own_bench, tuple(seeds[i] for i in part[begin : begin + size]))
+        for own_bench, part in zip(benches, np.array_split(np.arange(runs), len(benches)), strict=True)
         for begin in range(0, len(part), size)
     ]
     work = partial(_run, watched=monitor, warm_ups=(states, faults), fault_names=names)
     results, finished = [dict[str, FloatArray]() for _ in tasks], 0
-    with progress_of_runs(progress) as told:
-        for i, found in as_they_come(work, tasks, executor):
-            results[i], finished = found, finished + len(found["false"])
-            if told is not None:
-                told(finished, runs)
+    with progress_of_runs(progress) as report_runs:
+        for i, batch in as_they_come(work, tasks, executor):
+            results[i], finished = batch, finished + len(batch["false"])
+            if report_runs is not None:
+                report_runs(finished, runs)
     parts = {name: np.concatenate([part[name] for part in results]) for name in results[0]}
     return _summed(parts, design, bench, watched=monitor is not None, level=confidence)
 
@@ -312,10 +312,10 @@ def _summed(
 ) -> Evaluation:
     onset = bench.onset
     runs, observer = len(parts["false"]), design.observer
-    detected, judged = ~np.isnan(parts["found"]), ~np.isnan(parts["wrong"])
+    detected, judged = ~np.isnan(parts["alarm"]), ~np.isnan(parts["wrong"])
     counted = runs if watched else 0
     faulty = counted if onset is not None else 0
-    delays = np.array([]) if not watched or onset is None else (parts["found"] - onset) * bench.signals.dt
+    delays = np.array([]) if not watched or onset is None else (parts["alarm"] - onset) * bench.signals.dt
 
     def errors(name: str, signals: tuple[str, ...]) -> Mapping[str, Interval]:
         return MappingProxyType({signal: mean(parts[name][:, i], level) for i, signal in enumerate(signals)})

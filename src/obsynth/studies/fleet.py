@@ -132,13 +132,13 @@ class Fleet(ResultTable):
         import matplotlib.pyplot as plt
         import pandas as pd
 
-        shown = [(run, run.file) for run in self.runs if run.file is not None][:MOST_SHOWN]
-        if not shown:
+        drawn = [(run, run.file) for run in self.runs if run.file is not None][:MOST_SHOWN]
+        if not drawn:
             raise SpecError("No design was run on any log: there is nothing to draw.", path="runs")
         figure, axes = plt.subplots(
-            len(shown), 1, figsize=(8.0, 1.2 + 1.3 * len(shown)), squeeze=False, layout="constrained"
+            len(drawn), 1, figsize=(8.0, 1.2 + 1.3 * len(drawn)), squeeze=False, layout="constrained"
         )
-        for axis, (run, file) in zip(axes[:, 0], shown, strict=True):
+        for axis, (run, file) in zip(axes[:, 0], drawn, strict=True):
             table = pd.read_csv(file)
             times = table["time"] if pd.api.types.is_numeric_dtype(table["time"]) else np.arange(len(table))
             estimates = [name for name in run.largest if not name.startswith("r[")]
@@ -239,26 +239,26 @@ def run_fleet(
             pairs,
             _run,
             executor=executor,
-            told=progress,
+            progress=progress,
             known=place.known,
-            kept=lambda pair, outcome: place.kept(pair, *outcome),
+            keep=lambda pair, outcome: place.keep(pair, *outcome),
         )
     )
 
 
-def _files(given: Any, endings: tuple[str, ...], what: str) -> list[Path]:
-    listed = [given] if isinstance(given, (str, Path)) else list(given)
+def _files(paths: Any, endings: tuple[str, ...], argument: str) -> list[Path]:
+    listed = [paths] if isinstance(paths, (str, Path)) else list(paths)
     for name in listed:
-        require_kind(name, (str, Path), what, "names of files or of folders")
-    found: list[Path] = []
+        require_kind(name, (str, Path), argument, "names of files or of folders")
+    files: list[Path] = []
     for path in map(Path, listed):
-        found += sorted(p for p in path.iterdir() if p.name.endswith(endings)) if path.is_dir() else [path]
-    if not found:
-        raise SpecError(f"{', '.join(map(str, listed))}: there is no file *{' or *'.join(endings)}.", path=what)
-    missing = [str(path) for path in found if not path.is_file()]
+        files += sorted(p for p in path.iterdir() if p.name.endswith(endings)) if path.is_dir() else [path]
+    if not files:
+        raise SpecError(f"{', '.join(map(str, listed))}: there is no file *{' or *'.join(endings)}.", path=argument)
+    missing = [str(path) for path in files if not path.is_file()]
     if missing:
-        raise SpecError(f"{', '.join(missing)}: no such file.", path=what)
-    return found
+        raise SpecError(f"{', '.join(missing)}: no such file.", path=argument)
+    return files
 
 
 def _pairs(gains: Sequence[Path], logs: Sequence[Path], options: Mapping[str, Any]) -> list[Work]:
@@ -266,16 +266,16 @@ def _pairs(gains: Sequence[Path], logs: Sequence[Path], options: Mapping[str, An
     digests = {path: file_digest(input_file(path)) for path in (*gains, *logs)}
     called = {log: log.name[: -len(log_suffix(log))] for log in logs}
     own = {log: name for log, name in called.items() if name in names.values()}
-    said = json.dumps(options, sort_keys=True, default=str)
+    settings = json.dumps(options, sort_keys=True, default=str)
     if options.get("normal") is not None:
         # Thresholds that were learned anew are others.
         normal = options["normal"]
         files = sorted(normal.glob("*.json")) if normal.is_dir() else [normal]
-        said += "".join(file_digest(input_file(file)) for file in files)
+        settings += "".join(file_digest(input_file(file)) for file in files)
     return [
         Work(
             f"{names[gain]} on {called[log]}",
-            hashlib.sha256(f"{__version__} {digests[gain]} {digests[log]} {said}".encode()).hexdigest(),
+            hashlib.sha256(f"{__version__} {digests[gain]} {digests[log]} {settings}".encode()).hexdigest(),
             partial(_estimates, gain, log, **options),
         )
         for gain in gains
@@ -295,24 +295,24 @@ def _verified(path: Path, digest: str, *, unverified: bool) -> ObserverDesign:
 def _estimates(gains: Path, log: Path, *, unverified: bool = False, **options: Any) -> tuple[DataRun, str]:
     """Return the run of a design on a log, and its estimates as CSV."""
     stream, design = io.StringIO(), _verified(gains, file_digest(gains), unverified=bool(unverified))
-    asked = {name: options.pop(name) for name in ("monitor", "normal", "sensor_faults") if name in options}
-    kind, normal = asked.pop("monitor", None), asked.get("normal")
+    monitor_options = {name: options.pop(name) for name in ("monitor", "normal", "sensor_faults") if name in options}
+    kind, normal = monitor_options.pop("monitor", None), monitor_options.get("normal")
     if kind is not None:
         if normal is not None and normal.is_dir():
-            asked["normal"] = normal / f"{gains.name.removesuffix(GAINS_ENDING).removesuffix('.json')}.json"
-        options["monitor"] = online_monitor(design, kind, unverified=bool(unverified), **asked)
+            monitor_options["normal"] = normal / f"{gains.name.removesuffix(GAINS_ENDING).removesuffix('.json')}.json"
+        options["monitor"] = online_monitor(design, kind, unverified=bool(unverified), **monitor_options)
     return run_on_data(design, log, stream, **options), stream.getvalue()
 
 
 def _run(pair: Work) -> tuple[FleetRun, str]:
     """Return what a run comes to, and its estimates as CSV; errors of the package are results."""
     try:
-        found, text = pair.make()
+        data_run, text = pair.make()
     except ObsynthError as error:
         return FleetRun(pair.name, WORK_STATUSES[error.exit_code], str(error)), ""
     return FleetRun(
-        pair.name, "run", "", found.rows, dict(found.statuses), dict(found.alarms), _largest(text),
-        fault=found.isolated,
+        pair.name, "run", "", data_run.rows, dict(data_run.statuses), dict(data_run.alarms), _largest(text),
+        fault=data_run.isolated,
     ), text  # fmt: skip
 
 

@@ -48,17 +48,20 @@ def thresholds_beside_least(
     """
     noisy = bool(plant.Dw.any() or plant.Bw.any())
     noise = np.full(impulses.shape[2] - plant.nf - plant.nd, DEVIATIONS if noisy else 0.0)
-    found = []
+    pairs = []
     for row, name in enumerate(faults):
         gains = np.abs(impulses[:, row]).sum(axis=0)
         if moving is not None:
             gains[plant.nf : plant.nf + plant.nd] = moving[row]
         bound = float(gains[plant.nf :] @ np.concatenate([bounds, noise]))
-        seen = impulses[:, row, plant.fault_names.index(name)]
-        lag = int(np.argmax(np.abs(seen) > SAME_RESPONSE))
-        alone = abs(seen[lag] - 1.0) <= SAME_RESPONSE and float(np.abs(seen).sum() - abs(seen[lag])) <= SAME_RESPONSE
+        response = impulses[:, row, plant.fault_names.index(name)]
+        lag = int(np.argmax(np.abs(response) > SAME_RESPONSE))
+        alone = (
+            abs(response[lag] - 1.0) <= SAME_RESPONSE
+            and float(np.abs(response).sum() - abs(response[lag])) <= SAME_RESPONSE
+        )
         blind = [other for k, other in enumerate(plant.fault_names) if other != name and gains[k] <= SAME_RESPONSE]
-        found.append(
+        pairs.append(
             (
                 bound,
                 _least(
@@ -66,7 +69,7 @@ def thresholds_beside_least(
                 ),
             )
         )
-    return found
+    return pairs
 
 
 def moving_gains(
@@ -74,12 +77,12 @@ def moving_gains(
 ) -> FloatArray | None:
     """Return what a disturbance of any course within one does to each estimate at most ``(estimates, nd)``; ``None``
     where nothing is known of a sampled plant between its samples."""
-    found = moving_columns(plant)
-    if found is None:
+    moving = moving_columns(plant)
+    if moving is None:
         return None
     nx, nd = plant.nx, plant.nd
     # Sums over a sample by columns, and the value at the sample, which outputs show at once.
-    columns, values = np.hstack([found.columns, found.directions]), np.where(found.moved, 0.0, plant.Bd)
+    columns, values = np.hstack([moving.columns, moving.directions]), np.where(moving.moved, 0.0, plant.Bd)
     count = columns.shape[1]
     driven = plant.replace(
         Bd=np.hstack([columns, values]),
@@ -91,7 +94,7 @@ def moving_gains(
     impulses, _ = step_responses(driven, observer, steps, feedback)
     gains = np.abs(impulses[:, :, plant.nf : plant.nf + count + nd]).sum(axis=0)
     moved, turned, direct = np.split(gains, [count - nx, count], axis=1)
-    return np.asarray(moved.reshape(len(moved), -1, nd).sum(axis=1) + turned @ found.sizes + direct)
+    return np.asarray(moved.reshape(len(moved), -1, nd).sum(axis=1) + turned @ moving.sizes + direct)
 
 
 def _least(
@@ -105,10 +108,10 @@ def _least(
     moves: bool,
 ) -> float:
     """Return the least threshold: of a fault of any time course told after a lag, else of a constant one."""
-    course = {"course": "constant"} if lag is None else {"course": "any", "lag": lag}
+    time_course = {"course": "constant"} if lag is None else {"course": "any", "lag": lag}
     samples = max(min(LONGEST_WINDOW, MOST_WINDOW_STATES // max(plant.nx, 1)), (lag or 0) + 2)
     try:
-        asked = GuaranteedTestMethod.of(
+        test = GuaranteedTestMethod.of(
             {
                 "fault": fault,
                 "samples": samples,
@@ -116,10 +119,10 @@ def _least(
                 "noise_bound": DEVIATIONS if noisy else None,
                 "disturbance_bounds": dict(zip(plant.disturbance_names, bounds.tolist(), strict=True)),
                 "disturbance": "any" if moves else "jump",
-                **course,
+                **time_course,
             }
         )
-        size = largest_hidden_fault(problem_of(plant, asked).window(samples)).size
+        size = largest_hidden_fault(problem_of(plant, test).window(samples)).size
     except ObsynthError:
         return float("nan")
     return size if np.isfinite(size) else float("nan")
@@ -131,14 +134,14 @@ def in_words(
     """Return a sentence on one fault; ``moving``: whether disturbances move between samples; ``noisy``: whether the
     plant has noise, which counts as within `DEVIATIONS`."""
     size = f"{upper_number(bound, digits=3)}{f' {unit}' if unit else ''}"
-    course = "move within their bounds" if moving else "are held"
+    motion = "move within their bounds" if moving else "are held"
     noise = (
         f" (those of the scenario; noise within {DEVIATIONS:g} standard deviations)"
         if noisy
         else " (those of the scenario)"
     )
     own = (
-        f"Fault-free, once the start has died out, if the model is exact and disturbances {course} between "
+        f"Fault-free, once the start has died out, if the model is exact and disturbances {motion} between "
         f"samples{noise}, |estimate of {fault}| <= {size}"
     )
     if not np.isfinite(least):

@@ -52,22 +52,22 @@ class RegionTradeOff:
     def claims(self) -> FloatArray:
         """``(n,)``: what is proved; NaN where no design was found."""
         return np.array(
-            [np.nan if isinstance(one, str) else one.certificate.claims[self.claim] for one in self.designs]
+            [np.nan if isinstance(design, str) else design.certificate.claims[self.claim] for design in self.designs]
         )
 
     @property
     def reached(self) -> FloatArray:
         """``(n,)``: what some course was found to reach; no claim can be better.  NaN where none was looked for."""
-        found = np.full(len(self.designs), np.nan)
-        for i, one in enumerate(self.designs):
-            rows = () if isinstance(one, str) else one.report.checks
-            found[i] = next((row.value for row in rows if row.name in (SWITCHING_ROW, FROZEN_ROW)), np.nan)
-        return found
+        reached = np.full(len(self.designs), np.nan)
+        for i, design in enumerate(self.designs):
+            rows = () if isinstance(design, str) else design.report.checks
+            reached[i] = next((row.value for row in rows if row.name in (SWITCHING_ROW, FROZEN_ROW)), np.nan)
+        return reached
 
     def table(self) -> pd.DataFrame:
         """Return a row for each value: what is proved, what is reached, their ratio, and why there is no design."""
         claims, reached = self.claims, self.reached
-        why = [one if isinstance(one, str) else "" for one in self.designs]
+        why = [design if isinstance(design, str) else "" for design in self.designs]
         columns = {self.by: self.values, self.claim: claims, "reached": reached, "ratio": reached / claims, "why": why}
         return pd.DataFrame(columns)
 
@@ -145,28 +145,28 @@ def region_trade_off(
     if sizes is not None and rates is not None:
         raise SpecError("Give sizes or rates, not both.", path="rates")
     by = "size" if rates is None else "rate"
-    given = tuple((SIZES if sizes is None else sizes) if rates is None else rates)
-    for value in given:
+    values = tuple((SIZES if sizes is None else sizes) if rates is None else rates)
+    for value in values:
         if not (value is not None and is_finite_number(value) and value > 0.0) and not (by == "rate" and value is None):
             raise SpecError(f"{by}s has {shown(value)}: give positive numbers.", path=f"{by}s")
-    if not given:
+    if not values:
         raise SpecError(f"{by}s is empty: give positive numbers.", path=f"{by}s")
     if isinstance(plant, DAEModel) and rates is not None:
         raise SpecError("rates are for scheduling parameters, which a nonlinear plant has none of.", path="rates")
-    found: list[ObserverDesign | str] = []
-    for value in given:
+    designs: list[ObserverDesign | str] = []
+    for value in values:
         try:
-            found.append(_designed(plant, by, value, method, options))
+            designs.append(_designed(plant, by, value, method, options))
         except SpecError:
             raise
         except ObsynthError as error:
-            found.append(f"{type(error).__name__}: {error}")
-    made = [one for one in found if isinstance(one, ObserverDesign)]
-    known = [name for name in CLAIMS if made and all(name in one.certificate.claims for one in made)]
-    if claim is not None and made and any(claim not in one.certificate.claims for one in made):
+            designs.append(f"{type(error).__name__}: {error}")
+    made = [design for design in designs if isinstance(design, ObserverDesign)]
+    known = [name for name in CLAIMS if made and all(name in design.certificate.claims for design in made)]
+    if claim is not None and made and any(claim not in design.certificate.claims for design in made):
         raise SpecError(f"No design claims {claim!r}: there are {', '.join(known)}.", path="claim")
-    numbers = tuple(float("inf") if value is None else float(value) for value in given)
-    return RegionTradeOff(by, numbers, claim or (known[0] if known else CLAIMS[0]), tuple(found))
+    numbers = tuple(float("inf") if value is None else float(value) for value in values)
+    return RegionTradeOff(by, numbers, claim or (known[0] if known else CLAIMS[0]), tuple(designs))
 
 
 def _designed(
@@ -183,25 +183,29 @@ def _designed(
 
 def _changed(plant: PolytopicSystem, by: str, value: float | None) -> PolytopicSystem:
     """Return the plant over a share of its region, or with another rate."""
-    held, given = plant.scheduling, plant.as_dict()
+    scheduling, data = plant.scheduling, plant.as_dict()
     if by == "rate":
-        if len(held.names) != 1:
-            raise SpecError(f"rates are for one scheduling parameter: there are {', '.join(held.names)}.", path="rates")
-        entry = {"range": [float(held.low[0]), float(held.high[0])], "rate": value}
-        return PolytopicSystem(**{**given, "scheduling": {held.names[0]: entry}})
+        if len(scheduling.names) != 1:
+            raise SpecError(
+                f"rates are for one scheduling parameter: there are {', '.join(scheduling.names)}.", path="rates"
+            )
+        entry = {"range": [float(scheduling.low[0]), float(scheduling.high[0])], "rate": value}
+        return PolytopicSystem(**{**data, "scheduling": {scheduling.names[0]: entry}})
     size = 1.0 if value is None else value
     ranges = {
         name: {"range": _about_middle((low, high), size), "rate": rate}
-        for name, low, high, rate in zip(held.names, held.low, held.high, held.rates, strict=True)
+        for name, low, high, rate in zip(
+            scheduling.names, scheduling.low, scheduling.high, scheduling.rates, strict=True
+        )
     }
-    if "plant" in given:
-        return PolytopicSystem(**{**given, "scheduling": ranges})
+    if "plant" in data:
+        return PolytopicSystem(**{**data, "scheduling": ranges})
     if size > 1.0:
         raise SpecError("Vertices alone hold nothing beyond themselves: give sizes up to 1.", path="sizes")
     middle = 1.0 / plant.count
     weights = size * np.eye(plant.count) + (1.0 - size) * middle
     vertices = [plant.mean(row) for row in weights]
-    return PolytopicSystem(vertices, scheduling=None if held.gives_weights else ranges)
+    return PolytopicSystem(vertices, scheduling=None if scheduling.gives_weights else ranges)
 
 
 def _about_middle(ends: Any, size: float) -> list[float]:

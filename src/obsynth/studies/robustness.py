@@ -195,18 +195,18 @@ def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict
     sampled = uncertain is not None and any(kind == SAMPLED for kind, _ in uncertain.steps)
     discrete = plant.is_discrete and not sampled
     basis = moving_basis(plant, box)
-    whole = moving_family(plant, box, basis)
-    least = np.vstack([np.abs(whole.center), whole.spread + whole.radius])
-    size = whole.magnitude.sum(axis=1)
+    family = moving_family(plant, box, basis)
+    least = np.vstack([np.abs(family.center), family.spread + family.radius])
+    size = family.magnitude.sum(axis=1)
     apart = untouched_states(least, np.concatenate([size, size]))
-    values = np.linalg.eigvals(whole.center[np.ix_(apart, apart)])
+    values = np.linalg.eigvals(family.center[np.ix_(apart, apart)])
     outside = (
         np.abs(values) >= 1.0 - ROW_ROUNDING_SHARE if discrete else values.real >= -ROW_ROUNDING_SHARE * size.max()
     )
     lasting = tuple(complex(value) for value in values[outside])
     # Stable modes that no constant touches are stable everywhere.
-    rest = [i for i in range(len(whole.center)) if i not in apart]
-    if not rest:
+    touched = [i for i in range(len(family.center)) if i not in apart]
+    if not touched:
         return BoxVerdict("proved", 0), lasting
     back = 2.0 * np.eye(len(basis)) - basis
 
@@ -214,11 +214,11 @@ def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict
         bare = plant if plant.uncertainty is None else plant_as_written_at(plant, plant.uncertainty, box.values(q))
         # Of the signals nothing is asked: without them the elimination has a tenth of the columns.
         moving = DescriptorSystem(E=bare.E, A=bare.A, C=np.zeros((1, bare.nx)), dt=bare.dt)
-        found = eliminate_algebraic_states(moving).plant.A
-        return np.asarray((back @ found @ basis)[np.ix_(rest, rest)])
+        reduced = eliminate_algebraic_states(moving).plant.A
+        return np.asarray((back @ reduced @ basis)[np.ix_(touched, touched)])
 
     def build(lower: FloatArray, upper: FloatArray) -> AffineMatrix:
-        return moving_family(plant, box.part(lower, upper), basis)[rest, rest]
+        return moving_family(plant, box.part(lower, upper), basis)[touched, touched]
 
     most = MOST_BOXES if uncertain is None or len(basis) * 4 > len(as_written(plant, uncertain)["A"]) else FEW_BOXES
     return proved_stable(build, affine.count, exactly, discrete=discrete, most=most), lasting
@@ -232,10 +232,10 @@ def _error_per_unit(design: ObserverDesign, responses: Responses, affine: Affine
     back = 2.0 * np.eye(plant.nx) - affine.coordinates
     total = np.zeros((len(structure.Co), plant.nx + plant.nu))
     for i in range(affine.count):
-        both = np.hstack([structure.state.parts[i] @ back, structure.inputs.parts[i]])
-        total += (1.0 + abs(structure.offsets[i])) * responses.gain(structure.Co, both[inner], both[outputs])
-    rest = np.hstack([structure.state.radius @ np.abs(back), structure.inputs.radius])
-    total += responses.absolute_gain(structure.Co, rest[inner]) + rest[outputs]
+        part = np.hstack([structure.state.parts[i] @ back, structure.inputs.parts[i]])
+        total += (1.0 + abs(structure.offsets[i])) * responses.gain(structure.Co, part[inner], part[outputs])
+    remainder = np.hstack([structure.state.radius @ np.abs(back), structure.inputs.radius])
+    total += responses.absolute_gain(structure.Co, remainder[inner]) + remainder[outputs]
     names = (*plant.state_names, *plant.input_names)
     return {
         label: _named(names, row)

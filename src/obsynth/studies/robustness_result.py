@@ -121,8 +121,8 @@ class Robustness:
 
     def claims(self) -> dict[str, Any]:
         """Return what a certificate claims, as plain data."""
-        found = self.as_dict()
-        return {name: found[name] for name in ROBUSTNESS_CLAIMS}
+        data = self.as_dict()
+        return {name: data[name] for name in ROBUSTNESS_CLAIMS}
 
     @property
     def statement(self) -> str:
@@ -248,7 +248,7 @@ def robustness_statement(claims: Mapping[str, Any], design: ObserverDesign, dige
 
 
 def _top(shares: Mapping[str, float]) -> str:
-    found = sorted(shares.items(), key=lambda item: -item[1])[:MOST_BLAMED]
+    largest = sorted(shares.items(), key=lambda item: -item[1])[:MOST_BLAMED]
     return (
-        ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in found if share > LISTED_BLAME_SHARE) or "nothing"
+        ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in largest if share > LISTED_BLAME_SHARE) or "nothing"
     )

@@ -92,16 +92,21 @@ class SensorSets:
 
     def rows(self) -> tuple[tuple[str, ...], ...]:
         """Return the table as texts: the header, then one row per set."""
-        if any(found.threshold is not None for found in self.sets):
+        if any(sensor_set.threshold is not None for sensor_set in self.sets):
             tested = [("add", "cost", "threshold", "samples", "sample time (s)")]
-            for found in self.sets:
-                numbers = (f"{found.cost:g}", f"{found.threshold:.4g}", f"{found.samples}", f"{found.sample_time:g}")
-                tested.append((", ".join(found.sensors) or "nothing", *numbers))
+            for sensor_set in self.sets:
+                numbers = (
+                    f"{sensor_set.cost:g}",
+                    f"{sensor_set.threshold:.4g}",
+                    f"{sensor_set.samples}",
+                    f"{sensor_set.sample_time:g}",
+                )
+                tested.append((", ".join(sensor_set.sensors) or "nothing", *numbers))
             return tuple(tested)
         rows = [("add", "cost", "deviation after design")]
-        for found in self.sets:
-            deviation = "-" if found.deviation is None else f"{found.deviation:.3g}"
-            rows.append((", ".join(found.sensors) or "nothing", f"{found.cost:g}", deviation))
+        for sensor_set in self.sets:
+            deviation = "-" if sensor_set.deviation is None else f"{sensor_set.deviation:.3g}"
+            rows.append((", ".join(sensor_set.sensors) or "nothing", f"{sensor_set.cost:g}", deviation))
         return tuple(rows)
 
     def to_dict(self) -> dict[str, Any]:
@@ -113,7 +118,7 @@ class SensorSets:
             "may_be_lost": list(self.may_be_lost),
             "lost_without": {name: list(lost) for name, lost in self.lost_without.items()},
             "notes": list(self.notes),
-            "sets": [{**vars(found), "sensors": list(found.sensors)} for found in self.sets],
+            "sets": [{**vars(sensor_set), "sensors": list(sensor_set.sensors)} for sensor_set in self.sets],
         }
 
     def __repr__(self) -> str:
@@ -232,13 +237,13 @@ def sensor_sets(
     if not chosen:
         raise SpecError("The plant has no faults to place sensors for.", path="faults")
     sensors = _candidates(plant, candidates, noise)
-    _require_positive(cost or {}, sensors, "cost", whole=False)
+    _require_positive(cost or {}, sensors, "cost", of_all=False)
     costs = [float((cost or {}).get(sensor.name, 1.0)) for sensor in sensors]
     search = SensorSearch(plant, sensors, goal, chosen, may_fail, copies)
     report_stage("asking what all candidates together reach")
-    wanted = search.reachable()
-    lost = [task for task in search.tasks(plant, chosen) if task not in wanted]
-    if not wanted:
+    reachable = search.reachable()
+    lost = [task for task in search.tasks(plant, chosen) if task not in reachable]
+    if not reachable:
         raise PreconditionError(
             f"Not even all {len(sensors)} candidates together suffice for any fault: to {goal} is not possible. Give "
             "other candidates, or a weaker goal.",
@@ -247,25 +252,25 @@ def sensor_sets(
         )
     report_stage("searching for least sets")
     bound = largest if largest is not None else min(plant.nd + len(chosen) + 1 + may_fail, len(sensors) * copies)
-    found, exact = search.minimal_sets(wanted, bound, most)
-    notes = [_note(search, exact, bound, most, len(found))]
-    if not found:
-        one = search.greedy_set(wanted)
-        if one is not None and largest is not None and len(one) > largest:
+    sets, exact = search.minimal_sets(reachable, bound, most)
+    notes = [_note(search, exact, bound, most, len(sets))]
+    if not sets:
+        greedy = search.greedy_set(reachable)
+        if greedy is not None and largest is not None and len(greedy) > largest:
             # More than asked for: said, not given.
-            notes.append(f"One of {len(one)} does: {', '.join(sensors[i].name for i in one)}.")
+            notes.append(f"One of {len(greedy)} does: {', '.join(sensors[i].name for i in greedy)}.")
         else:
-            found, exact = ([], exact) if one is None else ([one], False)
+            sets, exact = ([], exact) if greedy is None else ([greedy], False)
     report_stage("designing for each set")
-    ranked = _ranked(search, found, costs, noise is not None and goal.startswith("estimate"))
+    ranked = _ranked(search, sets, costs, noise is not None and goal.startswith("estimate"))
     failing = _lost_without(plant, search.had, range(plant.ny))
-    kept = tuple(name for name, faults in failing.items() if len(search.had) == len(wanted) and not faults)
+    may_be_lost = tuple(name for name, faults in failing.items() if len(search.had) == len(reachable) and not faults)
     out_of_reach = []
     for task in lost:
-        others = ", ".join(plant.fault_names[j] for j in task.beside)
-        said = f" (from {others})." if others else "."
-        out_of_reach.append(f"{plant.fault_names[task.fault]}: not possible with all candidates{said}")
-    return SensorSets(goal, ranked, exact, tuple(out_of_reach), kept, failing, tuple(notes))
+        beside = ", ".join(plant.fault_names[j] for j in task.beside)
+        ending = f" (from {beside})." if beside else "."
+        out_of_reach.append(f"{plant.fault_names[task.fault]}: not possible with all candidates{ending}")
+    return SensorSets(goal, ranked, exact, tuple(out_of_reach), may_be_lost, failing, tuple(notes))
 
 
 def _by_threshold(
@@ -291,7 +296,7 @@ def _by_threshold(
     times = [] if sample_time is None else list(np.atleast_1d(np.asarray(sample_time, dtype=np.float64)))
     if bool(times) == plant.is_discrete:
         raise SpecError("sample_time is for continuous plants, which need one.", path="sample_time")
-    _require_positive(cost, sensors, "cost", whole=False)
+    _require_positive(cost, sensors, "cost", of_all=False)
     costs = [float(cost.get(sensor.name, 1.0)) for sensor in sensors]
     size = float(below or 0.0)
     problem = ThresholdProblem(plant, fault, size, sensors, costs, tuple(map(float, times)), test)
@@ -303,7 +308,7 @@ def _by_threshold(
             condition="sensors",
             signals=(fault,),
         )
-    found = problem.minimal_sets(largest, most)
+    sets = problem.minimal_sets(largest, most)
     rows = tuple(
         SensorSet(
             tuple(sensors[i].name for i in chosen),
@@ -313,25 +318,25 @@ def _by_threshold(
             made.samples,
             made.linear[0].dt,
         )
-        for chosen, made in found
+        for chosen, made in sets
     )
     note = "Cheapest first; of each set the test with the shortest delay. More sensors never raise a least threshold."
-    return SensorSets(f"find {fault} by a threshold of {size:g}", rows, len(found) < most, (), (), {}, (note,))
+    return SensorSets(f"find {fault} by a threshold of {size:g}", rows, len(sets) < most, (), (), {}, (note,))
 
 
 def _candidates(
-    plant: DescriptorSystem, given: Sequence[str] | Mapping[str, Any] | None, noise: Any
+    plant: DescriptorSystem, candidates: Sequence[str] | Mapping[str, Any] | None, noise: Any
 ) -> tuple[Sensor, ...]:
-    if isinstance(given, Mapping):
+    if isinstance(candidates, Mapping):
         zero = (np.zeros(plant.nu), np.zeros(plant.nd), np.zeros(plant.nf))
         sensors: tuple[Sensor, ...] = ()
-        for name, row in given.items():
+        for name, row in candidates.items():
             try:
                 sensors += (Sensor(str(name), real_vector(row, plant.nx, str(name)), *zero),)
             except SpecError:
                 raise SpecError(f"{name}: give a row of {plant.nx} numbers for C.", path="candidates") from None
     else:
-        listed = None if given is None else list(given)
+        listed = None if candidates is None else list(candidates)
         unknown = [name for name in listed or () if name not in plant.state_names]
         if unknown:
             raise SpecError(f"{', '.join(map(repr, unknown))}: no such state.", path="candidates")
@@ -339,17 +344,19 @@ def _candidates(
     if noise is None:
         return sensors
     levels = noise if isinstance(noise, Mapping) else {sensor.name: noise for sensor in sensors}
-    _require_positive(levels, sensors, "noise", whole=True)
+    _require_positive(levels, sensors, "noise", of_all=True)
     return tuple(replace(sensor, deviation=float(levels[sensor.name])) for sensor in sensors)
 
 
-def _require_positive(given: Mapping[str, Any], sensors: Sequence[Sensor], what: str, *, whole: bool) -> None:
+def _require_positive(numbers: Mapping[str, Any], sensors: Sequence[Sensor], argument: str, *, of_all: bool) -> None:
     names = [sensor.name for sensor in sensors]
-    unknown = [name for name in given if name not in names]
-    missing = [name for name in names if name not in given] if whole else []
-    wrong = [name for name, value in given.items() if not (is_finite_number(value) and value > 0.0)]
+    unknown = [name for name in numbers if name not in names]
+    missing = [name for name in names if name not in numbers] if of_all else []
+    wrong = [name for name, value in numbers.items() if not (is_finite_number(value) and value > 0.0)]
     if unknown or missing or wrong:
-        raise SpecError(f"{what}: unknown {unknown}, missing {missing}, not a positive number {wrong}.", path=what)
+        raise SpecError(
+            f"{argument}: unknown {unknown}, missing {missing}, not a positive number {wrong}.", path=argument
+        )
 
 
 def _note(search: SensorSearch, exact: bool, bound: int, most: int, count: int) -> str:
@@ -370,12 +377,12 @@ def _note(search: SensorSearch, exact: bool, bound: int, most: int, count: int) 
 
 
 def _ranked(
-    search: SensorSearch, found: Sequence[tuple[int, ...]], costs: Sequence[float], with_design: bool
+    search: SensorSearch, sets: Sequence[tuple[int, ...]], costs: Sequence[float], with_design: bool
 ) -> tuple[SensorSet, ...]:
     """Return the sets by cost and largest deviation after design, with the walks that the first got by default."""
     rates: dict[str, float] | None = None
     rows = []
-    for chosen in found:
+    for chosen in sets:
         names, deviation = tuple(search.sensors[i].name for i in chosen), None
         if with_design:
             plant = search.equipped(chosen)
@@ -395,11 +402,11 @@ def _lost_without(plant: DescriptorSystem, had: Sequence[Task], outputs: Sequenc
     Outputs that may fail together may fail alone: halves are asked about before what is in them."""
     if not had or not outputs:
         return {}
-    asked = DecoupledFaults(_without(plant, outputs), exactly=False)
+    decoupled = DecoupledFaults(_without(plant, outputs), exactly=False)
     if len(outputs) == 1:
-        lost = (plant.fault_names[task.fault] for task in had if not reached(asked, task))
+        lost = (plant.fault_names[task.fault] for task in had if not reached(decoupled, task))
         return {plant.output_names[outputs[0]]: tuple(dict.fromkeys(lost))}
-    if all(reached(asked, task) for task in had):
+    if all(reached(decoupled, task) for task in had):
         return {plant.output_names[i]: () for i in outputs}
     half = len(outputs) // 2
     return {**_lost_without(plant, had, outputs[:half]), **_lost_without(plant, had, outputs[half:])}
@@ -407,15 +414,15 @@ def _lost_without(plant: DescriptorSystem, had: Sequence[Task], outputs: Sequenc
 
 def _without(plant: DescriptorSystem, outputs: Sequence[int]) -> DescriptorSystem:
     """Return a plant without some of its outputs."""
-    rest = [i for i in range(plant.ny) if i not in outputs]
+    remaining = [i for i in range(plant.ny) if i not in outputs]
     gone = {plant.output_names[i] for i in outputs}
     return plant.replace(
-        C=plant.C[rest],
-        D=plant.D[rest],
-        Dd=plant.Dd[rest],
-        Df=plant.Df[rest],
-        Dw=plant.Dw[rest],
-        output_names=[plant.output_names[i] for i in rest],
+        C=plant.C[remaining],
+        D=plant.D[remaining],
+        Dd=plant.Dd[remaining],
+        Df=plant.Df[remaining],
+        Dw=plant.Dw[remaining],
+        output_names=[plant.output_names[i] for i in remaining],
         scales={name: value for name, value in plant.scales.items() if name not in gone},
         units={},
         operating_point={},

@@ -142,13 +142,13 @@ class Sweep(ResultTable):
         name : str
             Of the claim or of the row, such as ``"gain"``.
         """
-        found = np.full(len(self.results), np.nan)
+        values = np.full(len(self.results), np.nan)
         for i, result in enumerate(self.results):
             if name in result.claims:
-                found[i] = result.claims[name]
+                values[i] = result.claims[name]
             elif result.status == WORK_STATUSES[0]:
-                found[i] = next((row.value for row in result.design.report.checks if row.name == name), np.nan)
-        return found
+                values[i] = next((row.value for row in result.design.report.checks if row.name == name), np.nan)
+        return values
 
     def plot(self, claim: str | None = None, *, parameter: str | None = None) -> Figure:
         """Draw a claim of every case over a parameter; cases without a design are marked by what they came to.
@@ -229,17 +229,17 @@ def sweep(
     """
     made = _cases(cases, parameters or {}, method)
     place = None if folder is None else ResultFolder(folder, _SWEEP_KIND, SweepResult, ending=".gains.json")
-    with progress_of_runs(progress) as told:
+    with progress_of_runs(progress) as report_cases:
         return Sweep(
             carried_out(
                 made,
                 run_case,
                 executor=executor,
-                told=told,
+                progress=report_cases,
                 at_start=True,
                 known=lambda case: None if place is None else place.known(case, parameters=case.parameters),
-                kept=lambda case, result: (
-                    result if place is None else place.kept(case, replace(result, content=None), result.content)
+                keep=lambda case, result: (
+                    result if place is None else place.keep(case, replace(result, content=None), result.content)
                 ),
             )
         )
@@ -272,12 +272,12 @@ def run_case(case: Work) -> SweepResult:
     try:
         made = case.make()
     except ObsynthError as error:
-        told = error.as_dict()
+        details = error.as_dict()
         return result(
             WORK_STATUSES[error.exit_code],
             message=str(error),
-            condition=str(told.get("condition") or ""),
-            signals=tuple(told.get("signals", ())),
+            condition=str(details.get("condition") or ""),
+            signals=tuple(details.get("signals", ())),
             seconds=time.process_time() - started,
         )
     checks = [check for check in made.report.checks if check.kind != "information"]

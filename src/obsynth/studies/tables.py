@@ -54,7 +54,7 @@ _NAME_WIDTH, _HEADING_WIDTH = 11, 8
 
 def evaluation_report(
     name: str,
-    found: Evaluation,
+    evaluation: Evaluation,
     *,
     monitor: Monitor | ParameterMonitor | None,
     console: Console,
@@ -62,13 +62,13 @@ def evaluation_report(
     beside: Sequence[str] = (),
 ) -> None:
     """Print rates, delays and errors over many runs; ``beside``: sentences on thresholds."""
-    share = f"{100.0 * found.confidence:g} % interval"
-    console.print(Text(f"{name}: {found.runs} runs", style="bold"))
+    share = f"{100.0 * evaluation.confidence:g} % interval"
+    console.print(Text(f"{name}: {evaluation.runs} runs", style="bold"))
     console.print()
     if monitor is not None:
         table = headed_table("decisions", "value", share, "of", "unit")
         for key, (title, unit) in _DECISIONS.items():
-            item: Interval = getattr(found, key)
+            item: Interval = getattr(evaluation, key)
             if item.count:
                 table.add_row(Text(title), number(item.value), _interval(item), str(item.count), Text(unit))
         kind, statement = described(monitor)
@@ -79,7 +79,7 @@ def evaluation_report(
         console.print()
     for sentence in beside:
         console.print(Text(sentence))
-    for title, errors in (("Fault estimates", found.fault_rmse), ("State estimates", found.state_rmse)):
+    for title, errors in (("Fault estimates", evaluation.fault_rmse), ("State estimates", evaluation.state_rmse)):
         if errors:
             table = headed_table("signal", "RMSE after warm-up", share, "unit")
             title, rows = worst_rows(title, list(errors.items()), lambda row: row[1].value)
@@ -109,33 +109,33 @@ def _interval(item: Interval) -> str:
     return "-" if math.isnan(item.low) else f"{number(item.low)} to {number(item.high)}"
 
 
-def comparison_report(found: Comparison, *, console: Console, file: Path | None = None) -> None:
+def comparison_report(comparison: Comparison, *, console: Console, file: Path | None = None) -> None:
     """Print what was compared, the table, the refusals and the recommendation."""
-    header, *rows = found.rows()
+    header, *rows = comparison.rows()
     wide = console.width >= NARROW
-    kept = [i for i, name in enumerate(header) if wide or name not in _LESS]
+    columns = [i for i, name in enumerate(header) if wide or name not in _LESS]
     table = headed_table(
-        *(header[i] if wide else fill(header[i], _HEADING_WIDTH, break_long_words=False) for i in kept)
+        *(header[i] if wide else fill(header[i], _HEADING_WIDTH, break_long_words=False) for i in columns)
     )
     # Only names break, and at their hyphens and blanks: a number that is cut is another number.
-    for column, i in zip(table.columns, kept, strict=True):
+    for column, i in zip(table.columns, columns, strict=True):
         column.no_wrap = header[i] not in _NAME_COLUMNS
         if not column.no_wrap:
             words = [word for row in rows for word in row[i].replace("-", "- ").split()]
             column.min_width = min(max(map(len, [header[i], *words])), _NAME_WIDTH)
     for row in rows:
-        texts = [row[i] if wide or header[i] not in _NAME_COLUMNS else fill(row[i], _NAME_WIDTH) for i in kept]
+        texts = [row[i] if wide or header[i] not in _NAME_COLUMNS else fill(row[i], _NAME_WIDTH) for i in columns]
         table.add_row(*map(Text, texts))
-    console.print(Text(found.setting))
-    for note in found.notes:
+    console.print(Text(comparison.setting))
+    for note in comparison.notes:
         console.print(Text(note, style="yellow"))
     if rows:
         print_section(console, "", table)
-        console.print(Text(found.meanings([header[i] for i in kept]), style="dim"))
-    for text in found.beside_the_least:
+        console.print(Text(comparison.meanings([header[i] for i in columns]), style="dim"))
+    for text in comparison.beside_the_least:
         console.print(Text(text))
-    for refusal in found.refusals:
+    for refusal in comparison.refusals:
         console.print(Text(refusal, style="yellow"))
-    console.print(Text(found.advice, style="bold"))
+    console.print(Text(comparison.advice, style="bold"))
     if file is not None:
         console.print(Text(f"Written: {file}"), soft_wrap=True)

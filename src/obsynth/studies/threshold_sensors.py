@@ -32,8 +32,8 @@ class ThresholdProblem:
 
     def best(self, chosen: Sequence[int]) -> GuaranteedTest | None:
         """Return the test with the fewest seconds that goes below with some sensors; ``None`` where none does."""
-        found = [test for test in self._tests(chosen) if test.threshold <= self.below]
-        return min(found, key=lambda test: (test.delay, test.threshold)) if found else None
+        tests = [test for test in self._tests(chosen) if test.threshold <= self.below]
+        return min(tests, key=lambda test: (test.delay, test.threshold)) if tests else None
 
     def least(self, chosen: Sequence[int]) -> float:
         """Return the least threshold with some sensors."""
@@ -63,13 +63,13 @@ class ThresholdProblem:
                 path="candidates",
             )
         sets = [chosen for size in sizes for chosen in combinations(range(count), size)]
-        found: list[tuple[tuple[int, ...], GuaranteedTest]] = []
+        minimal: list[tuple[tuple[int, ...], GuaranteedTest]] = []
         for chosen in sorted(sets, key=lambda each: (sum(self.costs[i] for i in each), len(each))):
-            if any(set(smaller) <= set(chosen) for smaller, _ in found):
+            if any(set(smaller) <= set(chosen) for smaller, _ in minimal):
                 continue
             test = self.best(chosen)
             if test is not None:
-                found.append((chosen, test))
-            if len(found) == most:
+                minimal.append((chosen, test))
+            if len(minimal) == most:
                 break
-        return found
+        return minimal

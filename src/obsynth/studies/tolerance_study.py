@@ -153,11 +153,11 @@ class ToleranceStudy:
         return "\n".join([*text_table(self.rows(), left=2), self.conclusion])
 
 
-def study_statement(result: Mapping[str, Any], asked: Mapping[str, Any], digest: str) -> str:
+def study_statement(result: Mapping[str, Any], options: Mapping[str, Any], digest: str) -> str:
     """Return what a study found at its largest tolerance; ``digest`` is that of the gain set."""
     last = int(np.argmax(result["tolerances"]))
     unit = f" {result['unit']}" if result["unit"] else ""
-    told = [
+    figures = [
         f"the {name} has a false alarm in {100.0 * alarms:.4g} % of them and detects "
         + (
             f"no step of {result['fault']}"
@@ -168,13 +168,14 @@ def study_statement(result: Mapping[str, Any], asked: Mapping[str, Any], digest:
             result["monitors"], result["false_alarms"][last], result["least_faults"][last], strict=True
         )
     ]
-    bounds = ", ".join(f"{name} within {shown(value)}" for name, value in (asked["disturbance_bounds"] or {}).items())
-    noise = "" if asked["noise_bound"] is None else f"noise within {deviations_told(asked['noise_bound'])}"
-    kept = "; ".join(part for part in (bounds, noise) if part)
+    bounds = ", ".join(f"{name} within {shown(value)}" for name, value in (options["disturbance_bounds"] or {}).items())
+    noise = "" if options["noise_bound"] is None else f"noise within {deviations_told(options['noise_bound'])}"
+    assumptions = "; ".join(part for part in (bounds, noise) if part)
     return (
-        f"Of {result['runs']} runs of {shown(asked['scenario']['horizon'])} s, seeds from {asked['scenario']['seed']}, "
+        f"Of {result['runs']} runs of {shown(options['scenario']['horizon'])} s, "
+        f"seeds from {options['scenario']['seed']}, "
         f"each of a plant drawn within {100.0 * result['tolerances'][last]:.4g} % tolerances"
-        f"{f' ({kept})' if kept else ''}: {', and '.join(told)}. Gain set {digest[:SHOWN_DIGITS]}."
+        f"{f' ({assumptions})' if assumptions else ''}: {', and '.join(figures)}. Gain set {digest[:SHOWN_DIGITS]}."
     )
 
 
@@ -265,7 +266,7 @@ def tolerance_study(
                 scaled, quiet, constants=constants, disturbance_bounds=disturbance_bounds, noise_bound=noise_bound
             )
             alarms[i, j], least[i, j] = _counted(watched, without, with_one)
-    asked = {
+    options = {
         "scenario": scenario.as_dict(),
         "tolerances": shares,
         "fault": chosen,
@@ -273,7 +274,7 @@ def tolerance_study(
         "disturbance_bounds": None if disturbance_bounds is None else dict(disturbance_bounds),
         "noise_bound": noise_bound,
     }
-    return ToleranceStudy(np.array(shares), alarms, least, chosen, plant.units.get(chosen, ""), runs, design, asked)
+    return ToleranceStudy(np.array(shares), alarms, least, chosen, plant.units.get(chosen, ""), runs, design, options)
 
 
 def _scaled(design: ObserverDesign, factor: float) -> ObserverDesign:
@@ -287,17 +288,17 @@ def _scaled(design: ObserverDesign, factor: float) -> ObserverDesign:
 def _both(design: ObserverDesign, scenario: Scenario, fault: str, runs: int) -> tuple[Runs, Runs]:
     """Return the same runs without and with a fault of size 1, each of a plant drawn from the box."""
     faulty = scenario.replace(faults={fault: Step(size=1.0, start=ONSET * scenario.horizon)})
-    found: list[list[Runs]] = [[], []]
+    by_case: list[list[Runs]] = [[], []]
     for i, true in enumerate(drawn_designs(design, runs, scenario.seed)):
-        for kept, what in zip(found, (scenario, faulty), strict=True):
-            kept.append(make_bench(true, what).run([scenario.seed + i]))
-    return _together(found[0]), _together(found[1])
+        for batch, case in zip(by_case, (scenario, faulty), strict=True):
+            batch.append(make_bench(true, case).run([scenario.seed + i]))
+    return _together(by_case[0]), _together(by_case[1])
 
 
-def _together(found: list[Runs]) -> Runs:
+def _together(runs: list[Runs]) -> Runs:
     signals = ("states", "outputs", "inputs", "faults", "disturbances", "rows")
-    joined: dict[str, Any] = {name: np.concatenate([getattr(run, name) for run in found], axis=1) for name in signals}
-    return Runs(**joined, observer=found[0].observer)
+    joined: dict[str, Any] = {name: np.concatenate([getattr(run, name) for run in runs], axis=1) for name in signals}
+    return Runs(**joined, observer=runs[0].observer)
 
 
 def _counted(watched: Monitor, without: Runs, with_one: Runs) -> tuple[float, float]:

@@ -60,8 +60,8 @@ class ResultTable(ABC):
     @property
     def counts(self) -> dict[str, int]:
         """Number of results by what they came to."""
-        found = [result.status for result in self._results]
-        return {status: found.count(status) for status in ("run", *WORK_STATUSES.values()) if status in found}
+        statuses = [result.status for result in self._results]
+        return {status: statuses.count(status) for status in ("run", *WORK_STATUSES.values()) if status in statuses}
 
     @abstractmethod
     def rows(self) -> tuple[list[str], list[list[Any]]]:
@@ -93,20 +93,20 @@ def carried_out(
     *,
     executor: Executor | None,
     known: Callable[[Work], _Result | None],
-    kept: Callable[[Work, _Outcome], _Result],
-    told: Callable[[int, int], object] | None,
+    keep: Callable[[Work, _Outcome], _Result],
+    progress: Callable[[int, int], object] | None,
     at_start: bool = False,
 ) -> tuple[_Result, ...]:
-    """Return the result of every item, in order; ``known`` ones are not worked on, others ``kept`` as they come."""
-    found = {i: result for i, item in enumerate(items) if (result := known(item)) is not None}
-    waiting = [i for i in range(len(items)) if i not in found]
-    if told is not None and at_start:
-        told(len(found), len(items))
+    """Return each item's result, in order: no work is done for ``known`` ones, ``keep`` takes others as they come."""
+    results = {i: result for i, item in enumerate(items) if (result := known(item)) is not None}
+    waiting = [i for i in range(len(items)) if i not in results]
+    if progress is not None and at_start:
+        progress(len(results), len(items))
     for place, outcome in as_they_come(work, [items[i] for i in waiting], executor):
-        found[waiting[place]] = kept(items[waiting[place]], outcome)
-        if told is not None:
-            told(len(found), len(items))
-    return tuple(found[i] for i in range(len(items)))
+        results[waiting[place]] = keep(items[waiting[place]], outcome)
+        if progress is not None:
+            progress(len(results), len(items))
+    return tuple(results[i] for i in range(len(items)))
 
 
 class ResultFolder(Generic[_Result]):
@@ -130,7 +130,7 @@ class ResultFolder(Generic[_Result]):
         stem = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in item.name)[:LONGEST_STEM]
         return self.folder / f"{stem}-{item.key[:DIGEST_DIGITS]}{ending}"
 
-    def kept(self, item: Work, result: _Result, content: bytes | str | None) -> _Result:
+    def keep(self, item: Work, result: _Result, content: bytes | str | None) -> _Result:
         """Write what was made, then the result; return the result with the file."""
         file = write_atomically(self._file(item, self.ending), content) if content else None
         known = {"key": item.key, "file": None if file is None else file_digest(file)}
@@ -146,15 +146,15 @@ class ResultFolder(Generic[_Result]):
         written, file = self._file(item, ".result.json"), self._file(item, self.ending)
         try:
             # What does not do is written anew.
-            _, kept, intact = opened(
+            _, contents, intact = opened(
                 written, (self.kind,), RESULT_VERSION, "result", "", under="result", is_protected=False
             )
-            body, digest = restored(kept), kept.get("file")
-            found: _Result = TypeAdapter(self.record).validate_python({name: body[name] for name in self.fields})
+            body, digest = restored(contents), contents.get("file")
+            result: _Result = TypeAdapter(self.record).validate_python({name: body[name] for name in self.fields})
         except (SpecError, LookupError, TypeError, ValueError, RecursionError):
             return None
-        if not intact or kept.get("key") != item.key:
+        if not intact or contents.get("key") != item.key:
             return None
         if digest is not None and (not file.is_file() or file_digest(file) != digest):
             return None
-        return replace(found, **own, file=None if digest is None else file)  # type: ignore[type-var]
+        return replace(result, **own, file=None if digest is None else file)  # type: ignore[type-var]

@@ -46,7 +46,7 @@ def _run_tolerances(options: argparse.Namespace) -> int:
         kind = None if options.out is None else RESULT_FILE if _is_json(options.out) else picture_kind(options.out)
         spec, scenario, target, design = prepared(options, report_stage, kind)
 
-        found = tolerance_study(
+        study = tolerance_study(
             design,
             scenario,
             tolerances=[_tolerance(item) for item in options.tolerances.split(",")],
@@ -56,15 +56,15 @@ def _run_tolerances(options: argparse.Namespace) -> int:
             progress=report_stage,
         )
     if target is not None and _is_json(target):
-        found.save(target)
+        study.save(target)
     elif target is not None:
         from obsynth.studies.plots.tolerances import plot_tolerances
 
-        written_picture(target, 2, lambda axes: plot_tolerances(found, axes=axes))
+        written_picture(target, 2, lambda axes: plot_tolerances(study, axes=axes))
     emit(
         options,
-        {"spec": spec.path, "file": target, "statement": found.statement, **found.as_dict()},
-        f"{found}\n{found.statement}",
+        {"spec": spec.path, "file": target, "statement": study.statement, **study.as_dict()},
+        f"{study}\n{study.statement}",
     )
     return 0
 
@@ -109,7 +109,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
                 change=(options.change or CHANGE) if options.monitor == "cusum" else None,
             )
         with chosen_executor(options.jobs, None) as executor:
-            found = evaluate(
+            evaluation = evaluate(
                 design,
                 scenario,
                 runs=options.runs,
@@ -126,22 +126,27 @@ def run_evaluate(options: argparse.Namespace) -> int:
     units, moving = design.plant.units, bool(least) and is_moving(design)
     noisy = bool(least) and bool(design.linear[0].Dw.any() or design.linear[0].Bw.any())
     sentences = [in_words(name, *pair, units.get(name, ""), moving=moving, noisy=noisy) for name, pair in least.items()]
-    told: dict[str, Any] | None = None
+    monitor_data: dict[str, Any] | None = None
     if watched is not None:
         kind, statement = described(watched)
-        told = {"kind": kind, "statement": statement, "final_threshold": final_threshold(watched)}
+        monitor_data = {"kind": kind, "statement": statement, "final_threshold": final_threshold(watched)}
     emit(
         options,
         {
             "spec": spec.path,
-            "monitor": told,
+            "monitor": monitor_data,
             "least_thresholds": {
                 name: {"bound": pair[0], "least": pair[1], "moving": moving} for name, pair in least.items()
             },
-            **found.as_dict(),
+            **evaluation.as_dict(),
         },
         lambda: evaluation_report(
-            design.name, found, monitor=watched, console=stdout_console(), units=design.plant.units, beside=sentences
+            design.name,
+            evaluation,
+            monitor=watched,
+            console=stdout_console(),
+            units=design.plant.units,
+            beside=sentences,
         ),
     )
     return 0
@@ -160,12 +165,12 @@ def run_compare(options: argparse.Namespace) -> int:
             refuse_given(options, ("map", "scale", "time_column", "input_delay"), "a log: give --data")
         if options.out is not None:
             output_file(options.out, RESULT_FILE if _is_json(options.out) else COMPARISON_PAGE, options)
-        given = {} if spec.method == "auto" else {spec.method: spec.options}
+        method_options = {} if spec.method == "auto" else {spec.method: spec.options}
         rows = stated_delay(options)
-        found = compare(
+        comparison = compare(
             spec.transformation or linear_plant(spec.plant),
             scenario=spec.scenario,
-            options=given,
+            options=method_options,
             sample_time=options.sample_time,
             within=options.within,
             tolerance=options.tolerance,
@@ -179,14 +184,14 @@ def run_compare(options: argparse.Namespace) -> int:
         if options.out is not None:
             report_stage(f"writing {options.out}")
             if _is_json(options.out):
-                found.save(options.out)
+                comparison.save(options.out)
             else:
-                write_atomically(options.out, found.page())
+                write_atomically(options.out, comparison.page())
     from obsynth.studies.tables import comparison_report
 
     emit(
         options,
-        {"spec": spec.path, "statement": found.statement, **found.to_dict()},
-        lambda: comparison_report(found, console=stdout_console(), file=options.out),
+        {"spec": spec.path, "statement": comparison.statement, **comparison.to_dict()},
+        lambda: comparison_report(comparison, console=stdout_console(), file=options.out),
     )
-    return 0 if found.recommended else PreconditionError.exit_code
+    return 0 if comparison.recommended else PreconditionError.exit_code

@@ -18,17 +18,17 @@ def run_sensors(options: argparse.Namespace) -> int:
     with progress(quiet=options.quiet) as report_stage:
         spec = load_spec(options.system)
         plant = linear_plant(spec.plant)
-        given: dict[str, Any] = {"goal": options.goal, "noise": options.noise, "largest": options.largest}
+        arguments: dict[str, Any] = {"goal": options.goal, "noise": options.noise, "largest": options.largest}
         if options.goal == "threshold":
             own = dict(spec.options) if spec.method == "guaranteed-test" else {}
             fault = options.fault or own.pop("fault", None)
             if fault is None and plant.nf == 1:
                 fault = plant.fault_names[0]
             own = {name: value for name, value in own.items() if name != "fault"}
-            given |= {"fault": fault, "below": options.below, "sample_time": options.sample_time, "test": own}
+            arguments |= {"fault": fault, "below": options.below, "sample_time": options.sample_time, "test": own}
         else:
             refuse_given(options, ("below", "sample_time"), "--goal threshold")
-            given |= {"faults": None if options.fault is None else [options.fault]}
-        found = sensor_sets(plant, progress=report_stage, **given)
-    emit(options, {"spec": spec.path, **found.to_dict()}, lambda: stdout_console().print(str(found), highlight=False))
+            arguments |= {"faults": None if options.fault is None else [options.fault]}
+        sets = sensor_sets(plant, progress=report_stage, **arguments)
+    emit(options, {"spec": spec.path, **sets.to_dict()}, lambda: stdout_console().print(str(sets), highlight=False))
     return 0

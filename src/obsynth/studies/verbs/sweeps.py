@@ -43,8 +43,8 @@ def run_sweep(options: argparse.Namespace) -> int:
     def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:
         return sweep(options.system, parameters, executor=executor, folder=options.out, progress=done)
 
-    def draw(found: Any) -> Any:
-        claims = {name for result in found.results for name in result.claims}
+    def draw(designed: Any) -> Any:
+        claims = {name for result in designed.results for name in result.claims}
         if options.claim is not None and options.claim not in claims:
             known = ", ".join(sorted(claims)) or "none"
             print(
@@ -52,11 +52,11 @@ def run_sweep(options: argparse.Namespace) -> int:
                 file=sys.stderr,
             )
             return None
-        return found.plot(options.claim) if claims else None
+        return designed.plot(options.claim) if claims else None
 
     table = FileKind("the table of a sweep", rb"\Acase,")
-    found, files = _carried_out(options, options.out, ("designs", table, "sweep.png"), work, draw)
-    _tell(options, found, files, "cases")
+    outcome, files = _carried_out(options, options.out, ("designs", table, "sweep.png"), work, draw)
+    _tell(options, outcome, files, "cases")
     return 0
 
 
@@ -82,13 +82,13 @@ def run_many(options: argparse.Namespace) -> int:
     from obsynth.studies.fleet import run_fleet
 
     alone = ("system", "state", "prove", "smooth", "lag")
-    given = [name for name in alone if getattr(options, name)]
-    if given:
-        names = ", ".join(f"--{name}" for name in given)
-        raise SpecError(f"{names}: for one gain set; --gains is a folder of many.", path=f"--{given[0]}")
+    refused = [name for name in alone if getattr(options, name)]
+    if refused:
+        names = ", ".join(f"--{name}" for name in refused)
+        raise SpecError(f"{names}: for one gain set; --gains is a folder of many.", path=f"--{refused[0]}")
     of_each = ("normal", "no_sensor_faults")
-    others = [name for name in MONITOR_NAMES if name not in of_each]
-    refuse_given(options, ("state_every", "sample_time", *others), "one gain set: --gains is a folder of many")
+    monitor_names = [name for name in MONITOR_NAMES if name not in of_each]
+    refuse_given(options, ("state_every", "sample_time", *monitor_names), "one gain set: --gains is a folder of many")
     if options.monitor is None:
         refuse_given(options, of_each, "a monitor: name it with --monitor")
     folder = Path(options.out)
@@ -98,7 +98,7 @@ def run_many(options: argparse.Namespace) -> int:
     for path in (Path(options.gains), Path(options.data)):
         if path.is_file():
             input_file(path)  # what is read is never written, by force or not
-    asked = {
+    settings = {
         "columns": dict(options.map) or None,
         "time_column": options.time_column,
         "time_zone": options.time_zone,
@@ -117,19 +117,19 @@ def run_many(options: argparse.Namespace) -> int:
     }
 
     def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:
-        stated = {name: value for name, value in asked.items() if value is not None}
+        stated = {name: value for name, value in settings.items() if value is not None}
         return run_fleet(options.gains, options.data, folder, executor=executor, progress=done, **stated)
 
     table = FileKind("the table of many runs", rb"\Arun,status,")
-    found, files = _carried_out(
+    fleet, files = _carried_out(
         options,
         folder,
         ("runs", table, "fleet.png"),
         work,
-        lambda found: found.plot() if "run" in found.counts else None,
+        lambda fleet: fleet.plot() if "run" in fleet.counts else None,
     )
     if options.json or not options.quiet:
-        _tell(options, found, files, "runs")
+        _tell(options, fleet, files, "runs")
     return 0
 
 
@@ -141,29 +141,29 @@ def _carried_out(
     draw: Callable[[Any], Any],
 ) -> tuple[Any, tuple[Path, ...]]:
     """Return what ``work`` comes to, and the files of its table and picture; nothing is left of a folder in vain."""
-    what, kind, picture_name = named
+    unit, kind, picture_name = named
     with made_folder(folder):
         table = output_file(folder / "table.csv", kind, options)
         picture = output_file(folder / picture_name, PICTURE, options)
         with progress(quiet=options.quiet) as report_stage, chosen_executor(options.jobs, options.cluster) as executor:
-            found = work(executor, lambda done, total: report_stage(f"{done} of {total} {what}"))
-            contents: dict[Path, str | bytes] = {table: found.csv()}
-            image = _png_of(lambda: draw(found))
+            outcome = work(executor, lambda done, total: report_stage(f"{done} of {total} {unit}"))
+            contents: dict[Path, str | bytes] = {table: outcome.csv()}
+            image = _png_of(lambda: draw(outcome))
             if image is not None:
                 contents[picture] = image
-            return found, write_together(contents)
+            return outcome, write_together(contents)
 
 
-def _tell(options: argparse.Namespace, found: Any, files: tuple[Path, ...], what: str) -> None:
+def _tell(options: argparse.Namespace, outcome: Any, files: tuple[Path, ...], unit: str) -> None:
     """Print the table of a sweep or of many runs, and the files."""
-    header, rows = found.rows()
+    header, rows = outcome.rows()
     if options.json:
         cases = [dict(zip(header, row, strict=True)) for row in rows]
-        print_json({"command": options.verb, "counts": found.counts, what: cases, "files": [str(f) for f in files]})
+        print_json({"command": options.verb, "counts": outcome.counts, unit: cases, "files": [str(f) for f in files]})
         return
     console = stdout_console()
-    shown = _printed_cases if what == "cases" else _printed_runs
-    console.print(shown(found, console.width))
+    printed = _printed_cases if unit == "cases" else _printed_runs
+    console.print(printed(outcome, console.width))
     console.print(f"Written: {', '.join(map(str, files))}", soft_wrap=True)
 
 
@@ -228,7 +228,7 @@ def _png_of(plot: Callable[[], Any]) -> bytes | None:
     return picture
 
 
-def _printed(found: Any, header: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> Any:
+def _printed(outcome: Any, header: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> Any:
     """Return a table for people, below what became of the cases, what is the same in all, and what has no room."""
     from rich.console import Group
     from rich.text import Text
@@ -239,44 +239,49 @@ def _printed(found: Any, header: Sequence[str], rows: Iterable[Sequence[str]], w
     columns = dict(zip(header, zip(*listed, strict=True), strict=True)) if listed else {}
     filled = {name: column for name, column in columns.items() if any(column)}
     same = {name: column[0] for name, column in filled.items() if len(listed) > 1 and len(set(column)) == 1}
-    shown, widths, missing, room = dict[str, tuple[str, ...]](), dict[str, int](), list[str](), width + _BLANKS_BETWEEN
+    printed, widths, missing, room = (
+        dict[str, tuple[str, ...]](),
+        dict[str, int](),
+        list[str](),
+        width + _BLANKS_BETWEEN,
+    )
     for name, column in filled.items():
         if name not in same:
             # Texts fold at blanks; a number that is cut is another number.
             words = [word for text in (name.replace(".", ". "), *column) for word in text.split()]
             wide = max(map(len, words)) + _BLANKS_BETWEEN
             if wide <= room:
-                shown[name], widths[name], room = column, wide - _BLANKS_BETWEEN, room - wide
+                printed[name], widths[name], room = column, wide - _BLANKS_BETWEEN, room - wide
             else:
                 missing.append(name)
-    lines = [", ".join(f"{count} {status}" for status, count in found.counts.items())]
+    lines = [", ".join(f"{count} {status}" for status, count in outcome.counts.items())]
     if same:
         lines.append(f"In all of them: {', '.join(f'{name} {value}' for name, value in same.items())}.")
     if missing:
         lines.append(f"In table.csv alone: {', '.join(missing)}.")
-    table = headed_table(*(name.replace(".", ". ") for name in shown))
-    for place, (name, cells) in zip(table.columns, shown.items(), strict=True):
+    table = headed_table(*(name.replace(".", ". ") for name in printed))
+    for place, (name, cells) in zip(table.columns, printed.items(), strict=True):
         # What room is left goes to the first texts that could use it.
         more = min(max(map(len, cells)) - widths[name], room)
         place.width, room = widths[name] + max(more, 0), room - max(more, 0)
-    for row in zip(*shown.values(), strict=True):
+    for row in zip(*printed.values(), strict=True):
         table.add_row(*(Text(cell or "-") for cell in row))
     return Group(*map(Text, lines), Text(), table)
 
 
-def _printed_cases(found: Any, width: int) -> Any:
+def _printed_cases(outcome: Any, width: int) -> Any:
     """Return the table of a sweep for people: without message and file."""
-    header, rows = found.rows()
-    kept = [i for i, name in enumerate(header) if name not in ("message", "file")]
-    told = ([f"{row[i]:.4g}" if isinstance(row[i], float) else str(row[i]) for i in kept] for row in rows)
-    return _printed(found, [header[i] for i in kept], told, width)
+    header, rows = outcome.rows()
+    columns = [i for i, name in enumerate(header) if name not in ("message", "file")]
+    texts = ([f"{row[i]:.4g}" if isinstance(row[i], float) else str(row[i]) for i in columns] for row in rows)
+    return _printed(outcome, [header[i] for i in columns], texts, width)
 
 
-def _printed_runs(found: Any, width: int) -> Any:
+def _printed_runs(outcome: Any, width: int) -> Any:
     """Return the table of runs for people: the first alarm of each, and why one was not made."""
     rows = []
-    for run in found.runs:
+    for run in outcome.runs:
         first = min(run.alarms, key=lambda name: run.alarms[name], default="")
         alarm = f"{first} at {run.alarms[first]:g} s" if first else "-"
         rows.append((run.name, run.status, str(run.rows), str(run.statuses.get("ok", 0)), alarm, run.message))
-    return _printed(found, ("run", "status", "rows", "ok", "first alarm", "why not"), rows, width)
+    return _printed(outcome, ("run", "status", "rows", "ok", "first alarm", "why not"), rows, width)
