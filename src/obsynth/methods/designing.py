@@ -22,6 +22,7 @@ from obsynth.numerics.arguments import arguments_checked, field_types
 from obsynth.numerics.libraries import failed_computations, failure_of, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.transformations.delays import continuous_with_delays, plant_and_recovery, sample_time_of_delays
 from obsynth.plants.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
 from obsynth.plants.transformations.recovery import StateRecovery, Transformation
@@ -139,11 +140,13 @@ def design(
 
 def _for_region(plant: Plant, options: Mapping[str, Any]) -> str:
     """Return the first method that exists over the region of a polytopic plant with these options."""
-    taking = [method for method in methods_for("polytopic") if set(options) <= set(field_types(method_class(method)))]
+    faulty = isinstance(plant, PolytopicSystem) and plant.nf > 0
+    known = [method for method in methods_for("polytopic") if "faults" in method_class(method).purposes or not faulty]
+    taking = [method for method in known if set(options) <= set(field_types(method_class(method)))]
     for method in taking:
         if all(condition.holds for condition in method_class(method).of(options).existence(plant)):
             return method
-    return (taking or list(methods_for("polytopic")))[0]
+    return (taking or known)[0]
 
 
 def _require_sampled_delays(plant: Any, method: str, options: Mapping[str, Any]) -> None:

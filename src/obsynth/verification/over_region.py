@@ -153,10 +153,12 @@ def rated_gain_row(
     return _proof_row(name, claim, level, proof)
 
 
-def deviation_row(claim: str, vertices: Sequence[Vertex], witness: Witness | None, level: float) -> Check:
-    """Return the row that the root mean square of errors is below ``level`` in continuous time."""
+def deviation_row(
+    claim: str, vertices: Sequence[Vertex], witness: Witness | None, level: float, *, discrete: bool = False
+) -> Check:
+    """Return the row that the root mean square of errors is below ``level``."""
     sound = witness is not None and np.isfinite(level) and level > 0.0
-    proof = prove_mean_square(vertices, witness, level, discrete=False) if sound and witness else _no_certificate()
+    proof = prove_mean_square(vertices, witness, level, discrete=discrete) if sound and witness else _no_certificate()
     return _proof_row(DEVIATION_ROW, claim, level, proof)
 
 

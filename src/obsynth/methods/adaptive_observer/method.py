@@ -139,7 +139,7 @@ class AdaptiveObserver(DescriptorKalman):
         if self.form == "random-walk" and self.reset:
             yield "reset is for the forms with a forgetting factor."
 
-    def existence(
+    def existence(  # type: ignore[override]
         self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, exactly: bool = True
     ) -> tuple[Condition, ...]:
         """Return the existence conditions; the list ends at the first failure."""

@@ -12,9 +12,11 @@ from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Syn
 from obsynth.numerics.arguments import Positive, WrittenAs
 from obsynth.observers.outliers import Outliers
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
+from obsynth.verification.over_region import DECAY_ROW, DEVIATION_ROW, WITNESSES
 
 
 @dataclass(frozen=True)
@@ -26,11 +28,13 @@ class DescriptorKalman(Method):
 
     Parameters
     ----------
-    plant : TimeVaryingDescriptorSystem or DescriptorSystem
+    plant : TimeVaryingDescriptorSystem, DescriptorSystem or PolytopicSystem
         ``E (ne, nx)``, ``C (ny, nx)``; a DescriptorSystem must be discrete in time.  What known inputs do to the
         outputs at once, ``D u``, is subtracted.  Its parameters are taken as zero.  Nothing is assumed about its
         unknown inputs: those that show in the outputs at once become states of the filter, and are estimated; the
-        equations that the others enter are left out.
+        equations that the others enter are left out.  Over the region of a PolytopicSystem a scheduled observer is
+        designed, with constant Q and R and no other option: its gains are steady at each vertex, and the mean square
+        of its errors is proved for every course of the parameters.
     Q : MatrixLike, optional
         Covariance ``(ne, ne)`` of mu(k): constant, stack, callable, or rows of expressions in ``k``; a number stands
         for that multiple of the identity.  By default ``Bw Bw'`` of a DescriptorSystem with noise, else the identity
@@ -70,7 +74,8 @@ class DescriptorKalman(Method):
     ObserverDesign
         ``observer`` is a `RecursiveObserver`; ``gains``: ``L (nx, ne)``, ``K (nx, ny)`` of the last step.
         ``certificate.claims``: ``condition`` (dimensionless; largest of H_k), ``contraction`` (per step),
-        ``residual_directions``.
+        ``residual_directions``.  Over a region: a `ScheduledObserver`; ``L (nx, nx)``, ``K (nx, ny)`` and ``S[1]``,
+        ...; ``region_deviation``: the root of the mean square of all state errors, and ``region_decay``.
 
     Raises
     ------
@@ -109,11 +114,18 @@ class DescriptorKalman(Method):
     """
 
     id: ClassVar[str] = "descriptor-kalman"
-    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant", "time-varying")
+    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant", "time-varying", "polytopic")
     time: ClassVar[str] = "discrete, time-varying"
     summary: ClassVar[str] = "states with deviations from Q and R"
     source: ClassVar[str] = "Nikoukhah, Willsky, Levy 1992"
-    claims: ClassVar[Mapping[str, ClaimMeaning]] = RECURSIVE_CLAIMS
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = {
+        **RECURSIVE_CLAIMS,
+        "region_deviation": ClaimMeaning(
+            "", "root mean square of all state errors over a region, for the stated noise", DEVIATION_ROW
+        ),
+        "region_decay": ClaimMeaning("", "factor a sample by which errors shrink over a region", DECAY_ROW),
+    }
+    witnesses: ClassVar[frozenset[str]] = frozenset({"tracking", *WITNESSES})
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"state despite noise"})
 
     Q: Annotated[Any, WrittenAs("varying covariance")] = None
@@ -128,15 +140,24 @@ class DescriptorKalman(Method):
     state_bounds: Annotated[Any, WrittenAs("named pairs")] = None
 
     def existence(
-        self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, exactly: bool = True
+        self, plant: DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem, *, exactly: bool = True
     ) -> tuple[Condition, ...]:
         """Return the existence conditions; the list ends at the first failure."""
+        if isinstance(plant, PolytopicSystem):
+            from obsynth.analysis.existence.kalman_over_region import kalman_conditions_over_region
+
+            return kalman_conditions_over_region(plant)
         from obsynth.analysis.existence.kalman import kalman_conditions
 
         return kalman_conditions(plant, early=self.early_constraints)
 
-    def require_stated(self, plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> None:
+    def require_stated(self, plant: DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem) -> None:
         """Raise `SpecError` where noise or unknown inputs of the plant are none that the method covers."""
+        if isinstance(plant, PolytopicSystem):
+            from obsynth.methods.descriptor_kalman.noise_over_region import NoiseOverRegion
+
+            NoiseOverRegion.of(plant, self.Q, self.R)
+            return
         from obsynth.analysis.existence.kalman import with_stated_noise, without_unknown_inputs
 
         with_stated_noise(plant, self.as_given())
@@ -144,9 +165,16 @@ class DescriptorKalman(Method):
             without_unknown_inputs(plant)
 
     def synthesise(
-        self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, progress: Callable[[str], None]
+        self,
+        plant: DescriptorSystem | TimeVaryingDescriptorSystem | PolytopicSystem,
+        *,
+        progress: Callable[[str], None],
     ) -> Synthesis:
         """Return gains, observer and certificate, not yet verified."""
+        if isinstance(plant, PolytopicSystem):
+            from obsynth.methods.descriptor_kalman.over_region import synthesise_over_region
+
+            return synthesise_over_region(plant, self, progress=progress)
         from obsynth.methods.engines.recursive.synthesis import synthesise
 
         return synthesise(plant, self, progress=progress)
@@ -154,6 +182,11 @@ class DescriptorKalman(Method):
     @classmethod
     def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
         """Yield a row for each claim, from the plant and the shipped realisation alone."""
+        if isinstance(design.plant, PolytopicSystem):
+            from obsynth.methods.descriptor_kalman.checks_over_region import checks_over_region
+
+            yield from checks_over_region(design)
+            return
         from obsynth.methods.engines.recursive.checks import checks
 
-        return checks(design, printed_digits)
+        yield from checks(design, printed_digits)

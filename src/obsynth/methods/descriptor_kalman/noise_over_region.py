@@ -1,0 +1,86 @@
+"""The noise that a Kalman filter over a region is for: given covariances, or what drives the plant at each vertex."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import require_shape
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.ranks import covariance_factor
+from obsynth.plants.polytopic import PolytopicSystem
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseOverRegion:
+    """Factors of covariances: independent unit white noise enters the equations, and the outputs, by these.
+
+    Parameters
+    ----------
+    process : tuple of FloatArray
+        ``(nx, q)`` at each vertex.
+    sensor : FloatArray
+        ``(ny, p)``.
+    Q, R : FloatArray or None
+        The covariances as they are stated; None where the plant's own noise counts.
+    missing : tuple of str
+        Which of the two are identities because nothing is stated.
+    """
+
+    process: tuple[FloatArray, ...]
+    sensor: FloatArray
+    Q: FloatArray | None
+    R: FloatArray | None
+    missing: tuple[str, ...]
+
+    @classmethod
+    def of(cls, plant: PolytopicSystem, Q: Any, R: Any) -> NoiseOverRegion:
+        """Return the noise of options Q and R over a region, checked; `SpecError` for what it cannot be."""
+        first = plant.vertices[0]
+        if plant.nw and (Q is None or R is None) and any(np.any(v.Bw @ v.Dw.T) for v in plant.vertices):
+            raise SpecError(
+                "The plant's noise drives equations and outputs at once (Bw Dw' is not zero), which this method does "
+                "not cover: state independent noises, or give Q and R.",
+                path="Dw",
+            )
+        missing = tuple(name for name, given in (("Q", Q), ("R", R)) if given is None and not plant.nw)
+        Q, R = (1.0 if name in missing else given for name, given in (("Q", Q), ("R", R)))
+        process, sensor = _constant(Q, plant.nx, "Q"), _constant(R, plant.ny, "R")
+        return cls(
+            tuple(v.Bw for v in plant.vertices)
+            if process is None
+            else (covariance_factor(process, "Q"),) * plant.count,
+            first.Dw if sensor is None else covariance_factor(sensor, "R"),
+            process,
+            sensor,
+            missing,
+        )
+
+    @property
+    def middle(self) -> FloatArray:
+        """What drives the mean of the vertices, at most: the mean of their noise inputs."""
+        return np.asarray(sum(self.process[1:], start=self.process[0]) / len(self.process))
+
+    def stated(self) -> dict[str, Any]:
+        """Return the covariances as options, for the gain set."""
+        return {name: None if value is None else value.tolist() for name, value in (("Q", self.Q), ("R", self.R))}
+
+
+def _constant(given: Any, size: int, name: str) -> FloatArray | None:
+    """Return a constant covariance; ``None`` for the plant's own noise."""
+    if given is None:
+        return None
+    if callable(given) or np.ndim(given) not in (0, 2) or isinstance(given, str):
+        raise SpecError(
+            f"{name} changes with k, or is no matrix: over a region give a constant covariance ({size} x {size}), or a "
+            "number.",
+            path=name,
+        )
+    matrix = as_matrix(given, name)
+    matrix = float(matrix[0, 0]) * np.eye(size) if np.ndim(given) == 0 else matrix
+    require_shape(matrix.shape, (size, size), name)
+    covariance_factor(matrix, name)  # refused here where it is none
+    return matrix
