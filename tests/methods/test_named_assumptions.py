@@ -46,7 +46,7 @@ def _spring() -> obsynth.PolytopicSystem:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("method", ["descriptor_kalman", "pd_observer", "functional_filter", "optimal_filter"])
+@pytest.mark.parametrize("method", ["adaptive_observer", "pd_observer", "functional_filter", "optimal_filter"])
 def test_a_method_that_does_not_take_a_region_says_nothing_of_other_observers(method: str) -> None:
     with pytest.raises(obsynth.PreconditionError, match=r"^This method does not take the plant") as e:
         getattr(obsynth, method)(_spring())
