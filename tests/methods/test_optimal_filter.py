@@ -159,6 +159,15 @@ def test_noise_that_is_measured_a_sample_later_does_nothing_with_one_sample_of_d
     assert design.gain < 1e-8
 
 
+def test_a_mean_square_of_zero_is_claimed_as_zero() -> None:
+    """The recomputed one, 1e-17, was compared with 2e-31: a relative difference of 1e15."""
+    design = obsynth.optimal_filter(BEHIND, delay=1, norm="h2")
+    assert design.report.passed
+    assert (design.gain, design.least) == (0.0, 0.0)
+    noisy = changed(design, plant=BEHIND.replace(Dw=[[1], [1e-6]]))
+    assert "deviation" in {check.name for check in obsynth.verify(noisy).failures}
+
+
 def test_mean_square_in_continuous_time() -> None:
     design = obsynth.optimal_filter(LAG, reference=ONE, norm="h2")
     assert design.report.passed
@@ -385,6 +394,124 @@ def test_what_does_not_exist_or_is_malformed_is_refused(case, options, error, wo
 def test_a_reference_model_may_be_a_control_system() -> None:
     design = obsynth.optimal_filter(SLOW, reference=control.tf([5.0], [1.0, 5.0]))
     assert design.gain == pytest.approx(5.0, rel=1e-8)
+
+
+def shaped(case: obsynth.DescriptorSystem, model) -> obsynth.DescriptorSystem:
+    """Return a plant with one noise whose shaping model is part of it."""
+    a, b, c, d = model
+    return plant(
+        A=np.block([[case.A, case.Bw @ c], [np.zeros((len(a), case.nx)), a]]),
+        Bf=np.vstack([case.Bf, np.zeros((len(a), case.nf))]), Bw=np.vstack([case.Bw @ d, b]),
+        C=np.hstack([case.C, case.Dw @ c]), Df=case.Df, Dw=case.Dw @ d, dt=case.dt,
+    )  # fmt: skip
+
+
+SLOW_NOISE = (np.array([[0.8]]), np.array([[1.0]]), np.array([[0.3]]), np.array([[0.4]]))
+EMPHASIS = control.tf([1.0, -0.5], [1.0, -0.9], True)
+
+
+@pytest.mark.parametrize("norm", ["hinf", "h2"])
+@pytest.mark.parametrize(("case", "delay"), [(ZERO_AT_2, 1), (STATIC, 0)])
+def test_a_weight_of_the_noise_is_a_model_of_it(case, delay, norm) -> None:
+    weighted = obsynth.optimal_filter(case, delay=delay, norm=norm, weights={"inputs": {"w1": SLOW_NOISE}})
+    inside = obsynth.optimal_filter(shaped(case, SLOW_NOISE), delay=delay, norm=norm)
+    assert weighted.report.passed
+    assert weighted.gain == pytest.approx(inside.gain, rel=1e-6)
+    assert weighted.least == pytest.approx(inside.least, rel=1e-6)
+    assert "of the weighted problem" in weighted.notes[0]
+    assert "weighted error" in str(weighted.report) or norm == "h2"
+
+
+def test_numbers_scale_errors_and_noise() -> None:
+    """Two faults on two outputs: the larger of what each error counts times its noise."""
+    case = plant(A=[[0.0]], Bf=[[0, 0]], Bw=[[0, 0]], C=[[0], [0]], Df=np.eye(2), Dw=np.eye(2))
+    for errors, inputs, truth in (
+        ({"f1": 3.0}, None, 3.0),
+        ({"f1": 3.0}, {"w1": 0.5}, 1.5),
+        ({"f1": 3.0, "f2": 0.1}, {"w1": 0.2, "w2": 50.0}, 5.0),
+        (0.25, 8.0, 2.0),
+    ):
+        design = obsynth.optimal_filter(case, delay=0, weights={"errors": errors, "inputs": inputs})
+        assert design.report.passed
+        assert truth * (1 - 1e-14) <= design.gain <= truth * (1 + 1e-7)
+        assert truth * (1 - 1e-8) <= design.least <= truth * (1 + 1e-14)
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_the_weighted_error_of_two_sensors_has_its_closed_form(delay: int) -> None:
+    """y1 = f + w1, y2 = f + w2: the error is the mean of the noise whatever its weight, W / sqrt 2 at its largest."""
+    peak = 0.5 / 0.1  # |W| of (z - .5) / (z - .9) at z = 1
+    design = obsynth.optimal_filter(TWO, delay=delay, weights={"errors": {"f1": EMPHASIS}})
+    assert design.report.passed
+    assert peak / 2**0.5 * (1 - 1e-14) <= design.gain <= peak / 2**0.5 * (1 + 1e-7)
+    assert design.least == pytest.approx(peak / 2**0.5, rel=1e-4)
+
+
+def test_a_weight_of_the_errors_in_continuous_time_is_part_of_what_is_matched() -> None:
+    """LAG: y1 = x + f, y2 = x + w2."""
+    weight = control.tf([1.0, 3.0], [1.0, 0.5])
+    design = obsynth.optimal_filter(LAG, reference=ONE, weights={"errors": weight})
+    assert design.report.passed
+    assert design.least == pytest.approx(design.gain, rel=1e-6)
+    # The gain on a grid of the closed loop: none is above, and the largest is near.
+    observer, points = design.observer, 1j * np.geomspace(1e-4, 1e4, 400)
+    largest = 0.0
+    for s in points:
+        seen = LAG.C @ np.linalg.solve(s * np.eye(1) - LAG.A, LAG.Bw) + LAG.Dw
+        filter_ = observer.Cz @ np.linalg.solve(s * np.eye(observer.order) - observer.Az, observer.By) + observer.Dy
+        largest = max(largest, abs(weight(s)) * np.linalg.norm(filter_ @ seen, 2))
+    assert largest <= design.gain
+    assert largest == pytest.approx(design.gain, rel=1e-3)
+    assert design.gain == pytest.approx(6.0 / 2**0.5, rel=1e-6)  # that of slow signals, where |W| = 6
+
+
+def test_weighted_faults_drive_the_error_of_matching() -> None:
+    """f and w / 2 pass at once: of f = 4 n the least is as with noise of 1/8 and errors of 4."""
+    design = obsynth.optimal_filter(HALF, **matched(ONE), weights={"inputs": {"f1": 4.0}})
+    assert design.report.passed
+    truth = 4.0 * 0.125 / (1 + 0.125**2) ** 0.5
+    assert design.gain == pytest.approx(truth, rel=1e-7)
+    assert design.least == pytest.approx(truth, rel=1e-7)
+    both = obsynth.optimal_filter(HALF, **matched(ONE), weights={"errors": EMPHASIS, "inputs": {"f1": 4.0}})
+    assert both.report.passed
+    assert both.gain == pytest.approx(5.0 * truth, rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("weights", "words"),
+    [
+        ({"wind": 1.0}, "errors"),
+        ({"inputs": {"wind": 1.0}}, "wind"),
+        ({"inputs": {"f1": 1.0}}, "f1"),
+        ({"errors": {"w1": 1.0}}, "w1"),
+        ({"errors": {"f1": 0.0}}, "zero"),
+        ({"errors": {"f1": "much"}}, "a number"),
+        ({"errors": {"f1": np.nan}}, "a number"),
+        ({"errors": {"f1": control.tf([1.0], [1.0, -0.5], True)}}, "no stable inverse"),
+        ({"errors": {"f1": control.tf([1.0, -2.0], [1.0, -0.5], True)}}, "no stable inverse"),
+        ({"inputs": {"w1": control.tf([1.0], [1.0, -1.5], True)}}, "not stable"),
+        ({"inputs": {"w1": control.tf([1.0], [1.0, 1.5])}}, "dt"),
+        ({"inputs": {"w1": {"D": [[1.0, 2.0]]}}}, "one of each"),
+        (3.0, "give"),
+    ],
+)
+def test_weights_that_are_none_are_refused(weights, words) -> None:
+    with pytest.raises(obsynth.SpecError, match=words):
+        obsynth.optimal_filter(STATIC, delay=0, weights=weights)
+
+
+def test_claims_are_of_the_weights_that_are_stored(tmp_path) -> None:
+    weights = {"errors": {"f1": EMPHASIS}, "inputs": {"w1": SLOW_NOISE}}
+    design = obsynth.optimal_filter(ZERO_AT_2, delay=1, weights=weights)
+    again = obsynth.load(design.save(tmp_path / "a.gains.json"))
+    assert obsynth.verify(again).passed
+    stored = again.options["weights"]
+    assert set(stored) == {"errors", "inputs"}
+    louder = {**stored, "inputs": {"w1": {**stored["inputs"]["w1"], "D": [[0.5]]}}}
+    quieter = {**stored, "inputs": {"w1": {**stored["inputs"]["w1"], "D": [[0.3]]}}}
+    for other, row in ((louder, "gain"), (quieter, "least gain"), ({"inputs": {"x": 1.0}}, "fits"), ("x", "fits")):
+        failures = {check.name for check in obsynth.verify(changed(again, options={"weights": other})).failures}
+        assert row in failures or (row == "fits" and "fits the plant" in failures), (row, failures)
 
 
 def test_a_copy_follows_modes_that_the_filter_reads_and_u_drives() -> None:

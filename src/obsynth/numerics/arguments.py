@@ -361,6 +361,10 @@ def _problem_with_written(value: Any, name: str, kind: str) -> str | None:
         fits = fits or (isinstance(value, (list, tuple)) and len(value) == 4)
         expected = "{'bandwidth': 10}, matrices {'A': ..., 'B': ..., 'C': ..., 'D': ...} or a system of python-control"
         return None if fits else f"{name} is {shown(value)}: give {expected}."
+    if kind == "weights":
+        fits = value is None or isinstance(value, Mapping)
+        wanted = "{'errors': {'fault': weight}, 'inputs': {'noise': weight}}"
+        return None if fits else f"{name} is {shown(value)}: give {wanted}."
     fits = not isinstance(value, (bool, np.bool_)) and (not kinds or value is None or isinstance(value, kinds))
     if fits and kind == "fault sets" and not isinstance(value, (str, type(None))):
         fits = all(isinstance(entry, (str, list, tuple)) for entry in value)

@@ -108,7 +108,7 @@ def estimation_problem(
     delay : int or sequence of int, optional
         Samples L of the exact fault map ``z^-L`` (discrete time), of all faults or of each.
     reference : tuple of FloatArray, optional
-        A reference model ``(a, b, c, d)`` of what the estimate shall be of the faults.
+        A reference model ``(a, b, c, d)`` of what the estimate shall be of the faults (of the delayed ones).
     exact : bool, optional
         Whether faults pass exactly by the fault map; otherwise they drive the error beside w (model matching).
 
@@ -129,7 +129,8 @@ def estimation_problem(
         bw, dw = np.hstack([bf, bw]), np.hstack([df, dw])
     lags = np.broadcast_to(np.asarray(0 if delay is None else delay, dtype=np.int64), (nf,))
     if reference is not None and exact and plant.dt > 0.0:
-        lags, reference = _without_dead_samples(reference, longest=len(form.A) + 1)
+        dead, reference = _without_dead_samples(reference, longest=len(form.A) + 1)
+        lags = lags + dead
     lags = lags + form.shift
     window = _decoupling_window(form.A, form.C, (bh, dh), (bw, dw), nf if exact else 0, lags, plant.dt, nf, form.shift)
     core = _core(form.A, (bw, dw), window, len(form.C))

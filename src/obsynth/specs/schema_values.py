@@ -306,6 +306,7 @@ OPTION_KINDS: Mapping[str, Any] = {
     "samples": _as_in_python("samples"),
     "delay": _as_in_python("delay"),
     "reference model": _as_in_python("reference model"),
+    "weights": _as_in_python("weights"),
     "free faults": Text | list[Text] | None,
     "named numbers": Positive | dict[Text, Positive] | None,
     "named vector": list[float] | dict[Text, float] | None,

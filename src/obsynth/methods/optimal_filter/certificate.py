@@ -60,11 +60,11 @@ def certified(
         claims["delay"] = float(fault_map.delay)
     if norm == "h2":
         return {}, claims | {
-            "deviation": chosen.gain,
-            "least_deviation": chosen.gain if chosen.least is None else chosen.least,
+            "deviation": 0.0 if chosen.is_nothing else chosen.gain,
+            "least_deviation": 0.0 if chosen.is_nothing else chosen.gain if chosen.least is None else chosen.least,
         }
     model = ErrorModel(plant, observer, found.T, -found.T0, lag=found.lag, decoupled=True)
-    channel = ErrorChannel(model, None if fault_map.exact else fault_map.reference)
+    channel = ErrorChannel(model, None if fault_map.exact else fault_map.reference, fault_map.weights)
     factors = [factor * chosen.nothing for factor in ZERO_LEVELS] if chosen.is_nothing else []
     levels = factors or [chosen.gain * (1.0 + room) for room in CLAIM_ROOMS]
     matrices: dict[str, FloatArray] = {}
@@ -118,7 +118,7 @@ def _reached_sizes(a: FloatArray, b: FloatArray) -> FloatArray:
 def _lower_bounds(plant: DescriptorSystem, chosen: Designed, claims: dict[str, float]) -> dict[str, FloatArray]:
     """Claim what is proved of every causal filter, and of every delay; return the witnesses."""
     fault_map, best, matrices = chosen.fault_map, 0.0, dict[str, FloatArray]()
-    setting = fault_map.setting
+    setting, plant = fault_map.setting, fault_map.driven(plant)
     block = plant.nx + plant.nf + plant.nd + plant.nw
     samples = min(setting.longest + MORE_SAMPLES, max(setting.longest, 1) + MOST_UNKNOWNS // block)
     best_points: list[complex] = []

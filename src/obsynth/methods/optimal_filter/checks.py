@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import PreconditionError
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.optimal_filter.delays import in_words, plain_delays
 from obsynth.methods.optimal_filter.error_channel import ErrorChannel
-from obsynth.methods.optimal_filter.fault_maps import FaultMap, designed
+from obsynth.methods.optimal_filter.fault_maps import ZERO_GAIN, FaultMap, designed
+from obsynth.methods.optimal_filter.weights import weights_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
@@ -66,7 +67,8 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     )
     if options["exact"]:
         yield _fault_map(design, model)
-    channel = ErrorChannel(model, None if options["exact"] else _reference(matrices))
+    weights = _claimed_map(design).weights
+    channel = ErrorChannel(model, None if options["exact"] else _reference(matrices), weights)
     if options["norm"] == "h2":
         yield _deviation(channel, claimed(claims, "deviation"), plant)
         yield _least_deviation(design, plant)
@@ -79,7 +81,10 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         proof = prove_norm_by_eigenvalues(channel, channel.order, level, dt=plant.dt)
         source = "eigenvalues of the Hamiltonian matrix"
     driven = "noise" if options["exact"] else "faults and noise together"
-    yield proof_row("gain", f"the error is at most {claims['gain']:.9g} times the {driven}", proof, source)
+    driven = driven if weights is None else f"{driven}, each behind its weight"
+    error = "error" if weights is None else "weighted error"
+    yield proof_row("gain", f"the {error} is at most {claims['gain']:.9g} times the {driven}", proof, source)
+    plant = _claimed_map(design).driven(plant)
     if "least" in claims:
         yield _least(design, plant)
     if "non_causal_limit" in claims:
@@ -108,6 +113,11 @@ def _fits(design: ObserverDesign) -> bool:
     parts = (observer.Az, observer.Bu, observer.By, observer.Cz, observer.Du, observer.Dy, *matrices.values())
     states, reference = matrices["T0"].shape[1], _reference(matrices)
     extra = 0 if reference is None or options["exact"] else len(reference[0])
+    try:
+        weights = _claimed_map(design).weights
+    except SpecError:
+        return False
+    extra += 0 if weights is None else weights.order
     rows = plant.nf if reference is None else len(reference[2])
     shapes = {
         "stability": (observer.order,) * 2,
@@ -184,7 +194,10 @@ def _setting(design: ObserverDesign) -> Setting:
 def _claimed_map(design: ObserverDesign) -> FaultMap:
     reference = _reference(design.certificate.matrices)
     delays = design.linear[1].fault_delays if reference is None else None
-    return FaultMap(delays, reference, bool(design.options["exact"]))
+    exact, rows = bool(design.options["exact"]), len(design.linear[1].Cz)
+    plant = seen_plant(design.linear[0], design.options["decoupled"])
+    weights = weights_of(design.options.get("weights"), plant, rows=rows, exact=exact)
+    return FaultMap(delays, reference, exact, weights)
 
 
 def _fault_map(design: ObserverDesign, model: ErrorModel) -> Check:
@@ -293,10 +306,12 @@ def _deviation(channel: ErrorChannel, stated: float, plant: DescriptorSystem) ->
         # White noise that passes, by more than rounding, has no mean square.
         d = np.where(np.abs(d) > ROUNDED_UNITS * direct.radius, np.inf, 0.0)
     found = float(np.sqrt(max(np.trace(c @ covariance @ c.T + d @ d.T), 0.0)))
+    # Of zero nothing but rounding may be left.
+    unit = stated if stated else channel.size * ZERO_GAIN / DEVIATION_SHARE
     return upper_bound_check(
         "deviation",
         "root mean square of the error for white noise, recomputed: relative difference",
-        abs(found - stated) / max(stated, float(np.finfo(float).tiny)),
+        abs(found - stated) / max(unit, float(np.finfo(float).tiny)),
         DEVIATION_SHARE,
         source="Lyapunov equation",
         kind="computed",

@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
+from obsynth.methods.optimal_filter.weights import Weights
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
 from obsynth.proofs.balls import Ball
@@ -19,12 +21,13 @@ from obsynth.verification.error_system import ErrorModel
 class ErrorChannel:
     """``e+ = a e + b v``, error ``c e + d v``, of the stored numbers, formed in any arithmetic.
 
-    v: the noise, or the faults and the noise where ``matched`` is the reference model that the error is from; the
-    error is in units of ``unit``, a power of two.
+    v: the noise, or the faults and the noise where ``matched`` is the reference model that the error is from, each
+    before its weight; the error is behind its own, in units of ``unit``, a power of two.
     """
 
     model: ErrorModel
     matched: Model | None = None
+    weights: Weights | None = None
     unit: float = 1.0
 
     def in_units_of(self, gain: float) -> ErrorChannel:
@@ -34,7 +37,19 @@ class ErrorChannel:
     @property
     def order(self) -> int:
         """States of the error system."""
-        return self.model.observer.order + (0 if self.matched is None else len(self.matched[0]))
+        order = self.model.observer.order + (0 if self.matched is None else len(self.matched[0]))
+        return order + (0 if self.weights is None else self.weights.order)
+
+    @property
+    def size(self) -> float:
+        """What the noise could do to the error in a sample, whatever cancels."""
+        model = self.model
+        observer, plant = model.observer, model.plant
+        own = np.abs(model.own) @ np.abs(plant.Bw) + np.abs(observer.By) @ np.abs(plant.Dw)
+        direct = np.abs(observer.Dy) @ np.abs(plant.Dw)
+        if model.T0 is not None:
+            direct = direct + np.abs(model.T0[:, : plant.nx]) @ np.abs(plant.Bw)
+        return float(np.linalg.norm(observer.Cz) * np.linalg.norm(own) + np.linalg.norm(direct))
 
     @property
     def middle(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -44,6 +59,22 @@ class ErrorChannel:
 
     def __call__(self, kind: type[Enclosed]) -> tuple[Enclosed, Enclosed, Enclosed, Enclosed]:
         """Return the matrices with what forming them may have cost."""
+        a, b, c, d = self._weighted(kind)
+        return a, b, c.scaled(1.0 / self.unit), d.scaled(1.0 / self.unit)
+
+    def _weighted(self, kind: type[Enclosed]) -> tuple[Enclosed, Enclosed, Enclosed, Enclosed]:
+        system, weights = self._unweighted(kind), self.weights
+        if weights is None:
+            return system
+        inputs = [weights.noise] if self.matched is None else [weights.faults, weights.noise]
+        counts = [self.model.plant.nw] if self.matched is None else [self.model.plant.nf, self.model.plant.nw]
+        parts = [_identity(count) if model is None else model for model, count in zip(inputs, counts, strict=True)]
+        before = tuple(np.asarray(block_diag(*(part[i] for part in parts)), dtype=np.float64) for i in range(4))
+        behind = _identity(len(self.model.observer.Cz)) if weights.errors is None else weights.errors
+        found = _in_series(kind, tuple(kind.exact(part) for part in before), system)
+        return _in_series(kind, found, tuple(kind.exact(part) for part in behind))
+
+    def _unweighted(self, kind: type[Enclosed]) -> tuple[Enclosed, Enclosed, Enclosed, Enclosed]:
         model, exact = self.model, kind.exact
         observer, plant = model.observer, model.plant
         t, by, dy = exact(model.own), exact(observer.By), exact(observer.Dy)
@@ -58,13 +89,30 @@ class ErrorChannel:
 
         (noise, through), a, c = driven(plant.Bw, plant.Dw), exact(observer.Az), -exact(observer.Cz)
         if self.matched is None:
-            return a, noise, c.scaled(1.0 / self.unit), through.scaled(1.0 / self.unit)
+            return a, noise, c, through
         fault, seen = driven(plant.Bf, plant.Df)
         ar, br, cr, dr = (exact(part) for part in self.matched)
         n, k = observer.order, len(self.matched[0])
         return (
             kind.blocks([[a, zero(n, k)], [zero(k, n), ar]]),
             kind.blocks([[fault, noise], [br, zero(k, plant.nw)]]),
-            kind.blocks([[c, -cr]]).scaled(1.0 / self.unit),
-            kind.blocks([[seen - dr, through]]).scaled(1.0 / self.unit),
+            kind.blocks([[c, -cr]]),
+            kind.blocks([[seen - dr, through]]),
         )
+
+
+def _identity(count: int) -> Model:
+    none = np.zeros((0, 0))
+    return none, np.zeros((0, count)), np.zeros((count, 0)), np.eye(count)
+
+
+def _in_series(kind: type[Enclosed], first: Any, second: Any) -> tuple[Enclosed, Enclosed, Enclosed, Enclosed]:
+    """Return ``second`` behind ``first``, with what forming it may have cost."""
+    (a1, b1, c1, d1), (a2, b2, c2, d2) = first, second
+    nothing = kind.exact(np.zeros((a1.shape[0], a2.shape[0])))
+    return (
+        kind.blocks([[a1, nothing], [b2 @ c1, a2]]),
+        kind.blocks([[b1], [b2 @ d1]]),
+        kind.blocks([[d2 @ c1, c2]]),
+        d2 @ d1,
+    )

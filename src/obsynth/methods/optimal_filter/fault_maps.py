@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import reduce
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -13,6 +14,7 @@ from obsynth.analysis.existence.condition import Condition
 from obsynth.errors import PreconditionError
 from obsynth.methods.optimal_filter.delays import delays_of
 from obsynth.methods.optimal_filter.reference import lag_model, reference_model
+from obsynth.methods.optimal_filter.weights import Weights, in_series, inverse, weights_of
 from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
 from obsynth.numerics.decoupling_windows import Channels, EstimationProblem, Model, estimation_problem
 from obsynth.numerics.least_estimation import (
@@ -28,6 +30,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import regularity_of
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.verification.invisible_faults import Setting, seen_plant
+from obsynth.verification.weighted_plant import weighted_plant
 
 #: A gain below this share of what the faults do to the error without a filter is zero but for rounding.
 ZERO_GAIN = 1e-9
@@ -50,16 +53,21 @@ class Options(Protocol):
     def exact(self) -> bool:
         """Whether faults pass exactly by the fault map."""
 
+    @property
+    def weights(self) -> Any:
+        """Weights of errors and inputs, or ``None``."""
+
     def decoupled_names(self, plant: DescriptorSystem) -> tuple[str, ...]:
         """Return the disturbances that never reach the error."""
 
 
 class FaultMap(NamedTuple):
-    """What the estimate is of the faults: a delay of each, or a reference model; exact or not."""
+    """What the estimate is of the faults: a delay of each, or a reference model; exact or not; what is weighted."""
 
     delays: tuple[int, ...] | None
     reference: Model | None
     exact: bool
+    weights: Weights | None = None
 
     @property
     def delay(self) -> int | None:
@@ -69,7 +77,15 @@ class FaultMap(NamedTuple):
     @property
     def setting(self) -> Setting:
         """What bounds on every filter are for."""
-        return Setting(self.delays or (), () if self.reference is None else (self.reference,), self.exact)
+        weights = self.weights or Weights(None, None, None)
+        models = (weights.faults, self.reference, weights.errors)
+        return Setting(self.delays or (), tuple(model for model in models if model is not None), self.exact)
+
+    def driven(self, plant: DescriptorSystem) -> DescriptorSystem:
+        """Return the plant behind the weights of its noise and its faults."""
+        if self.weights is None:
+            return plant
+        return weighted_plant(plant, noise=self.weights.noise, faults=self.weights.faults)
 
     def later(self, samples: int = 1, *, which: tuple[bool, ...] | None = None) -> FaultMap:
         """Return the map with more samples of delay, of all faults or of some."""
@@ -145,6 +161,12 @@ def first_problem(plant: DescriptorSystem, asked: Options) -> tuple[FaultMap, Es
 
 
 def _open_maps(plant: DescriptorSystem, asked: Options) -> Iterator[FaultMap]:
+    for fault_map in _unweighted_maps(plant, asked):
+        rows = plant.nf if fault_map.reference is None else len(fault_map.reference[2])
+        yield fault_map._replace(weights=weights_of(asked.weights, plant, rows=rows, exact=fault_map.exact))
+
+
+def _unweighted_maps(plant: DescriptorSystem, asked: Options) -> Iterator[FaultMap]:
     if asked.reference is not None:
         yield FaultMap(None, reference_model(asked.reference, plant), asked.exact)
     elif plant.is_discrete:
@@ -175,6 +197,7 @@ def _power(value: float) -> float:
 
 def problem_of(plant: DescriptorSystem, fault_map: FaultMap) -> EstimationProblem:
     """Return the problem of estimation of a fault map, in units in which the plant is near one."""
+    plant = fault_map.driven(plant)
     own, units = _units_of(plant)
     left, shown, states = own.equations[:, None], own.outputs[:, None], own.states
     each = own.faults if fault_map.exact else np.full(plant.nf, units.error)
@@ -193,27 +216,29 @@ def problem_of(plant: DescriptorSystem, fault_map: FaultMap) -> EstimationProble
         shown * plant.Dw * noise,
         plant.dt,
     )
-    reference = fault_map.reference
-    if reference is None:
+    models = fault_map.setting.models
+    if not models:
         found = estimation_problem(channels, delay=fault_map.delays, exact=fault_map.exact)
         weights = (own.faults / units.error)[:, None]
         return replace(found, L=weights * found.L, D1=weights * found.D1, F=weights * found.F)
-    a, b, c, d = reference
+    a, b, c, d = reduce(in_series, models)
     scaled = (a, b * each, c / units.error, d * each / units.error)
-    return estimation_problem(channels, reference=scaled, exact=fault_map.exact)
+    return estimation_problem(channels, delay=fault_map.delays, reference=scaled, exact=fault_map.exact)
 
 
 def unit_of_gains(plant: DescriptorSystem, fault_map: FaultMap) -> float:
     """Return what a gain of the problem of estimation is in the units of the plant."""
-    _, units = _units_of(plant)
+    _, units = _units_of(fault_map.driven(plant))
     return units.error / (units.noise if fault_map.exact else units.error)
 
 
-def filter_in_plant_units(plant: DescriptorSystem, filter_: Model) -> Model:
+def filter_in_plant_units(plant: DescriptorSystem, fault_map: FaultMap, filter_: Model) -> Model:
     """Return a filter of the problem of estimation as one from y to the faults, both in the units of the plant."""
-    own, units = _units_of(plant)
+    own, units = _units_of(fault_map.driven(plant))
     a, b, c, d = filter_
-    return a, b * own.outputs, units.error * c, units.error * d * own.outputs
+    weighted = a, b * own.outputs, units.error * c, units.error * d * own.outputs
+    errors = None if fault_map.weights is None else fault_map.weights.errors
+    return weighted if errors is None else in_series(weighted, inverse(errors))
 
 
 def designed(
@@ -244,7 +269,7 @@ def designed(
     return Designed(
         fault_map,
         problem,
-        filter_in_plant_units(plant, filter_),
+        filter_in_plant_units(plant, fault_map, filter_),
         gain * ratio,
         least.limit * ratio,
         least.limit_angle,

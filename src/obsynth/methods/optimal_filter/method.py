@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 
 from obsynth.analysis.existence.condition import OPTIONS_PATH, Condition
-from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, plain
 from obsynth.methods.optimal_filter.delays import is_auto
 from obsynth.numerics.arguments import OpenUnitInterval, WrittenAs
 from obsynth.numerics.arrays import FloatArray
@@ -49,6 +49,12 @@ class OptimalFilterMethod(Method):
         Whether faults pass exactly by the fault map; otherwise they drive the error beside the noise.
     decoupled : str or sequence of str, optional
         Disturbances that never reach the error, whatever their time course; none by default.
+    weights : mapping, optional
+        ``{"errors": {"fault": weight}, "inputs": {"noise": weight}}``: what errors count, and the model that forms a
+        disturbance or a noise (with ``exact=False`` also a fault) from a signal of unit energy.  Each weight is a
+        number or a stable model of one input and one output, such as ``control.tf([1, 1], [1, 0.1])``, or one for
+        all of a group.  Weights of errors pass at once and have strictly stable zeros.  All claims are then of the
+        weighted problem.
     steady_error_limit : float, optional
         Largest share of a constant fault that its estimate may miss in the end, proved on plant and stored numbers: a
         design beyond it is refused.
@@ -116,6 +122,7 @@ class OptimalFilterMethod(Method):
     norm: Literal["hinf", "h2"] = "hinf"
     exact: bool = True
     decoupled: Annotated[Any, WrittenAs("texts")] = None
+    weights: Annotated[Any, WrittenAs("weights")] = None
     steady_error_limit: OpenUnitInterval = STEADY_ERROR
 
     def conflicts(self) -> Iterator[str]:
@@ -136,12 +143,7 @@ class OptimalFilterMethod(Method):
     def as_plain(self) -> dict[str, Any]:
         """Return every option by name, as lists, mappings, numbers and texts."""
         found = super().as_plain()
-        if hasattr(self.reference, "dt"):
-            import control
-
-            system = control.ss(self.reference)
-            found["reference"] = {name: getattr(system, name).tolist() for name in "ABCD"}
-        return found
+        return found | {"reference": _as_matrices(self.reference), "weights": _as_matrices(self.weights)}
 
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return whether any causal filter has the fault map that is asked for, in floating point."""
@@ -175,3 +177,13 @@ class OptimalFilterMethod(Method):
         a, b, c, d = (matrices[f"reference_{name}"] for name in "ABCD")
         still = np.eye(len(a)) * (model.plant.dt > 0.0)
         return np.asarray(d + c @ np.linalg.solve(still - a, b))
+
+
+def _as_matrices(value: Any) -> Any:
+    """Return an option in which systems of python-control are mappings of their matrices."""
+    if hasattr(value, "dt"):
+        import control
+
+        system = control.ss(value)
+        return {name: getattr(system, name).tolist() for name in "ABCD"}
+    return {name: _as_matrices(part) for name, part in value.items()} if isinstance(value, Mapping) else plain(value)

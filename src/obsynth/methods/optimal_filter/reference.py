@@ -26,12 +26,19 @@ def reference_model(given: Any, plant: DescriptorSystem) -> Model:
         if not fits or not width > 0:
             raise SpecError("A lag is {'bandwidth': rad/s, 'order': 1}, both positive.", path=PATH)
         return lag_model(float(width), int(order), plant.nf, plant.dt)
-    a, b, c, d = _matrices(given, plant)
-    if d.shape[1] != plant.nf:
-        raise SpecError(f"The reference model has {d.shape[1]} inputs; the plant has {plant.nf} faults.", path=PATH)
+    model = model_of(given, plant, "reference model", PATH)
+    inputs = model[3].shape[1]
+    if inputs != plant.nf:
+        raise SpecError(f"The reference model has {inputs} inputs; the plant has {plant.nf} faults.", path=PATH)
+    return model
+
+
+def model_of(given: Any, plant: DescriptorSystem, what: str, path: str) -> Model:
+    """Return ``(A, B, C, D)`` of a stable model in the time of a plant; raise `SpecError`, which says what it is."""
+    a, b, c, d = _matrices(given, plant, what, path)
     modes = np.linalg.eigvals(a) if len(a) else np.zeros(0)
     if np.any(np.abs(modes) >= 1.0) if plant.is_discrete else np.any(modes.real >= 0.0):
-        raise SpecError("The reference model is not stable: no stable filter follows it.", path=PATH)
+        raise SpecError(f"The {what} is not stable: no stable filter follows it.", path=path)
     return a, b, c, d
 
 
@@ -50,47 +57,45 @@ def plain(model: Model) -> dict[str, Any]:
     return {name: part.tolist() for name, part in zip("ABCD", model, strict=True)}
 
 
-def _matrices(given: Any, plant: DescriptorSystem) -> Model:
+def _matrices(given: Any, plant: DescriptorSystem, what: str, path: str) -> Model:
     if isinstance(given, Mapping):
         if set(given) - set("ABCD") or "D" not in given:
-            raise SpecError("A reference model is {'bandwidth': 10}, or has matrices A, B, C and D.", path=PATH)
+            lag = "is {'bandwidth': 10}, or " if path == PATH else ""
+            raise SpecError(f"A {what} {lag}has matrices A, B, C and D.", path=path)
         parts = [given.get(name, ()) for name in "ABCD"]
     elif isinstance(given, Sequence) and not isinstance(given, str) and len(given) == 4:
         parts = [*given]
     elif hasattr(given, "dt"):
-        return _of_control(given, plant)
+        return _of_control(given, plant, what, path)
     else:
-        raise SpecError(
-            "A reference model is {'bandwidth': 10}, matrices (A, B, C, D), or a system of python-control.", path=PATH
-        )
-    return _shaped(parts)
+        lag = "{'bandwidth': 10}" if path == PATH else "a number"
+        raise SpecError(f"A {what} is {lag}, matrices (A, B, C, D), or a system of python-control.", path=path)
+    return _shaped(parts, what, path)
 
 
-def _shaped(parts: Sequence[Any]) -> Model:
+def _shaped(parts: Sequence[Any], what: str, path: str) -> Model:
     """Return matrices that fit each other."""
-    d = as_matrix(parts[3], "reference.D")
+    d = as_matrix(parts[3], f"{path.rpartition('.')[2]}.D")
     rows, inputs = d.shape
     n = len(np.atleast_2d(parts[0])) if np.size(parts[0]) else 0
     wanted = ((n, n), (n, inputs), (rows, n))
     found: list[FloatArray] = []
     for name, part, shape in zip("ABC", parts, wanted, strict=False):
-        matrix = as_matrix(part, f"reference.{name}") if n else np.zeros(shape)
+        matrix = as_matrix(part, f"{path.rpartition('.')[2]}.{name}") if n else np.zeros(shape)
         if matrix.shape != shape:
-            raise SpecError(f"{name} of the reference model has shape {matrix.shape}: {shape} fits A and D.", path=PATH)
+            raise SpecError(f"{name} of the {what} has shape {matrix.shape}: {shape} fits A and D.", path=path)
         found.append(matrix)
     return found[0], found[1], found[2], d
 
 
-def _of_control(given: Any, plant: DescriptorSystem) -> Model:
+def _of_control(given: Any, plant: DescriptorSystem, what: str, path: str) -> Model:
     """Return the matrices of a system of python-control; raise `SpecError` for an improper or wrongly timed one."""
     import control
 
     try:
         system = control.ss(given)
     except (ValueError, TypeError, AttributeError, ImportError) as error:
-        raise SpecError(f"The reference model has no proper state space: {error}.", path=PATH) from None
+        raise SpecError(f"The {what} has no proper state space: {error}.", path=path) from None
     if bool(system.dt) != plant.is_discrete or (plant.is_discrete and system.dt not in (True, plant.dt)):
-        raise SpecError(
-            f"The reference model has dt = {system.dt}, the plant {plant.dt:g}: give both the same.", path=PATH
-        )
-    return _shaped([system.A, system.B, system.C, system.D])
+        raise SpecError(f"The {what} has dt = {system.dt}, the plant {plant.dt:g}: give both the same.", path=path)
+    return _shaped([system.A, system.B, system.C, system.D], what, path)

@@ -26,6 +26,7 @@ from obsynth.methods.optimal_filter.fault_maps import (
 from obsynth.methods.optimal_filter.method import OptimalFilterMethod
 from obsynth.methods.optimal_filter.realisation import Followed, followed, observer_of, realisations
 from obsynth.methods.optimal_filter.reference import plain
+from obsynth.methods.optimal_filter.weights import plain_weights
 from obsynth.methods.refusals import require_all_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.least_estimation import ADDED_NOISES, achieved, realised, whitened
@@ -77,7 +78,7 @@ def synthesis_of_gains(
     own = realised(least.problem, *white.restored(least.problem, gains["K"], gains["Z0"]), plant.ny)
     own = own if plant.is_discrete else uncayley(*own, least.problem.alpha)
     gain = unit_of_gains(plant, fault_map) * achieved(white, gains["K"], gains["Z0"], asked.norm)
-    chosen = least._replace(filter=filter_in_plant_units(plant, own), gain=gain, least=least.gain)
+    chosen = least._replace(filter=filter_in_plant_units(plant, fault_map, own), gain=gain, least=least.gain)
     return _made(plant, asked, [], chosen)
 
 
@@ -96,6 +97,7 @@ def _made(plant: DescriptorSystem, asked: OptimalFilterMethod, curve: list[_Row]
         "norm": asked.norm,
         "exact": fault_map.exact,
         "decoupled": [*plant.disturbance_names],
+        "weights": plain_weights(asked.weights, plant),
         "steady_error_limit": asked.steady_error_limit,
     }
     solver = {
@@ -235,9 +237,10 @@ def _statement(curve: list[_Row], chosen: Designed, asked: OptimalFilterMethod, 
         of = "over all causal filters, linear or not, with this exact fault map"
     else:
         of = f"over all causal filters, linear or not, with this exact fault map and delay {in_words(fault_map.delays)}"
+    of = of if fault_map.weights is None else f"{of}, of the weighted problem"
     if asked.norm == "h2":
         of = of.replace("causal filters, linear or not,", "causal linear filters")
-        text = f"Least deviation {of}: {chosen.gain:.8g}, reached by this filter."
+        text = f"Least deviation {of}: {claims['deviation']:.8g}, reached by this filter."
     elif chosen.is_nothing:
         text = f"Least gain {of}: 0; this filter: 0 but for rounding."
     else:
@@ -282,7 +285,8 @@ def _noise_that_closes(plant: DescriptorSystem, chosen: Designed) -> tuple[dict[
     """Return the least noise of the sensors without any, of some that are tried, with which the gap is closed."""
     quiet = [i for i in range(plant.ny) if not plant.Dw[i].any()] or list(range(plant.ny))
     sizes = 1.0 / PlantUnits.of(plant).outputs
-    for share in OFFERED_NOISES if plant.nx <= MOST_STATES_OF_OFFERS else ():
+    few = plant.nx <= MOST_STATES_OF_OFFERS and chosen.fault_map.weights is None
+    for share in OFFERED_NOISES if few else ():
         noise = {plant.output_names[i]: float(f"{share * sizes[i]:.0e}") for i in quiet}
         columns = np.zeros((plant.ny, len(quiet)))
         columns[quiet, range(len(quiet))] = [*noise.values()]

@@ -1,0 +1,158 @@
+"""Weights of the errors, of the noise and of the faults: numbers or stable models, one for each signal.
+
+The gain of the weighted problem is that from n to ``We e``, where ``w = Ww n`` (and ``f = Wf n`` where faults drive
+the error).  A filter for ``We e`` gives ``We fhat``; the inverse of We behind it gives fhat, so that every We must pass
+at once and have strictly stable zeros.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from obsynth.analysis.existence.condition import OPTIONS_PATH
+from obsynth.errors import SpecError
+from obsynth.methods.optimal_filter.reference import model_of, plain
+from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.decoupling_windows import Model
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.signal_names import require_known
+
+#: Where a message points.
+PATH = f"{OPTIONS_PATH}.weights"
+#: What is weighted, by the names of the groups.
+ERRORS, INPUTS = "errors", "inputs"
+
+
+class Weights(NamedTuple):
+    """Diagonal models: of the errors, of the noise, and of the faults where these drive the error."""
+
+    errors: Model | None
+    noise: Model | None
+    faults: Model | None
+
+    @property
+    def order(self) -> int:
+        """States of all of them."""
+        return sum(len(model[0]) for model in self if model is not None)
+
+
+def weights_of(given: Any, plant: DescriptorSystem, *, rows: int, exact: bool) -> Weights | None:
+    """Return the weights of a plant whose bounded disturbances count as noise; ``None`` where nothing is weighted.
+
+    ``rows``: of the estimate.  Raise `SpecError` for signals that have none, and for models that are no weights.
+    """
+    if given is None:
+        return None
+    if not isinstance(given, Mapping) or not set(given) <= {ERRORS, INPUTS}:
+        raise SpecError(
+            "weights are {'errors': {'fault': weight}, 'inputs': {'noise': weight}}, each a number or a stable model "
+            "of one input and one output, such as control.tf([1, 1], [1, 0.1]).",
+            path=PATH,
+        )
+    names = plant.fault_names if rows == plant.nf else tuple(f"reference {i + 1}" for i in range(rows))
+    errors = _by_name(given.get(ERRORS), names, plant, ERRORS)
+    for name, model in errors.items():
+        _require_inverse(model, plant, f"{ERRORS}.{name}")
+    faults = () if exact else plant.fault_names
+    inputs = _by_name(given.get(INPUTS), (*plant.noise_names, *faults), plant, INPUTS)
+    found = Weights(
+        _diagonal(errors, names),
+        _diagonal(inputs, plant.noise_names),
+        _diagonal(inputs, faults),
+    )
+    return None if found == (None, None, None) else found
+
+
+def plain_weights(given: Any, plant: DescriptorSystem) -> Any:
+    """Return the weights as an option: numbers, and matrices of models by name."""
+    if given is None:
+        return None
+    groups = {ERRORS: given.get(ERRORS), INPUTS: given.get(INPUTS)}
+    found: dict[str, Any] = {}
+    for group, entry in groups.items():
+        if isinstance(entry, Mapping) and not _is_model(entry):
+            found[group] = {str(name): _plain(one, plant, f"{group}.{name}") for name, one in entry.items()}
+        elif entry is not None:
+            found[group] = _plain(entry, plant, group)
+    return found
+
+
+def inverse(model: Model) -> Model:
+    """Return the inverse of a square model that passes at once."""
+    a, b, c, d = model
+    over = np.asarray(np.linalg.inv(d), dtype=np.float64)
+    return a - b @ over @ c, b @ over, -over @ c, over
+
+
+def in_series(first: Model, second: Model) -> Model:
+    """Return the model of ``second`` behind ``first``."""
+    a1, b1, c1, d1 = first
+    a2, b2, c2, d2 = second
+    return (
+        np.block([[a1, np.zeros((len(a1), len(a2)))], [b2 @ c1, a2]]),
+        np.vstack([b1, b2 @ d1]),
+        np.hstack([d2 @ c1, c2]),
+        np.asarray(d2 @ d1, dtype=np.float64),
+    )
+
+
+def _is_model(entry: Mapping[str, Any]) -> bool:
+    return "D" in entry and set(entry) <= set("ABCD")
+
+
+def _plain(entry: Any, plant: DescriptorSystem, name: str) -> Any:
+    return float(entry) if is_finite_number(entry) else plain(_weight(entry, plant, name))
+
+
+def _by_name(given: Any, names: tuple[str, ...], plant: DescriptorSystem, group: str) -> dict[str, Model]:
+    """Return the weights of named signals; one that is not by name is that of all of them."""
+    if given is None:
+        return {}
+    if isinstance(given, Mapping) and not _is_model(given):
+        require_known(given, names, what=f"{PATH}.{group}", kind="signal")
+        return {name: _weight(given[name], plant, f"{group}.{name}") for name in names if name in given}
+    weight = _weight(given, plant, group)
+    return dict.fromkeys(names, weight)
+
+
+def _weight(given: Any, plant: DescriptorSystem, name: str) -> Model:
+    path = f"{PATH}.{name}"
+    if is_finite_number(given):
+        if given == 0:
+            raise SpecError(f"The weight of {name} is zero: leave the signal out of the plant instead.", path=path)
+        none = np.zeros((0, 0))
+        return none, np.zeros((0, 1)), np.zeros((1, 0)), np.array([[float(given)]])
+    model = model_of(given, plant, "weight", path)
+    if model[3].shape != (1, 1):
+        raise SpecError(
+            f"The weight of {name} has {model[3].shape[1]} inputs and {model[3].shape[0]} outputs: give one of each.",
+            path=path,
+        )
+    return model
+
+
+def _require_inverse(model: Model, plant: DescriptorSystem, name: str) -> None:
+    a, _, _, d = model
+    if d[0, 0] != 0.0:
+        zeros = np.linalg.eigvals(inverse(model)[0]) if len(a) else np.zeros(0)
+        if np.all(np.abs(zeros) < 1.0) if plant.is_discrete else np.all(zeros.real < 0.0):
+            return
+    raise SpecError(
+        f"The weight of {name} has no stable inverse: it must pass at once (as many zeros as poles) and its zeros must "
+        "be strictly stable. A zero outside may be replaced by its mirror image: the size of the weight is the same.",
+        path=f"{PATH}.{name}",
+    )
+
+
+def _diagonal(weights: Mapping[str, Model], names: tuple[str, ...]) -> Model | None:
+    """Return one model of all signals; ``None`` where none of them is weighted."""
+    if not set(names) & set(weights):
+        return None
+    plain_one: Model = (np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1)))
+    parts = [weights.get(name, plain_one) for name in names]
+    a, b, c, d = (np.asarray(block_diag(*(part[i] for part in parts)), dtype=np.float64) for i in range(4))
+    return a, b, c, d
