@@ -64,12 +64,12 @@ class Candidate:
         has unknown inputs."""
         if not self.figures:
             return (2.0, 0.0, 0.0, np.inf)
-        missed = float(not all(found.reaches for found in self.figures))
-        coupled = float(has_unknown_inputs and any(found.unknown_input_gain > DECOUPLED for found in self.figures))
-        slow = float(any(found.most > SLOW_ESTIMATE * settling for found in self.figures))
+        missed = float(not all(fault.reaches for fault in self.figures))
+        coupled = float(has_unknown_inputs and any(fault.unknown_input_gain > DECOUPLED for fault in self.figures))
+        slow = float(any(fault.most > SLOW_ESTIMATE * settling for fault in self.figures))
         dt = self.observer.dt if self.observer is not None else 0.0
         # A mean over time T divides noise by the root of T: it cannot change deviation times the root of delay.
-        prices = [found.deviation * np.sqrt(max(found.most, dt)) for found in self.figures]
+        prices = [fault.deviation * np.sqrt(max(fault.most, dt)) for fault in self.figures]
         price = float(np.prod(prices) ** (1.0 / len(prices))) if np.all(np.isfinite(prices)) else np.inf
         return (missed, coupled, slow, price)
 
@@ -97,8 +97,8 @@ def candidate(
         return _refused(method, one_line(str(error)), 1e3 * (perf_counter() - begun))
     spent = 1e3 * (perf_counter() - begun)
     if not observer.fault_names or any(name not in sampled.fault_names for name in observer.fault_names):
-        what = "estimates the state, but no fault" if observer.state_names else "detects faults, but estimates none"
-        return _refused(method, what, spent)
+        why = "estimates the state, but no fault" if observer.state_names else "detects faults, but estimates none"
+        return _refused(method, why, spent)
     return Candidate(method, made, observer, fault_figures(sampled, observer, steps), spent, "")
 
 
@@ -116,16 +116,16 @@ def one_line(text: str) -> str:
     """Return the start of a message in one line, with what would help, which stands at its end."""
     flat = _REFUSED_CONDITION.sub(r"\1: ", " ".join(text.replace("\n  - ", " ").split()))
     for mark in ("Measure one of:", "Leave out one of:"):
-        head, found, tail = flat.rpartition(mark)
-        if found:
+        head, separator, tail = flat.rpartition(mark)
+        if separator:
             return f"{_cut(head)} {mark}{tail}"
     return _cut(flat)
 
 
 def _cut(text: str) -> str:
     """Return so many whole sentences of a text as have room, and the first in any case."""
-    first, *others = re.split(r"(?<=[.]) (?=[A-Z])", (without_opening(text) or text).strip())
-    for sentence in others:
+    first, *sentences = re.split(r"(?<=[.]) (?=[A-Z])", (without_opening(text) or text).strip())
+    for sentence in sentences:
         if len(first) + len(sentence) >= MOST_LETTERS:
             break
         first += f" {sentence}"
@@ -134,7 +134,7 @@ def _cut(text: str) -> str:
 
 def linear_methods() -> Sequence[type[Method]]:
     """Return the methods that take linear plants with constant matrices."""
-    return [found for found in map(method_class, REGISTRY) if "time-invariant" in found.plants]
+    return [method for method in map(method_class, REGISTRY) if "time-invariant" in method.plants]
 
 
 def _methods_with(purpose: Purpose, among: Iterable[str]) -> list[str]:
@@ -173,17 +173,17 @@ def automatic_design(plant: Any, options: Mapping[str, Any], maker: Maker, refus
 def _chosen(
     plant: DescriptorSystem, options: Mapping[str, Any], possible: list[str], maker: Maker, refusing: Maker
 ) -> ObserverDesign:
-    found = [entry for entry in designed(plant, options, possible, maker) if entry.design is not None]
-    if not found:
+    candidates = [entry for entry in designed(plant, options, possible, maker) if entry.design is not None]
+    if not candidates:
         # What forbids the one that needs least forbids the fault.
         purposes: tuple[Purpose, ...] = ("faults under the weakest conditions", "faults")
         last = next((name for purpose in purposes for name in _methods_with(purpose, possible)), possible[0])
         return refusing(plant, last, options)
     settling = settling_time(plant)
-    best, *others = sorted(found, key=lambda entry: entry.rank(plant.nd > 0, settling))
+    best, *ranked_below = sorted(candidates, key=lambda entry: entry.rank(plant.nd > 0, settling))
     if best.design is None:
         raise PreconditionError("No method exists for this plant.", condition="existence")
-    return _with_note(best.design, reason(best, others, plant))
+    return _with_note(best.design, reason(best, ranked_below, plant))
 
 
 def designed(plant: DescriptorSystem, options: Mapping[str, Any], methods: list[str], maker: Maker) -> list[Candidate]:
@@ -196,26 +196,26 @@ def designed(plant: DescriptorSystem, options: Mapping[str, Any], methods: list[
         # Not of index one: only methods that need no elimination are left, and nothing to compare on.
         return []
     own_time = plant.dt == 0.0
-    taken = [
+    fitting = [
         method
         for method in _methods_with("faults", methods)
         if not (plant.dt > 0.0 and method_class(method).time == "continuous")
     ]
-    return [candidate(method, plant, sampled, steps, maker, options, continuous=own_time) for method in taken]
+    return [candidate(method, plant, sampled, steps, maker, options, continuous=own_time) for method in fitting]
 
 
-def reason(best: Candidate, others: list[Candidate], plant: DescriptorSystem) -> str:
+def reason(best: Candidate, ranked_below: list[Candidate], plant: DescriptorSystem) -> str:
     """Return in one sentence why a candidate is first."""
-    if not others:
+    if not ranked_below:
         return "no other method exists for this plant"
-    gain = max(found.unknown_input_gain for found in best.figures)
+    gain = max(fault.unknown_input_gain for fault in best.figures)
     words = ["its estimates reach every step"] if best.rank(False)[0] == 0.0 else []
     if plant.nd:
         words.append(f"gain from the unknown inputs {gain:.1e}")
-    deviation = ", ".join(f"{found.deviation:.3g}" for found in best.figures)
-    delay = ", ".join(f"{found.most:.3g}" for found in best.figures)
+    deviation = ", ".join(f"{fault.deviation:.3g}" for fault in best.figures)
+    delay = ", ".join(f"{fault.most:.3g}" for fault in best.figures)
     words.append(f"90 % of a step after {delay} s, with a deviation of {deviation}")
-    below = ", ".join(other.method for other in others)
+    below = ", ".join(other.method for other in ranked_below)
     return f"{'; '.join(words)}; ranked below it: {below}; obsynth compare ranks by errors over a scenario instead"
 
 

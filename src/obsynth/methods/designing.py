@@ -116,13 +116,13 @@ def design(
     own, recovery = plant_and_recovery(plant, recovery)
 
     def made(plant: Plant, method: str, options: Mapping[str, Any], *, advise: bool = False) -> ObserverDesign:
-        asked = method_class(method).of(options)
+        configured = method_class(method).of(options)
         each = partial(_designed, name=name, recovery=recovery, progress=report_stage, advise=advise)
         uncertain = plant.uncertainty if isinstance(plant, DescriptorSystem) else None
-        if asked.over_scenario and scenario is not None and uncertain is not None and uncertain.box.names:
+        if configured.over_scenario and scenario is not None and uncertain is not None and uncertain.box.names:
             each = partial(each, more={"scenario": scenario})
-        found: ObserverDesign = each(plant, asked)
-        return found.replace(notes=(*notes, *found.notes)) if notes else found
+        designed: ObserverDesign = each(plant, configured)
+        return designed.replace(notes=(*notes, *designed.notes)) if notes else designed
 
     if method == AUTO:
         from obsynth.methods.automatic import automatic_design
@@ -133,8 +133,8 @@ def design(
         with failed_computations(), one_thread_if_small(own.nx):
             working = working_plant(own, recovery, report_stage, None)
             own, recovery = working.plant, working.recovery
-            found = automatic_design(own, options, made, partial(made, advise=True))
-            return found.replace(notes=(*working.notes, *found.notes)) if working.reduced else found
+            chosen = automatic_design(own, options, made, partial(made, advise=True))
+            return chosen.replace(notes=(*working.notes, *chosen.notes)) if working.reduced else chosen
     return made(own, method, options, advise=True)
 
 
@@ -151,14 +151,14 @@ def _for_region(plant: Plant, options: Mapping[str, Any]) -> str:
 
 def _require_sampled_delays(plant: Any, method: str, options: Mapping[str, Any]) -> None:
     """Refuse a continuous plant with delays; which methods exist for it on samples is tried before it is said."""
-    given = plant.plant if isinstance(plant, Transformation) else plant
-    if not isinstance(given, DescriptorSystem) or not given.delays or given.is_discrete:
+    own = plant.plant if isinstance(plant, Transformation) else plant
+    if not isinstance(own, DescriptorSystem) or not own.delays or own.is_discrete:
         return
     try:
-        sampled = discretise(plant, sample_time_of_delays(given))
+        sampled = discretise(plant, sample_time_of_delays(own))
         reports = check(sampled, {} if method == AUTO else {method: options})
     except (SpecError, PreconditionError, SolverError):
-        raise continuous_with_delays(given) from None
+        raise continuous_with_delays(own) from None
     exist = [name for name, report in reports.items() if report.passed]
     if method in exist:
         tried = f" {method} exists for that."
@@ -166,12 +166,12 @@ def _require_sampled_delays(plant: Any, method: str, options: Mapping[str, Any])
         tried = f" For that exist: {', '.join(exist)}."
     else:
         tried = " No method exists for that as it is, either: obsynth.check says why."
-    raise continuous_with_delays(given, tried)
+    raise continuous_with_delays(own, tried)
 
 
 def _designed(
     plant: Plant,
-    asked: Method,
+    method: Method,
     *,
     name: str,
     recovery: StateRecovery | None,
@@ -183,46 +183,46 @@ def _designed(
 
     ``more``: what the synthesis takes besides.
     """
-    for condition in kind_conditions(plant, type(asked)):
+    for condition in kind_conditions(plant, type(method)):
         condition.require()
     with failed_computations(), one_thread_if_small(plant.nx):
-        working = working_plant(plant, recovery, progress, asked)
+        working = working_plant(plant, recovery, progress, method)
         plant, recovery, notes = working.plant, working.recovery, working.notes
         try:
-            found = asked.synthesise(plant, progress=progress, **more)
+            synthesis = method.synthesise(plant, progress=progress, **more)
         except PreconditionError as error:
             if not isinstance(plant, DescriptorSystem) or not advise:
                 raise
             progress("searching for sensors that would make it possible")
             sensors, done = working.sensors(), notes if working.reduced else ()
-            raise with_advice(error, plant, asked, sensors=sensors, notes=done) from None
+            raise with_advice(error, plant, method, sensors=sensors, notes=done) from None
         if notes:
-            found = replace(found, notes=(*notes, *found.notes))
+            synthesis = replace(synthesis, notes=(*notes, *synthesis.notes))
         progress("verifying the shipped realisation")
         try:
-            return verified(plant, asked.id, found, name=name, recovery=recovery)
+            return verified(plant, method.id, synthesis, name=name, recovery=recovery)
         except VerificationError as error:
             if not advise or error.report is None or {row.name for row in error.report.failures} != {CONSTANT_FAULT}:
                 raise
             progress("searching for a method that estimates constant faults of this plant")
-            instead = _right_at_constant_faults(plant, asked, name, recovery)
+            instead = _right_at_constant_faults(plant, method, name, recovery)
             raise VerificationError(f"{error} {instead}", report=error.report) from None
 
 
-def _right_at_constant_faults(plant: Plant, asked: Method, name: str, recovery: StateRecovery | None) -> str:
+def _right_at_constant_faults(plant: Plant, method: Method, name: str, recovery: StateRecovery | None) -> str:
     """Return which other method is verified for a plant whose constant faults rounding of one method's gains hides."""
-    others = [
+    alternatives = [
         other for other in methods_for(kind_of(plant)) if "steady_error_limit" in field_types(method_class(other))
     ]
-    for other in (other for other in others if other != asked.id):
-        known = method_class(other).of({"steady_error_limit": asked.as_given()["steady_error_limit"]})
+    for other in (other for other in alternatives if other != method.id):
+        known = method_class(other).of({"steady_error_limit": method.as_given()["steady_error_limit"]})
         try:
-            found = _designed(plant, known, name=name, recovery=recovery, progress=silent, advise=False)
+            trial = _designed(plant, known, name=name, recovery=recovery, progress=silent, advise=False)
         except ObsynthError:
             continue
-        if CONSTANT_FAULT in {row.name for row in found.report.checks}:
+        if CONSTANT_FAULT in {row.name for row in trial.report.checks}:
             return f"{other} was tried with its defaults and is verified for this plant: design that."
-    tried = ", ".join(other for other in others if other != asked.id)
+    tried = ", ".join(other for other in alternatives if other != method.id)
     return f"No other method that estimates faults is verified for this plant with its defaults either ({tried})."
 
 
@@ -286,25 +286,25 @@ def check(
         return {method: VerificationReport.of(condition_rows((row,))) for method in REGISTRY}
 
 
-def _checked(given: Plant, options: Mapping[str, Mapping[str, Any]]) -> dict[str, VerificationReport]:
-    found = {}
+def _checked(plant: Plant, options: Mapping[str, Mapping[str, Any]]) -> dict[str, VerificationReport]:
+    reports = {}
     for method in REGISTRY:
         known = method_class(method)
         stated = options.get(method, known.placeholders)
         by_default = AUTO in options and set(options[AUTO]) <= set(field_types(known))
         conditions: Sequence[Condition]
         try:
-            asked = known.of(options[AUTO] if by_default else stated)
-            conditions = kind_conditions(given, known)
+            configured = known.of(options[AUTO] if by_default else stated)
+            conditions = kind_conditions(plant, known)
             if not conditions:
-                working = working_plant(given, None, silent, asked)
-                conditions = (*working.conditions(), *_existence(working.plant, asked))
+                working = working_plant(plant, None, silent, configured)
+                conditions = (*working.conditions(), *_existence(working.plant, configured))
         except SpecError as error:
             if not by_default:
                 raise
-            conditions = kind_conditions(given, known) or (_not_stated(error, method),)
-        found[method] = VerificationReport.of(condition_rows(conditions))
-    return found
+            conditions = kind_conditions(plant, known) or (_not_stated(error, method),)
+        reports[method] = VerificationReport.of(condition_rows(conditions))
+    return reports
 
 
 def _not_stated(error: SpecError | PreconditionError, method: str) -> Condition:
@@ -314,61 +314,61 @@ def _not_stated(error: SpecError | PreconditionError, method: str) -> Condition:
     return Condition("stated", claim, False, np.nan, np.nan, method, str(error), signals=signals)
 
 
-def _existence(plant: Plant, asked: Method) -> Sequence[Condition]:
+def _existence(plant: Plant, method: Method) -> Sequence[Condition]:
     """Return a method's existence conditions, and where they hold one for what a design needs and nobody states.
 
     Where its numbers fail, one says so: the other methods go on.
     """
     try:
-        found = asked.existence(plant)
-        if all(condition.holds for condition in found):
+        conditions = method.existence(plant)
+        if all(condition.holds for condition in conditions):
             try:
-                asked.require_stated(plant)
+                method.require_stated(plant)
             except (SpecError, PreconditionError) as error:
-                return (*found, _not_stated(error, asked.id))
-        return found
+                return (*conditions, _not_stated(error, method.id))
+        return conditions
     except PreconditionError as error:
-        name, told, signals, unclear = error.condition, str(error), error.signals, error.unclear
+        name, message, signals, unclear = error.condition, str(error), error.signals, error.unclear
     except (SolverError, np.linalg.LinAlgError, ArithmeticError, ValueError, MemoryError) as error:
         failure = error if isinstance(error, SolverError) else failure_of(error)
         if failure is None:
             raise
-        name, told, signals, unclear = "computed", str(failure), (), True
+        name, message, signals, unclear = "computed", str(failure), (), True
     claim = "conditions that can be decided"
-    return (Condition(name, claim, False, np.nan, np.nan, asked.id, told, signals=signals, unclear=unclear),)
+    return (Condition(name, claim, False, np.nan, np.nan, method.id, message, signals=signals, unclear=unclear),)
 
 
 def draft_of(
-    plant: Plant, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
+    plant: Plant, method: str, synthesis: Synthesis, *, name: str, recovery: StateRecovery | None = None
 ) -> ObserverDesign:
     """Return the design that a synthesis stands for, without a report."""
-    given, source = plant, source_of(plant)
-    if found.plant is not None:
-        plant = found.plant
-    if found.transformation is not None:
-        own = found.transformation.recovery
-        plant, recovery = found.transformation.plant, own if recovery is None else recovery.then(own)
+    designed_for, source = plant, source_of(plant)
+    if synthesis.plant is not None:
+        plant = synthesis.plant
+    if synthesis.transformation is not None:
+        own = synthesis.transformation.recovery
+        plant, recovery = synthesis.transformation.plant, own if recovery is None else recovery.then(own)
         source = source_of(plant)
     return ObserverDesign(
         name=name,
         method=method,
-        plant=_with_tolerances_of(given, plant),
-        options=found.options,
-        gains=found.gains,
-        observer=found.observer,
-        certificate=found.certificate,
-        solver=found.solver,
-        notes=found.notes,
+        plant=_with_tolerances_of(designed_for, plant),
+        options=synthesis.options,
+        gains=synthesis.gains,
+        observer=synthesis.observer,
+        certificate=synthesis.certificate,
+        solver=synthesis.solver,
+        notes=synthesis.notes,
         recovery=recovery,
         source=source,
     )
 
 
 def verified(
-    plant: Plant, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
+    plant: Plant, method: str, synthesis: Synthesis, *, name: str, recovery: StateRecovery | None = None
 ) -> ObserverDesign:
     """Return the design with its report."""
-    draft = with_stored_errors(draft_of(plant, method, found, name=name, recovery=recovery))
+    draft = with_stored_errors(draft_of(plant, method, synthesis, name=name, recovery=recovery))
     linear = isinstance(draft.observer, LinearObserver) and isinstance(draft.plant, DescriptorSystem)
     # First: which rows gains fail that hide a fault is a matter of this machine's rounding.
     notes = require_above_rounding(*draft.linear) if linear else ()
@@ -457,37 +457,39 @@ def design_from_gains(
     try:
         signature(known.from_gains).bind(own, **gains)
     except TypeError:
-        wanted = [part for part in signature(known.from_gains).parameters.values() if part.kind is part.KEYWORD_ONLY]
-        needed = ", ".join(part.name for part in wanted if part.default is part.empty)
-        others = ", ".join(part.name for part in wanted if part.default is not part.empty)
-        wants = f"{needed or 'no gains: design it instead'}{f' (and {others})' if others else ''}"
+        parameters = [
+            part for part in signature(known.from_gains).parameters.values() if part.kind is part.KEYWORD_ONLY
+        ]
+        needed = ", ".join(part.name for part in parameters if part.default is part.empty)
+        optional = ", ".join(part.name for part in parameters if part.default is not part.empty)
+        wants = f"{needed or 'no gains: design it instead'}{f' (and {optional})' if optional else ''}"
         message = f"{method} is given by {wants}, not by {', '.join(gains) or 'nothing'}."
         raise SpecError(message, path="gains") from None
     draft = draft_of(own, method, known.from_gains(own, **gains), name=name, recovery=recovery)
     return draft.replace(report=verify(draft))
 
 
-def _with_tolerances_of(given: Plant, shipped: Any) -> Any:
+def _with_tolerances_of(original: Plant, shipped: Any) -> Any:
     """Return the shipped plant with the tolerances of the given one, or with the note that they are not carried
     over."""
-    if not (isinstance(given, DescriptorSystem) and isinstance(shipped, DescriptorSystem)):
+    if not (isinstance(original, DescriptorSystem) and isinstance(shipped, DescriptorSystem)):
         return shipped
-    uncertain = given.uncertainty
+    uncertain = original.uncertainty
     if uncertain is None or (shipped.uncertainty is not None and not shipped.uncertainty.lost):
         return shipped
     if not uncertain.lost:
         try:
-            same = eliminate_algebraic_states(given).plant
+            same = eliminate_algebraic_states(original).plant
         except PreconditionError:
-            same = given
+            same = original
         if same.state_names == shipped.state_names and same.dt == shipped.dt and agree(same, shipped):
             return shipped.replace(uncertainty=same.uncertainty)
     return shipped.replace(uncertainty=uncertain.left_behind("the method changed the plant by itself"))
 
 
-def agree(one: DescriptorSystem, other: DescriptorSystem) -> bool:
+def agree(first: DescriptorSystem, second: DescriptorSystem) -> bool:
     """Whether the matrices of two plants are the same but for rounding."""
-    pairs = [(getattr(one, name), getattr(other, name)) for name in UNCERTAIN_MATRICES]
+    pairs = [(getattr(first, name), getattr(second, name)) for name in UNCERTAIN_MATRICES]
     return all(
         a.shape == b.shape and bool(np.all(np.abs(a - b) <= SAME_PLANT * np.abs(a).max(initial=0.0))) for a, b in pairs
     )
@@ -499,8 +501,8 @@ def with_stored_errors(draft: ObserverDesign) -> ObserverDesign:
     with np.errstate(all="ignore"):
         base = before_the_mean(draft)[0] if method.averaged else draft
         model = method.error_model(base)
-        found = None if model is None or not model.fits else StoredErrors.of(model)
-    if found is None:
+        errors = None if model is None or not model.fits else StoredErrors.of(model)
+    if errors is None:
         return draft
     old = draft.certificate
-    return draft.replace(certificate=Certificate({**old.matrices, **found.witnesses()}, old.claims))
+    return draft.replace(certificate=Certificate({**old.matrices, **errors.witnesses()}, old.claims))

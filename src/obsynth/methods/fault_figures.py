@@ -80,7 +80,7 @@ def on_the_clock(plant: DescriptorSystem, sample_time: float) -> DescriptorSyste
     return discretise(plant, sample_time).plant
 
 
-def held(plant: DescriptorSystem, steps: int) -> tuple[int, FloatArray]:
+def steps_in_bounds(plant: DescriptorSystem, steps: int) -> tuple[int, FloatArray]:
     """Return for how many samples, and with which ``feedback (nu, nx)``, ``u = -feedback x``, a sampled plant
     ``(E = I)`` is kept in bounds: with none where it hardly grows; with no input, for a shorter time."""
     nothing = np.zeros((plant.nu, plant.nx))
@@ -88,9 +88,9 @@ def held(plant: DescriptorSystem, steps: int) -> tuple[int, FloatArray]:
     if rate * steps <= np.log(HELD_GROWTH):
         return steps, nothing
     try:
-        found = stabilising_feedback(plant)
-        if float(np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ found)))) < 1.0:
-            return steps, found
+        feedback = stabilising_feedback(plant)
+        if float(np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ feedback)))) < 1.0:
+            return steps, feedback
     except PreconditionError:
         pass
     return max(int(np.log(LARGEST_STEP_GROWTH) / rate), 2), nothing
@@ -108,24 +108,24 @@ def step_responses(
     direct = np.hstack([plant.Df, plant.Dd, measured])
     # A feedback u = -feedback x is known to the observer: it changes no estimate, and keeps numbers small.
     gain = np.zeros((plant.nu, plant.nx)) if feedback is None else feedback
-    seen = plant.C - plant.D @ gain
-    moved, into = plant.A - plant.B @ gain, observer.By @ seen - observer.Bu @ gain
+    output_map = plant.C - plant.D @ gain
+    moved, into = plant.A - plant.B @ gain, observer.By @ output_map - observer.Bu @ gain
     a = np.block([[moved, np.zeros((plant.nx, order))], [into, observer.Az]])
     b = np.vstack([inputs, observer.By @ direct])
-    c = np.hstack([observer.Dy[rows] @ seen - observer.Du[rows] @ gain, observer.Cz[rows]])
-    found = np.empty((steps, len(c), b.shape[1]))
-    found[0] = observer.Dy[rows] @ direct
+    c = np.hstack([observer.Dy[rows] @ output_map - observer.Du[rows] @ gain, observer.Cz[rows]])
+    responses = np.empty((steps, len(c), b.shape[1]))
+    responses[0] = observer.Dy[rows] @ direct
     state = b
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(1, steps):
-            found[k] = c @ state
+            responses[k] = c @ state
             state = a @ state
-    return found, np.cumsum(found[:, :, : plant.nf], axis=0)
+    return responses, np.cumsum(responses[:, :, : plant.nf], axis=0)
 
 
 def fault_figures(plant: DescriptorSystem, observer: LinearObserver, steps: int) -> tuple[FaultFigures, ...]:
     """Return the figures of every fault that a sampled observer estimates on a sampled plant ``(E = I)``."""
-    impulse, step = step_responses(plant, observer, *held(plant, steps))
+    impulse, step = step_responses(plant, observer, *steps_in_bounds(plant, steps))
     unknown = impulse[:, :, plant.nf : plant.nf + plant.nd]
     noise = impulse[:, :, plant.nf + plant.nd :]
     # An observer that runs away has figures beyond all numbers, and needs no warning besides.

@@ -30,7 +30,7 @@ def design_function(
     named, either = Parameter.KEYWORD_ONLY, Parameter.POSITIONAL_OR_KEYWORD
     first = [Parameter(name, either, default=None) for name in ("plant", *positional)]
 
-    def designed(plant: Any, *given: Any, **options: Any) -> Made:
+    def designed(plant: Any, *values: Any, **options: Any) -> Made:
         own = plant.plant if isinstance(plant, Transformation) else plant
         if method.over_scenario and options.get("scenario") and getattr(own, "uncertainty", None) is None:
             raise SpecError(
@@ -38,12 +38,12 @@ def design_function(
                 "(obsynth.uncertain_system), or leave scenario out.",
                 path="scenario",
             )
-        bound = {**Signature(first).bind(plant, *given).arguments, **options}
+        bound = {**Signature(first).bind(plant, *values).arguments, **options}
         _require_kinds(method, bound)
-        found = design(**bound, method=method.id)
-        if isinstance(found, result):
-            return found
-        return result(**{part.name: getattr(found, part.name) for part in fields(found)})
+        outcome = design(**bound, method=method.id)
+        if isinstance(outcome, result):
+            return outcome
+        return result(**{part.name: getattr(outcome, part.name) for part in fields(outcome)})
 
     options = [
         Parameter(o.name, either if o.name in positional else named, default=o.default, annotation=o.type)
@@ -59,15 +59,17 @@ def design_function(
     return designed
 
 
-def _require_kinds(method: type[Method], given: dict[str, Any]) -> None:
+def _require_kinds(method: type[Method], arguments: dict[str, Any]) -> None:
     """Raise `SpecError` for all arguments of a wrong kind at once, where the plant or the name is one of them."""
     wrong = {name: text for name, kind in argument_kinds(design).items()
-             if name in given and (text := problem_with(given[name], name, kind))}  # fmt: skip
+             if name in arguments and (text := problem_with(arguments[name], name, kind))}  # fmt: skip
     if not wrong:
         return
     kinds = field_types(method)
     wrong |= {
-        name: text for name, kind in kinds.items() if name in given and (text := problem_with(given[name], name, kind))
+        name: text
+        for name, kind in kinds.items()
+        if name in arguments and (text := problem_with(arguments[name], name, kind))
     }
     function = method.id.replace("-", "_")
     message = next(iter(wrong.values())) if len(wrong) == 1 else f"Arguments of {function}:"

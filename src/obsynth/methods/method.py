@@ -121,15 +121,15 @@ class Method(ABC):
             raise SpecError(f"Options of {self.id}:", path=OPTIONS_PATH, problems=problems)
 
     @classmethod
-    def of(cls, given: Mapping[str, Any]) -> Self:
+    def of(cls, options: Mapping[str, Any]) -> Self:
         """Return the method with these options; raise `SpecError` for unknown names, wrong types and broken rules."""
-        unknown = sorted(set(given) - set(field_types(cls)))
+        unknown = sorted(set(options) - set(field_types(cls)))
         if unknown:
             listed = ", ".join(sorted(field_types(cls)))
             raise SpecError(
                 f"{cls.id} has no option {', '.join(map(repr, unknown))}; there are: {listed}.", path=OPTIONS_PATH
             )
-        return cls(**given)
+        return cls(**options)
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""
@@ -158,8 +158,8 @@ class Method(ABC):
         method's own package returns: heavy, and imported only here.
         """
         package = type(self).__module__.rpartition(".")[0]
-        found: Synthesis = import_module(f"{package}.synthesis").synthesise(plant, self, progress=progress)
-        return found
+        synthesis: Synthesis = import_module(f"{package}.synthesis").synthesise(plant, self, progress=progress)
+        return synthesis
 
     @classmethod
     def from_gains(cls, plant: Any) -> Synthesis:
@@ -173,8 +173,8 @@ class Method(ABC):
         By default what the function ``checks(design, printed_digits)`` of the module ``checks`` beside the class does.
         """
         package = cls.__module__.rpartition(".")[0]
-        found: Iterator[Check] = import_module(f"{package}.checks").checks(design, printed_digits)
-        return found
+        rows: Iterator[Check] = import_module(f"{package}.checks").checks(design, printed_digits)
+        return rows
 
     @classmethod
     def has_error_model(cls, design: ObserverDesign) -> bool:

@@ -62,13 +62,13 @@ def require_all_conditions(conditions: Iterable[Condition]) -> None:
     failed = [condition for condition in conditions if not condition.holds]
     if not failed:
         return
-    first, *others = failed
+    first, *further = failed
     try:
         first.require()
     except PreconditionError as error:
-        if not others:
+        if not further:
             raise
-        also = "; ".join(f"{other.name}: {other.detail}" for other in others)
+        also = "; ".join(f"{other.name}: {other.detail}" for other in further)
         raise PreconditionError(
             f"{error} Also fails: {also}",
             condition=first.name,
@@ -81,7 +81,7 @@ def require_all_conditions(conditions: Iterable[Condition]) -> None:
 def with_advice(
     error: PreconditionError,
     plant: DescriptorSystem,
-    asked: Method,
+    method: Method,
     *,
     sensors: Sequence[Sensor] | None = None,
     notes: Sequence[str] = (),
@@ -94,7 +94,7 @@ def with_advice(
     def holds(plant: DescriptorSystem) -> bool:
         # What would help is told to be tried, not proved: the tried plant is decided exactly then.
         try:
-            return all(condition.holds for condition in asked.for_plant(plant).existence(plant, exactly=False))
+            return all(condition.holds for condition in method.for_plant(plant).existence(plant, exactly=False))
         except (ObsynthError, np.linalg.LinAlgError):
             return False
 
@@ -104,13 +104,13 @@ def with_advice(
     if len(notes) > 1 and text is not None:
         # Outputs were left out: nothing is proved of the plant with them.
         error = PreconditionError(
-            f"{asked.id} works on a proper form of this plant, which does not allow it: {text}",
+            f"{method.id} works on a proper form of this plant, which does not allow it: {text}",
             condition=error.condition,
             mode=error.mode,
             signals=error.signals,
             unclear=error.unclear,
         )
-    error = _named_assumption(error, plant, asked)
+    error = _named_assumption(error, plant, method)
     candidates = state_sensors(plant) if sensors is None else sensors
     sets = least_additions(plant, candidates, holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
     if sets:
@@ -131,25 +131,25 @@ def with_advice(
     )
 
 
-def _named_assumption(error: PreconditionError, plant: DescriptorSystem, asked: Method) -> PreconditionError:
+def _named_assumption(error: PreconditionError, plant: DescriptorSystem, method: Method) -> PreconditionError:
     """Return the refusal as one of this method alone where others estimate the faults of the plant: they are named."""
     text = without_opening(str(error))
-    if text is None or plant.nx > MOST_FOR_ONE or "faults" not in asked.purposes:
+    if text is None or plant.nx > MOST_FOR_ONE or "faults" not in method.purposes:
         return error
-    others = [name for name in _methods_for_faults(asked) if _takes(name, plant)]
-    states = bool(getattr(asked, "states", None))
+    alternatives = [name for name in _methods_for_faults(method) if _takes(name, plant)]
+    states = bool(getattr(method, "states", None))
     if states:
         # Of the methods for faults these estimate the whole state, with faults that follow their models.
-        others = [name for name in others if name in _OF_THE_WHOLE_STATE]
-    if not others:
+        alternatives = [name for name in alternatives if name in _OF_THE_WHOLE_STATE]
+    if not alternatives:
         return error
-    exist = "exists" if len(others) == 1 else "exist"
+    exist = "exists" if len(alternatives) == 1 else "exist"
     return PreconditionError(
-        f"{asked.id} assumes more than this plant has: {text} "
+        f"{method.id} assumes more than this plant has: {text} "
         + (
-            f"The states can be estimated beside faults that follow their models: {', '.join(others)} {exist}."
+            f"The states can be estimated beside faults that follow their models: {', '.join(alternatives)} {exist}."
             if states
-            else f"The faults can be estimated: {', '.join(others)} {exist}."
+            else f"The faults can be estimated: {', '.join(alternatives)} {exist}."
         ),
         condition=error.condition,
         mode=error.mode,
@@ -158,12 +158,12 @@ def _named_assumption(error: PreconditionError, plant: DescriptorSystem, asked: 
     )
 
 
-def _methods_for_faults(asked: Method) -> list[str]:
-    found = {name: method_class(name) for name in REGISTRY}
+def _methods_for_faults(own: Method) -> list[str]:
+    classes = {name: method_class(name) for name in REGISTRY}
     return [
         name
-        for name, method in found.items()
-        if name != asked.id and "faults" in method.purposes and "time-invariant" in method.plants
+        for name, method in classes.items()
+        if name != own.id and "faults" in method.purposes and "time-invariant" in method.plants
     ]
 
 
@@ -181,16 +181,16 @@ def _drops(plant: DescriptorSystem, holds: Callable[[DescriptorSystem], bool]) -
     if plant.nx > MOST_FOR_ONE:
         return []
     kinds = {"unknown input": ("Bd", "Dd", "disturbance_names"), "fault": ("Bf", "Df", "fault_names")}
-    found = []
-    for kind, (entering, direct, listed_names) in kinds.items():
+    droppable = []
+    for kind, (matrix, direct, listed_names) in kinds.items():
         names = getattr(plant, listed_names)
         for i, name in enumerate(names if kind != "fault" or plant.nf > 1 else ()):
-            rest = [j for j in range(len(names)) if j != i]
-            fewer = {part: getattr(plant, part)[:, rest] for part in (entering, direct)}
-            fewer |= {listed_names: [names[j] for j in rest]}
+            remaining = [j for j in range(len(names)) if j != i]
+            fewer = {part: getattr(plant, part)[:, remaining] for part in (matrix, direct)}
+            fewer |= {listed_names: [names[j] for j in remaining]}
             if holds(plant.replace(**fewer, units={}, operating_point={})):
-                found.append(f"{kind} {name}")
-    return found
+                droppable.append(f"{kind} {name}")
+    return droppable
 
 
 def _nothing(plant: DescriptorSystem) -> str:
@@ -204,10 +204,10 @@ def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) ->
 
     Raise `PreconditionError` (unclear) where rounding of the outputs hides the estimate of a unit fault."""
     steady = tuple(_under_constant_faults(plant, observer))
-    found = _least(plant, observer)
-    if found is None:
+    shares = _least(plant, observer)
+    if shares is None:
         return steady
-    least, own = found
+    least, own = shares
     worst = int(np.argmax(least))
     if least[worst] >= LARGEST_ROUNDED_SHARE:
         name = plant.fault_names[worst]
@@ -246,7 +246,7 @@ def _under_constant_faults(plant: DescriptorSystem, observer: LinearObserver) ->
 
 def _doubt(plant: DescriptorSystem, observer: LinearObserver, fault: int) -> Unclear:
     """Return the last digit of a number of the plant, or else of the observer, that moves an estimate most."""
-    found = max(
+    worst_witness = max(
         (witness for point in _points(plant) for witness in last_digits(plant, observer, fault, point)),
         key=lambda witness: (
             witness.changes[0].matrix in ("C", "Df") and witness.size >= LARGEST_ROUNDED_SHARE,
@@ -254,11 +254,11 @@ def _doubt(plant: DescriptorSystem, observer: LinearObserver, fault: int) -> Unc
         ),
         default=None,
     )
-    size, place = (0.0, 0j) if found is None else (found.size, found.point or 0j)
+    size, place = (0.0, 0j) if worst_witness is None else (worst_witness.size, worst_witness.point or 0j)
     where = pole_text(place)
     return Unclear(
         UNIT_ROUNDOFF,
-        found,
+        worst_witness,
         f"has an estimate of {plant.fault_names[fault]!r} that differs by {size:.2g} of the fault at "
         f"{'z' if plant.is_discrete else 's'} = {where}",
         "A slower decay, a larger gamma, or an output that is more sensitive to the fault would decide it.",
@@ -273,13 +273,13 @@ def last_digits(plant: DescriptorSystem, observer: LinearObserver, fault: int, p
     outputs, resolvent = responses
     row = range(len(observer.Cz))[observer.fault_rows][fault]
     states = np.linalg.solve(point * plant.E - plant.A, plant.Bf)[:, fault]
-    left, shown = observer.Cz[row] @ resolvent, outputs[:, fault]
-    gain = left @ observer.By + observer.Dy[row]
+    row_response, output = observer.Cz[row] @ resolvent, outputs[:, fault]
+    gain = row_response @ observer.By + observer.Dy[row]
     effects = {
         "C": np.outer(np.abs(gain), np.abs(states)),
         "Df": np.outer(np.abs(gain), np.eye(plant.nf)[fault]),
-        "By": np.outer(np.abs(left), np.abs(shown)),
-        "Dy": np.outer(np.arange(len(observer.Dy)) == row, np.abs(shown)),
+        "By": np.outer(np.abs(row_response), np.abs(output)),
+        "Dy": np.outer(np.arange(len(observer.Dy)) == row, np.abs(output)),
     }
     for name, effect in effects.items():
         matrix = getattr(plant if name in ("C", "Df") else observer, name)
@@ -330,14 +330,14 @@ def _responses(
 def rounding_shares(plant: DescriptorSystem, observer: LinearObserver, point: complex) -> FloatArray:
     """Return the shares of each fault that rounding may be ``(2, nf)``: of the outputs, and of the observer's own
     numbers; NaN where one is no number."""
-    found = _responses(plant, observer, point)
-    if found is None:
+    responses = _responses(plant, observer, point)
+    if responses is None:
         return np.full((2, plant.nf), np.nan)
-    outputs, resolvent = found
-    rows, seen, size = observer.fault_rows, np.abs(outputs), np.abs(resolvent)
-    entering, state = np.abs(observer.By) @ seen, np.abs(resolvent @ observer.By @ outputs)
-    of_outputs = size @ entering
+    outputs, resolvent = responses
+    rows, output_sizes, size = observer.fault_rows, np.abs(outputs), np.abs(resolvent)
+    driving, state = np.abs(observer.By) @ output_sizes, np.abs(resolvent @ observer.By @ outputs)
+    of_outputs = size @ driving
     moved = np.stack((of_outputs, of_outputs + size @ (np.abs(observer.Az) @ state) + state))
-    shares = np.abs(observer.Cz[rows]) @ moved + np.abs(observer.Dy[rows]) @ seen
-    told = UNIT_ROUNDOFF * np.diagonal(shares, axis1=1, axis2=2)
-    return np.asarray(np.where(np.isfinite(told).all(axis=1, keepdims=True), told, np.nan))
+    shares = np.abs(observer.Cz[rows]) @ moved + np.abs(observer.Dy[rows]) @ output_sizes
+    rounded = UNIT_ROUNDOFF * np.diagonal(shares, axis1=1, axis2=2)
+    return np.asarray(np.where(np.isfinite(rounded).all(axis=1, keepdims=True), rounded, np.nan))

@@ -55,20 +55,20 @@ def method_class(method: str) -> type[Method]:
         own: type[Method] = getattr(import_module(module), name)
         return own
     try:
-        found = getattr(import_module(module), name)
+        loaded = getattr(import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise not_loadable(method, error) from error
-    if not (isinstance(found, type) and issubclass(found, Method)) or found.id != method:
+    if not (isinstance(loaded, type) and issubclass(loaded, Method)) or loaded.id != method:
         raise not_loadable(method, f"it is no class derived from obsynth.methods.method.Method with the id {method!r}")
-    return found
+    return loaded
 
 
 def error_model(design: ObserverDesign) -> ErrorModel:
     """Return what a linear design follows; raise `SpecError` where its certificate does not say it."""
-    found = method_class(design.method).error_model(design)
-    if found is None or not found.fits:
+    model = method_class(design.method).error_model(design)
+    if model is None or not model.fits:
         raise SpecError(f"Design {design.name!r} has no tracking map: its residual has no model.", path="observer")
-    return found
+    return model
 
 
 def methods_for(kind: PlantKind) -> tuple[str, ...]:
@@ -93,11 +93,11 @@ def kind_conditions(plant: Plant, method: type[Method]) -> tuple[Condition, ...]
     kind = kind_of(plant)
     if kind in method.plants:
         return ()
-    wanted = " or ".join(_PLANT_KINDS[taken][1] for taken in method.plants)
+    needed = " or ".join(_PLANT_KINDS[plant_kind][1] for plant_kind in method.plants)
     return (
         Condition(
             "kind of plant",
-            f"{method.id} needs {wanted}",
+            f"{method.id} needs {needed}",
             False,
             0.0,
             1.0,

@@ -46,11 +46,11 @@ def _algebraic_rows(observer: LinearObserver, e: FloatArray, t: FloatArray, affi
     algebraic = ~e.any(axis=1)
     if not algebraic.any() or not np.any(np.abs(missed) > IDENTITY_SHARE * size.max(axis=1, keepdims=True)):
         return np.zeros((rows, plant.nx))
-    found = np.zeros((rows, plant.nx))
-    both = np.hstack([plant.A, plant.B])[algebraic]
-    wanted = np.hstack([missed, -(observer.Du + observer.Dy @ plant.D)])
-    found[:, algebraic] = np.linalg.lstsq(both.T, wanted.T, rcond=None)[0].T
-    return found
+    multipliers = np.zeros((rows, plant.nx))
+    coefficients = np.hstack([plant.A, plant.B])[algebraic]
+    gaps = np.hstack([missed, -(observer.Du + observer.Dy @ plant.D)])
+    multipliers[:, algebraic] = np.linalg.lstsq(coefficients.T, gaps.T, rcond=None)[0].T
+    return multipliers
 
 
 def structure_of(

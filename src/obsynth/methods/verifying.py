@@ -104,8 +104,8 @@ def _constant_fault_rows(method: type[Method], shipped: ObserverDesign, printed_
             "options", "steady_error_limit is a number between 0 and 1", 1.0, 0.0, source="options", detail=shown(limit)
         )
         return
-    given = ConstantFaults(model, method.constant_fault_gain(shipped, model))
-    row = constant_fault_row(given, float(limit), printed_digits)
+    constant_faults = ConstantFaults(model, method.constant_fault_gain(shipped, model))
+    row = constant_fault_row(constant_faults, float(limit), printed_digits)
     if row is not None:
         yield row
 

@@ -50,48 +50,50 @@ class WorkingPlant:
 
 
 def working_plant(
-    plant: Plant, recovery: StateRecovery | None, progress: Callable[[str], None], asked: Method | None
+    plant: Plant, recovery: StateRecovery | None, progress: Callable[[str], None], method: Method | None
 ) -> WorkingPlant:
-    """Return the plant that a method works on; ``asked`` decides, with its options, whether the index is reduced."""
+    """Return the plant that a method works on; ``method`` decides, with its options, whether the index is reduced."""
     if not isinstance(plant, DescriptorSystem):
         return WorkingPlant(plant, recovery)
     if plant.nx < MANY_VARIABLES:
         plant = plant.dense()
-        found, notes = _of_low_index(plant, asked)
-        if found is None:
+        transformation, notes = _of_low_index(plant, method)
+        if transformation is None:
             return WorkingPlant(plant, recovery)
         progress("reducing the index")
-        notes = (f"The plant has index 2 or more: {found.description}.", *notes)
-        return WorkingPlant(found.plant, _through(recovery, found), notes, " ".join(notes), found.dropped)
+        notes = (f"The plant has index 2 or more: {transformation.description}.", *notes)
+        return WorkingPlant(
+            transformation.plant, _through(recovery, transformation), notes, " ".join(notes), transformation.dropped
+        )
     if not plant.is_sparse:
         return WorkingPlant(plant, recovery)
     progress("eliminating the algebraic states")
-    found = eliminate_algebraic_states(plant)
-    return WorkingPlant(found.plant, _through(recovery, found), found.notes)
+    transformation = eliminate_algebraic_states(plant)
+    return WorkingPlant(transformation.plant, _through(recovery, transformation), transformation.notes)
 
 
-def _through(recovery: StateRecovery | None, found: Transformation) -> StateRecovery:
-    return found.recovery if recovery is None else recovery.then(found.recovery)
+def _through(recovery: StateRecovery | None, transformation: Transformation) -> StateRecovery:
+    return transformation.recovery if recovery is None else recovery.then(transformation.recovery)
 
 
-def _of_low_index(plant: DescriptorSystem, asked: Method | None) -> tuple[Transformation | None, tuple[str, ...]]:
+def _of_low_index(plant: DescriptorSystem, method: Method | None) -> tuple[Transformation | None, tuple[str, ...]]:
     """Return the minimal proper form of a plant of index 2 or more, and what was left out for it; ``None`` for any
     other plant, or where the method takes it as written."""
     if plant.nx > EXACT_ELIMINATION_UP_TO or (structure_of(plant).index or 0) < 2:
         return None, ()
-    if asked is not None and asked.is_for_states_as_written(plant):
+    if method is not None and method.is_for_states_as_written(plant):
         return None, ()
     try:
         return eliminate_algebraic_states(plant), ()
     except PreconditionError as error:
-        if error.condition != "index" or asked is None or _exists(plant, asked):
+        if error.condition != "index" or method is None or _exists(plant, method):
             return None, ()
     return _without_improper_outputs(plant)
 
 
-def _exists(plant: DescriptorSystem, asked: Method) -> bool:
+def _exists(plant: DescriptorSystem, method: Method) -> bool:
     try:
-        return all(condition.holds for condition in asked.existence(plant))
+        return all(condition.holds for condition in method.existence(plant))
     except PreconditionError:
         return False
 
@@ -99,16 +101,16 @@ def _exists(plant: DescriptorSystem, asked: Method) -> bool:
 def _without_improper_outputs(plant: DescriptorSystem) -> tuple[Transformation | None, tuple[str, ...]]:
     """Return the proper form of a plant without the outputs that need derivatives, where others are left."""
     outputs, signals = improper_outputs(plant)
-    kept = [row for row, name in enumerate(plant.output_names) if name not in outputs]
-    if not outputs or not kept:
+    proper_rows = [row for row, name in enumerate(plant.output_names) if name not in outputs]
+    if not outputs or not proper_rows:
         return None, ()
-    rows = {name: getattr(plant, name)[kept] for name in ("C", "D", "Df", "Dd", "Dw")}
-    fewer = plant.replace(output_names=[plant.output_names[row] for row in kept], **rows)
+    rows = {name: getattr(plant, name)[proper_rows] for name in ("C", "D", "Df", "Dd", "Dw")}
+    fewer = plant.replace(output_names=[plant.output_names[row] for row in proper_rows], **rows)
     needs = f"a later sample of {', '.join(signals)}" if plant.dt else f"the derivative of {', '.join(signals)}"
-    one = len(outputs) == 1
+    single = len(outputs) == 1
     note = (
-        f"The output{'' if one else 's'} {', '.join(outputs)} need{'s' if one else ''} {needs}: "
-        f"{'it is' if one else 'they are'} left out, and the design is for the others."
+        f"The output{'' if single else 's'} {', '.join(outputs)} need{'s' if single else ''} {needs}: "
+        f"{'it is' if single else 'they are'} left out, and the design is for the others."
     )
     try:
         return eliminate_algebraic_states(fewer), (note,)

@@ -15,7 +15,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.methods.automatic import DECOUPLED, SETTLING_TIMES, Candidate, Maker, candidate, linear_methods
 from obsynth.methods.designing import agree, design
-from obsynth.methods.fault_figures import held, on_the_clock, step_responses
+from obsynth.methods.fault_figures import on_the_clock, step_responses, steps_in_bounds
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.optimal_filter.least_possible import least_possible
 from obsynth.methods.registry import method_class
@@ -278,7 +278,7 @@ def side_by_side(
     sampled = on_the_clock(plant, dt)
     happening = _scenario(plant, scenario, dt, settings.disturbance)
     steps = int(min(happening.horizon / dt, MOST_SCENARIO_SAMPLES)) + 1
-    followed, feedback = held(sampled, steps)
+    followed, feedback = steps_in_bounds(sampled, steps)
     if followed < steps:
         steps, happening = followed, happening.replace(horizon=followed * dt)
     candidates = source.candidates(plant, sampled, steps, report_stage)

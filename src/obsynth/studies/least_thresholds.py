@@ -8,7 +8,7 @@ import numpy as np
 
 from obsynth.errors import ObsynthError
 from obsynth.methods.automatic import SETTLING_TIMES
-from obsynth.methods.fault_figures import held, on_the_clock, step_responses
+from obsynth.methods.fault_figures import on_the_clock, step_responses, steps_in_bounds
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import MOST_WINDOW_STATES, problem_of
@@ -166,7 +166,7 @@ def design_beside_least(design: ObserverDesign, scenario: Scenario) -> dict[str,
     try:
         sampled = on_the_clock(plant, plant.dt)
         steps = int(min(max(SETTLING_TIMES * settling_time(plant) / plant.dt, observer.order + 2), MOST_RESPONSE_STEPS))
-        steps, feedback = held(sampled, steps)
+        steps, feedback = steps_in_bounds(sampled, steps)
         impulses, _ = step_responses(sampled, observer, steps, feedback)
         bounds = largest_disturbances(scenario, sampled.disturbance_names, steps, plant.dt)
         moving = moving_gains(sampled, observer, steps, feedback)

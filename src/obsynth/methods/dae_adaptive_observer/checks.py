@@ -83,13 +83,13 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         facts = dae_facts(observer)
         yield from _model_rows(observer, facts)
         yield listed_gains(design, {"K": facts.K, "Upsilon": facts.Upsilon}, tolerance=CLAIM_TOLERANCE)
-        found = {
+        claims = {
             "index": float(facts.index),
             "condition": facts.condition,
             "contraction": facts.contraction,
             "steps": float(facts.steps),
         }
-        yield claims_row(design, found, rough=found)
+        yield claims_row(design, claims, rough=claims)
         yield from _consistency_rows(design, observer, min(TRIAL_STEPS, facts.steps))
     except (ObsynthError, np.linalg.LinAlgError, ValueError, KeyError, TypeError) as error:
         yield failed_run(error)
@@ -144,13 +144,13 @@ def _model_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
     deviations = facts.identifiable.deviations[observer.model.nx :]
     for name, prior, bound, deviation in zip(names, priors, deviations, facts.deviations, strict=True):
         unit = observer.model.units.get(name, "")
-        told = "the outputs alone do not determine it" if not np.isfinite(bound) else f"Cramer-Rao {bound:.3g} {unit}"
+        detail = "the outputs alone do not determine it" if not np.isfinite(bound) else f"Cramer-Rao {bound:.3g} {unit}"
         yield information(
             f"excitation: {name}",
             "information from nominal constant inputs, in prior deviations to the power -2",
             float((prior / bound) ** 2),
             source=f"{SOURCE}, (26)",
-            detail=told,
+            detail=detail,
         )
         yield information(
             f"noise in fhat[{name}]",
@@ -174,14 +174,14 @@ def _model_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
 def _proved_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
     """Yield what is proved of the linearisation along the nominal run, for all derivatives that the row allows."""
     units = observer.model.state_scales
-    scaled = np.abs(facts.kept) * units[None, None, :] / units[None, :, None]
+    scaled = np.abs(facts.transitions) * units[None, None, :] / units[None, :, None]
     sizes = np.maximum(1.0, scaled.max(axis=(1, 2), keepdims=True, initial=0.0))
     allowed = DERIVATIVE_TOLERANCE * sizes * (units[:, None] / units[None, :])[None]
-    last = Ball(facts.kept[-1], allowed[-1])
+    last = Ball(facts.transitions[-1], allowed[-1])
     rate = proved_rate(last)
     claim = "F (I - K H) at the end of the nominal run makes errors smaller: its spectral radius"
     source, decay = f"{SOURCE}, convergence", f"decay in {facts.decay_time:.3g} steps"
-    told = f"for all derivatives within {DERIVATIVE_TOLERANCE:g} of the computed ones, in sizes of the signals"
+    scope = f"for all derivatives within {DERIVATIVE_TOLERANCE:g} of the computed ones, in sizes of the signals"
     if rate is None:
         yield upper_bound_check(
             "contraction",
@@ -199,11 +199,11 @@ def _proved_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
             np.nextafter(1.0, 0.0),
             source=source,
             kind="proved",
-            detail=f"Lyapunov inequality {told}; computed {facts.contraction:.6g}, {decay}",
+            detail=f"Lyapunov inequality {scope}; computed {facts.contraction:.6g}, {decay}",
         )
     powers = np.exp2(np.round(np.log2(units)))
-    pairs = zip(facts.kept, allowed, strict=True)
-    mean = float(np.exp(logarithm_of_product([Ball(*pair) for pair in pairs], powers) / len(facts.kept)))
+    pairs = zip(facts.transitions, allowed, strict=True)
+    mean = float(np.exp(logarithm_of_product([Ball(*pair) for pair in pairs], powers) / len(facts.transitions)))
     proved = mean < 1.0
     yield information(
         "contraction along the run",
@@ -211,7 +211,7 @@ def _proved_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
         mean,
         source=source,
         status="proved" if proved else "assumed",
-        detail=f"{len(facts.kept)} steps, outward rounding, {told}" if proved else "not proved to be below one",
+        detail=f"{len(facts.transitions)} steps, outward rounding, {scope}" if proved else "not proved to be below one",
     )
     if not len(facts.deviations):
         return
@@ -234,16 +234,16 @@ def _derivative_gap(observer: DAEObserver) -> float:
     model, running = observer.model, observer.start()
     u, nothing = np.array(model.nominal_input), np.full(model.ny, np.nan)
     x, theta = running.raw_step(nothing, u).part("posterior"), np.array(observer.initial_parameters)
-    found = running.raw_step(nothing, u)
-    H, L = found.part("H"), found.part("L")
-    exact = np.vstack([np.hstack([found.part("F"), found.part("G")]), np.hstack([H, L])])
+    solved = running.raw_step(nothing, u)
+    H, L = solved.part("H"), solved.part("L")
+    exact = np.vstack([np.hstack([solved.part("F"), solved.part("G")]), np.hstack([H, L])])
     priors = np.sqrt(np.diag(observer.initial_parameter_covariance))
     sizes = np.concatenate([model.state_scales, priors])
-    seen = np.abs(H) @ model.state_scales + np.abs(L) @ priors
-    rows = np.concatenate([model.state_scales, np.where(seen > 0.0, seen, 1.0)])
-    step, end = observer.steps.implicit, found.part("posterior") - x
+    output_sizes = np.abs(H) @ model.state_scales + np.abs(L) @ priors
+    rows = np.concatenate([model.state_scales, np.where(output_sizes > 0.0, output_sizes, 1.0)])
+    step, end = observer.steps.implicit, solved.part("posterior") - x
 
-    def both(point: FloatArray) -> FloatArray:
+    def step_and_outputs(point: FloatArray) -> FloatArray:
         """Return the end of a step from a point, and the outputs of the point moved to where the step ends."""
         x_moved, theta_moved = point[: model.nx], point[model.nx :]
         reached = step.solve_carefully(x_moved, u, theta_moved).x
@@ -253,7 +253,7 @@ def _derivative_gap(observer: DAEObserver) -> float:
     for j, size in enumerate(sizes):
         moved = np.zeros(len(sizes))
         moved[j] = DERIVATIVE_DIFFERENCE * size
-        slope = (both(centre + moved) - both(centre - moved)) / (2.0 * DERIVATIVE_DIFFERENCE)
+        slope = (step_and_outputs(centre + moved) - step_and_outputs(centre - moved)) / (2.0 * DERIVATIVE_DIFFERENCE)
         gap = np.abs(slope - exact[:, j] * size) / rows
         worst = max(worst, float(gap.max()) / max(1.0, float(np.abs(exact[:, j] * size / rows).max())))
     return worst
@@ -355,26 +355,26 @@ def _trials(
         states.append(truth.states[-1])
         outputs.append(truth.outputs)
     # As C it would be faster, but the compiler takes longer than all of this.
-    found = run_dae_batch(shipped, np.array(outputs), u, compiled=False, progress=False)
+    batch = run_dae_batch(shipped, np.array(outputs), u, compiled=False, progress=False)
     if stated.model.nq:
-        gaps = found.parameters[:, -1] - np.array(parameters)
-        weighted = np.linalg.solve(found.parameter_covariances[:, -1], gaps[:, :, None])[:, :, 0]
+        gaps = batch.parameters[:, -1] - np.array(parameters)
+        weighted = np.linalg.solve(batch.parameter_covariances[:, -1], gaps[:, :, None])[:, :, 0]
         errors = np.sum(gaps * weighted, axis=1) / gaps.shape[1]
     else:
         ends = [shipped.run(y, u, progress=False).state_covariances[-1] for y in outputs]
-        errors = _state_errors(found.states[:, -1] - np.array(states), ends, stated)
-    return errors, float(found.nis[:, 1:].sum()), float(found.nis_degrees[:, 1:].sum())
+        errors = _state_errors(batch.states[:, -1] - np.array(states), ends, stated)
+    return errors, float(batch.nis[:, 1:].sum()), float(batch.nis_degrees[:, 1:].sum())
 
 
 def _state_errors(gaps: FloatArray, covariances: Sequence[FloatArray], stated: DAEObserver) -> FloatArray:
     """Return squared errors of states per degree of freedom ``(trials,)``: in the directions that are uncertain, as
     algebraic equations without noise leave none in others."""
-    units, found = stated.model.state_scales, np.zeros(len(gaps))
+    units, errors = stated.model.state_scales, np.zeros(len(gaps))
     for trial, (gap, covariance) in enumerate(zip(gaps / units, covariances, strict=True)):
         values, vectors = np.linalg.eigh(covariance / np.outer(units, units))
-        kept = values > RANK_TOLERANCE * values[-1]
-        found[trial] = np.mean((vectors[:, kept].T @ gap) ** 2 / values[kept])
-    return found
+        uncertain = values > RANK_TOLERANCE * values[-1]
+        errors[trial] = np.mean((vectors[:, uncertain].T @ gap) ** 2 / values[uncertain])
+    return errors
 
 
 def _band(count: float) -> tuple[float, float]:

@@ -26,11 +26,11 @@ from obsynth.plants.noise import offset_state
 from obsynth.results.design import Certificate
 
 
-def synthesise(plant: DAEModel, asked: DaeAdaptiveObserver, *, progress: Callable[[str], None]) -> Synthesis:
+def synthesise(plant: DAEModel, method: DaeAdaptiveObserver, *, progress: Callable[[str], None]) -> Synthesis:
     """Put the observer together; see `obsynth.dae_adaptive_observer` for the options, results and errors."""
-    observer = dae_observer_from_options(plant, asked.as_given())
+    observer = dae_observer_from_options(plant, method.as_given())
     progress("checking index and parameters")
-    require_all(asked.existence(plant))
+    require_all(method.existence(plant))
     progress("running the observer on its own model")
     facts = dae_facts(plain_recursion(observer))
     claims = {
@@ -40,7 +40,7 @@ def synthesise(plant: DAEModel, asked: DaeAdaptiveObserver, *, progress: Callabl
         "steps": float(facts.steps),
     }
     return Synthesis(
-        resolved_options(observer) | {"outliers": asked.outliers},
+        resolved_options(observer) | {"outliers": method.outliers},
         {"K": facts.K, "Upsilon": facts.Upsilon},
         observer,
         Certificate({}, claims),

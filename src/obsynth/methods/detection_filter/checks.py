@@ -113,21 +113,21 @@ def _norm_rows(design: ObserverDesign) -> Iterator[Check]:
     )
     if not all(by_itself):
         return
-    what = "both norms hold for the plant together with the filter as it is stored, rounding included"
+    claim = "both norms hold for the plant together with the filter as it is stored, rounding included"
     added = [added_gain(plant, observer, *signal) for signal in (unknown, faults)]
     if not any(added):
-        yield _together(what, True, "the stored numbers meet the equations of the error exactly")
+        yield _together(claim, True, "the stored numbers meet the equations of the error exactly")
         return
     detail = f"they add at most {added[0]:.2g} to the gain, and take {added[1]:.2g} from the sensitivity"
     less, more = np.nextafter(gain - added[0], -np.inf), np.nextafter(sensitivity + added[1], np.inf)
     holds = bool(np.all(np.isfinite(added))) and less > 0.0 and gain_is_proved(felt, less, witness) and shows(more)
-    yield _together(what, holds, detail if holds else _why_not(plant))
+    yield _together(claim, holds, detail if holds else _why_not(plant))
 
 
-def _together(what: str, holds: bool, detail: str) -> Check:
+def _together(claim: str, holds: bool, detail: str) -> Check:
     source = "plant and stored filter, outward rounded"
     return information(
-        TOGETHER, what, float(not holds), source=source, detail=detail, status="proved" if holds else "assumed"
+        TOGETHER, claim, float(not holds), source=source, detail=detail, status="proved" if holds else "assumed"
     )
 
 

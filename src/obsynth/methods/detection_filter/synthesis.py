@@ -42,15 +42,15 @@ UNREACHED = 1e-12
 GRID_FREQUENCIES, GRID_REFINEMENTS = 400, 40
 
 
-def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progress: Callable[[str], None]) -> Synthesis:
+def synthesise(plant: DescriptorSystem, method: DetectionFilterMethod, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the filter; see `obsynth.detection_filter` for the options, results and errors."""
     progress("checking the existence conditions")
-    require_all(asked.existence(plant))
-    found = eliminate_algebraic_states(plant)
-    smooth = found.plant if found.description else plant
+    require_all(method.existence(plant))
+    elimination = eliminate_algebraic_states(plant)
+    smooth = elimination.plant if elimination.description else plant
     progress("choosing the gains")
     units = _OwnUnits.of(smooth)
-    gain, weight = units.given(*_gains(units.scaled(smooth)))
+    gain, weight = units.in_data_units(*_gains(units.scaled(smooth)))
     observer = LinearObserver(
         Az=smooth.A - gain @ smooth.C,
         Bu=smooth.B - gain @ smooth.D,
@@ -77,7 +77,7 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
             "the outputs near the imaginary axis do that, and noise that hardly reaches some states: state noise of "
             "the states (Bw)."
         )
-    low, high = (float(value) for value in asked.band)
+    low, high = (float(value) for value in method.band)
     least, where = _sensitivity(smooth, observer, low, high)
     reached = error_transfer(smooth, observer, smooth.Bf, smooth.Df)
     levels = [least * (1.0 - margin) for margin in SENSITIVITY_MARGINS]
@@ -89,12 +89,12 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
         "frequency": where,
     }
     return Synthesis(
-        asked.as_plain(),
+        method.as_plain(),
         {"L": gain, "V": weight},
         observer,
         Certificate({"P": witness}, claims),
         notes=_notes(smooth, observer, claims),
-        transformation=found if found.description else None,
+        transformation=elimination if elimination.description else None,
     )
 
 
@@ -119,23 +119,28 @@ class _OwnUnits:
     @classmethod
     def of(cls, plant: DescriptorSystem) -> _OwnUnits:
         """Return the units of a plant with ``E = I``."""
-        found, direct = PlantUnits.of(plant).rounded(), unknown_inputs(plant)[1]
-        return cls(found.states, 1.0 / power_of_two_below(np.linalg.norm(direct, axis=1)), found.rate)
+        units, direct = PlantUnits.of(plant).rounded(), unknown_inputs(plant)[1]
+        return cls(units.states, 1.0 / power_of_two_below(np.linalg.norm(direct, axis=1)), units.rate)
 
     def moved(self, a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return dynamics and inputs in these units of states and time."""
-        left = self.rate / self.states[:, None]
-        return left * a * self.states, left * b
+        factors = self.rate / self.states[:, None]
+        return factors * a * self.states, factors * b
 
     def scaled(self, plant: DescriptorSystem) -> DescriptorSystem:
         """Return the plant in these units; unknown inputs keep theirs, in which they are as large as one."""
         (a, bd), bw = self.moved(plant.A, plant.Bd), self.moved(plant.A, plant.Bw)[1]
-        shown = self.outputs[:, None]
+        output_factors = self.outputs[:, None]
         return plant.replace(
-            A=a, Bd=bd, Bw=bw, C=shown * plant.C * self.states, Dd=shown * plant.Dd, Dw=shown * plant.Dw
+            A=a,
+            Bd=bd,
+            Bw=bw,
+            C=output_factors * plant.C * self.states,
+            Dd=output_factors * plant.Dd,
+            Dw=output_factors * plant.Dw,
         )
 
-    def given(self, gain: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def in_data_units(self, gain: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return L and V in the units of the data."""
         return self.states[:, None] * gain * self.outputs / self.rate, weight * self.outputs
 
@@ -167,24 +172,24 @@ def _gain_witnesses(transfer: Transfer, bound: float, units: _OwnUnits) -> Itera
         variances = np.diag(continuous_lyapunov(a, -b @ b.T))
         for least in (1.0, max(UNREACHED * np.max(variances), np.finfo(np.float64).tiny)):
             weight = np.maximum(variances, least)
-            shown = largest_singular_value(c @ continuous_lyapunov(a, -np.diag(weight)) / np.sqrt(weight))
-            room = gap / max(shown**2, gap)
-            found = continuous_lyapunov(a, -b @ b.T - STRICTNESS * room * np.diag(weight))
-            yield 0.5 * (found + found.T) * (units.states[:, None] * units.states / units.rate)
+            size = largest_singular_value(c @ continuous_lyapunov(a, -np.diag(weight)) / np.sqrt(weight))
+            room = gap / max(size**2, gap)
+            covariance = continuous_lyapunov(a, -b @ b.T - STRICTNESS * room * np.diag(weight))
+            yield 0.5 * (covariance + covariance.T) * (units.states[:, None] * units.states / units.rate)
     except (np.linalg.LinAlgError, ValueError):
         return
 
 
 def _notes(plant: DescriptorSystem, observer: LinearObserver, claims: Mapping[str, float]) -> tuple[str, ...]:
-    told = (
+    notes = (
         f"Unknown inputs and noise reach the residuals with a gain of at most {claims['disturbance_gain']:.7g}, the "
         f"faults with at least {claims['fault_sensitivity']:.4g} from {claims['band_from']:g} to {claims['band_to']:g} "
         f"rad/s (least at {claims['frequency']:.3g} rad/s).",
     )
     if np.isfinite(added_gain(plant, observer, *unknown_inputs(plant))):
-        return told
+        return notes
     return (
-        *told,
+        *notes,
         "The plant is not stable: both norms are those of the error's own equations, and what rounding of the stored "
         "numbers adds has no finite gain. It matters for disturbances that last very long.",
     )
@@ -208,13 +213,13 @@ def _gains(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
 def _sensitivity(plant: DescriptorSystem, observer: LinearObserver, low: float, high: float) -> tuple[float, float]:
     """Return the least singular value from the faults to the residuals on a band, and where."""
     errors = ErrorModel(plant, observer, np.eye(plant.nx))
-    shown, direct, _, _ = errors.residual_output
+    output_map, direct, _, _ = errors.residual_output
 
     def least(points: FloatArray) -> FloatArray:
         if plant.nf > plant.ny:
             return np.zeros(len(points))
-        found = response(errors.Az, errors.fault, -shown, direct, np.asarray(1j * points, dtype=np.complex128))
-        return np.asarray(np.linalg.svd(found, compute_uv=False)[:, -1])
+        responses = response(errors.Az, errors.fault, -output_map, direct, np.asarray(1j * points, dtype=np.complex128))
+        return np.asarray(np.linalg.svd(responses, compute_uv=False)[:, -1])
 
     grid = np.unique(
         np.concatenate(

@@ -123,10 +123,12 @@ class ExtendedKalman(Method):
         """Return the existence conditions; the list ends at the first failure."""
         from obsynth.analysis.existence.moussaali_dae import dae_conditions, known_parameters
 
-        found = tuple(condition for condition in dae_conditions(plant, self.dt or 1.0) if condition.name == "index")
-        if not found or not found[0].holds:
-            return found
-        return (*found, known_parameters(plant))
+        conditions = tuple(
+            condition for condition in dae_conditions(plant, self.dt or 1.0) if condition.name == "index"
+        )
+        if not conditions or not conditions[0].holds:
+            return conditions
+        return (*conditions, known_parameters(plant))
 
     def require_stated(self, plant: DAEModel) -> None:
         """Raise `SpecError` where noise is not stated."""
@@ -142,6 +144,6 @@ class ExtendedKalman(Method):
         from obsynth.methods.dae_adaptive_observer.synthesis import synthesise
 
         require_all(self.existence(plant))
-        found = synthesise(plant, self.with_adaptation(), progress=progress)
-        options = {name: value for name, value in found.options.items() if name in field_types(type(self))}
-        return replace(found, options=options, gains={"K": found.gains["K"]})
+        synthesis = synthesise(plant, self.with_adaptation(), progress=progress)
+        options = {name: value for name, value in synthesis.options.items() if name in field_types(type(self))}
+        return replace(synthesis, options=options, gains={"K": synthesis.gains["K"]})

@@ -167,13 +167,13 @@ class DAEFacts:
     identifiable: Identifiability  # of states and parameters along the nominal trajectory
     K: FloatArray  # ``(nx, ny)`` at the end
     Upsilon: FloatArray  # ``(nx, nq)`` at the end
-    kept: FloatArray  # ``(steps, nx, nx)``: F (I - K H) of every step
+    transitions: FloatArray  # ``(steps, nx, nx)``: F (I - K H) of every step
     parameter_covariance: FloatArray  # ``(nq, nq)`` at the end
 
     @property
     def steps(self) -> int:
         """Steps of the run."""
-        return len(self.kept)
+        return len(self.transitions)
 
     @property
     def decay_time(self) -> float:
@@ -188,11 +188,11 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
     model = observer.model
     u = np.array(model.nominal_input)
     outputs = _nominal_outputs(observer, u)
-    gathered, kept = GatheredRows(observer), []
+    gathered, transitions = GatheredRows(observer), []
 
     def add(rows: DAERow) -> None:
         gathered.add(rows)
-        kept.append(np.array(rows.several.part("kept")))
+        transitions.append(np.array(rows.several.part("kept")))
 
     end = advanced(observer.steps, outputs, np.tile(u, (len(outputs), 1)), add)
     found = gathered.estimates()
@@ -221,7 +221,7 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
         identifiable=identifiable,
         K=read_only(observer.steps.part(end, "K")),
         Upsilon=read_only(observer.steps.part(end, "Upsilon")),
-        kept=read_only(np.concatenate(kept)[1:]),
+        transitions=read_only(np.concatenate(transitions)[1:]),
         parameter_covariance=read_only(covariance),
     )
 
