@@ -37,16 +37,16 @@ def conditions_of(design: ObserverDesign) -> Conditions:
     return makers[design.method](design)
 
 
-def _put(found: Conditions, **values: Any) -> Conditions:
+def _put(problem: Conditions, **values: Any) -> Conditions:
     """Give variables their values, symmetric ones exactly so."""
     for name, value in values.items():
-        variable, number = found.variables[name], np.asarray(value, dtype=np.float64)
+        variable, number = problem.variables[name], np.asarray(value, dtype=np.float64)
         variable.value = 0.5 * (number + number.T) if variable.attributes["symmetric"] else number
-    return found
+    return problem
 
 
-def _kept(design: ObserverDesign) -> Any:
-    """The design of gains that are shipped already is that design."""
+def _shipped_already(design: ObserverDesign) -> Any:
+    """Return what makes a design of gains that a design has shipped already: the design itself, under another name."""
     return lambda gains, name: design.replace(name=name)
 
 
@@ -54,11 +54,11 @@ def _wang(design: ObserverDesign) -> Conditions:
     plant, _ = design.linear
     gains, factor = design.gains, design.certificate.matrices["P_factor"]
     gamma = design.certificate.claims.get("gamma")
-    found = wang2015(plant, gamma=gamma, T=gains["T"], N=gains["N"], W=gains["W"], margin=0.0)
+    problem = wang2015(plant, gamma=gamma, T=gains["T"], N=gains["N"], W=gains["W"], margin=0.0)
     P = factor.T @ factor
     # L = L0 + P^-1 Y (I - Upsilon W): of all Y, the one that has no part along Upsilon.
-    values = {"P": P, "Y": P @ (gains["L"] - found.data["L0"])}
-    return _put(found, **values, **({} if gamma is not None else {"gamma_squared": 0.0}))
+    values = {"P": P, "Y": P @ (gains["L"] - problem.data["L0"])}
+    return _put(problem, **values, **({} if gamma is not None else {"gamma_squared": 0.0}))
 
 
 def _filasova(design: ObserverDesign) -> Conditions:
@@ -66,12 +66,12 @@ def _filasova(design: ObserverDesign) -> Conditions:
     claims, matrices, gains = design.certificate.claims, design.certificate.matrices, design.gains
     theorem = filasova_theorem2 if claims["theorem"] == 2.0 else filasova_theorem1
     decay = claims["decay"]
-    found = theorem(plant, delta=claims["delta"], decay=decay, reading="printed", margin=0.0)
+    problem = theorem(plant, delta=claims["delta"], decay=decay, reading="printed", margin=0.0)
     loop = gains.get("G", np.eye(plant.nf))
     J = np.vstack([gains["J"], loop @ gains["M"]])
     L = np.vstack([gains["L"], loop @ gains["N"]])
     P3 = matrices["P3"]
-    return _put(found, P1=matrices["P1"], P3=P3, Y=P3.T @ (J - decay * L), Z=P3.T @ L)
+    return _put(problem, P1=matrices["P1"], P3=P3, Y=P3.T @ (J - decay * L), Z=P3.T @ L)
 
 
 def _share_pasand(design: ObserverDesign) -> Conditions:
@@ -80,12 +80,14 @@ def _share_pasand(design: ObserverDesign) -> Conditions:
     U_a, K_a = gains["U_a"], gains["K_a"]
     X = np.asarray(np.linalg.inv(matrices["stability"]))
     model = shipped_model(matrices, plant.nf)
-    held = existence_conditions(plant, model)
-    found = augmented_problem(plant, model, (U_a, gains["D_a"]), X=X, margin=0.0, conditions=held, design=_kept(design))
-    seen, injection, _ = direct_part(plant)
+    conditions = existence_conditions(plant, model)
+    problem = augmented_problem(
+        plant, model, (U_a, gains["D_a"]), X=X, margin=0.0, conditions=conditions, design=_shipped_already(design)
+    )
+    undisturbed, injection, _ = direct_part(plant)
     injected = np.vstack([injection, np.zeros((model.order, plant.ny))])
-    gain = (K_a - U_a @ injected) @ seen.T
-    return _put(found, P=np.eye(len(X)), Y=np.linalg.solve(X, gain))
+    gain = (K_a - U_a @ injected) @ undisturbed.T
+    return _put(problem, P=np.eye(len(X)), Y=np.linalg.solve(X, gain))
 
 
 def _kalman(design: ObserverDesign) -> Conditions:
@@ -93,12 +95,12 @@ def _kalman(design: ObserverDesign) -> Conditions:
     if not plant.is_time_invariant:
         raise SpecError("The plant changes with k: its filter has no steady gain.", path="plant")
     process, sensor = observer.Q.at(0), observer.R.at(0)
-    held = tuple(recursive_conditions(plant, parameters=False))
+    conditions = tuple(recursive_conditions(plant, parameters=False))
     steady = steady_state_filter(plant, Q=process, R=sensor)
-    found = steady_gain(plant, process, sensor, margin=0.0, conditions=held, design=_kept(design))
-    data = found.data
+    problem = steady_gain(plant, process, sensor, margin=0.0, conditions=conditions, design=_shipped_already(design))
+    data = problem.data
     S = np.hstack([steady.L - data["L0"], steady.K - data["K0"]]) @ np.hstack([data["N1"], data["N2"]]).T
     X = data["X"]
     P = X.T @ discrete_lyapunov((steady.L @ data["A"]).T, np.eye(len(X))) @ X
     driven = np.linalg.solve(X, np.hstack([steady.L @ data["W"], -steady.K @ data["V"]]))
-    return _put(found, P=P, Y=P @ np.linalg.solve(X, S), Z=driven.T @ P @ driven)
+    return _put(problem, P=P, Y=P @ np.linalg.solve(X, S), Z=driven.T @ P @ driven)

@@ -27,8 +27,8 @@ from obsynth.results.design import ObserverDesign
 SAME_GAIN = 1e-3
 
 
-def design_of(source: str, plant: Any, *given: Any) -> ObserverDesign:
-    """Return the design of gains that conditions of this source have; ``given`` ends with the gains and a name."""
+def design_of(source: str, plant: Any, *arguments: Any) -> ObserverDesign:
+    """Return the design of gains that conditions of this source have; ``arguments`` end with the gains and a name."""
     makers: dict[str, Callable[..., ObserverDesign]] = {
         "wang2015": _wang2015,
         "filasova": _filasova,
@@ -38,25 +38,25 @@ def design_of(source: str, plant: Any, *given: Any) -> ObserverDesign:
         "wang over region": _wang_over_region,
         "sharepasand over region": _sharepasand_over_region,
     }
-    return makers[source](plant, *given)
+    return makers[source](plant, *arguments)
 
 
 def _wang2015(
     plant: DescriptorSystem | Transformation, convex: GainProblem, gains: dict[str, FloatArray], name: str
 ) -> ObserverDesign:
     """Return the design of gains, claiming as little above its true norm as can be proved."""
-    given: dict[str, Any] = {letter: gains[letter] for letter in "TNLW"}
+    letters: dict[str, Any] = {letter: gains[letter] for letter in "TNLW"}
     if not convex.disturbances:
-        return design_from_gains(plant, "fault-estimation-filter", **given, name=name)
+        return design_from_gains(plant, "fault-estimation-filter", **letters, name=name)
     norm = error_norm(linear_plant(plant).dense(), gains)
     if not np.isfinite(norm):
-        return design_from_gains(plant, "fault-estimation-filter", **given, gamma=1.0, name=name)
+        return design_from_gains(plant, "fault-estimation-filter", **letters, gamma=1.0, name=name)
     size = max(norm, float(np.finfo(np.float64).eps) * convex.disturbance_size, float(np.finfo(np.float64).tiny))
     for room in CLAIMED_ABOVE_NORM:
-        found = design_from_gains(plant, "fault-estimation-filter", **given, gamma=(1.0 + room) * size, name=name)
-        if found.report.passed:
+        design = design_from_gains(plant, "fault-estimation-filter", **letters, gamma=(1.0 + room) * size, name=name)
+        if design.report.passed:
             break
-    return found
+    return design
 
 
 def problem_of_options(plant: DescriptorSystem, options: dict[str, Any]) -> tuple[Any, Any, float]:
@@ -67,21 +67,21 @@ def problem_of_options(plant: DescriptorSystem, options: dict[str, Any]) -> tupl
     from obsynth.numerics.least_estimation import whitened
     from obsynth.verification.invisible_faults import seen_plant
 
-    asked = OptimalFilterMethod.of(options)
-    held = conditions(plant, asked)
-    require_all_conditions(held)
-    seen = seen_plant(plant, asked.decoupled_names(plant))
-    fault_map, problem = first_problem(seen, asked)
-    return whitened(problem), (asked, fault_map, held), unit_of_gains(seen, fault_map)
+    method = OptimalFilterMethod.of(options)
+    existence = conditions(plant, method)
+    require_all_conditions(existence)
+    visible = seen_plant(plant, method.decoupled_names(plant))
+    fault_map, problem = first_problem(visible, method)
+    return whitened(problem), (method, fault_map, existence), unit_of_gains(visible, fault_map)
 
 
 def _optimal_filter(
-    plant: DescriptorSystem | Transformation, asked: tuple[Any, Any, Any], gains: dict[str, FloatArray], name: str
+    plant: DescriptorSystem | Transformation, recipe: tuple[Any, Any, Any], gains: dict[str, FloatArray], name: str
 ) -> ObserverDesign:
     """Return the filter of gains on the innovation, with what can be proved of it and of every other one."""
     from obsynth.methods.optimal_filter.synthesis import synthesis_of_gains
 
-    method, fault_map, _ = asked
+    method, fault_map, _ = recipe
     own = linear_plant(plant)
     draft = draft_of(own, method.id, synthesis_of_gains(own.dense(), method, fault_map, gains), name=name)
     return draft.replace(report=verify(draft))
@@ -133,8 +133,8 @@ def _kalman(
     made = descriptor_kalman(plant, Q=Q, R=R, name=name)
     varying, process, sensor = noisy
     steady = steady_state_filter(varying, Q=process, R=sensor)
-    for letter, wanted in (("L", steady.L), ("K", steady.K)):
-        miss = float(np.linalg.norm(gains[letter] - wanted) / max(float(np.linalg.norm(wanted)), 1.0))
+    for letter, steady_gain in (("L", steady.L), ("K", steady.K)):
+        miss = float(np.linalg.norm(gains[letter] - steady_gain) / max(float(np.linalg.norm(steady_gain)), 1.0))
         if not miss <= SAME_GAIN:
             raise VerificationError(
                 f"{letter} of the inequality differs from the steady gain of the recursion by {miss:.3g} of its "

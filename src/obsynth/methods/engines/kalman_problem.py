@@ -89,31 +89,31 @@ class KalmanProblem:
         measured = self.D @ self.D.T + self.background @ self.background.T
         direct = np.linalg.solve(measured, self.D @ self.B.T).T
         free = self.F - direct @ self.C
-        rest = self.B @ self.B.T + self.drive @ self.drive.T - direct @ self.D @ self.B.T
-        rest = 0.5 * (rest + rest.T)
+        process = self.B @ self.B.T + self.drive @ self.drive.T - direct @ self.D @ self.B.T
+        process = 0.5 * (process + process.T)
         bound = float(np.exp(-decay * self.dt)) if self.dt > 0.0 else -decay
         best: FloatArray | None = None
         for _ in range(KALMAN_ROUNDS):
-            found = _filtered(free, self.C, rest, measured, (bound, self.dt), change)
-            if found is None:
+            filtered = _filtered(free, self.C, process, measured, (bound, self.dt), change)
+            if filtered is None:
                 break
-            total = found[0] + direct
+            total = filtered[0] + direct
             # Strictly: a rate that is only met within rounding is none.
             if abscissa(self.F - total @ self.C, self.dt) < bound:
                 best = total
-            change = found[1]
+            change = filtered[1]
         return best, change
 
     def deviations(self, gain: FloatArray, change: FloatArray) -> FloatArray:
         """Return the deviation of each estimate (unit intensity where dt = 0); ``gain (n, ny)``, ``change (n, n)``."""
-        entering = np.asarray(np.linalg.solve(change, self.B - gain @ self.D), dtype=np.float64)
+        driving = np.asarray(np.linalg.solve(change, self.B - gain @ self.D), dtype=np.float64)
         moved = np.asarray(np.linalg.solve(change, (self.F - gain @ self.C) @ change), dtype=np.float64)
-        direct = np.zeros((self.estimates.shape[0], entering.shape[1]))
+        direct = np.zeros((self.estimates.shape[0], driving.shape[1]))
         bound = 1.0 if self.dt > 0.0 else 0.0
         if not abscissa(moved, self.dt) < bound:
             # Stable in some coordinates and not in others: only rounding tells.
             return np.full(len(direct), np.inf)
-        covariance = noise_covariance(moved, entering, self.estimates @ change, direct, self.dt)
+        covariance = noise_covariance(moved, driving, self.estimates @ change, direct, self.dt)
         return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
 
 
@@ -122,11 +122,11 @@ def _filtered(
     c: FloatArray,
     driven: FloatArray,
     measured: FloatArray,
-    asked: tuple[float, float],
+    rate_bound: tuple[float, float],
     change: FloatArray,
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return the gain of a Kalman filter, and states in which its error covariance is the identity."""
-    bound, dt = asked
+    bound, dt = rate_bound
     with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
         # What a badly conditioned equation gives is judged by its poles.
         try:
@@ -196,9 +196,9 @@ def compromise(problem: KalmanProblem, rate: float) -> tuple[FloatArray, float, 
     high = rate
     slowest = float(np.min(decay_rates(eigenvalues(problem.F - plain @ problem.C), problem.dt), initial=np.inf))
     for _ in range(MOST_RATE_HALVINGS):
-        found = attempt(high)
-        if found is not None:
-            best = found
+        trial = attempt(high)
+        if trial is not None:
+            best = trial
             break
         high /= 2.0
         if high <= slowest:
@@ -209,9 +209,9 @@ def compromise(problem: KalmanProblem, rate: float) -> tuple[FloatArray, float, 
     low, high = best[1], 2.0 * best[1]
     while high > RATE_STEP * low:
         middle = float(np.sqrt(low * high))
-        found = attempt(middle)
-        if found is None:
+        trial = attempt(middle)
+        if trial is None:
             high = middle
         else:
-            best, low = found, middle
+            best, low = trial, middle
     return best

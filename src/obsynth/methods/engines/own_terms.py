@@ -56,17 +56,17 @@ REGION_TOLERANCE = 1e-6
 
 
 def filter_by_inequality(
-    plant: DescriptorSystem, asked: FaultEstimationFilter, *, progress: Callable[[str], None]
+    plant: DescriptorSystem, method: FaultEstimationFilter, *, progress: Callable[[str], None]
 ) -> Synthesis:
     """Return a fault-estimation filter by (45) with what was asked for in it; see `obsynth.fault_estimation_filter`."""
     progress("checking the existence conditions")
     require_all(fault_filter_conditions(plant))
-    free = bool(asked.asks_for_free_weight)
-    found = wang2015(plant, S=asked.S, W="free" if free else None, gamma=None)
-    squared, P, Y = found.variables["gamma_squared"], found.variables["P"], found.variables["Y"]
-    parts = [] if asked.region is None else [checked_region(asked.region)]
-    if asked.decay is not None:
-        parts.append(disk(0.0, float(np.exp(-asked.decay * plant.dt))))
+    free = bool(method.asks_for_free_weight)
+    problem = wang2015(plant, S=method.S, W="free" if free else None, gamma=None)
+    squared, P, Y = problem.variables["gamma_squared"], problem.variables["P"], problem.variables["Y"]
+    parts = [] if method.region is None else [checked_region(method.region)]
+    if method.decay is not None:
+        parts.append(disk(0.0, float(np.exp(-method.decay * plant.dt))))
     where = None if not parts else parts[0] if len(parts) == 1 else parts[0] & parts[1]
     added: dict[str, Any] = {}
     if where is not None:
@@ -77,92 +77,92 @@ def filter_by_inequality(
                 condition="region",
                 mode=0j,
             )
-        added["region"] = atoms.region(found.data["A1"], P, where, Y=Y, Cy=found.data["C1"], margin=lmi.MARGIN)[1]
-    if asked.gamma is not None:
-        added["gamma"] = squared <= asked.gamma**2
+        added["region"] = atoms.region(problem.data["A1"], P, where, Y=Y, Cy=problem.data["C1"], margin=lmi.MARGIN)[1]
+    if method.gamma is not None:
+        added["gamma"] = squared <= method.gamma**2
     goal: Any = None
     drop: tuple[str, ...] = ()
-    if asked.objective == "h2":
+    if method.objective == "h2":
         # From unit white disturbances and noise to the fault errors.
         work = with_sensor_faults_as_states(plant)
         b, d = np.hstack([work.Bd, work.Bw]), np.hstack([work.Dd, work.Dw])
-        added["H2 stable"], added["H2"], Z = h2_terms(plant, found, *noise_paths(plant, found, b, d))
-        goal, found = cp.trace(Z), replace(found, variables={**found.variables, "Z": Z})
-        drop = ("(45)",) if asked.gamma is None else ()
-    elif asked.objective is not None:
-        goal = asked.objective(found.letters())
-    found = found.changed(constraints=_with_own(asked, found, added), objective=goal, drop=drop)
+        added["H2 stable"], added["H2"], Z = h2_terms(plant, problem, *noise_paths(plant, problem, b, d))
+        goal, problem = cp.trace(Z), replace(problem, variables={**problem.variables, "Z": Z})
+        drop = ("(45)",) if method.gamma is None else ()
+    elif method.objective is not None:
+        goal = method.objective(problem.letters())
+    problem = problem.changed(constraints=_with_own(method, problem, added), objective=goal, drop=drop)
     progress("solving the matrix inequality")
-    runs = [_solved(found, asked)]
+    runs = [_solved(problem, method)]
     if goal is None and plant.nd:
         # The bare optimum is badly conditioned: a little more gain buys small matrices.
         least = float(np.sqrt(max(squared.value, 0.0)))
-        level = (1.0 + asked.gamma_margin) * least if asked.gamma is None else asked.gamma
-        found = found.changed(constraints={"gamma": squared <= level**2}, objective=cp.trace(P) + cp.norm(Y, "fro"))
-        runs.append(_solved(found, asked))
-    gains = found.gains()
+        level = (1.0 + method.gamma_margin) * least if method.gamma is None else method.gamma
+        problem = problem.changed(constraints={"gamma": squared <= level**2}, objective=cp.trace(P) + cp.norm(Y, "fro"))
+        runs.append(_solved(problem, method))
+    gains = problem.gains()
     work = with_sensor_faults_as_states(plant)
     _require_inside(gains["T"] @ work.A - gains["L"] @ work.C, where)
     gamma = None
     if plant.nd:
         gamma = (1.0 + CLAIM_ROOM) * error_norm(plant, gains)
-        gamma = asked.gamma if asked.gamma is not None and asked.gamma > gamma else gamma
+        gamma = method.gamma if method.gamma is not None and method.gamma > gamma else gamma
     progress("building the realisation and its certificate")
-    given: dict[str, Any] = {letter: gains[letter] for letter in "TNLW"}
-    made = filter_from_gains(plant, **given, gamma=gamma, indexes=None)
-    if asked.mean > 1 and isinstance(made.observer, LinearObserver):
-        zeros = np.zeros(((asked.mean - 1) * plant.nf, made.certificate.matrices["tracking"].shape[1]))
+    letters: dict[str, Any] = {letter: gains[letter] for letter in "TNLW"}
+    made = filter_from_gains(plant, **letters, gamma=gamma, indexes=None)
+    if method.mean > 1 and isinstance(made.observer, LinearObserver):
+        zeros = np.zeros(((method.mean - 1) * plant.nf, made.certificate.matrices["tracking"].shape[1]))
         matrices, claims = dict(made.certificate.matrices), made.certificate.claims
         matrices["tracking"] = np.vstack([matrices["tracking"], zeros])
-        made = replace(made, observer=averaged(made.observer, asked.mean), certificate=Certificate(matrices, claims))
-    return _recorded(made, asked, found, runs, where, weight="free" if free else "paper")
+        made = replace(made, observer=averaged(made.observer, method.mean), certificate=Certificate(matrices, claims))
+    return _recorded(made, method, problem, runs, where, weight="free" if free else "paper")
 
 
-def pd_by_inequality(plant: DescriptorSystem, asked: PdObserver, *, progress: Callable[[str], None]) -> Synthesis:
+def pd_by_inequality(plant: DescriptorSystem, method: PdObserver, *, progress: Callable[[str], None]) -> Synthesis:
     """Return a PD observer by a theorem with what was asked for in it; see `obsynth.pd_observer`."""
     progress("checking the existence conditions")
     require_all(pd_observer_conditions(plant))
-    theorem = filasova_theorem2 if asked.theorem == 2 else filasova_theorem1
-    where = None if asked.region is None else checked_region(asked.region)
-    decay, form = asked.decay or 0.0, explicit_form(plant)
-    delta = asked.delta
+    theorem = filasova_theorem2 if method.theorem == 2 else filasova_theorem1
+    where = None if method.region is None else checked_region(method.region)
+    decay, form = method.decay or 0.0, explicit_form(plant)
+    delta = method.delta
     if delta is None:
-        delta = _fitting_delta(default_delta(plant if form is None else form.plant, asked, decay), where)
-    found = theorem(plant, delta=delta, decay=decay, region=where)
-    goal = None if asked.objective is None else asked.objective(found.letters())
-    found = found.changed(constraints=_with_own(asked, found, {}), objective=goal)
+        delta = _fitting_delta(default_delta(plant if form is None else form.plant, method, decay), where)
+    problem = theorem(plant, delta=delta, decay=decay, region=where)
+    goal = None if method.objective is None else method.objective(problem.letters())
+    problem = problem.changed(constraints=_with_own(method, problem, {}), objective=goal)
     progress("solving the matrix inequality")
-    runs = [_solved(found, asked)]
-    gains = found.gains()
-    A_o, C_o = found.data["A_o"], found.data["C_o"]
+    runs = [_solved(problem, method)]
+    gains = problem.gains()
+    A_o, C_o = problem.data["A_o"], problem.data["C_o"]
     J, L = np.vstack([gains["J"], gains["M"]]), np.vstack([gains["L"], gains["N"]])
     _require_inside(np.asarray(np.linalg.solve(np.eye(len(A_o)) + L @ C_o, A_o - J @ C_o)), where)
     progress("building the realisation and its certificate")
     made = pd_from_gains(plant, gains=gains, adaptation_gain=None, decay=decay)
-    return _recorded(made, asked, found, runs, where, delta=delta, decay=decay)
+    return _recorded(made, method, problem, runs, where, delta=delta, decay=decay)
 
 
-def ui_pi_by_inequality(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callable[[str], None]) -> Synthesis:
+def ui_pi_by_inequality(plant: DescriptorSystem, method: UiPiObserver, *, progress: Callable[[str], None]) -> Synthesis:
     """Return a UI-PI observer by its inequality with what was asked for in it; see `obsynth.ui_pi_observer`."""
     progress("checking the existence conditions")
-    model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
+    model = exosystem(method.fault_model, plant.fault_names, plant.dt)
     known = existence(plant, model)
     require_all_conditions(known.conditions)
-    where = _region_of_poles(asked, plant.dt)
-    found = sharepasand(
-        plant, fault_model=asked.fault_model, region=where, E_sharp=asked.E_sharp, C_sharp=asked.C_sharp, G=asked.G
+    where = _region_of_poles(method, plant.dt)
+    problem = sharepasand(
+        plant, fault_model=method.fault_model, region=where, E_sharp=method.E_sharp, C_sharp=method.C_sharp, G=method.G
     )
-    goal = asked.objective(found.letters()) if callable(asked.objective) else None
-    found = found.changed(constraints=_with_own(asked, found, {}), objective=goal)
+    goal = method.objective(problem.letters()) if callable(method.objective) else None
+    problem = problem.changed(constraints=_with_own(method, problem, {}), objective=goal)
     progress("solving the matrix inequality")
-    runs = [_solved(found, asked)]
-    gains = found.gains()
+    runs = [_solved(problem, method)]
+    gains = problem.gains()
     _require_inside(gains["Ahat"], where)
     progress("building the realisation and its certificate")
-    given = {letter: gains[letter] for letter in "UDKF"}
-    made = ui_pi_from_gains(known.plant, **given, fault_model=asked.fault_model)
-    told = _recorded(made, asked, found, runs, where, **asked.resolved(model, plant.fault_names))
-    return replace(told, transformation=known.transformation)
+    letters = {letter: gains[letter] for letter in "UDKF"}
+    made = ui_pi_from_gains(known.plant, **letters, fault_model=method.fault_model)
+    synthesis = _recorded(made, method, problem, runs, where, **method.resolved(model, plant.fault_names))
+    return replace(synthesis, transformation=known.transformation)
 
 
 def _fitting_delta(delta: float, where: LMIRegion | None) -> float:
@@ -175,28 +175,28 @@ def _fitting_delta(delta: float, where: LMIRegion | None) -> float:
     return float(1.0 / inside[np.argmin(np.abs(np.log(inside * delta)))]) if len(inside) else delta
 
 
-def _with_own(asked: Any, found: Conditions, added: Mapping[str, Any]) -> dict[str, Any]:
+def _with_own(method: Any, problem: Conditions, added: Mapping[str, Any]) -> dict[str, Any]:
     """Return constraints to add, those of the user among them."""
-    own = {} if asked.constraints is None else named_constraints(asked.constraints(found.letters()))
+    own = {} if method.constraints is None else named_constraints(method.constraints(problem.letters()))
     return {**added, **own}
 
 
-def _region_of_poles(asked: UiPiObserver, dt: float) -> LMIRegion | None:
+def _region_of_poles(method: UiPiObserver, dt: float) -> LMIRegion | None:
     """Return the region of an observer's poles, by name too: decay, radius, damping."""
-    given = dict(asked.region) if isinstance(asked.region, Mapping) else {}
-    if asked.region is not None and not given:
-        return checked_region(asked.region)
-    checked = asked.checked_region(dt)
-    decay = asked.decay if checked is None else checked.decay
+    stated = dict(method.region) if isinstance(method.region, Mapping) else {}
+    if method.region is not None and not stated:
+        return checked_region(method.region)
+    checked = method.checked_region(dt)
+    decay = method.decay if checked is None else checked.decay
     parts = [] if not decay else [disk(0.0, float(np.exp(-decay * dt))) if dt > 0.0 else half_plane(decay)]
     if checked is not None and checked.radius is not None:
         parts.append(disk(0.0, checked.radius))
     if checked is not None and checked.damping is not None:
         parts.append(sector(checked.damping))
-    whole = None
+    region = None
     for part in parts:
-        whole = part if whole is None else whole & part
-    return whole
+        region = part if region is None else region & part
+    return region
 
 
 def _require_inside(closed: FloatArray, where: LMIRegion | None) -> None:
@@ -211,36 +211,41 @@ def _require_inside(closed: FloatArray, where: LMIRegion | None) -> None:
         )
 
 
-def _solved(found: Conditions, asked: Any) -> dict[str, Any]:
+def _solved(problem: Conditions, method: Any) -> dict[str, Any]:
     """Solve a problem by the solver that was asked for, and return the record of the run."""
-    names = AUTOMATIC if asked.solver == AUTOMATIC[0] else (asked.solver,)
+    names = AUTOMATIC if method.solver == AUTOMATIC[0] else (method.solver,)
     for name in (name for name in names if name == names[0] or name in semidefinite_solvers()):
-        settings = {**SOLVER_SETTINGS.get(name, {}), **(asked.solver_options or {})}
+        settings = {**SOLVER_SETTINGS.get(name, {}), **(method.solver_options or {})}
         failure = None
-        record: dict[str, Any] = {"what": found.source, "solver": str(name), "settings": settings}
+        record: dict[str, Any] = {"what": problem.source, "solver": str(name), "settings": settings}
         try:
-            found.solve(name, settings)
+            problem.solve(name, settings)
             break
         except SolverError as error:
             error.record, failure = {**record, "status": "crashed"}, error
     if failure is not None:
         raise failure
-    record |= {"status": str(found.problem.status)}
+    record |= {"status": str(problem.problem.status)}
     if record["status"] not in USABLE_STATUSES:
         raise SolverError(
-            f"{name} ended with status {record['status']!r} for {found.source} with "
-            f"{', '.join(map(repr, found.constraints))}: with these constraints nothing was found. Relax them, or take "
-            "another solver.",
+            f"{name} ended with status {record['status']!r} for {problem.source} with "
+            f"{', '.join(map(repr, problem.constraints))}: with these constraints nothing was found. Relax them, "
+            "or take another solver.",
             record=record,
         )
     return record
 
 
 def _recorded(
-    made: Synthesis, asked: Any, found: Conditions, runs: list[dict[str, Any]], where: LMIRegion | None, **resolved: Any
+    made: Synthesis,
+    method: Any,
+    problem: Conditions,
+    runs: list[dict[str, Any]],
+    where: LMIRegion | None,
+    **resolved: Any,
 ) -> Synthesis:
     """Return a synthesis from gains as the one that was asked for, with its record."""
-    options = {**asked.as_plain(), **resolved, "constraints": list(found.constraints)}
+    options = {**method.as_plain(), **resolved, "constraints": list(problem.constraints)}
     imposed = f", and every eigenvalue in {where}" if where is not None else ""
-    note = f"The inequality was solved as it stands in the paper, with {', '.join(found.constraints)}{imposed}."
+    note = f"The inequality was solved as it stands in the paper, with {', '.join(problem.constraints)}{imposed}."
     return replace(made, options=options, solver={"engine": "lmi", "runs": runs}, notes=(note, *made.notes))

@@ -48,12 +48,12 @@ class Region:
             if key in known and (not is_finite_number(value) or value < 0.0 or (key != "decay" and value == 0.0)):
                 problems.append(f"{key} is {value!r}: give a positive number.")
         if not problems:
-            found = cls(**data)
-            if found.damping is not None and found.damping >= 1.0:
-                problems.append(f"damping is {found.damping}: give a ratio below 1.")
-            if found.radius is not None and found.radius <= found.decay:
-                problems.append(f"the region is empty: radius {found.radius} is not above decay {found.decay}.")
-            if dt > 0.0 and (found.radius is not None or found.damping is not None):
+            region = cls(**data)
+            if region.damping is not None and region.damping >= 1.0:
+                problems.append(f"damping is {region.damping}: give a ratio below 1.")
+            if region.radius is not None and region.radius <= region.decay:
+                problems.append(f"the region is empty: radius {region.radius} is not above decay {region.decay}.")
+            if dt > 0.0 and (region.radius is not None or region.damping is not None):
                 problems.append("radius and damping are for continuous time: give decay alone.")
         if problems or not data:
             raise SpecError(
@@ -99,11 +99,11 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
     if n == 0:
         return np.zeros((0, problem.C.shape[0])), {}
     # What one way cannot find, the other may.
-    ways = [_partly, _by_inequality] if n > MOST_MOVED_STATES else [_by_inequality, _partly]
+    attempts = [_partly, _by_inequality] if n > MOST_MOVED_STATES else [_by_inequality, _partly]
     failures: list[SolverError] = []
-    for way in ways:
+    for attempt in attempts:
         try:
-            gain, record = way(problem, region, solver=solver)
+            gain, record = attempt(problem, region, solver=solver)
         except SolverError as error:
             failures.append(error)
             continue
@@ -116,7 +116,7 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
                 record=record,
             )
         )
-    raise failures[ways.index(_by_inequality)]
+    raise failures[attempts.index(_by_inequality)]
 
 
 def _partly(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
@@ -138,7 +138,7 @@ def _partly(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[Flo
     first, mixed, second = triangular[:good, :good], triangular[:good, good:], triangular[good:, good:]
     apart = np.vstack([solve_sylvester(first, -second, -mixed), np.eye(len(second))])
     moved, rows = turn @ apart, turn[:, good:].T
-    rest = replace(
+    remaining = replace(
         problem,
         F=second,
         C=problem.C @ moved,
@@ -146,7 +146,7 @@ def _partly(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[Flo
         drive=rows @ problem.drive,
         estimates=problem.estimates @ moved,
     )
-    more, record = _by_inequality(rest, region, solver=solver)
+    more, record = _by_inequality(remaining, region, solver=solver)
     return np.asarray(gain + moved @ more), record
 
 
@@ -157,14 +157,14 @@ def _by_inequality(problem: KalmanProblem, region: Region, *, solver: str) -> tu
     f, c = inverse @ problem.F @ change, problem.C @ change
     estimates = problem.estimates @ change
     # The drive is left out: the region says how fast the poles must be, and less noise is what is left to ask for.
-    entering = inverse @ np.hstack([problem.B, np.zeros((n, problem.background.shape[1]))])
+    driving = inverse @ np.hstack([problem.B, np.zeros((n, problem.background.shape[1]))])
     direct = np.hstack([problem.D, problem.background])
     size = max(largest_singular_value(estimates), SMALLEST)
     weight = estimates.T @ estimates / size**2 + STATE_WEIGHT * np.eye(n)
     p, y = lmi.symmetric_variable(n), lmi.matrix_variable(n, c.shape[0])
-    z = lmi.symmetric_variable(entering.shape[1])
+    z = lmi.symmetric_variable(driving.shape[1])
     moved = p @ f - y @ c
-    noise = p @ entering - y @ direct
+    noise = p @ driving - y @ direct
     constraints = [
         lmi.at_least(p, LEAST_LYAPUNOV),
         lmi.at_least(lmi.symmetric_blocks([[z], [noise, p]])),
@@ -183,18 +183,18 @@ def _by_inequality(problem: KalmanProblem, region: Region, *, solver: str) -> tu
 
 
 def _continuous_region(region: Region, p: Any, moved: Any) -> list[Any]:
-    found = []
+    constraints = []
     if region.decay:
-        found.append(lmi.at_most(moved + moved.T + 2.0 * region.decay * (1.0 + INNER_SHARE) * p, 0.0))
+        constraints.append(lmi.at_most(moved + moved.T + 2.0 * region.decay * (1.0 + INNER_SHARE) * p, 0.0))
     if region.radius is not None:
         radius = region.radius * (1.0 - INNER_SHARE)
-        found.append(lmi.at_least(lmi.symmetric_blocks([[radius * p], [moved, radius * p]])))
+        constraints.append(lmi.at_least(lmi.symmetric_blocks([[radius * p], [moved, radius * p]])))
     if region.damping is not None:
         cosine = min(region.damping * (1.0 + INNER_SHARE), 1.0)
         sine = float(np.sqrt(1.0 - cosine**2))
-        both, turned = sine * (moved + moved.T), cosine * (moved.T - moved)
-        found.append(lmi.at_most(lmi.symmetric_blocks([[both], [turned, both]]), 0.0))
-    return found
+        damped, turned = sine * (moved + moved.T), cosine * (moved.T - moved)
+        constraints.append(lmi.at_most(lmi.symmetric_blocks([[damped], [turned, damped]]), 0.0))
+    return constraints
 
 
 def _scaling(problem: KalmanProblem, region: Region) -> FloatArray:
@@ -203,8 +203,8 @@ def _scaling(problem: KalmanProblem, region: Region) -> FloatArray:
     gain = problem.gain(region.decay)
     if gain is None:
         return np.eye(problem.F.shape[0])
-    closed, entering = problem.F - gain @ problem.C, problem.B - gain @ problem.D
-    noise = entering @ entering.T + problem.drive @ problem.drive.T
+    closed, driving = problem.F - gain @ problem.C, problem.B - gain @ problem.D
+    noise = driving @ driving.T + problem.drive @ problem.drive.T
     noise = noise + gain @ problem.background @ problem.background.T @ gain.T
     with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
         # A poor scaling is judged by what the solver makes of it.

@@ -23,8 +23,8 @@ def fault_deviation(plant: DescriptorSystem, observer: LinearObserver) -> float:
     places = [plant.fault_names.index(name) for name in observer.fault_names]
     sizes = own.faults[places]
     scale = 1.0 / np.where(sizes > 0.0, sizes, 1.0)[:, None]
-    shown, direct = scale * observer.Cz[rows], scale * observer.Dy[rows] @ noise
-    if not len(shown):
+    output_map, direct = scale * observer.Cz[rows], scale * observer.Dy[rows] @ noise
+    if not len(output_map):
         return 0.0
     poles = np.linalg.eigvals(observer.Az) if len(observer.Az) else np.zeros(0)
     stable = np.all(np.abs(poles) < 1.0) if observer.dt else np.all(poles.real < 0.0)
@@ -33,11 +33,11 @@ def fault_deviation(plant: DescriptorSystem, observer: LinearObserver) -> float:
     if not len(poles):
         return float(np.max(np.linalg.norm(direct, axis=1)))
     a, factors = balanced_matrix(observer.Az)
-    shown, into = shown * factors, into / factors[:, None]
+    output_map, into = output_map * factors, into / factors[:, None]
     try:
         with warnings.catch_warnings(action="error"):
             spread = discrete_lyapunov(a, into @ into.T) if observer.dt else continuous_lyapunov(a, -into @ into.T)
     except RuntimeWarning:
         return np.inf  # a pole on the boundary within rounding
-    variances = np.diag(shown @ spread @ shown.T) + np.sum(direct * direct, axis=1)
+    variances = np.diag(output_map @ spread @ output_map.T) + np.sum(direct * direct, axis=1)
     return float(np.sqrt(np.max(np.maximum(variances, 0.0))))

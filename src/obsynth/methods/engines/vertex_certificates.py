@@ -110,32 +110,32 @@ def certified(
         No certificate was found.  That proves nothing: there may be one.
     """
     # A little more decay than asked for: what a solver leaves of its constraints is off by its tolerances.
-    asked = None if decay is None else decay * (1.0 - DECAY_ROOM if errors.dt > 0.0 else 1.0 + DECAY_ROOM)
-    options: dict[str, Any] = {"goal": goal, "decay": asked, "lyapunov": lyapunov, "steps": steps, "gain": gain}
+    target_decay = None if decay is None else decay * (1.0 - DECAY_ROOM if errors.dt > 0.0 else 1.0 + DECAY_ROOM)
+    options: dict[str, Any] = {"goal": goal, "decay": target_decay, "lyapunov": lyapunov, "steps": steps, "gain": gain}
     units = ErrorUnits.of(errors)
     runs: list[dict[str, Any]] = []
     prover = prove_gain if goal == "gain" else prove_mean_square
     more = {"ball": errors.ball} if goal == "gain" else {}
     least, z_unit, size = _least(units, options, gains, solver, settings, runs)
-    wanted = [level] if level is not None else [(1.0 + max(room, margin)) * least for room in ROOMS]
+    levels = [level] if level is not None else [(1.0 + max(room, margin)) * least for room in ROOMS]
     if level is None and least < NEGLIGIBLE[0] * size:
-        wanted = [share * size for share in NEGLIGIBLE]
-    for target in dict.fromkeys(wanted):
+        levels = [share * size for share in NEGLIGIBLE]
+    for target in dict.fromkeys(levels):
         z_unit = z_unit if target == level or least >= NEGLIGIBLE[0] * size else _power_of_two(target)
         moved = units.moved(z_unit)
-        found = vertex_inequalities(moved, level=target / z_unit, gains=units.gains_in(gains), **options)
-        if not has_numbers(found, solver, settings, runs):
+        problem = vertex_inequalities(moved, level=target / z_unit, gains=units.gains_in(gains), **options)
+        if not has_numbers(problem, solver, settings, runs):
             continue
-        inner, own = witness_of(moved, found, steps=steps)
-        several = [own]
+        inner, own = witness_of(moved, problem, steps=steps)
+        candidates = [own]
         if goal == "gain" and gains is None and _one_gain_is_enough(moved):
             # The solver's own only where a decay needs more than the best one for the gain.
-            several = [[_best_gain(moved, inner.P[0], target / z_unit)], own]
+            candidates = [[_best_gain(moved, inner.P[0], target / z_unit)], own]
         witness = units.witness_out(inner, z_unit)
-        for each in several:
+        for each in candidates:
             made = [units.gain_out(L) for L in each] if gains is None else [np.asarray(L, np.float64) for L in gains]
             proof = prover(errors.closed(made), witness, target, discrete=errors.dt > 0.0, **more)
-            rate = proved_decay(errors, made, witness, wanted=decay) if proof.proved else None
+            rate = proved_decay(errors, made, witness, required=decay) if proof.proved else None
             if rate is not None and (decay is None or (rate <= decay if errors.dt > 0.0 else rate >= decay)):
                 return VertexCertificate(made, witness, target, least, rate, proof, tuple(runs))
     if level is not None and level < least:
@@ -163,16 +163,16 @@ def _one_gain_is_enough(errors: ErrorPolytope) -> bool:
     """
     if errors.dt > 0.0 or errors.differential is not None or any(d.any() for d in errors.Dz):
         return False
-    seen = [b @ errors.D[0].T for b in errors.B]
-    same = errors.constant_output and all(np.array_equal(each, seen[0]) for each in seen)
+    cross = [b @ errors.D[0].T for b in errors.B]
+    same = errors.constant_output and all(np.array_equal(each, cross[0]) for each in cross)
     return same and decide_rank(errors.D[0], expected=errors.outputs).full
 
 
 def _best_gain(errors: ErrorPolytope, P: FloatArray, level: float) -> FloatArray:
     """Return the gain of `_one_gain_is_enough`."""
     D, C = errors.D[0], errors.C[0]
-    seen = np.linalg.inv(D @ D.T)
-    return np.asarray(level**2 * np.linalg.solve(P, C.T @ seen) + errors.B[0] @ D.T @ seen)
+    inverse = np.linalg.inv(D @ D.T)
+    return np.asarray(level**2 * np.linalg.solve(P, C.T @ inverse) + errors.B[0] @ D.T @ inverse)
 
 
 def best_decay(
@@ -211,7 +211,7 @@ def best_decay(
     best: tuple[float, Witness, list[FloatArray]] | None = None
     trial = high if discrete else low
     for _ in range(MOST_BISECTIONS):
-        found = vertex_inequalities(
+        problem = vertex_inequalities(
             moved,
             goal="decay",
             decay=trial,
@@ -219,9 +219,9 @@ def best_decay(
             gain_limit=None if gains else limit,
             **options,
         )
-        good = has_numbers(found, "CLARABEL", None, [])
+        good = has_numbers(problem, "CLARABEL", None, [])
         if good:
-            inner, own = witness_of(moved, found, steps=options.get("steps"))
+            inner, own = witness_of(moved, problem, steps=options.get("steps"))
             made = [units.gain_out(L) for L in own] if gains is None else list(gains)
             witness = units.witness_out(inner, 1.0)
             good = prove_decay(errors.closed(made), witness, trial, discrete=discrete, ball=errors.ball).proved
@@ -244,12 +244,12 @@ def best_decay(
 
 
 def proved_decay(
-    errors: ErrorPolytope, gains: Sequence[FloatArray], witness: Witness, *, wanted: float | None = None
+    errors: ErrorPolytope, gains: Sequence[FloatArray], witness: Witness, *, required: float | None = None
 ) -> float:
-    """Return a decay that a given certificate proves: ``wanted`` where it does, else near the fastest it can."""
+    """Return a decay that a given certificate proves: ``required`` where it does, else near the fastest it can."""
     vertices, discrete = errors.closed(gains), errors.dt > 0.0
     fastest = _decay_of(errors, gains, witness)
-    tries = [] if wanted is None else [wanted]
+    tries = [] if required is None else [required]
     if discrete:
         tries += [fastest + share * (1.0 - fastest) for share in DECAY_SHARES]
     else:
@@ -288,15 +288,15 @@ def _least(
     unit = _power_of_two(size) if size > 0.0 else 1.0
     for _ in range(MOST_RESCALINGS):
         moved = units.moved(unit)
-        found = vertex_inequalities(moved, gains=units.gains_in(gains), **options)
-        if not has_numbers(found, solver, settings, runs):
+        problem = vertex_inequalities(moved, gains=units.gains_in(gains), **options)
+        if not has_numbers(problem, solver, settings, runs):
             raise SolverError(
                 "No common Lyapunov matrix was found for the vertices: the solver ended with "
                 f"{runs[-1]['status']!r}. That is no proof that there is none. Give a slower decay, or "
                 f"{_remedy(plain)}.",
                 record=runs[-1],
             )
-        squared = found.variables["gamma_squared" if options["goal"] == "gain" else "mean_square"].value
+        squared = problem.variables["gamma_squared" if options["goal"] == "gain" else "mean_square"].value
         least = float(np.sqrt(max(float(squared), 0.0)))
         if least == 0.0 or LEVEL_UNITS[0] <= least <= LEVEL_UNITS[1]:
             return max(least, float(np.finfo(np.float64).eps)) * unit, unit, size
@@ -312,20 +312,20 @@ def _power_of_two(value: float) -> float:
     return float(np.exp2(np.round(np.log2(value))))
 
 
-def has_numbers(found: Any, solver: str, settings: Mapping[str, Any] | None, runs: list[dict[str, Any]]) -> bool:
+def has_numbers(problem: Any, solver: str, settings: Mapping[str, Any] | None, runs: list[dict[str, Any]]) -> bool:
     """Solve, and return whether there are numbers to look at."""
-    record = {"what": found.source, "solver": str(solver), "settings": dict(settings or {})}
+    record = {"what": problem.source, "solver": str(solver), "settings": dict(settings or {})}
     try:
-        found.solve(solver, settings or {})
+        problem.solve(solver, settings or {})
     except SolverError:
         runs.append({**record, "status": "crashed"})
         return False
-    status = str(found.problem.status)
+    status = str(problem.problem.status)
     runs.append({**record, "status": status})
     if status not in USABLE_STATUSES:
         return False
     return all(
-        variable.value is not None and np.isfinite(variable.value).all() for variable in found.problem.variables()
+        variable.value is not None and np.isfinite(variable.value).all() for variable in problem.problem.variables()
     )
 
 

@@ -70,13 +70,13 @@ class FilterPart:
     states: tuple[int, ...] = ()
 
 
-def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, delay: int, mean: int) -> FilterPart:
-    """Return the filter of a gain, with a delay in samples; ``shown (rows, p)``: innovations shipped as residuals."""
+def filter_part(model: FilterModel, gain: KalmanGain, residual_map: FloatArray, *, delay: int, mean: int) -> FilterPart:
+    """Return the filter of a gain, with a delay in samples; ``residual_map (rows, p)`` makes residuals of innovations."""
     sizes = np.sqrt(np.maximum(np.diag(gain.innovation), 0.0))
     gain = replace(
         gain, K=_without_rounding(gain.K, sizes), lag=tuple(_without_rounding(part, sizes) for part in gain.lag)
     )
-    shown = _without_rounding(shown, sizes)
+    residual_map = _without_rounding(residual_map, sizes)
     parts = (model.A, -model.C), (model.B, model.L), (model.T, model.T0)
     dynamics = OutputRows(*(product_but_rounding(gain.K, fed_back, own) for own, fed_back in parts))
     innovation = OutputRows(-model.C, model.L, model.T0)
@@ -97,7 +97,7 @@ def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, dela
         dynamics, row = _registered(dynamics, row)
         total = total.plus(row)
     estimates = total.times(np.eye(count) / mean) if mean > 1 else total
-    return FilterPart(dynamics, estimates, innovation.times(shown), model.faults, delay + (mean - 1) // 2)
+    return FilterPart(dynamics, estimates, innovation.times(residual_map), model.faults, delay + (mean - 1) // 2)
 
 
 def _without_rounding(gain: FloatArray, sizes: FloatArray) -> FloatArray:
@@ -123,11 +123,11 @@ def _plain_coordinates(a: FloatArray) -> FloatArray | None:
 def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray) -> OutputRows:
     """Return the dynamics in other coordinates; with digits to spare, for the small rows of entries that cancel."""
     with flint.ctx.workprec(EXPONENTIAL_BITS):
-        k, there = arb_matrix(gain.K), arb_matrix(coordinates)
-        back = there.inv()
+        k, basis = arb_matrix(gain.K), arb_matrix(coordinates)
+        back = basis.inv()
         parts = ((model.A, -model.C), (model.B, model.L), (model.T, model.T0))
         a, b, t = (back * (arb_matrix(own) + k * arb_matrix(fed_back)) for own, fed_back in parts)
-        return OutputRows(*(as_ball(part).midpoint for part in (a * there, b, t)))
+        return OutputRows(*(as_ball(part).midpoint for part in (a * basis, b, t)))
 
 
 def _registered(dynamics: OutputRows, row: OutputRows) -> tuple[OutputRows, OutputRows]:
@@ -180,11 +180,11 @@ def assembled(
     return observer, _stacked([part.dynamics.T0 for part in parts], nx), t0
 
 
-def _side_by_side(found: Sequence[OutputRows], orders: Sequence[int], inputs: int, nx: int) -> OutputRows:
+def _side_by_side(outputs: Sequence[OutputRows], orders: Sequence[int], inputs: int, nx: int) -> OutputRows:
     """Return the rows of several filters, each reading its own states."""
-    own = [rows.of_order(order) for rows, order in zip(found, orders, strict=True)]
+    own = [rows.of_order(order) for rows, order in zip(outputs, orders, strict=True)]
     c = block_diag(*own) if own else np.zeros((0, 0))
-    return OutputRows(c, _stacked([rows.D for rows in found], inputs), _stacked([rows.T0 for rows in found], nx))
+    return OutputRows(c, _stacked([rows.D for rows in outputs], inputs), _stacked([rows.T0 for rows in outputs], nx))
 
 
 def _stacked(matrices: Sequence[FloatArray], width: int) -> FloatArray:

@@ -44,8 +44,8 @@ def decoupling_rows(design: ObserverDesign) -> Iterator[Check]:
     """Yield the measured gains: of d to everything, of other faults into each estimate or set of residuals."""
     plant, observer = design.linear
     # Unknown inputs move states: what their estimates make of them is in the identities.
-    others = list(range(len(observer.Cz)))[len(observer.state_names) :]
-    groups = [("unknown inputs", others, list[str]())] if plant.nd and others else []
+    checked_rows = list(range(len(observer.Cz)))[len(observer.state_names) :]
+    groups = [("unknown inputs", checked_rows, list[str]())] if plant.nd and checked_rows else []
     groups += [(f"free of others: {name}", rows, blind) for name, rows, blind in _blind_to(design) if blind]
     if not groups:
         return
@@ -57,15 +57,15 @@ def decoupling_rows(design: ObserverDesign) -> Iterator[Check]:
     known = range(plant.nd)
     inputs = [[*known, *(plant.nd + plant.fault_names.index(fault) for fault in blind)] for _, _, blind in groups]
     norms = decoupling_norms(every, observer, [(rows, of) for (_, rows, _), of in zip(groups, inputs, strict=True)])
-    for (name, _, blind), found in zip(groups, norms, strict=True):
+    for (name, _, blind), norm in zip(groups, norms, strict=True):
         claim = f"neither unknown inputs nor {', '.join(blind)} reach it, whatever their time course"
         yield upper_bound_check(
             name,
             claim if blind else "the unknown inputs reach neither estimates nor residuals",
-            found.relative,
+            norm.relative,
             DECOUPLING_LEVEL,
             source="computed from the transfer functions of plant and filter, without T and T0",
-            detail=f"relative to the terms; worst at {found.frequency:.3g} rad/s",
+            detail=f"relative to the terms; worst at {norm.frequency:.3g} rad/s",
         )
 
 
@@ -74,16 +74,16 @@ def _blind_to(design: ObserverDesign) -> Iterator[tuple[str, list[int], list[str
     plant, observer = design.linear
     options = design.options
     if options.get("residuals") is None:
-        others = [name for name in plant.fault_names if name not in observer.fault_names]
+        left_out = [name for name in plant.fault_names if name not in observer.fault_names]
         for row, name in enumerate(observer.fault_names):
             beside = [] if options.get("joint") else [other for other in observer.fault_names if other != name]
-            yield name, [observer.fault_rows.start + row], [*others, *beside]
+            yield name, [observer.fault_rows.start + row], [*left_out, *beside]
         return
     sets = residual_sets(options["residuals"], plant) or []
-    for seen in ([plant.fault_names[i] for i in indices] for indices in sets):
-        label = f"{' '.join(seen)}: "
+    for own_faults in ([plant.fault_names[i] for i in indices] for indices in sets):
+        label = f"{' '.join(own_faults)}: "
         rows = [row for row, name in enumerate(observer.residual_names) if len(sets) == 1 or name.startswith(label)]
-        yield label.rstrip(": "), rows, [name for name in plant.fault_names if name not in seen]
+        yield label.rstrip(": "), rows, [name for name in plant.fault_names if name not in own_faults]
 
 
 def noise_rows(design: ObserverDesign) -> Iterator[Check]:
@@ -91,11 +91,11 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
     (plant, observer), matrices = design.linear, design.certificate.matrices
     if not plant.nw or not observer.fault_names:
         return
-    found = estimate_deviations(plant, observer, matrices)
+    deviations = estimate_deviations(plant, observer, matrices)
     noise = noise_words(plant.noise_names)
     unit = "" if plant.dt > 0.0 else " (for a sample time of 1 s, times its root for others)"
     for name, (alone, total), (claimed, claimed_total) in zip(
-        observer.fault_names, found, matrices["deviations"], strict=True
+        observer.fault_names, deviations, matrices["deviations"], strict=True
     ):
         if np.isnan(alone) or np.isnan(claimed):
             yield information(
@@ -290,7 +290,7 @@ def _tracking(
     )
     if not observer.fault_names:
         return
-    wanted = wanted_faults(plant, observer, matrices, mean=int(design.options.get("mean", 1)))[observer.fault_rows]
+    targets = wanted_faults(plant, observer, matrices, mean=int(design.options.get("mean", 1)))[observer.fault_rows]
     rows, units = observer.fault_rows, _model_units(plant, phi, cw)
     # How large each state is that the faults move, in the natural unit of each of these.
     moved = np.max(np.abs(pi) * units, axis=1, initial=0.0, keepdims=True) / units
@@ -298,7 +298,7 @@ def _tracking(
         "fault models",
         "the gain of each estimate for its own fault model is one, for all others zero",
         Identity(
-            (observer.Cz[rows] @ pi, direct[rows] @ cw, -wanted),
+            (observer.Cz[rows] @ pi, direct[rows] @ cw, -targets),
             ((observer.Cz[rows], moved), (np.abs(direct[rows]), cw)),
             units,
         ),
@@ -308,5 +308,5 @@ def _tracking(
 def _model_units(plant: DescriptorSystem, phi: FloatArray, cw: FloatArray) -> FloatArray:
     """Return natural units of the states of the fault models ``(nw,)``: those of the faults that they make."""
     made = (cw != 0.0).astype(np.float64) @ reachable(phi) > 0.0
-    found = np.max(np.where(made, PlantUnits.of(plant).rounded().faults[:, None], 0.0), axis=0, initial=0.0)
-    return np.where(found > 0.0, found, 1.0)
+    units = np.max(np.where(made, PlantUnits.of(plant).rounded().faults[:, None], 0.0), axis=0, initial=0.0)
+    return np.where(units > 0.0, units, 1.0)

@@ -57,23 +57,23 @@ def functional_part(
 
     ``rate``: every error decays at this or faster, 1/s; or as the ``poles`` have it.
     """
-    found = _structure(model, goals.moving, rate, any_pole=poles is not None)
-    f, h = found.pair
+    structure = _structure(model, goals.moving, rate, any_pole=poles is not None)
+    f, h = structure.pair
     if poles is None:
         z = -_fast_gain(f, h, rate, model.dt)
     else:
         fixed = np.zeros(0, dtype=np.complex128)
-        wanted = checked_poles(poles, found.order, fixed, model.dt, of="functional-filter")
-        z = -place(f, h, wanted, dt=model.dt)[0]
-    q, p = found.order, len(model.C)
-    rows: FloatArray = np.asarray(found.X + z @ found.W)
+        wanted_poles = checked_poles(poles, structure.order, fixed, model.dt, of="functional-filter")
+        z = -place(f, h, wanted_poles, dt=model.dt)[0]
+    q, p = structure.order, len(model.C)
+    rows: FloatArray = np.asarray(structure.X + z @ structure.W)
     n, ec, k0 = np.split(rows, [q, q + p], axis=1)
-    theta, j = found.R - ec @ model.C, k0 + n @ ec
+    theta, j = structure.R - ec @ model.C, k0 + n @ ec
     known = OutputRows(np.zeros((p, q)), model.L, model.T0)
     own = OutputRows(n, product_but_rounding(theta, model.B), product_but_rounding(theta, model.T))
     # moving = p0 R + q0 C
-    both = _combinations(goals.moving, np.vstack([found.R, model.C]))
-    p0, q0 = both[:, :q], both[:, q:]
+    combined = _combinations(goals.moving, np.vstack([structure.R, model.C]))
+    p0, q0 = combined[:, :q], combined[:, q:]
     estimates = OutputRows(p0, goals.known, goals.T0).plus(known.times(p0 @ ec + q0))
     return FilterPart(
         own.plus(known.times(j)),
@@ -95,29 +95,29 @@ def _structure(model: FilterModel, moving: FloatArray, rate: float, *, any_pole:
         moved = rows @ a
         more = _beside(moved, sigma)
         if not len(more):
-            found = _Structure(rows, _combinations(moved, sigma), _left_null(sigma))
-            if not len(rows) or _assignable(*found.pair, rate, model.dt, any_pole=any_pole):
-                return found
+            structure = _Structure(rows, _combinations(moved, sigma), _left_null(sigma))
+            if not len(rows) or _assignable(*structure.pair, rate, model.dt, any_pole=any_pole):
+                return structure
             # With C A among the rows nothing of the outputs' motion is left unused.
             more = _beside(ca, np.vstack([rows, c]))
             if not len(more):
                 more = _beside(np.eye(len(a)), np.vstack([rows, c]))
             if not len(more):
                 # What is left moves with zeros of the plant: slower than wished by default, but it decays.
-                return found
+                return structure
         rows = np.vstack([rows, more])
 
 
-def _beside(rows: FloatArray, others: FloatArray) -> FloatArray:
-    """Return orthonormal rows that span what ``rows`` have beside the span of ``others``."""
+def _beside(rows: FloatArray, spanning: FloatArray) -> FloatArray:
+    """Return orthonormal rows that span what ``rows`` have beside the span of ``spanning``."""
     if not rows.size:
         return np.zeros((0, rows.shape[1]))
     sizes = np.linalg.norm(rows, axis=1, keepdims=True)
     rows = rows[sizes[:, 0] > 0.0] / sizes[sizes[:, 0] > 0.0]
-    basis = _row_basis(others)
-    left = rows - (rows @ basis.T) @ basis
-    left = left - (left @ basis.T) @ basis
-    _, values, right = np.linalg.svd(left)
+    basis = _row_basis(spanning)
+    remainder = rows - (rows @ basis.T) @ basis
+    remainder = remainder - (remainder @ basis.T) @ basis
+    _, values, right = np.linalg.svd(remainder)
     return np.asarray(right[: numerical_rank(values, scale=1.0)])
 
 
@@ -140,8 +140,8 @@ def _left_null(sigma: FloatArray) -> FloatArray:
     """Return an orthonormal basis ``(count, rows)`` of W with ``W sigma = 0``."""
     if not sigma.size:
         return np.eye(len(sigma))
-    left, values, _ = np.linalg.svd(sigma)
-    return np.asarray(left[:, rank_from(values, expected=min(sigma.shape)).rank :].T)
+    basis, values, _ = np.linalg.svd(sigma)
+    return np.asarray(basis[:, rank_from(values, expected=min(sigma.shape)).rank :].T)
 
 
 def _assignable(f: FloatArray, h: FloatArray, rate: float, dt: float, *, any_pole: bool) -> bool:
@@ -166,16 +166,18 @@ def _fast_gain(f: FloatArray, h: FloatArray, rate: float, dt: float) -> FloatArr
     if not p:
         return np.zeros((q, 0))
     # Modes that no gain moves may be slower than the rate: they get what the rest can have.
-    for wanted in (rate, 0.5 * rate, 0.1 * rate, 0.0):
+    for decay in (rate, 0.5 * rate, 0.1 * rate, 0.0):
         if dt > 0.0:
-            growth = float(np.exp(wanted * dt))
-            found = riccati_solution(growth * f, h, np.eye(q), np.eye(p), np.zeros((q, p)))
-            gain = None if found is None else f @ found @ h.T @ np.linalg.inv(h @ found @ h.T + np.eye(p))
+            growth = float(np.exp(decay * dt))
+            covariance = riccati_solution(growth * f, h, np.eye(q), np.eye(p), np.zeros((q, p)))
+            gain = (
+                None if covariance is None else f @ covariance @ h.T @ np.linalg.inv(h @ covariance @ h.T + np.eye(p))
+            )
         else:
-            process, shifted = max(rate, SMALLEST) ** 2 * np.eye(q), f + wanted * np.eye(q)
-            found = continuous_solution(shifted, h, process, np.eye(p), np.zeros((q, p)))
-            gain = None if found is None else found @ h.T
-        limit = np.exp(-wanted * dt) if dt > 0.0 else -wanted
+            process, shifted = max(rate, SMALLEST) ** 2 * np.eye(q), f + decay * np.eye(q)
+            covariance = continuous_solution(shifted, h, process, np.eye(p), np.zeros((q, p)))
+            gain = None if covariance is None else covariance @ h.T
+        limit = np.exp(-decay * dt) if dt > 0.0 else -decay
         if gain is not None and abscissa(f - gain @ h, dt) < limit:
             return np.asarray(gain)
     raise SolverError(

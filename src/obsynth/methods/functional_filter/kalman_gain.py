@@ -84,27 +84,27 @@ def filter_model(
     plant: DescriptorSystem, model: Exosystem, *, removed: Sequence[int], faults: Sequence[int]
 ) -> FilterModel:
     """Return the model for some faults, free of the unknown inputs and of the faults removed."""
-    found, used = decoupled(plant, removed, faults), model_states(model, faults)
+    form, used = decoupled(plant, removed, faults), model_states(model, faults)
     phi, cw = model.Phi[np.ix_(used, used)], model.Cw[np.ix_(list(faults), used)]
-    k, count = found.order, len(phi)
-    inverse = np.linalg.inv(found.E) if k else np.zeros((0, 0))
+    k, count = form.order, len(phi)
+    inverse = np.linalg.inv(form.E) if k else np.zeros((0, 0))
     zeros = np.zeros((count, k))
-    known = np.hstack([found.Bu, found.By])
-    rows = _telling_rows(np.hstack([found.C, found.G @ cw, -found.Du, found.H, found.M]))
+    known = np.hstack([form.Bu, form.By])
+    rows = _telling_rows(np.hstack([form.C, form.G @ cw, -form.Du, form.H, form.M]))
     return FilterModel(
-        A=np.block([[inverse @ found.A, inverse @ found.F @ cw], [zeros, phi]]),
-        C=rows @ np.hstack([found.C, found.G @ cw]),
+        A=np.block([[inverse @ form.A, inverse @ form.F @ cw], [zeros, phi]]),
+        C=rows @ np.hstack([form.C, form.G @ cw]),
         B=np.vstack([inverse @ known, np.zeros((count, plant.nu + plant.ny))]),
-        L=rows @ np.hstack([-found.Du, found.H]),
-        N=np.vstack([inverse @ found.N, np.zeros((count, plant.nw))]),
-        M=rows @ found.M,
+        L=rows @ np.hstack([-form.Du, form.H]),
+        N=np.vstack([inverse @ form.N, np.zeros((count, plant.nw))]),
+        M=rows @ form.M,
         estimate=np.hstack([np.zeros((len(faults), k)), cw]),
         drive=np.vstack([np.zeros((k, count)), np.eye(count)]),
-        T=np.vstack([inverse @ found.rows[:k, : plant.nx], np.zeros((count, plant.nx))]),
-        T0=-rows @ found.rows[k:, : plant.nx],
+        T=np.vstack([inverse @ form.rows[:k, : plant.nx], np.zeros((count, plant.nx))]),
+        T0=-rows @ form.rows[k:, : plant.nx],
         faults=tuple(faults),
         order=k,
-        fault_sizes=found.fault_sizes,
+        fault_sizes=form.fault_sizes,
         dt=plant.dt,
     )
 
@@ -117,14 +117,14 @@ def model_states(model: Exosystem, faults: Sequence[int]) -> list[int]:
     return [int(i) for i in np.flatnonzero(reached)]
 
 
-def _telling_rows(whole: FloatArray) -> FloatArray:
-    """Return combinations ``(q, p)`` of the rows ``whole (p, columns)`` that say something: some are empty."""
-    if not whole.size:
-        return np.eye(len(whole))
-    sizes = np.max(np.abs(whole), axis=0)
-    left, values, _ = np.linalg.svd(whole / np.where(sizes > 0.0, sizes, 1.0))
-    rank = rank_from(values, expected=len(whole)).rank
-    return np.eye(len(whole)) if rank == len(whole) else np.asarray(left[:, :rank].T)
+def _telling_rows(rows: FloatArray) -> FloatArray:
+    """Return combinations ``(q, p)`` of ``rows (p, columns)`` that say something: some are empty."""
+    if not rows.size:
+        return np.eye(len(rows))
+    sizes = np.max(np.abs(rows), axis=0)
+    basis, values, _ = np.linalg.svd(rows / np.where(sizes > 0.0, sizes, 1.0))
+    rank = rank_from(values, expected=len(rows)).rank
+    return np.eye(len(rows)) if rank == len(rows) else np.asarray(basis[:, :rank].T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ class KalmanGain:
     lag: tuple[FloatArray, ...]  # (n, p) each: gain of xi(k) from the innovation at k + j
     innovation: FloatArray  # (p, p), its covariance; intensity in continuous time
     covariance: FloatArray | None = None  # (n, n), of the errors of the prediction; ``None``: of poles
-    seen: tuple[float, float] | None = None  # of a walk by default: seconds, and share of a step still missing then
+    step_time_and_miss: tuple[float, float] | None = None  # by default: s, share of a step missing then
 
 
 def exact_rows(model: FilterModel) -> FloatArray:
@@ -143,8 +143,8 @@ def exact_rows(model: FilterModel) -> FloatArray:
     p = model.M.shape[0]
     if not p:
         return np.zeros((0, 0))
-    left, values, _ = np.linalg.svd(model.M) if model.M.shape[1] else (np.eye(p), np.zeros(0), None)
-    return np.asarray(left[:, rank_from(values, expected=p).rank :].T)
+    basis, values, _ = np.linalg.svd(model.M) if model.M.shape[1] else (np.eye(p), np.zeros(0), None)
+    return np.asarray(basis[:, rank_from(values, expected=p).rank :].T)
 
 
 def require_noise(model: FilterModel, plant_outputs: tuple[str, ...], noise: FloatArray) -> None:
@@ -154,9 +154,9 @@ def require_noise(model: FilterModel, plant_outputs: tuple[str, ...], noise: Flo
     if not trusted.size or float(np.max(np.abs(trusted))) <= RANK_TOLERANCE * float(np.max(np.abs(measured))):
         return
     silent = [name for name, row in zip(plant_outputs, noise, strict=True) if not row.any()]
-    which = f"no noise is stated for {', '.join(silent)}" if silent else "its noise cancels"
+    reason = f"no noise is stated for {', '.join(silent)}" if silent else "its noise cancels"
     raise PreconditionError(
-        f"A combination of the outputs is free of noise: {which}. A Kalman gain would be infinite there; "
+        f"A combination of the outputs is free of noise: {reason}. A Kalman gain would be infinite there; "
         "state the noise of every sensor (sensor_noise), or give poles.",
         condition="noise of every output",
         signals=silent or plant_outputs,
@@ -187,11 +187,11 @@ def kalman_gain(
         drive = process + (share * unit) ** 2 * states
         rows = measured + (trust * unit) ** 2 * (exact.T @ exact)
         if sampled:
-            found = _discrete(model, drive, rows, cross, lag, float(np.exp(decay * model.dt)), stable=stable)
+            solved = _discrete(model, drive, rows, cross, lag, float(np.exp(decay * model.dt)), stable=stable)
         else:
-            found = _continuous(model, drive, rows, cross, decay)
-        if found is not None and found[1] <= least:
-            best, least = found
+            solved = _continuous(model, drive, rows, cross, decay)
+        if solved is not None and solved[1] <= least:
+            best, least = solved
         if least <= WELL_SOLVED:
             break
     if best is not None:
@@ -213,10 +213,10 @@ def _discrete(
     stable: bool,
 ) -> tuple[KalmanGain, float] | None:
     equation = _Equation(growth * model.A, model.C, process, measured, growth * cross, sampled=True)
-    found = equation.solution(stable=stable)
-    if found is None:
+    solution = equation.solution(stable=stable)
+    if solution is None:
         return None
-    p, missed = found
+    p, missed = solution
     innovation = equation.innovation(p)
     gain = equation.gain(p) / growth
     closed = model.A - gain @ model.C
@@ -234,10 +234,10 @@ def _continuous(
 ) -> tuple[KalmanGain, float] | None:
     a = model.A + decay * np.eye(len(model.A))
     equation = _Equation(a, model.C, process, measured, cross, sampled=False)
-    found = equation.solution()
-    if found is None:
+    solution = equation.solution()
+    if solution is None:
         return None
-    p, missed = found
+    p, missed = solution
     gain = equation.gain(p)
     closed = model.A - gain @ model.C
     if not abscissa(closed, 0.0) < -decay - PROVABLE * _size(closed):
@@ -274,10 +274,10 @@ class _Equation:
         # What overflows is no solution.
         with np.errstate(over="ignore", invalid="ignore"):
             moved = self.a @ p @ self.a.T - p if self.sampled else self.a @ p + p @ self.a.T
-            taken = gain @ self.innovation(p) @ gain.T
-            size = sum(float(np.linalg.norm(term)) for term in (moved, taken, self.process))
+            correction = gain @ self.innovation(p) @ gain.T
+            size = sum(float(np.linalg.norm(term)) for term in (moved, correction, self.process))
             size += float(np.linalg.norm(p)) if self.sampled else float(np.linalg.norm(self.a @ p))
-            missed = float(np.linalg.norm(moved - taken + self.process)) / max(size, SMALLEST)
+            missed = float(np.linalg.norm(moved - correction + self.process)) / max(size, SMALLEST)
         return missed if np.isfinite(missed) else np.inf
 
     def solution(self, *, stable: bool = False) -> tuple[FloatArray, float] | None:
@@ -287,10 +287,10 @@ class _Equation:
         ``stable`` by the stable subspace then.
         """
         solve = riccati_solution if self.sampled else continuous_solution
-        given = (self.a, self.c, self.process, self.measured, self.cross)
-        p = solve(*given)
+        coefficients = (self.a, self.c, self.process, self.measured, self.cross)
+        p = solve(*coefficients)
         if stable and p is not None and not self._is_stable(p):
-            p = discrete_solution(*given)
+            p = discrete_solution(*coefficients)
         if p is None or not np.all(np.isfinite(p)):
             return None
         p = 0.5 * (p + p.T)
@@ -325,10 +325,10 @@ class _Equation:
         with warnings.catch_warnings(action="ignore"):
             # What an ill-conditioned step gives is judged by what it misses.
             try:
-                found = discrete_lyapunov(closed, driven) if self.sampled else continuous_lyapunov(closed, -driven)
+                covariance = discrete_lyapunov(closed, driven) if self.sampled else continuous_lyapunov(closed, -driven)
             except np.linalg.LinAlgError:
                 return None
-        return np.asarray(0.5 * (found + found.T)) if np.all(np.isfinite(found)) else None
+        return np.asarray(0.5 * (covariance + covariance.T)) if np.all(np.isfinite(covariance)) else None
 
 
 def _size(matrix: FloatArray) -> float:
@@ -341,5 +341,5 @@ def whitening(innovation: FloatArray) -> FloatArray:
     if not innovation.size:
         return innovation
     sizes, directions = np.linalg.eigh(0.5 * (innovation + innovation.T))
-    kept = sizes > RANK_TOLERANCE**2 * sizes[-1]
-    return np.asarray((directions[:, kept] / np.sqrt(sizes[kept])).T)
+    certain = sizes > RANK_TOLERANCE**2 * sizes[-1]
+    return np.asarray((directions[:, certain] / np.sqrt(sizes[certain])).T)

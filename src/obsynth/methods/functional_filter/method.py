@@ -144,22 +144,22 @@ class FunctionalFilter(Method):
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""
         if self.poles is not None:
-            given = [name for name in ("fault_rate", "decay", "noise") if getattr(self, name) is not None]
-            given += ["delay"] if self.delay else []
-            if given:
-                yield f"{', '.join(given)} choose gains, and so do poles: give one."
+            stated = [name for name in ("fault_rate", "decay", "noise") if getattr(self, name) is not None]
+            stated += ["delay"] if self.delay else []
+            if stated:
+                yield f"{', '.join(stated)} choose gains, and so do poles: give one."
         if self.states is not None and self.faults is None:
-            given = [name for name in ("fault_rate", "noise") if getattr(self, name) is not None]
-            given += [name for name, default in (("delay", 0), ("mean", 1)) if getattr(self, name) != default]
-            if given:
-                yield f"{', '.join(given)} concern estimates of faults: name these (faults), or leave them out."
+            stated = [name for name in ("fault_rate", "noise") if getattr(self, name) is not None]
+            stated += [name for name, default in (("delay", 0), ("mean", 1)) if getattr(self, name) != default]
+            if stated:
+                yield f"{', '.join(stated)} concern estimates of faults: name these (faults), or leave them out."
         if self.states is not None and self.faults is not None and self.poles is not None:
             yield "poles are of one observer: give decay, or design states and faults one at a time."
         if self.residuals is not None:
-            given = [name for name in ("faults", "states", "fault_rate") if getattr(self, name) is not None]
+            stated = [name for name in ("faults", "states", "fault_rate") if getattr(self, name) is not None]
             late = [name for name, default in (("delay", 0), ("mean", 1)) if getattr(self, name) != default]
-            if given or late or self.joint:
-                listed = [*given, *late, *(["joint"] if self.joint else [])]
+            if stated or late or self.joint:
+                listed = [*stated, *late, *(["joint"] if self.joint else [])]
                 yield f"{', '.join(listed)} concern estimates: leave them out if you ask for residuals only."
 
     def rates(self, plant: DescriptorSystem) -> FloatArray | None:
@@ -211,17 +211,17 @@ class FunctionalFilter(Method):
         return ErrorModel(plant, observer, matrices["T"], -matrices["T0"], decoupled=True)
 
 
-def _by_name(given: Any, names: Sequence[str], option: str, *, missing: float | None) -> FloatArray:
+def _by_name(numbers: Any, names: Sequence[str], option: str, *, missing: float | None) -> FloatArray:
     """Return a number for each name, from one number or a mapping."""
     path = f"{OPTIONS_PATH}.{option}"
-    if isinstance(given, Mapping):
-        unknown = [name for name in given if name not in names]
-        lacking = [name for name in names if name not in given]
+    if isinstance(numbers, Mapping):
+        unknown = [name for name in numbers if name not in names]
+        lacking = [name for name in names if name not in numbers]
         if unknown or (lacking and missing is None):
             raise SpecError(f"{option} must name {', '.join(names)}: unknown {unknown}, missing {lacking}.", path=path)
-        values = [given.get(name, missing) for name in names]
+        values = [numbers.get(name, missing) for name in names]
     else:
-        values = [given] * len(names)
+        values = [numbers] * len(names)
     if not all(is_finite_number(value) and value >= 0.0 for value in values) or not any(values):
-        raise SpecError(f"{option} is {given!r}: give positive numbers, one for all or by name.", path=path)
+        raise SpecError(f"{option} is {numbers!r}: give positive numbers, one for all or by name.", path=path)
     return np.array(values, dtype=np.float64)

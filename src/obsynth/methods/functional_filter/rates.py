@@ -57,8 +57,8 @@ def settling_time(plant: DescriptorSystem) -> float:
     alive = np.sort(moving_speeds(structure_of(plant).finite_eigenvalues, plant.dt, own))
     # The median, for which numpy would load its masked arrays.
     middle = 0.5 * (alive[(alive.size - 1) // 2] + alive[alive.size // 2]) if alive.size else 0.0
-    wanted = STEP_TIME_CONSTANTS / float(middle) if alive.size else max(plant.dt, 1.0) * 10.0
-    return max(wanted, LEAST_SAMPLES * plant.dt)
+    seconds = STEP_TIME_CONSTANTS / float(middle) if alive.size else max(plant.dt, 1.0) * 10.0
+    return max(seconds, LEAST_SAMPLES * plant.dt)
 
 
 def default_rates(
@@ -84,8 +84,8 @@ def default_rates(
         return tried[exponent]
 
     def missed(exponent: float, seconds: float) -> float:
-        found = gain(exponent)
-        return np.inf if found is None else step_misses(model, found, seconds)
+        trial_gain = gain(exponent)
+        return np.inf if trial_gain is None else step_misses(model, trial_gain, seconds)
 
     exponents = [float(e) for e in range(-DECADES, DECADES + 1)]
     for waited in range(longer + 1):
@@ -98,7 +98,7 @@ def default_rates(
         least = min(misses)
         if least <= NOTHING_SHOWN:
             break
-    if not any(found is not None for found in tried.values()):
+    if not any(slow_gain is not None for slow_gain in tried.values()):
         raise SolverError("No random-walk intensity of the fault gives a stable filter: give fault_rate, or poles.")
     high = exponents[len(misses) - 1]
     if least > RATE_REACHED:
@@ -111,13 +111,13 @@ def default_rates(
             middle = 0.5 * (low + high)
             low, high = (low, middle) if missed(middle, seconds) <= RATE_REACHED else (middle, high)
     walks = 10.0**high * unit
-    found = _forgetting(model, walks, _known(gain(high)), seconds, lag)
-    return walks, replace(found, seen=(seconds, step_misses(model, found, seconds)))
+    slow_gain = _forgetting(model, walks, _known(gain(high)), seconds, lag)
+    return walks, replace(slow_gain, step_time_and_miss=(seconds, step_misses(model, slow_gain, seconds)))
 
 
-def _forgetting(model: FilterModel, walks: FloatArray, found: KalmanGain, seconds: float, lag: int) -> KalmanGain:
+def _forgetting(model: FilterModel, walks: FloatArray, gain: KalmanGain, seconds: float, lag: int) -> KalmanGain:
     """Return the gain, or one for the same walks whose errors do not stay for good, where there is one."""
-    speed = slowest_decay(model.A - found.K @ model.C, model.dt)
+    speed = slowest_decay(model.A - gain.K @ model.C, model.dt)
     for times in TOO_SLOW:
         slowest = 1.0 / (times * seconds)
         if not speed < slowest:
@@ -126,7 +126,7 @@ def _forgetting(model: FilterModel, walks: FloatArray, found: KalmanGain, second
             return kalman_gain(model, walks, lag=lag, decay=slowest)
         except SolverError:
             continue
-    return found
+    return gain
 
 
 def step_misses(model: FilterModel, gain: KalmanGain, seconds: float) -> float:
@@ -203,9 +203,9 @@ def _smoothed(
     p: FloatArray, c: FloatArray, closed: FloatArray, estimate: FloatArray, gains: Sequence[FloatArray]
 ) -> list[float]:
     """Return the deviation of the estimate at each of `TRIED_LAGS`."""
-    known, moved, found = np.zeros_like(p), p.copy(), []
+    known, moved, deviations = np.zeros_like(p), p.copy(), []
     for gain in gains[: max(TRIED_LAGS) + 1]:
         known = known + gain @ c @ moved
         moved = closed @ moved
-        found.append(float(np.sqrt(max((estimate @ (p - known) @ estimate.T)[0, 0], 0.0))))
-    return [found[lag] for lag in TRIED_LAGS]
+        deviations.append(float(np.sqrt(max((estimate @ (p - known) @ estimate.T)[0, 0], 0.0))))
+    return [deviations[lag] for lag in TRIED_LAGS]

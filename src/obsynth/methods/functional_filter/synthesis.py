@@ -48,21 +48,21 @@ from obsynth.verification.inequalities import slowest_decay, stability_factor
 SLOW_ERRORS = 20.0
 
 
-def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Callable[[str], None]) -> Synthesis:
+def synthesise(plant: DescriptorSystem, method: FunctionalFilter, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the filter; see `obsynth.functional_filter` for the options, results and errors."""
-    _require_samples(plant, asked)
-    model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
+    _require_samples(plant, method)
+    model = exosystem(method.fault_model, plant.fault_names, plant.dt)
     progress("checking the existence conditions")
-    require_all_conditions(asked.existence(plant))
-    noisy, notes = _with_noise(plant, asked)
+    require_all_conditions(method.existence(plant))
+    noisy, notes = _with_noise(plant, method)
     progress("decoupling the unknown inputs")
-    models = _models(noisy, model, asked)
+    models = _models(noisy, model, method)
     progress("choosing the gains")
-    of_states = _state_parts(noisy, model, asked)
+    of_states = _state_parts(noisy, model, method)
     for longer in (MOST_LONGER, 0):
-        parts, rates, seen = _parts(noisy, models, asked, longer)
-        observer, t, t0 = assembled(plant, [*of_states, *parts], _residual_names(plant, models, parts, asked))
-        if not any(seconds > settling_time(plant) for seconds, _ in seen) or _is_above_rounding(plant, observer):
+        parts, rates, step_times = _parts(noisy, models, method, longer)
+        observer, t, t0 = assembled(plant, [*of_states, *parts], _residual_names(plant, models, parts, method))
+        if not any(seconds > settling_time(plant) for seconds, _ in step_times) or _is_above_rounding(plant, observer):
             break
     progress("building the realisation and its certificate")
     estimated = [plant.fault_names.index(name) for name in observer.fault_names]
@@ -81,24 +81,24 @@ def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Ca
     matrices["deviations"] = estimate_deviations(noisy, observer, matrices)
     slowest = slowest_decay(observer.Az, plant.dt)
     claims = {"order": float(observer.order), **({"decay": slowest} if np.isfinite(slowest) else {})}
-    options = _resolved(asked, plant, model, rates, estimated)
+    options = _resolved(method, plant, model, rates, estimated)
     return Synthesis(
         options,
         {"T": t, "T0": t0},
         observer,
         Certificate(matrices, claims),
-        notes=(*notes, *_notes(plant, slowest, rates, seen)),
+        notes=(*notes, *_notes(plant, slowest, rates, step_times)),
         plant=noisy if noisy is not plant else None,
     )
 
 
-def _state_parts(plant: DescriptorSystem, model: Exosystem, asked: FunctionalFilter) -> list[FilterPart]:
+def _state_parts(plant: DescriptorSystem, model: Exosystem, method: FunctionalFilter) -> list[FilterPart]:
     """Return the filter of the states asked for, if any."""
-    places = chosen_states(asked.states, plant)
+    places = chosen_states(method.states, plant)
     if not places:
         return []
     free = filter_model(plant, model, removed=range(plant.nf), faults=())
-    fixed = fixed_modes(plant, without_faults(plant), free.T, asked.decay or 0.0)
+    fixed = fixed_modes(plant, without_faults(plant), free.T, method.decay or 0.0)
     free = replace(
         free,
         A=block_diag(free.A, fixed.A),
@@ -107,8 +107,8 @@ def _state_parts(plant: DescriptorSystem, model: Exosystem, asked: FunctionalFil
         T=np.vstack([free.T, fixed.T]),
     )
     goals = state_goals(plant, places, free.T)
-    rate = asked.decay or 1.0 / settling_time(plant)
-    return [functional_part(free, goals, rate=rate, poles=asked.poles, places=places)]
+    rate = method.decay or 1.0 / settling_time(plant)
+    return [functional_part(free, goals, rate=rate, poles=method.poles, places=places)]
 
 
 def _is_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> bool:
@@ -120,17 +120,17 @@ def _is_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> boo
     return True
 
 
-def require_stated(plant: DescriptorSystem, asked: FunctionalFilter) -> None:
+def require_stated(plant: DescriptorSystem, method: FunctionalFilter) -> None:
     """Raise `PreconditionError` where a Kalman gain would be infinite: a combination of the outputs has no noise."""
-    _require_samples(plant, asked)
-    noisy, _ = _with_noise(plant, asked)
-    if asked.poles is None and not _is_for_states_alone(asked):
-        for model in _models(noisy, exosystem(asked.fault_model, plant.fault_names, plant.dt), asked):
+    _require_samples(plant, method)
+    noisy, _ = _with_noise(plant, method)
+    if method.poles is None and not _is_for_states_alone(method):
+        for model in _models(noisy, exosystem(method.fault_model, plant.fault_names, plant.dt), method):
             require_noise(model, noisy.output_names, noisy.Dw)
 
 
-def _require_samples(plant: DescriptorSystem, asked: FunctionalFilter) -> None:
-    late = [name for name, default in (("delay", 0), ("mean", 1)) if getattr(asked, name) != default]
+def _require_samples(plant: DescriptorSystem, method: FunctionalFilter) -> None:
+    late = [name for name, default in (("delay", 0), ("mean", 1)) if getattr(method, name) != default]
     if late and not plant.dt > 0.0:
         raise SpecError(
             f"{' and '.join(late)} count samples, but the plant is continuous: sample it (transform: sample_time).",
@@ -138,150 +138,150 @@ def _require_samples(plant: DescriptorSystem, asked: FunctionalFilter) -> None:
         )
 
 
-def _with_noise(plant: DescriptorSystem, asked: FunctionalFilter) -> tuple[DescriptorSystem, tuple[str, ...]]:
+def _with_noise(plant: DescriptorSystem, method: FunctionalFilter) -> tuple[DescriptorSystem, tuple[str, ...]]:
     """Return the plant with the noise that the gains are for."""
-    given = asked.sensor_noise(plant)
-    if given is None and plant.nw:
+    stated = method.sensor_noise(plant)
+    if stated is None and plant.nw:
         return plant, ()
-    if given is None and (asked.poles is not None or _is_for_states_alone(asked)):
+    if stated is None and (method.poles is not None or _is_for_states_alone(method)):
         return plant, ()
-    deviations = np.ones(plant.ny) if given is None else given
+    deviations = np.ones(plant.ny) if stated is None else stated
     process = np.flatnonzero(plant.Bw.any(axis=0))
     named = [f"noise {name}" for name in plant.output_names]
-    names = assumed_noise_names(plant.output_names) if given is None else named
+    names = assumed_noise_names(plant.output_names) if stated is None else named
     noisy = plant.replace(
         Bw=np.hstack([plant.Bw[:, process], np.zeros((plant.nx, plant.ny))]),
         Dw=np.hstack([plant.Dw[:, process] * 0.0, np.diag(deviations)]),
         noise_names=[*(plant.noise_names[i] for i in process), *names],
     )
     note = "No noise is stated: every sensor is assumed to have the standard deviation 1 in its own unit."
-    return noisy, () if given is not None else (note,)
+    return noisy, () if stated is not None else (note,)
 
 
-def _is_for_states_alone(asked: FunctionalFilter) -> bool:
-    return asked.states is not None and asked.faults is None
+def _is_for_states_alone(method: FunctionalFilter) -> bool:
+    return method.states is not None and method.faults is None
 
 
-def _models(plant: DescriptorSystem, model: Exosystem, asked: FunctionalFilter) -> list[FilterModel]:
+def _models(plant: DescriptorSystem, model: Exosystem, method: FunctionalFilter) -> list[FilterModel]:
     """Return a filter model for each group of faults that one filter serves."""
-    if _is_for_states_alone(asked):
+    if _is_for_states_alone(method):
         return []
-    groups = sets = residual_sets(asked.residuals, plant)
+    groups = sets = residual_sets(method.residuals, plant)
     if groups is None:
-        chosen = chosen_faults(asked.faults, plant)
-        groups = [chosen] if asked.joint else [[fault] for fault in chosen]
-    others = ([j for j in range(plant.nf) if j not in group] for group in groups)
+        chosen = chosen_faults(method.faults, plant)
+        groups = [chosen] if method.joint else [[fault] for fault in chosen]
+    complements = ([j for j in range(plant.nf) if j not in group] for group in groups)
     return [
         filter_model(plant, model, removed=removed, faults=group if sets is None else ())
-        for group, removed in zip(groups, others, strict=True)
+        for group, removed in zip(groups, complements, strict=True)
     ]
 
 
 def _parts(
-    plant: DescriptorSystem, models: Sequence[FilterModel], asked: FunctionalFilter, longer: int
+    plant: DescriptorSystem, models: Sequence[FilterModel], method: FunctionalFilter, longer: int
 ) -> tuple[list[FilterPart], list[FloatArray], list[tuple[float, float]]]:
     """Return the filters, the walks of their fault models' states, and when steps are seen with walks by default."""
-    if asked.poles is not None and models:
-        return _placed(plant, models, asked), [np.zeros(model.drive.shape[1]) for model in models], []
-    given = asked.rates(plant)
-    parts, rates, seen = [], [], []
+    if method.poles is not None and models:
+        return _placed(plant, models, method), [np.zeros(model.drive.shape[1]) for model in models], []
+    stated_rates = method.rates(plant)
+    parts, rates, step_times = [], [], []
     for model in models:
         require_noise(model, plant.output_names, plant.Dw)
-        walks, gain = _gain(plant, model, given, asked, longer)
+        walks, gain = _gain(plant, model, stated_rates, method, longer)
         rates.append(walks)
-        seen += [] if gain.seen is None else [gain.seen]
-        parts.append(filter_part(model, gain, whitening(gain.innovation), delay=asked.delay, mean=asked.mean))
-    return parts, rates, seen
+        step_times += [] if gain.step_time_and_miss is None else [gain.step_time_and_miss]
+        parts.append(filter_part(model, gain, whitening(gain.innovation), delay=method.delay, mean=method.mean))
+    return parts, rates, step_times
 
 
 def _gain(
-    plant: DescriptorSystem, model: FilterModel, given: FloatArray | None, asked: FunctionalFilter, longer: int
+    plant: DescriptorSystem, model: FilterModel, stated_rates: FloatArray | None, method: FunctionalFilter, longer: int
 ) -> tuple[FloatArray, KalmanGain]:
     if not model.drive.shape[1]:
-        return np.zeros(0), kalman_gain(model, np.zeros(0), decay=asked.decay or 0.0, insist=True)
-    if given is not None or asked.decay is not None:
+        return np.zeros(0), kalman_gain(model, np.zeros(0), decay=method.decay or 0.0, insist=True)
+    if stated_rates is not None or method.decay is not None:
         walks = np.zeros(model.drive.shape[1])
-        if given is not None:
+        if stated_rates is not None:
             for row, fault in zip(model.estimate[:, model.order :], model.faults, strict=True):
-                walks[row != 0.0] = given[fault]
-                if not given[fault] and not asked.decay:
+                walks[row != 0.0] = stated_rates[fault]
+                if not stated_rates[fault] and not method.decay:
                     raise SpecError(
                         f"fault_rate has no entry for {plant.fault_names[fault]}, which is to be estimated: with a "
                         "random-walk intensity of 0 it is a constant, and errors of its estimate would never decay.",
                         path="method.options.fault_rate",
                     )
-        return walks, kalman_gain(model, walks, lag=asked.delay, decay=asked.decay or 0.0, insist=True)
-    return default_rates(model, settling_time(plant), lag=asked.delay, longer=longer)
+        return walks, kalman_gain(model, walks, lag=method.delay, decay=method.decay or 0.0, insist=True)
+    return default_rates(model, settling_time(plant), lag=method.delay, longer=longer)
 
 
-def _placed(plant: DescriptorSystem, models: Sequence[FilterModel], asked: FunctionalFilter) -> list[FilterPart]:
+def _placed(plant: DescriptorSystem, models: Sequence[FilterModel], method: FunctionalFilter) -> list[FilterPart]:
     """Return the filters with the poles asked for: one list, or one for each of several filters."""
-    given = [asked.poles] if len(models) == 1 else list(asked.poles)
-    if len(given) != len(models) or not all(isinstance(entry, (list, tuple, np.ndarray)) for entry in given):
+    pole_sets = [method.poles] if len(models) == 1 else list(method.poles)
+    if len(pole_sets) != len(models) or not all(isinstance(entry, (list, tuple, np.ndarray)) for entry in pole_sets):
         orders = ", ".join(str(len(model.A)) for model in models)
         raise SpecError(
             f"{len(models)} filters are asked for, with {orders} poles: give a list of poles for each, such as "
             "[[-1], [-2, -3]], or ask for one fault, one set of residuals, or joint estimates.",
             path="method.options.poles",
         )
-    return [_placed_filter(plant, model, poles, asked) for model, poles in zip(models, given, strict=True)]
+    return [_placed_filter(plant, model, poles, method) for model, poles in zip(models, pole_sets, strict=True)]
 
 
 def _placed_filter(
-    plant: DescriptorSystem, model: FilterModel, poles: Sequence[Any], asked: FunctionalFilter
+    plant: DescriptorSystem, model: FilterModel, poles: Sequence[Any], method: FunctionalFilter
 ) -> FilterPart:
     fixed = np.zeros(0, dtype=np.complex128)
-    wanted = checked_poles(poles, len(model.A), fixed, plant.dt, of="functional-filter")
-    gain = place(model.A, model.C, wanted, dt=plant.dt)[0]
+    wanted_poles = checked_poles(poles, len(model.A), fixed, plant.dt, of="functional-filter")
+    gain = place(model.A, model.C, wanted_poles, dt=plant.dt)[0]
     lag = (np.zeros_like(gain),) if plant.dt > 0.0 else ()
     noise = model.M @ model.M.T if plant.nw and rounding_rank(model.M) == len(model.M) else np.eye(len(model.C))
-    return filter_part(model, KalmanGain(gain, lag, noise), whitening(noise), delay=0, mean=asked.mean)
+    return filter_part(model, KalmanGain(gain, lag, noise), whitening(noise), delay=0, mean=method.mean)
 
 
 def _residual_names(
     plant: DescriptorSystem,
     models: Sequence[FilterModel],
     parts: Sequence[FilterPart],
-    asked: FunctionalFilter,
+    method: FunctionalFilter,
 ) -> list[str]:
-    sets = residual_sets(asked.residuals, plant)
+    sets = residual_sets(method.residuals, plant)
     names = []
     for number, part in enumerate(parts):
-        seen = part.faults if sets is None else sets[number]
+        own_faults = part.faults if sets is None else sets[number]
         alone = len(parts) == 1
-        label = "" if alone else f"{' '.join(plant.fault_names[i] for i in seen)}: "
+        label = "" if alone else f"{' '.join(plant.fault_names[i] for i in own_faults)}: "
         names += [f"{label}r{i + 1}" for i in range(len(part.residuals.C))]
     return names if len(set(names)) == len(names) else [f"{i + 1}: {name}" for i, name in enumerate(names)]
 
 
 def _resolved(
-    asked: FunctionalFilter,
+    method: FunctionalFilter,
     plant: DescriptorSystem,
     model: Exosystem,
     rates: Sequence[FloatArray],
     estimated: Sequence[int],
 ) -> dict[str, Any]:
     """Return the options as plain data, for the gain set."""
-    found = asked.as_plain()
-    found["faults"] = (
+    options = method.as_plain()
+    options["faults"] = (
         None
-        if asked.residuals is not None or _is_for_states_alone(asked)
+        if method.residuals is not None or _is_for_states_alone(method)
         else [plant.fault_names[i] for i in estimated]
     )
-    found["fault_model_in_words"] = dict(zip(plant.fault_names, model.descriptions, strict=True))
+    options["fault_model_in_words"] = dict(zip(plant.fault_names, model.descriptions, strict=True))
     chosen = np.concatenate([np.zeros(0), *rates])
-    found["fault_rate_found"] = None if asked.fault_rate is not None or not chosen.any() else chosen.tolist()
-    return found
+    options["fault_rate_found"] = None if method.fault_rate is not None or not chosen.any() else chosen.tolist()
+    return options
 
 
 def _notes(
-    plant: DescriptorSystem, slowest: float, rates: Sequence[FloatArray], seen: Sequence[tuple[float, float]]
+    plant: DescriptorSystem, slowest: float, rates: Sequence[FloatArray], step_times: Sequence[tuple[float, float]]
 ) -> list[str]:
     notes = []
     unit = "per sample" if plant.dt > 0.0 else "per square root of a second"
-    if seen:
+    if step_times:
         largest = float(max(np.max(walk, initial=0.0) for walk in rates))
-        seconds, missed = (max(values) for values in zip(*seen, strict=True))
+        seconds, missed = (max(values) for values in zip(*step_times, strict=True))
         close = (
             "" if missed <= RATE_REACHED else f" (with any intensity, up to {missed:.0%} of it are still missing then)"
         )

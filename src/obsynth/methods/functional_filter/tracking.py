@@ -23,24 +23,24 @@ def tracking_map(errors: ErrorModel, phi: FloatArray, cw: FloatArray) -> FloatAr
     """Return Pi ``(nz, nw)``: where eps goes when every fault follows its model, ``Az Pi + b Cw = Pi Phi``."""
     from scipy.linalg import solve_sylvester
 
-    entering = -errors.fault @ cw
-    if not entering.size:
-        return np.zeros(entering.shape)
-    exact = _with_digits_to_spare(errors.Az, phi, entering) if entering.size <= MOST_RATIONAL_UNKNOWNS else None
-    return np.asarray(solve_sylvester(errors.Az, -phi, -entering)) if exact is None else exact
+    driving = -errors.fault @ cw
+    if not driving.size:
+        return np.zeros(driving.shape)
+    exact = _with_digits_to_spare(errors.Az, phi, driving) if driving.size <= MOST_RATIONAL_UNKNOWNS else None
+    return np.asarray(solve_sylvester(errors.Az, -phi, -driving)) if exact is None else exact
 
 
-def _with_digits_to_spare(a: FloatArray, phi: FloatArray, entering: FloatArray) -> FloatArray | None:
+def _with_digits_to_spare(a: FloatArray, phi: FloatArray, driving: FloatArray) -> FloatArray | None:
     """Return Pi to its last digit, however near a slow pole is to the fault model; ``None`` where it has one."""
-    order, count = entering.shape
-    whole, right = np.kron(a, np.eye(count)), np.kron(np.eye(order), phi.T)
+    order, count = driving.shape
+    dynamics, right = np.kron(a, np.eye(count)), np.kron(np.eye(order), phi.T)
     with flint.ctx.workprec(EXPONENTIAL_BITS):
-        own, model, known = (arb_matrix(np.asarray(part)) for part in (whole, right, entering.reshape(-1, 1)))
+        own, model, known = (arb_matrix(np.asarray(part)) for part in (dynamics, right, driving.reshape(-1, 1)))
         try:
-            found = (model - own).solve(known)
+            solution = (model - own).solve(known)
         except ZeroDivisionError:
             return None
-    return as_ball(found).midpoint.reshape(order, count)
+    return as_ball(solution).midpoint.reshape(order, count)
 
 
 def wanted_faults(

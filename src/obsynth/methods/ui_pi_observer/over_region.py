@@ -146,7 +146,7 @@ def _synthesis(
         G=None if found.witness.G is None else [G / states / states[:, None] for G in found.witness.G],
     )
     wanted = None if not decay else float(np.exp(-decay * plant.dt)) if plant.dt > 0.0 else decay
-    shrinking = proved_decay(shipped.errors, shipped.none, witness, wanted=wanted)
+    shrinking = proved_decay(shipped.errors, shipped.none, witness, required=wanted)
     matrices: dict[str, FloatArray] = {"tracking": U_a, "Phi": model.Phi, "Cw": model.Cw}
     matrices |= _stored(witness, WITNESSES)
     claims, runs, slow = {"region_decay": shrinking}, list(found.runs), None

@@ -43,10 +43,11 @@ def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> di
     made_of = _terms(stated.recursion.model.at(steps - 1), before, (y[-1], u[-2], u[-1]))
     covariance = exact.factor @ exact.factor.T
     size = made_of[:, 0] + np.abs(exact.estimate[:, 0]) + np.finfo(np.float64).tiny
-    found = running.factor @ running.factor.T
+    shipped_covariance = running.factor @ running.factor.T
     gaps = {
         "state": np.abs(running.x - exact.estimate[:, 0]) / size,
-        "covariance": np.abs(found - covariance) / np.maximum(np.outer(size, size), np.finfo(np.float64).tiny),
+        "covariance": np.abs(shipped_covariance - covariance)
+        / np.maximum(np.outer(size, size), np.finfo(np.float64).tiny),
     }
     if running.Upsilon.shape[1]:
         regressor = exact.estimate[:, 1:]
@@ -80,8 +81,8 @@ def _record(observer: RecursiveObserver, samples: int) -> tuple[FloatArray, Floa
     rows = _row_sizes(observer, H, S)
     moved = H * np.tile(natural_units(observer), samples)
     triangle = qr((np.hstack([moved, S[:, S.any(axis=0)]]) / rows[:, None]).T, mode="r")[0]
-    basis, kept, _ = qr(triangle[: len(H)].T, pivoting=True)
-    sizes = np.abs(np.diagonal(kept))
+    basis, upper, _ = qr(triangle[: len(H)].T, pivoting=True)
+    sizes = np.abs(np.diagonal(upper))
     perfect = basis[:, numerical_rank(sizes) :] / rows[:, None]
     if not perfect.shape[1]:
         return y, u
@@ -89,7 +90,7 @@ def _record(observer: RecursiveObserver, samples: int) -> tuple[FloatArray, Floa
     zero = np.zeros(y.size + u.size)
     none = _data(observer, *_split(zero, y, u))[:, 0]
     unit = np.eye(zero.size)
-    effect = np.array([perfect.T @ (_data(observer, *_split(one, y, u))[:, 0] - none) for one in unit]).T
+    effect = np.array([perfect.T @ (_data(observer, *_split(sample, y, u))[:, 0] - none) for sample in unit]).T
     flat = np.concatenate([y.ravel(), u.ravel()])
     return _split(flat - np.linalg.pinv(effect, rcond=RANK_TOLERANCE) @ (perfect.T @ data[:, 0]), y, u)
 
@@ -112,9 +113,9 @@ def _solved(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> tuple[
     # A factorisation adds rows: in units in which they are alike, which are powers of two, none loses its digits.
     rows = _row_sizes(observer, H, S)
     H, S, data = (part / rows[:, None] for part in (H, S, data))
-    found = least_squares_step(H, S, data) or rank_revealing_step(H, S, data, np.zeros((len(H), 0)))
-    largest = np.linalg.norm(found.estimate.reshape(len(y), n, -1), axis=1).max(axis=0)
-    last = LeastSquaresStep(found.estimate[-n:], found.factor[-n:], found.innovation, found.diffuse[-n:])
+    solution = least_squares_step(H, S, data) or rank_revealing_step(H, S, data, np.zeros((len(H), 0)))
+    largest = np.linalg.norm(solution.estimate.reshape(len(y), n, -1), axis=1).max(axis=0)
+    last = LeastSquaresStep(solution.estimate[-n:], solution.factor[-n:], solution.innovation, solution.diffuse[-n:])
     return last, np.asarray(largest)
 
 
@@ -148,8 +149,8 @@ def _problem(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> tuple
         H = np.vstack([H, np.hstack([first.H[n:], np.zeros((len(model.late), n * steps))])])
         roots.append(first.noise[n:])
     S = np.zeros((len(H), max(sum(root.shape[1] for root in roots), len(H))))
-    top = left = 0
+    top = column = 0
     for root in roots:
-        S[top : top + len(root), left : left + root.shape[1]] = root
-        top, left = top + len(root), left + root.shape[1]
+        S[top : top + len(root), column : column + root.shape[1]] = root
+        top, column = top + len(root), column + root.shape[1]
     return H, S, _data(observer, y, u)

@@ -140,18 +140,18 @@ def _dynamic_rows(
         detail=f"at k = {ranks.directions_k}",
     )
     in_batch = batch_steps(stated)
-    said = f"{in_batch} steps at once" + (
+    span = f"{in_batch} steps at once" + (
         ", which the size of the plant allows" if in_batch < min(BATCH_STEPS, looked_at(stated)) else ""
     )
-    for name, found in batch_residuals(stated, observer).items():
+    for name, gap in batch_residuals(stated, observer).items():
         yield upper_bound_check(
             f"batch: {name}",
             "the recursion equals the least-squares solution of the whole record",
-            found,
+            gap,
             BATCH_TOLERANCE * ranks.condition,
             source=f"{SOURCE}, (6)-(10)",
             kind="equality",
-            detail=said,
+            detail=span,
         )
     # Where both hold the same matrices, they need not be recomputed.
     followed = facts.steps - int(observer.early_constraints)
@@ -210,7 +210,7 @@ def _contraction_row(facts: GainScheduleSummary, proof: HorizonProof | None) -> 
 
 def _claims(design: ObserverDesign, facts: GainScheduleSummary, ranks: HorizonRanks) -> Check:
     claims = design.certificate.claims
-    found = {
+    values = {
         "condition": ranks.condition,
         "residual_directions": float(ranks.directions),
         "contraction": facts.contraction,
@@ -220,19 +220,19 @@ def _claims(design: ObserverDesign, facts: GainScheduleSummary, ranks: HorizonRa
         "condition_k": (ranks.condition_k, ranks.condition),
         "excitation_k": (facts.excitation_k, facts.excitation),
     }
-    found |= {name: float(k) for name, (k, value) in places.items() if name in claims and not np.isnan(value)}
+    values |= {name: float(k) for name, (k, value) in places.items() if name in claims and not np.isnan(value)}
     if not np.isnan(facts.excitation):
-        found["excitation"] = facts.excitation
+        values["excitation"] = facts.excitation
     # An excitation that is all rounding has no digits to compare.
-    return claims_row(design, found, rough=("excitation",))
+    return claims_row(design, values, rough=("excitation",))
 
 
-def claims_row(design: ObserverDesign, found: Mapping[str, float], *, rough: Collection[str]) -> Check:
+def claims_row(design: ObserverDesign, values: Mapping[str, float], *, rough: Collection[str]) -> Check:
     """Return the row that claimed numbers are found again, relative to their size; small ``rough`` ones as they are."""
     claims, tiny = design.certificate.claims, float(np.finfo(np.float64).tiny)
     gaps = [
         abs(claims.get(name, np.nan) - value) / max(abs(value), CLAIM_TOLERANCE if name in rough else tiny)
-        for name, value in found.items()
+        for name, value in values.items()
     ]
     return upper_bound_check(
         "claims", "every claimed number is found again", float(np.max(gaps)), CLAIM_TOLERANCE, source="certificate"

@@ -71,10 +71,10 @@ def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
             scores[k + 1] = normalised(joint, root, terms)
         factor = gains.factor
     yield from _error_rows(scores)
-    squares = np.concatenate([np.zeros(0), *(found.ravel() for found in nis)]) ** 2
+    squares = np.concatenate([np.zeros(0), *(block.ravel() for block in nis)]) ** 2
     if squares.size:
         yield _band("NIS", "squared whitened innovations per degree of freedom are one", squares)
-        products = np.concatenate([found.ravel() for found in pairs])
+        products = np.concatenate([block.ravel() for block in pairs])
         if products.size:
             yield _estimated(
                 "whiteness",
@@ -100,29 +100,29 @@ def state_terms(step: StepMatrices, sizes: FloatArray) -> FloatArray:
     problem.add(step.H, range(rows), range(rows, rows + columns))
     # In the units given a part of it may be less than what a pseudoinverse takes for zero.
     units = np.exp2(np.round(problem.solve()))
-    left, own = units[:rows], units[rows:]
-    inverse = own[:, None] * np.linalg.pinv(left[:, None] * step.H * own) * left
-    terms = (np.abs(inverse) @ sizes).T / own
-    return np.asarray(((terms + ROUNDED_BESIDE * np.max(terms, axis=-1, keepdims=True)) * own).T)
+    row_units, state_units = units[:rows], units[rows:]
+    inverse = state_units[:, None] * np.linalg.pinv(row_units[:, None] * step.H * state_units) * row_units
+    terms = (np.abs(inverse) @ sizes).T / state_units
+    return np.asarray(((terms + ROUNDED_BESIDE * np.max(terms, axis=-1, keepdims=True)) * state_units).T)
 
 
 def normalised(errors: FloatArray, root: FloatArray, terms: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return ``errors (trials, n)`` in units of their covariance ``root root'``, of the rank beside ``terms (n,)``, and
     those that are claimed to be zero in units of the terms."""
     sizes = np.where(terms > 0.0, terms, 1.0)
-    left, values, _ = np.linalg.svd(root / sizes[:, None])
-    found = (errors / sizes) @ left
-    kept = np.flatnonzero(values > KNOWN_SHARE)
-    return np.asarray(found[:, kept] / values[kept]), np.delete(found, kept, axis=1)
+    basis, values, _ = np.linalg.svd(root / sizes[:, None])
+    turned = (errors / sizes) @ basis
+    certain = np.flatnonzero(values > KNOWN_SHARE)
+    return np.asarray(turned[:, certain] / values[certain]), np.delete(turned, certain, axis=1)
 
 
 def _error_rows(scores: Mapping[int, tuple[FloatArray, FloatArray]]) -> Iterator[Check]:
     """Yield NEES at its worst sample, and the errors in directions without covariance."""
     # Errors at different samples are correlated, fully so without process noise: each has a band of its own.
     rows = [
-        _band("NEES", "squared errors per degree of freedom are one", found**2, f" at k = {k}")
-        for k, (found, _) in scores.items()
-        if found.size
+        _band("NEES", "squared errors per degree of freedom are one", errors**2, f" at k = {k}")
+        for k, (errors, _) in scores.items()
+        if errors.size
     ]
     if rows:
         yield min(rows, key=lambda row: row.margin / (row.bound - 1.0) * np.sign(row.bound - 1.0))

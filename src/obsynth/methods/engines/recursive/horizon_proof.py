@@ -80,14 +80,14 @@ def _followed(
     lengths: list[int] = []
     waiting: list[tuple[StepMatrices, GainStep]] = []
     last: GainStep | None = None
-    for step, found in zip(_true_steps(stated, shipped, steps), gains(shipped, steps), strict=False):
-        step = found.step if step is None else step
+    for step, gain_step in zip(_true_steps(stated, shipped, steps), gains(shipped, steps), strict=False):
+        step = gain_step.step if step is None else step
         # Steps of another size (corrections of x(0)) are stacks of their own.
-        if len(waiting) == AT_ONCE or (waiting and _sizes(*waiting[0]) != _sizes(step, found)):
+        if len(waiting) == AT_ONCE or (waiting and _sizes(*waiting[0]) != _sizes(step, gain_step)):
             bias = max(bias, _closed(waiting, errors, joint, lengths, units))
             waiting = []
-        waiting.append((step, found))
-        last = found
+        waiting.append((step, gain_step))
+        last = gain_step
     if last is None:
         raise SpecError("The plant has no steps.", path="horizon")
     bias = max(bias, _closed(waiting, errors, joint, lengths, units))
@@ -110,9 +110,9 @@ def _true_steps(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
     return chain([] if first is None else [first], (model.at(k) for k in range(steps)))
 
 
-def _sizes(step: StepMatrices, found: GainStep) -> tuple[tuple[int, ...], ...]:
+def _sizes(step: StepMatrices, gain_step: GainStep) -> tuple[tuple[int, ...], ...]:
     """Return the shapes that steps of one stack share."""
-    return step.H.shape, step.A.shape, found.gain.shape, found.learn.shape
+    return step.H.shape, step.A.shape, gain_step.gain.shape, gain_step.learn.shape
 
 
 def _closed(
@@ -133,35 +133,35 @@ def _closed(
 
 def largest_bias(pairs: list[tuple[StepMatrices, GainStep]], units: FloatArray) -> float:
     """Return the largest entry of ``[L K] H - I`` in units of the terms of its row, rounded up."""
-    gains, matrices = np.array([found.gain for _, found in pairs]), np.array([step.H for step, _ in pairs])
+    gains, matrices = np.array([gain_step.gain for _, gain_step in pairs]), np.array([step.H for step, _ in pairs])
     middle, radius = _product(gains, matrices)
-    one = np.eye(middle.shape[1])
-    missed = rounded_up(np.abs(middle - one) + radius, 3)
+    identity = np.eye(middle.shape[1])
+    missed = rounded_up(np.abs(middle - identity) + radius, 3)
     # An entry is judged by what rounding of its whole row does to it, in natural units of the states.
-    sizes = (np.abs(gains) @ np.abs(matrices) + one) * units
+    sizes = (np.abs(gains) @ np.abs(matrices) + identity) * units
     return float(np.max(missed * units / np.max(sizes, axis=2, keepdims=True), initial=0.0))
 
 
 def _product(first: ArrayLike, second: FloatArray) -> _Stack:
     """Return balls that hold the products of two stacks of exact matrices."""
-    left = np.asarray(first, dtype=np.float64)
-    return stacked_product((left, np.zeros_like(left)), (second, np.zeros_like(second)))
+    matrices = np.asarray(first, dtype=np.float64)
+    return stacked_product((matrices, np.zeros_like(matrices)), (second, np.zeros_like(second)))
 
 
 def _transitions(pairs: list[tuple[StepMatrices, GainStep]]) -> tuple[_Stack, _Stack | None]:
     """Return balls of ``L A`` and, with parameters, of the transition of both errors."""
     ne = pairs[0][0].A.shape[0]
     a = np.array([step.A for step, _ in pairs])
-    middle, radius = _product([found.gain[:, :ne] for _, found in pairs], a)
+    middle, radius = _product([gain_step.gain[:, :ne] for _, gain_step in pairs], a)
     nq, nx = pairs[0][1].retain.shape[0], middle.shape[1]
     if not nq:
         return (middle, radius), None
-    taken, taken_radius = _product([found.learn[:, :ne] for _, found in pairs], a)
-    whole, whole_radius = (np.zeros((len(pairs), nx + nq, nx + nq)) for _ in range(2))
-    whole[:, :nx, :nx], whole_radius[:, :nx, :nx] = middle, radius
-    whole[:, nx:, :nx], whole_radius[:, nx:, :nx] = taken, taken_radius
-    whole[:, nx:, nx:] = np.array([found.retain for _, found in pairs])
-    return (middle, radius), (whole, whole_radius)
+    learned, learned_radius = _product([gain_step.learn[:, :ne] for _, gain_step in pairs], a)
+    joint, joint_radius = (np.zeros((len(pairs), nx + nq, nx + nq)) for _ in range(2))
+    joint[:, :nx, :nx], joint_radius[:, :nx, :nx] = middle, radius
+    joint[:, nx:, :nx], joint_radius[:, nx:, :nx] = learned, learned_radius
+    joint[:, nx:, nx:] = np.array([gain_step.retain for _, gain_step in pairs])
+    return (middle, radius), (joint, joint_radius)
 
 
 def _mean_factor(errors: list[Ball], lengths: list[int], factor: FloatArray) -> tuple[float, str]:

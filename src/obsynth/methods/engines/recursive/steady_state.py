@@ -121,15 +121,15 @@ def _steady_covariance(
     noise = L @ Ball.exact(stated.Q.at(0)) @ L.T + K @ Ball.exact(stated.R.at(0)) @ K.T
     with warnings.catch_warnings(action="ignore"):
         # The enclosure says what an ill-conditioned equation costs.
-        found = discrete_lyapunov(transition.midpoint, noise.midpoint)
-    X = Ball.exact((found + found.T) / 2.0)
+        covariance = discrete_lyapunov(transition.midpoint, noise.midpoint)
+    X = Ball.exact((covariance + covariance.T) / 2.0)
     norm = Ball.exact(contraction.Q)
     gap = norm @ (transition @ X @ transition.T + noise - X) @ norm.T
     # One minus the rate squared, in a form that does not cancel: three roundings, which the radius below covers.
     share = (1.0 - contraction.rate) * (1.0 + contraction.rate)
     # Every row of the inverse is seen on its own.
-    seen = rounded_up(column_norms(Ball.exact(contraction.inverse).T) / (1.0 - contraction.defect), 4)
-    radius = rounded_up(np.outer(seen, seen) * gap.frobenius_norm / share, 8)
+    row_sizes = rounded_up(column_norms(Ball.exact(contraction.inverse).T) / (1.0 - contraction.defect), 4)
+    radius = rounded_up(np.outer(row_sizes, row_sizes) * gap.frobenius_norm / share, 8)
     enclosed = Ball(X.midpoint, radius)
     middle, spread = np.diag(X.midpoint), np.diag(radius)
     low, high = np.sqrt(np.maximum(middle - spread, 0.0)), np.sqrt(rounded_up(np.abs(middle) + spread, 4))

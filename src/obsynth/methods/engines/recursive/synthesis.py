@@ -35,12 +35,12 @@ LOST_EXCITATION = 1.0
 
 
 def synthesise(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Method, *, progress: Callable[[str], None]
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, method: Method, *, progress: Callable[[str], None]
 ) -> Synthesis:
     """Put the observer together; see `obsynth.descriptor_kalman` and `obsynth.adaptive_observer`."""
     progress("checking the existence conditions along the horizon")
-    require_all(asked.existence(plant))
-    options = with_stated_noise(plant, asked.as_given())
+    require_all(method.existence(plant))
+    options = with_stated_noise(plant, method.as_given())
     if options.get("guard", "") is None:
         options["guard"] = "none" if options["form"] == "literal" else "regularise"
     progress("computing the gains")
@@ -57,8 +57,8 @@ def synthesise(
     }
     if options["Q"] is not None:
         options["Q"] = reduced.process_covariance(options["Q"])
-    found = _of_varying(reduced.plant, options, missing=missing, own_units=far)
-    return replace(found, notes=(reduced.note, *found.notes))
+    synthesis = _of_varying(reduced.plant, options, missing=missing, own_units=far)
+    return replace(synthesis, notes=(reduced.note, *synthesis.notes))
 
 
 def _of_varying(
@@ -110,9 +110,9 @@ def _contracts(facts: GainScheduleSummary) -> bool:
 
 def _identities(units: PlantUnits, options: Mapping[str, Any]) -> dict[str, FloatArray]:
     """Return the covariances that are not given as identities in units in which a plant is near one."""
-    found = {"Q": 1.0 / units.equations, "R": 1.0 / units.outputs, "initial_covariance": units.states}
-    found["initial_parameter_covariance"] = units.faults
-    return {name: np.diag(size**2) for name, size in found.items() if name in options and options[name] is None}
+    deviations = {"Q": 1.0 / units.equations, "R": 1.0 / units.outputs, "initial_covariance": units.states}
+    deviations["initial_parameter_covariance"] = units.faults
+    return {name: np.diag(size**2) for name, size in deviations.items() if name in options and options[name] is None}
 
 
 def _has_steady_state(observer: RecursiveObserver) -> bool:
@@ -129,13 +129,13 @@ def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary
     if _contracts(facts):
         return
     names = leading_names(facts.survivors, observer.state_names)
-    kept = (
+    factor = (
         f"keeps the mean factor {facts.contraction:.6g} per step"
         if facts.contraction < float("inf")
         else "grows without bound"
     )
     if _has_steady_state(observer):
-        given = f" {' and '.join(identity)} taken as the identity weigh this plant in its units." if identity else ""
+        assumed = f" {' and '.join(identity)} taken as the identity weigh this plant in its units." if identity else ""
         short = (
             "the horizon is too short to decide whether errors decay fast enough"
             if observer.plant.horizon
@@ -143,14 +143,14 @@ def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary
         )
         raise PreconditionError(
             f"Unclear: {short}. The outputs observe every state, and with these Q and R the errors decay in the end; "
-            f"but over {facts.steps} steps the product of L_k A_k {kept}, in {', '.join(map(repr, names))}.{given} "
+            f"but over {facts.steps} steps the product of L_k A_k {factor}, in {', '.join(map(repr, names))}.{assumed} "
             "State Q and R in the units of equations and outputs, or take units in which entries are near one.",
             condition="contraction",
             signals=names,
             unclear=True,
         )
     raise PreconditionError(
-        f"Errors do not decay: over {facts.steps} steps the product of L_k A_k {kept}, in "
+        f"Errors do not decay: over {facts.steps} steps the product of L_k A_k {factor}, in "
         f"{', '.join(map(repr, names))}. Either these states are unobservable: measure more, or leave them out; or Q "
         "and initial_covariance claim that they are known exactly: give them a variance.",
         condition="contraction",
