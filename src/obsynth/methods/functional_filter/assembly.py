@@ -71,7 +71,7 @@ class FilterPart:
 
 
 def filter_part(model: FilterModel, gain: KalmanGain, residual_map: FloatArray, *, delay: int, mean: int) -> FilterPart:
-    """Return the filter of a gain, with a delay in samples; ``residual_map (rows, p)`` makes residuals of innovations."""
+    """Return the filter of a gain, with a delay in samples; ``residual_map (rows, p)``: residuals from innovations."""
     sizes = np.sqrt(np.maximum(np.diag(gain.innovation), 0.0))
     gain = replace(
         gain, K=_without_rounding(gain.K, sizes), lag=tuple(_without_rounding(part, sizes) for part in gain.lag)

@@ -34,24 +34,24 @@ BY_TEST = ("multipliers", "multiplier_radius", "witness", "witness_radius", "rou
 BANK_GROUPS, BANK_PAIRS, PAIR_MULTIPLIERS, PAIR_RADIUS = "groups", "pairs", "pair_multipliers", "pair_radius"
 
 
-def blind_to(asked: Any, plant: DescriptorSystem, fault: int, group: Sequence[int]) -> Any:
+def blind_to(options: Any, plant: DescriptorSystem, fault: int, group: Sequence[int]) -> Any:
     """Return the options of the test of a fault that is blind to all faults outside of a group."""
     names = plant.fault_names
     free = [name for k, name in enumerate(names) if k != fault and k not in group]
-    return replace(asked, isolate=False, fault=names[fault], free=free)
+    return replace(options, isolate=False, fault=names[fault], free=free)
 
 
-def blind_to_one(asked: Any, plant: DescriptorSystem, fault: int, other: int) -> Any:
+def blind_to_one(options: Any, plant: DescriptorSystem, fault: int, other: int) -> Any:
     """Return the options of the test of a fault that is blind to one other alone."""
     names = plant.fault_names
-    return replace(asked, isolate=False, fault=names[fault], free=[names[other]])
+    return replace(options, isolate=False, fault=names[fault], free=[names[other]])
 
 
-def proved_hidden(plant: DescriptorSystem, asked: Any) -> bool:
+def proved_hidden(plant: DescriptorSystem, options: Any) -> bool:
     """Whether numbers that satisfy every equation exactly hide the fault: there is no test with these options."""
-    problem = problem_of(plant, asked)
-    lag = asked.lag or 0
-    return proved_ray(problem.window(samples_decided_on(problem, asked, lag), lag=lag)) is not None
+    problem = problem_of(plant, options)
+    lag = options.lag or 0
+    return proved_ray(problem.window(samples_decided_on(problem, options, lag), lag=lag)) is not None
 
 
 def joined(parts: Sequence[LinearObserver], names: tuple[str, ...]) -> LinearObserver:
@@ -92,10 +92,10 @@ def groups_of(design: ObserverDesign) -> tuple[tuple[int, ...], ...]:
 def tests_of(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]) -> tuple[ObserverDesign, ...]:
     """Return the tests of a bank, each as a design of its own; ``read`` returns options that are checked."""
     plant, observer = design.linear
-    asked, certificate = read(design.options), design.certificate
-    found = []
+    options, certificate = read(design.options), design.certificate
+    tests = []
     for fault, group in enumerate(groups_of(design)):
-        own = blind_to(asked, plant, fault, group)
+        own = blind_to(options, plant, fault, group)
         window = window_as_designed(plant, own)
         cut = {"witness": len(window.inner.bar), "witness_radius": len(window.inner.bar)}
         matrices = {
@@ -104,26 +104,26 @@ def tests_of(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]) -
         if not np.any(matrices.get("witness", 0.0)):
             matrices = {name: value for name, value in matrices.items() if not name.startswith("witness")}
         length = len(window.weights(matrices["multipliers"].ravel())[0]) - 1
-        name, whole = plant.fault_names[fault], observer.order // plant.nf
+        name, registers = plant.fault_names[fault], observer.order // plant.nf
         ending = f"[{name}]"
         claims = {key.removesuffix(ending): value for key, value in certificate.claims.items() if key.endswith(ending)}
         table = certificate.matrices["trade_off"]
-        found.append(
+        tests.append(
             design.replace(
                 name=f"test of {name}",
                 options={field: getattr(own, field) for field in design.options},
                 gains={key.removesuffix(ending): gain for key, gain in design.gains.items() if key.endswith(ending)},
-                observer=_cut(observer, window, fault, whole, length),
+                observer=_cut(observer, window, fault, registers, length),
                 certificate=Certificate({**matrices, "trade_off": table[:, [0, fault + 1]]}, claims),
                 notes=(),
             )
         )
-    return tuple(found)
+    return tuple(tests)
 
 
-def _cut(observer: LinearObserver, window: Any, fault: int, whole: int, length: int) -> LinearObserver:
+def _cut(observer: LinearObserver, window: Any, fault: int, registers: int, length: int) -> LinearObserver:
     """Return the row of one test with its own registers, named as the test alone has it."""
-    at, own = slice(fault * whole, fault * whole + length), [fault]
+    at, own = slice(fault * registers, fault * registers + length), [fault]
     estimated = window.question.course != "step"
     name = (window.plant.fault_names[fault],)
     delay = length + 1 - window.question.samples
@@ -175,9 +175,9 @@ def bank_checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]
     for test in tests:
         for row in checks(test, read):
             yield replace(row, name=f"{row.name}[{test.options['fault']}]")
-    asked = read(design.options)
-    yield from _smallest_groups(design, asked)
-    yield from _pairs(design, asked)
+    options = read(design.options)
+    yield from _smallest_groups(design, options)
+    yield from _pairs(design, options)
 
 
 def hidden_by(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any], fault: int) -> dict[str, FloatArray]:
@@ -185,28 +185,28 @@ def hidden_by(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any], 
     plant, group = design.linear[0], groups_of(design)[fault]
     if len(group) == 1:
         return {}
-    others = [other for other in range(plant.nf) if other != fault]
-    own = blind_to(read(design.options), plant, fault, others[: len(group) - 2])
+    other_faults = [other for other in range(plant.nf) if other != fault]
+    own = blind_to(read(design.options), plant, fault, other_faults[: len(group) - 2])
     problem = problem_of(plant, own)
     window = problem.window(samples_decided_on(problem, own, own.lag or 0), lag=own.lag or 0)
     point = proved_ray(window)
     return {} if point is None else courses_of(window, point)
 
 
-def _smallest_groups(design: ObserverDesign, asked: TestOptions) -> Iterator[Check]:
+def _smallest_groups(design: ObserverDesign, options: TestOptions) -> Iterator[Check]:
     plant = design.linear[0]
     for fault, group in enumerate(groups_of(design)):
         if len(group) == 1:
             continue
-        others = [other for other in range(plant.nf) if other != fault]
-        smaller = [set(chosen) for chosen in combinations(others, len(group) - 2)]
-        left = sum(not proved_hidden(plant, blind_to(asked, plant, fault, sorted(chosen))) for chosen in smaller)
+        other_faults = [other for other in range(plant.nf) if other != fault]
+        smaller = [set(chosen) for chosen in combinations(other_faults, len(group) - 2)]
+        unrefuted = sum(not proved_hidden(plant, blind_to(options, plant, fault, sorted(chosen))) for chosen in smaller)
         name = plant.fault_names[fault]
         yield upper_bound_check(
             f"smallest group[{name}]",
             f"no test of {name} is insensitive to more faults: the other faults can then hide it, by numbers that "
             "satisfy every equation exactly",
-            float(left),
+            float(unrefuted),
             0.0,
             source=BANK_SOURCE,
             kind="proved",
@@ -216,18 +216,18 @@ def _smallest_groups(design: ObserverDesign, asked: TestOptions) -> Iterator[Che
 
 def pairs_of(plant: DescriptorSystem) -> tuple[tuple[int, int], ...]:
     """Return all pairs of a fault and another, in the order of the certificate."""
-    return tuple((one, other) for one in range(plant.nf) for other in range(plant.nf) if one != other)
+    return tuple((fault, other) for fault in range(plant.nf) for other in range(plant.nf) if fault != other)
 
 
-def _pairs(design: ObserverDesign, asked: TestOptions) -> Iterator[Check]:
+def _pairs(design: ObserverDesign, options: TestOptions) -> Iterator[Check]:
     """Yield the row on the table pair by pair; of two faults it is that of the tests themselves."""
     plant, shipped = design.linear[0], design.certificate.matrices
     pairs, wrong = pairs_of(plant), []
     table = shipped.get(BANK_PAIRS)
     fits = table is not None and table.shape == (plant.nf, plant.nf)
-    for place, (one, other) in enumerate(pairs if fits and table is not None else ()):
-        own = blind_to_one(asked, plant, one, other)
-        size = float(table[one, other]) if table is not None else np.nan
+    for place, (fault, other) in enumerate(pairs if fits and table is not None else ()):
+        own = blind_to_one(options, plant, fault, other)
+        size = float(table[fault, other]) if table is not None else np.nan
         if np.isinf(size):
             holds = proved_hidden(plant, own)
         else:
@@ -240,7 +240,7 @@ def _pairs(design: ObserverDesign, asked: TestOptions) -> Iterator[Check]:
             holds = exact is not None and bool(np.all(exact.radius <= test.radius))
             holds = holds and proved_threshold(promised, test, exact_zero=zero) <= size
         if not holds:
-            wrong.append(f"{plant.fault_names[one]} insensitive to {plant.fault_names[other]}")
+            wrong.append(f"{plant.fault_names[fault]} insensitive to {plant.fault_names[other]}")
     yield lower_bound_check(
         "pairs",
         "thresholds pair by pair, and the pairs without a test, hold",

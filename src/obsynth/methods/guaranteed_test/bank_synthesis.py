@@ -37,22 +37,22 @@ from obsynth.results.design import Certificate
 SHARE_ROOM, REMAINDER_ROUNDINGS = 1e-6, 1024.0
 
 
-def synthesise_bank(plant: DescriptorSystem, asked: Any, *, progress: Callable[[str], None]) -> Synthesis:
+def synthesise_bank(plant: DescriptorSystem, options: Any, *, progress: Callable[[str], None]) -> Synthesis:
     """Return one observer with a row for each fault, its certificate, and what an alarm of each row means."""
-    require_all(conditions(plant, replace(asked, isolate=False, fault=plant.fault_names[0]), with_windows=False))
+    require_all(conditions(plant, replace(options, isolate=False, fault=plant.fault_names[0]), with_windows=False))
     progress("searching for the smallest groups that can be isolated")
-    found = [_smallest(plant, asked, fault) for fault in range(plant.nf)]
-    groups, lags, reasons = zip(*found, strict=True)
-    if asked.course == "any" and asked.lag is None:
-        asked = replace(asked, lag=max(lags))
-    tests = [blind_to(asked, plant, fault, group) for fault, group in enumerate(groups)]
+    smallest = [_smallest(plant, options, fault) for fault in range(plant.nf)]
+    groups, lags, reasons = zip(*smallest, strict=True)
+    if options.course == "any" and options.lag is None:
+        options = replace(options, lag=max(lags))
+    tests = [blind_to(options, plant, fault, group) for fault, group in enumerate(groups)]
     progress("searching for the least number of samples")
     tables = [_table(plant, test) for test in tests]
     samples = max(samples for samples, _ in tables)
-    asked = replace(asked, samples=samples)
+    options = replace(options, samples=samples)
     progress(f"proving the thresholds on {samples} samples")
-    made = [synthesise(plant, replace(test, samples=samples, lag=asked.lag), progress=silent) for test in tests]
-    pairs = _pairs(plant, asked)
+    made = [synthesise(plant, replace(test, samples=samples, lag=options.lag), progress=silent) for test in tests]
+    pairs = _pairs(plant, options)
     matrices = _stacked([dict(test.certificate.matrices) for test in made]) | pairs
     matrices |= {
         BANK_GROUPS: np.array([[float(k in group) for k in range(plant.nf)] for group in groups]),
@@ -63,7 +63,7 @@ def synthesise_bank(plant: DescriptorSystem, asked: Any, *, progress: Callable[[
         for fault, test in zip(plant.fault_names, made, strict=True)
         for name, value in test.certificate.claims.items()
     }
-    options = {**made[0].options, "isolate": True, "fault": None, "free": "others"}
+    shipped_options = {**made[0].options, "isolate": True, "fault": None, "free": "others"}
     gains = {
         f"{name}[{fault}]": gain
         for fault, test in zip(plant.fault_names, made, strict=True)
@@ -71,19 +71,19 @@ def synthesise_bank(plant: DescriptorSystem, asked: Any, *, progress: Callable[[
     }
     observer = joined([test.observer for test in made], plant.fault_names)  # type: ignore[misc]
     notes = tuple(_bank_notes(plant, groups, reasons, claims, matrices[BANK_PAIRS]))
-    return Synthesis(options, gains, observer, Certificate(matrices, claims), notes=notes)
+    return Synthesis(shipped_options, gains, observer, Certificate(matrices, claims), notes=notes)
 
 
-def _smallest(plant: DescriptorSystem, asked: Any, fault: int) -> tuple[tuple[int, ...], int, str]:
+def _smallest(plant: DescriptorSystem, options: Any, fault: int) -> tuple[tuple[int, ...], int, str]:
     """Return the smallest group with this fault that can be isolated, the lag, and why there is no smaller one."""
-    others = [other for other in range(plant.nf) if other != fault]
+    other_faults = [other for other in range(plant.nf) if other != fault]
     why, first = "", None
-    for size in range(len(others) + 1):
+    for size in range(len(other_faults) + 1):
         best: tuple[float, tuple[int, ...], int] | None = None
-        candidates = list(combinations(others, size))
+        candidates = list(combinations(other_faults, size))
         for chosen in candidates:
             group = tuple(sorted((fault, *chosen)))
-            own = blind_to(asked, plant, fault, group)
+            own = blind_to(options, plant, fault, group)
             condition, lag = detectability(problem_of(plant, own), own)
             if not condition.holds:
                 first = first or condition
@@ -113,20 +113,20 @@ def _table(plant: DescriptorSystem, own: Any) -> tuple[int, FloatArray]:
     return samples, table
 
 
-def _pairs(plant: DescriptorSystem, asked: Any) -> dict[str, FloatArray]:
+def _pairs(plant: DescriptorSystem, options: Any) -> dict[str, FloatArray]:
     """Return the thresholds of tests that are blind to one other fault alone, infinite where there are none."""
     pairs = pairs_of(plant)
     table, proofs = np.zeros((plant.nf, plant.nf)), []
-    for one, other in pairs:
-        own = blind_to_one(asked, plant, one, other)
+    for fault, other in pairs:
+        own = blind_to_one(options, plant, fault, other)
         condition, _ = detectability(problem_of(plant, own), own)
         if condition.holds:
             made = synthesise(plant, own, progress=silent)
-            table[one, other] = made.certificate.claims["threshold"]
+            table[fault, other] = made.certificate.claims["threshold"]
             proofs.append(made.certificate.matrices)
         else:
             _require_proved(plant, own, condition)
-            table[one, other] = np.inf
+            table[fault, other] = np.inf
             proofs.append({"multipliers": np.zeros(1), "multiplier_radius": np.zeros(1)})
     if not pairs:
         return {BANK_PAIRS: table}
@@ -134,14 +134,14 @@ def _pairs(plant: DescriptorSystem, asked: Any) -> dict[str, FloatArray]:
     return {BANK_PAIRS: table, PAIR_MULTIPLIERS: stacked["multipliers"], PAIR_RADIUS: stacked["multiplier_radius"]}
 
 
-def _stacked(given: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:
+def _stacked(parts: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:
     """Return by name a row for each test, as wide as the widest."""
-    found = {}
+    stacked = {}
     for name in BY_TEST:
-        if not any(name in matrices for matrices in given):
+        if not any(name in matrices for matrices in parts):
             continue
-        found[name] = padded([np.ravel(matrices.get(name, np.zeros(1))) for matrices in given])
-    return found
+        stacked[name] = padded([np.ravel(matrices.get(name, np.zeros(1))) for matrices in parts])
+    return stacked
 
 
 def _bank_notes(
@@ -149,11 +149,11 @@ def _bank_notes(
 ) -> Any:
     names = plant.fault_names
     for fault, (group, why) in enumerate(zip(groups, reasons, strict=True)):
-        size, found = claims[f"threshold[{names[fault]}]"], claims[f"surely_found[{names[fault]}]"]
-        meant = " or ".join(names[k] for k in group)
+        size, certain = claims[f"threshold[{names[fault]}]"], claims[f"surely_found[{names[fault]}]"]
+        group_names = " or ".join(names[k] for k in group)
         yield (
-            f"An alarm of {names[fault]} means {meant}, as long as the bounds hold: threshold {size:.6g}, "
-            f"{found:.6g} is certain to be detected.{f' No smaller group can be isolated: {why}' if why else ''}"
+            f"An alarm of {names[fault]} means {group_names}, as long as the bounds hold: threshold {size:.6g}, "
+            f"{certain:.6g} is certain to be detected.{f' No smaller group can be isolated: {why}' if why else ''}"
         )
         listed = [
             f"{names[other]}: {'impossible' if np.isinf(pairs[fault, other]) else f'{pairs[fault, other]:.6g}'}"

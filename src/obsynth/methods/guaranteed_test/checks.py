@@ -59,11 +59,11 @@ def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], TestOptio
     constant, problem, programmes, reason = isinstance(design.plant, DescriptorSystem), None, None, ""
     try:
         plant: Any = design.linear[0] if constant else design.plant
-        asked = read(design.options)
-        if asked.model is None:
-            require_linear_options(asked)
-        problem = problem_as_designed(plant, asked)
-        programmes = WindowProgrammes.of(problem, int(asked.samples))
+        options = read(design.options)
+        if options.model is None:
+            require_linear_options(options)
+        problem = problem_as_designed(plant, options)
+        programmes = WindowProgrammes.of(problem, int(options.samples))
     except (ObsynthError, TypeError, ValueError, AttributeError, ArithmeticError, LookupError) as error:
         reason = str(error) or type(error).__name__
     yield upper_bound_check(
@@ -124,10 +124,10 @@ def _by_programme(design: ObserverDesign, *, constant: bool) -> dict[str, FloatA
     shipped, claims = dict(design.certificate.matrices), design.certificate.claims
     if not constant:
         return shipped
-    found = {name: np.asarray(part, dtype=np.float64) for name, part in shipped.items()}
-    found |= {name: found[name].reshape(1, -1) for name in BY_PROGRAMME if name in found}
+    matrices = {name: np.asarray(part, dtype=np.float64) for name, part in shipped.items()}
+    matrices |= {name: matrices[name].reshape(1, -1) for name in BY_PROGRAMME if name in matrices}
     own = {"thresholds": claims.get("threshold", np.nan), "leasts": claims.get("least", np.nan)}
-    return found | {name: np.array([[value]]) for name, value in own.items()} | {"programmes": np.zeros((1, 1))}
+    return matrices | {name: np.array([[value]]) for name, value in own.items()} | {"programmes": np.zeros((1, 1))}
 
 
 def _what_does_not_fit(
@@ -153,25 +153,29 @@ def _what_does_not_fit(
     ]
     if not constant:
         wrong += [name for name in ("thresholds", "leasts") if shipped.get(name, np.zeros(0)).shape != (count, 1)]
-        kept = shipped.get("programmes", np.zeros(0))
-        wrong += ["numbers of programmes"] if np.any(kept != np.round(kept)) or kept.max(initial=-1.0) >= count else []
+        numbers = shipped.get("programmes", np.zeros(0))
+        wrong += (
+            ["numbers of programmes"]
+            if np.any(numbers != np.round(numbers)) or numbers.max(initial=-1.0) >= count
+            else []
+        )
         return wrong
     nx, names = plant.nx, design.linear[1].state_names
     if names or {"state_tracking", "record"} & set(shipped):
         order, steps = (len(shipped.get(name, ())) for name in ("state_tracking", "record"))
         known = max(steps, windows[0].question.samples) * (plant.nu + plant.ny)
         sizes = {"state_tracking": order * nx, "state_rows": nx**2, "record": known}
-        found = ((name, size, shipped.get(name)) for name, size in sizes.items())
-        wrong += [name for name, size, m in found if m is None or m.size != size or not np.isfinite(m).all()]
+        parts = ((name, size, shipped.get(name)) for name, size in sizes.items())
+        wrong += [name for name, size, m in parts if m is None or m.size != size or not np.isfinite(m).all()]
     return wrong if len(names) in (0, nx) else [*wrong, "states"]
 
 
-def excess(found: NearbySolution | None, radius: FloatArray) -> float:
+def excess(proved: NearbySolution | None, radius: FloatArray) -> float:
     """Return the largest ratio of what is proved to what is shipped; NaN where nothing is proved."""
-    if found is None:
+    if proved is None:
         return np.nan
-    outside = found.radius > radius
-    return float(np.max(found.radius[outside] / np.maximum(radius[outside], np.finfo(float).tiny), initial=1.0))
+    outside = proved.radius > radius
+    return float(np.max(proved.radius[outside] / np.maximum(radius[outside], np.finfo(float).tiny), initial=1.0))
 
 
 def _worst(value: float) -> float:
@@ -186,13 +190,13 @@ def _judged(
     proved passes its own, the threshold itself, and the rounding error beside the shipped one."""
     claimed = float(shipped["thresholds"][k, 0])
     zero = claimed == 0.0
-    seen = window.outer if zero else window
-    exact = repaired_multipliers(seen, test.values, refine=False, exact_zero=zero, among=test.radius)
-    found = proved_threshold(window.outer, test, exact_zero=zero)
-    over = 0.0 if found <= claimed else found / claimed if claimed > 0.0 else np.inf
+    examined = window.outer if zero else window
+    exact = repaired_multipliers(examined, test.values, refine=False, exact_zero=zero, among=test.radius)
+    proved = proved_threshold(window.outer, test, exact_zero=zero)
+    over = 0.0 if proved <= claimed else proved / claimed if claimed > 0.0 else np.inf
     sizes = rounding_of(window, test.values, test.radius)
     share = sizes / np.maximum(shipped["rounding"][k], np.finfo(float).tiny)
-    return excess(exact, test.radius), over, found if constant else claimed, float(np.max(share, initial=0.0))
+    return excess(exact, test.radius), over, proved if constant else claimed, float(np.max(share, initial=0.0))
 
 
 def _of_the_tests(
@@ -273,7 +277,7 @@ def _of_what_runs(
     implied: LinearObserver | WindowObserver | None = None
     gains: dict[str, FloatArray] = {}
     multipliers = [tests[k].values if k in tests else np.zeros(window.rows) for k, window in enumerate(windows)]
-    room = np.array([[known_room(*both)] for both in zip(windows, multipliers, strict=True)])
+    room = np.array([[known_room(*pair)] for pair in zip(windows, multipliers, strict=True)])
     if isinstance(problem.plant, DescriptorSystem):
         observer, tracking = design.linear[1], shipped.get("state_tracking")
         # The observer beside the test may be any: its error is bounded by what it is.
@@ -283,8 +287,8 @@ def _of_what_runs(
     elif isinstance(design.observer, WindowObserver):
         has_test = np.isin(np.arange(len(windows)), list(tests))
         # Rows whose programme has a test may be left without a verdict.
-        kept = shipped["programmes"].ravel()
-        implied = replace(observer_of_rows(problem, programmes, has_test, multipliers), programmes=kept)
+        of_row = shipped["programmes"].ravel()
+        implied = replace(observer_of_rows(problem, programmes, has_test, multipliers), programmes=of_row)
         rooms, gains = {"weights": room}, {"weights": design.observer.weights}
     yield upper_bound_check(
         "weights",
@@ -299,17 +303,17 @@ def _of_what_runs(
 
 
 def _over_tolerances(design: ObserverDesign, window: Window, test: NearbySolution) -> Check:
-    shipped, found, reason = design.certificate.matrices, np.nan, ""
+    shipped, mean, reason = design.certificate.matrices, np.nan, ""
     try:
         T, T0, record = (shipped[name] for name in ("state_tracking", "state_rows", "record"))
-        found = mean_over_record(window, design.linear[1], test.values, T, T0, record)
+        mean = mean_over_record(window, design.linear[1], test.values, T, T0, record)
     except (ObsynthError, KeyError, ValueError, IndexError) as error:
         reason = str(error)
     return upper_bound_check(
         "mean threshold",
         "mean over the shipped record of the threshold that the residual never passes without a fault, for all "
         f"constants in their tolerances; to {MEAN_ROOM:.0%}, as each processor has its own bound",
-        found,
+        mean,
         float(design.certificate.claims["mean_threshold"]) * (1.0 + MEAN_ROOM),
         source="the observer's error over the box of the constants",
         detail=reason,
@@ -331,13 +335,13 @@ def _misfit(shipped: object, implied: Any, rooms: Mapping[str, FloatArray]) -> f
     """Return the largest difference of two observers as a share of the room of each number; infinite where none is."""
     worst = 0.0
     for part in fields(implied):
-        name, wanted, given = part.name, getattr(implied, part.name), getattr(shipped, part.name)
-        if not isinstance(wanted, np.ndarray):
-            worst = worst if given == wanted else np.inf
-        elif given is None or given.shape != wanted.shape:
+        name, implied_part, shipped_part = part.name, getattr(implied, part.name), getattr(shipped, part.name)
+        if not isinstance(implied_part, np.ndarray):
+            worst = worst if shipped_part == implied_part else np.inf
+        elif shipped_part is None or shipped_part.shape != implied_part.shape:
             worst = np.inf
-        elif given.size:
-            away = np.abs(given - wanted)
+        elif shipped_part.size:
+            away = np.abs(shipped_part - implied_part)
             room = np.broadcast_to(rooms.get(name, np.zeros(1)), away.shape)
             shares = np.divide(away, room, out=np.where(away == 0.0, 0.0, np.inf), where=(away > 0.0) & (room > 0.0))
             worst = max(worst, _worst(float(np.max(shares))))
@@ -355,8 +359,8 @@ def _proved_witness(
         return np.nan, np.nan
     witness = NearbySolution(shipped["witness"][k][:columns], shipped["witness_radius"][k][:columns])
     exact = repaired_point(window, witness.values, refine=False, among=witness.radius)
-    found = proved_least(window, witness)
-    return excess(exact, witness.radius), found if constant or found >= size else np.nan
+    least = proved_least(window, witness)
+    return excess(exact, witness.radius), least if constant or least >= size else np.nan
 
 
 def _is_lasting(
@@ -385,11 +389,11 @@ def _of_the_least(
     if least is None:
         return
     # Where the least is zero there is nothing to show.
-    shown = [k for k in used if not np.isnan(shipped["leasts"][k, 0]) and shipped["leasts"][k, 0] != 0.0]
-    proofs = [_proved_witness(programmes.windows[k], shipped, k, constant=constant) for k in shown]
-    away = max((_worst(one) for one, _ in proofs), default=0.0)
+    with_witness = [k for k in used if not np.isnan(shipped["leasts"][k, 0]) and shipped["leasts"][k, 0] != 0.0]
+    proofs = [_proved_witness(programmes.windows[k], shipped, k, constant=constant) for k in with_witness]
+    away = max((_worst(distance) for distance, _ in proofs), default=0.0)
     sizes = [size for _, size in proofs]
-    going_on = all(_is_lasting(problem, programmes, shipped, k) for k in shown)
+    going_on = all(_is_lasting(problem, programmes, shipped, k) for k in with_witness)
     best = np.nan if not going_on or np.isnan(sizes).any() else max(sizes, default=0.0)
     if away != 0.0:
         yield upper_bound_check(

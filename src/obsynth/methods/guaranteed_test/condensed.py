@@ -68,9 +68,9 @@ class Condensed:
         plant, samples = window.plant, window.question.samples
         bounds = window.bounds
         # Products of entries and whole numbers would be rounded.
-        whole = window.rows == window.outputs_at + samples * plant.ny and np.abs(window.times).max(initial=1) == 1
+        is_plain = window.rows == window.outputs_at + samples * plant.ny and np.abs(window.times).max(initial=1) == 1
         unbounded = bool(np.isinf(bounds.state).all() and np.isinf(bounds.first).all())
-        if not whole or not unbounded or window.equations != samples - 1:
+        if not is_plain or not unbounded or window.equations != samples - 1:
             return None
         return cls(window) if plant.nx and decide_rank(plant.E).full else None
 
@@ -83,47 +83,47 @@ class Condensed:
         return matrix if self._inverse is None else self._inverse * matrix
 
     @cached_property
-    def _others(self) -> np.ndarray:
+    def _columns_beside_states(self) -> np.ndarray:
         """Columns that are no states."""
         return np.array([k for k, label in enumerate(self.window.labels) if label[0] != "x"])
 
     def _parts(self, columns: np.ndarray) -> tuple[list[FloatArray], list[FloatArray]]:
         """Return what columns put into the equations of each sample and into the outputs of each."""
         window, plant = self.window, self.window.plant
-        whole = window.matrix[:, columns].toarray()
-        equations = whole[: window.outputs_at].reshape(window.equations, plant.nx, -1)
-        outputs = whole[window.outputs_at :].reshape(window.question.samples, plant.ny, -1)
+        dense = window.matrix[:, columns].toarray()
+        equations = dense[: window.outputs_at].reshape(window.equations, plant.nx, -1)
+        outputs = dense[window.outputs_at :].reshape(window.question.samples, plant.ny, -1)
         return list(equations), list(outputs)
 
     @cached_property
     def _responses(self) -> Any:
         """What the first state, free columns and theta do to all outputs, in balls: ``(samples ny, nx + free + 1)``."""
         window, plant = self.window, self.window.plant
-        free = [k for k in self._others.tolist() if k and window.free[k]]
+        free = [k for k in self._columns_beside_states.tolist() if k and window.free[k]]
         equations, outputs = self._parts(np.array([*free, 0]))
         a, c = self._over_e(arb_matrix(plant.A)), arb_matrix(plant.C)
-        seen, state, found = c, arb_matrix(np.zeros((plant.nx, len(free) + 1))), []
+        observed, state, responses = c, arb_matrix(np.zeros((plant.nx, len(free) + 1))), []
         for k, output in enumerate(outputs):
-            here = c * state + arb_matrix(output)
-            rows = [seen.tolist(), here.tolist()]
-            found += [first + others for first, others in zip(*rows, strict=True)]
-            seen = seen * a
+            response = c * state + arb_matrix(output)
+            rows = [observed.tolist(), response.tolist()]
+            responses += [first + second for first, second in zip(*rows, strict=True)]
+            observed = observed * a
             if k < window.equations:
                 state = a * state - self._over_e(arb_matrix(equations[k]))
-        return arb_mat(found)
+        return arb_mat(responses)
 
     @many_bits()
     def least_weights(self) -> FloatArray | None:
         """Return the least weights of the outputs that see theta alone ``(rows,)``, equations zero; else ``None``."""
         responses = self._responses
         count = responses.ncols()
-        wanted = arb_mat(count, 1, [arb(0)] * (count - 1) + [arb(1)])
+        target = arb_mat(count, 1, [arb(0)] * (count - 1) + [arb(1)])
         try:
             # Far states of a network show so little that double precision has no say in it.
-            found = responses * (responses.transpose() * responses).solve(wanted)
+            weights = responses * (responses.transpose() * responses).solve(target)
         except ZeroDivisionError:
             return None
-        return np.concatenate([np.zeros(self.window.outputs_at), _middles(found)[:, 0]])
+        return np.concatenate([np.zeros(self.window.outputs_at), _middles(weights)[:, 0]])
 
     @many_bits()
     def multipliers(
@@ -153,15 +153,15 @@ class Condensed:
             if refine:
                 weights = _middles(exact)[:, 0]
         equations = self._equations(exact)
-        found = np.array(values)
+        repaired = np.array(values)
         if refine:
-            found[first:] = weights
-            found[:first] = _middles(equations)[:, 0]
-        distance = np.concatenate([_away(equations, found[:first]), _away(exact, found[first:])])
-        kept = np.ones(len(found), dtype=bool)
-        kept[first:] = False
-        kept[first + chosen] = True
-        return found, np.where(kept, np.maximum(distance, np.finfo(np.float64).tiny), 0.0)
+            repaired[first:] = weights
+            repaired[:first] = _middles(equations)[:, 0]
+        distance = np.concatenate([_away(equations, repaired[:first]), _away(exact, repaired[first:])])
+        corrected = np.ones(len(repaired), dtype=bool)
+        corrected[first:] = False
+        corrected[first + chosen] = True
+        return repaired, np.where(corrected, np.maximum(distance, np.finfo(np.float64).tiny), 0.0)
 
     def _chosen(self, weights: FloatArray) -> np.ndarray | None:
         """Return the outputs whose weights are corrected: heavy ones with responses that differ most."""
@@ -179,14 +179,14 @@ class Condensed:
         """Return the multipliers of all equations that belong to weights of the outputs, in balls."""
         window, plant = self.window, self.window.plant
         a, c = arb_matrix(plant.A.T), arb_matrix(plant.C.T)
-        later, found = arb_matrix(np.zeros((plant.nx, 1))), []
+        later, blocks = arb_matrix(np.zeros((plant.nx, 1))), []
         entries = weights.entries()
         for k in range(window.equations - 1, -1, -1):
             part = arb_mat(plant.ny, 1, entries[(k + 1) * plant.ny : (k + 2) * plant.ny])
             later = a * later - c * part
             later = later if self._inverse is None else self._inverse.transpose() * later
-            found.append(later.entries())
-        return arb_mat(len(found) * plant.nx, 1, [entry for part in found[::-1] for entry in part])
+            blocks.append(later.entries())
+        return arb_mat(len(blocks) * plant.nx, 1, [entry for part in blocks[::-1] for entry in part])
 
     @many_bits()
     def point(self, values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
@@ -198,27 +198,27 @@ class Condensed:
         absorbing = self._absorbing
         if absorbing is None:
             return None
-        kept = np.array([k for k in self._others if k not in set(absorbing.ravel().tolist())])
-        equations, outputs = self._parts(kept)
-        others = arb_matrix(values[kept][:, None])
+        columns = np.array([k for k in self._columns_beside_states if k not in set(absorbing.ravel().tolist())])
+        equations, outputs = self._parts(columns)
+        known = arb_matrix(values[columns][:, None])
         a, c = self._over_e(arb_matrix(plant.A)), arb_matrix(plant.C)
         labels = {label: k for k, label in enumerate(window.labels)}
         state = arb_matrix(np.array([[values[labels["x", 0, i]]] for i in range(plant.nx)]))
         noise = window.bounds.noise_output[:, self._noise_columns]
         back = arb_matrix(noise).inv()
-        found, distance = np.array(values), np.zeros(len(values))
+        witness, distance = np.array(values), np.zeros(len(values))
         for k in range(window.question.samples):
-            left = back * (c * state + arb_matrix(outputs[k]) * others)
-            self._put(found, distance, absorbing[k], -left)
+            residual = back * (c * state + arb_matrix(outputs[k]) * known)
+            self._put(witness, distance, absorbing[k], -residual)
             if k < window.equations:
-                state = a * state - self._over_e(arb_matrix(equations[k]) * others)
-                self._put(found, distance, np.array([labels["x", k + 1, i] for i in range(plant.nx)]), state)
-        return found, distance
+                state = a * state - self._over_e(arb_matrix(equations[k]) * known)
+                self._put(witness, distance, np.array([labels["x", k + 1, i] for i in range(plant.nx)]), state)
+        return witness, distance
 
     @staticmethod
-    def _put(found: FloatArray, distance: FloatArray, places: np.ndarray, exact: Any) -> None:
-        found[places] = _middles(exact)[:, 0]
-        distance[places] = np.maximum(_away(exact, found[places]), np.finfo(np.float64).tiny)
+    def _put(witness: FloatArray, distance: FloatArray, places: np.ndarray, exact: Any) -> None:
+        witness[places] = _middles(exact)[:, 0]
+        distance[places] = np.maximum(_away(exact, witness[places]), np.finfo(np.float64).tiny)
 
     @cached_property
     def _noise_columns(self) -> np.ndarray:

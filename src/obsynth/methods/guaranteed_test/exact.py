@@ -90,11 +90,13 @@ class Programmes:
         programme, right, _ = self._programme(y, u)
         tests = [
             programme.test,
-            *(programme.proved(answer) for s in (1.0, -1.0) for answer in programme.answers(right, s)),
+            *(programme.proved(multipliers) for s in (1.0, -1.0) for multipliers in programme.answers(right, s)),
         ]
-        found = [(abs(float(test.values @ right)) / (width or 1.0), test.values) for test, width in filter(None, tests)]
-        best = max((share for share, _ in found), default=0.0)
-        return [values for share, values in found if share == best and share > 1.0]
+        ratios = [
+            (abs(float(test.values @ right)) / (width or 1.0), test.values) for test, width in filter(None, tests)
+        ]
+        best = max((share for share, _ in ratios), default=0.0)
+        return [values for share, values in ratios if share == best and share > 1.0]
 
     def least_test(self, y: FloatArray, u: FloatArray) -> tuple[float, float]:
         """Return residual and threshold of the least test of what is there; NaN and infinite where none is proved."""
@@ -120,7 +122,7 @@ class _Programme:
         self.prescribed, self.bounded = matrix[:, prescribed].T.tocsr(), outer.matrix[:, outer.bounded].T.tocsr()
         self.bars = outer.bar[outer.bounded]
         self.prescribed_sizes, self.bounded_sizes = abs(self.prescribed), abs(self.bounded)
-        self.wanted = np.eye(1, len(prescribed)).ravel()
+        self.target = np.eye(1, len(prescribed)).ravel()
         # Entries that are products with a whole number have been rounded once.
         self.share = gamma(window.rows + 8) + 2.0 * UNIT_ROUNDOFF
         dense = self.prescribed.toarray()
@@ -129,9 +131,9 @@ class _Programme:
         self.test: tuple[NearbySolution, float] | None = None
         at_rest = np.zeros(window.rows)
         for sign in (1.0, -1.0):
-            found = [self.proved(multipliers) for multipliers in self.answers(at_rest, sign)]
+            tests = [self.proved(multipliers) for multipliers in self.answers(at_rest, sign)]
             self.bases[sign] = self.highs.getBasis()
-            self.test = self.test or next((one for one in found if one is not None), None)
+            self.test = self.test or next((test for test in tests if test is not None), None)
 
     def answers(self, right: FloatArray, sign: float) -> Iterator[FloatArray]:
         """Yield multipliers for the largest (``sign`` -1: least) fault, as HiGHS gives them; none where it has none."""
@@ -160,8 +162,8 @@ class _Programme:
                 return
             if status == highspy.HighsModelStatus.kInfeasible and self.test is not None:
                 # It says that nothing explains the window: its ray, if it proves that, moves the test out of the way.
-                _, found, ray = self.highs.getDualRay()
-                direction = np.ldexp(np.asarray(ray), rows) if found else np.zeros(1)
+                _, has_ray, ray = self.highs.getDualRay()
+                direction = np.ldexp(np.asarray(ray), rows) if has_ray else np.zeros(1)
                 size = float(np.max(np.abs(direction), initial=0.0))
                 if size > 0.0:
                     direction *= TIMES_OF_A_RAY * float(np.max(np.abs(self.test[0].values))) / size
@@ -170,24 +172,24 @@ class _Programme:
     def proved(self, multipliers: FloatArray) -> tuple[NearbySolution, float] | None:
         """Return multipliers with the distance to exact ones, and what bounds can do to these."""
         if self.square is None or not self.square.contraction < 1.0:
-            found = repaired_multipliers(self.window, multipliers, refine=True)
-            return None if found is None else (found, proved_threshold(self.window.outer, found))
+            repaired = repaired_multipliers(self.window, multipliers, refine=True)
+            return None if repaired is None else (repaired, proved_threshold(self.window.outer, repaired))
         values = np.array(multipliers)
-        values[self.square.chosen] += self.square.step(self.wanted - self.prescribed @ values)
-        left = np.abs(self.wanted - self.prescribed @ values)
-        left = rounded_up(left + self.share * (self.prescribed_sizes @ np.abs(values) + self.wanted), 4)
+        values[self.square.chosen] += self.square.step(self.target - self.prescribed @ values)
+        missed = np.abs(self.target - self.prescribed @ values)
+        missed = rounded_up(missed + self.share * (self.prescribed_sizes @ np.abs(values) + self.target), 4)
         radius = np.zeros(len(values))
-        radius[self.square.chosen] = self.square.bounded_step(left)
+        radius[self.square.chosen] = self.square.bounded_step(missed)
         sizes = self.bounded_sizes @ rounded_up(self.share * np.abs(values) + radius, 2)
-        seen = np.abs(self.bounded @ values) + rounded_up(sizes, self.window.rows)
-        total = float(rounded_up(self.bars @ seen, len(seen) + 4))
+        responses = np.abs(self.bounded @ values) + rounded_up(sizes, self.window.rows)
+        total = float(rounded_up(self.bars @ responses, len(responses) + 4))
         return (NearbySolution(values, radius), total) if np.isfinite(total) else None
 
     def end(self, right: FloatArray, largest: FloatArray, sign: float) -> float:
         """Return the upper (``sign`` 1) or lower end of the fault for these right sides; infinite without a proof."""
         tests = [self.test, *map(self.proved, self.answers(right, sign))]
         ends = [sign * np.inf]
-        for test, width in (found for found in tests if found is not None):
+        for test, width in (proof for proof in tests if proof is not None):
             rounding = float(rounding_of(self.window, test.values, test.radius) @ largest)
             rounding += self.window.standing_room(test.values, test.radius)
             ends.append(float(test.values @ right) + sign * (width + rounding))
@@ -217,10 +219,10 @@ def _highs(window: Window) -> Any:
             self.silent()
             super().enableCallbacks()  # type: ignore[no-untyped-call]
 
-    found = Silent()  # type: ignore[no-untyped-call]
-    found.silent()
+    solver = Silent()  # type: ignore[no-untyped-call]
+    solver.silent()
     for name in ("primal_feasibility_tolerance", "dual_feasibility_tolerance"):
-        found.setOptionValue(name, TOLERANCE)
-    found.setOptionValue("threads", 1)
-    found.passModel(model)
-    return found
+        solver.setOptionValue(name, TOLERANCE)
+    solver.setOptionValue("threads", 1)
+    solver.passModel(model)
+    return solver

@@ -35,12 +35,12 @@ MOST_NAMED_STATES = 8
 
 
 def conditions(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: TestOptions, *, with_windows: bool = True
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: TestOptions, *, with_windows: bool = True
 ) -> tuple[Condition, ...]:
     """Return the conditions in order; ``with_windows``: also whether a window tells the fault, if the others hold."""
     first: tuple[Condition, ...] = ()
     names, none = fault_names(plant), "the plant has no parameter (Phi, Psi)."
-    named = asked.fault is not None or len(names) == 1
+    named = options.fault is not None or len(names) == 1
     if isinstance(plant, DescriptorSystem):
         detail = "the plant is continuous: sample it (transform: sample_time, obsynth.discretise)."
         sampled = plant.dt > 0.0
@@ -49,9 +49,9 @@ def conditions(
                 "discrete time", "dt > 0", sampled, plant.dt, 0.0, SOURCE, "" if sampled else detail, of_the_method=True
             ),
         )
-        named, none = named if not asked.isolate else plant.nf > 0, "the plant has no fault (Bf, Df)."
+        named, none = named if not options.isolate else plant.nf > 0, "the plant has no fault (Bf, Df)."
     advice = f"name one of {', '.join(names)} (fault)." if names else none
-    lacking = list(missing_bounds(plant, asked))
+    lacking = list(missing_bounds(plant, options))
     first = (
         *first,
         Condition(
@@ -78,29 +78,29 @@ def conditions(
     if not all(condition.holds for condition in first) or not with_windows:
         return first
     # Of a bank: that a fault is told where no other is there; some group then tells it.
-    alone = [replace(asked, isolate=False, fault=name, free="none") for name in names]
-    each = alone if asked.isolate and isinstance(plant, DescriptorSystem) else [asked]
+    alone = [replace(options, isolate=False, fault=name, free="none") for name in names]
+    each = alone if options.isolate and isinstance(plant, DescriptorSystem) else [options]
     return (*first, *(detectability(problem_of(plant, own), own)[0] for own in each))
 
 
-def detectability(problem: WindowProblem, asked: TestOptions) -> tuple[Condition, int]:
+def detectability(problem: WindowProblem, options: TestOptions) -> tuple[Condition, int]:
     """Return the condition that some window tells the fault, and the lag with which it does."""
     lags = [problem.question.lag]
-    if problem.question.course == "any" and asked.lag is None:
+    if problem.question.course == "any" and options.lag is None:
         lags = list(range(problem.plant.nx + 2))
     if isinstance(problem.plant, TimeVaryingDescriptorSystem):
-        lags = [lag for lag in lags if lag < _samples_by_row(problem, asked)] or lags[:1]
+        lags = [lag for lag in lags if lag < _samples_by_row(problem, options)] or lags[:1]
     for lag in lags:
-        for window in _decisive(problem, asked, lag):
+        for window in _decisive(problem, options, lag):
             if has_test(window):
                 return detectability_condition(window, True, ""), lag
-    return detectability_condition(window, False, _why(problem, asked, window)), lags[-1]
+    return detectability_condition(window, False, _why(problem, options, window)), lags[-1]
 
 
-def _decisive(problem: WindowProblem, asked: TestOptions, lag: int) -> Iterator[Window]:
+def _decisive(problem: WindowProblem, options: TestOptions, lag: int) -> Iterator[Window]:
     """Yield the windows of which one has a test where there is any."""
     if isinstance(problem.plant, TimeVaryingDescriptorSystem):
-        samples = _samples_by_row(problem, asked)
+        samples = _samples_by_row(problem, options)
         rows = problem.tried(samples)
         if not rows:
             raise SpecError(
@@ -110,26 +110,26 @@ def _decisive(problem: WindowProblem, asked: TestOptions, lag: int) -> Iterator[
             )
         yield from (problem.window(samples, lag=lag, row=row) for row in reversed(rows))
         return
-    most = samples_decided_on(problem, asked, lag)
+    most = samples_decided_on(problem, options, lag)
     least = max(problem.question.before, lag) + 2
     # A test on fewer samples is one on more: short windows are decided in no time.
     doubled = [least * 2**k for k in range(most.bit_length())]
     yield from (problem.window(samples, lag=lag) for samples in (*(tried for tried in doubled if tried < most), most))
 
 
-def _samples_by_row(problem: WindowProblem, asked: TestOptions) -> int:
+def _samples_by_row(problem: WindowProblem, options: TestOptions) -> int:
     """Return the samples on which it is decided where each row has a window of its own."""
-    given = samples_given(asked)
-    return problem.ladder()[-1] if given == "auto" else int(given)
+    samples = samples_given(options)
+    return problem.ladder()[-1] if samples == "auto" else int(samples)
 
 
-def samples_decided_on(problem: WindowProblem, asked: TestOptions, lag: int) -> int:
+def samples_decided_on(problem: WindowProblem, options: TestOptions, lag: int) -> int:
     """Return the samples on which it is decided."""
     enough = problem.enough(lag)
-    if asked.samples != "auto":
-        return int(min(max(asked.samples, lag + 1), max(enough, lag + 1)))
-    if asked.after is not None:
-        return min(asked.before + asked.after, enough)
+    if options.samples != "auto":
+        return int(min(max(options.samples, lag + 1), max(enough, lag + 1)))
+    if options.after is not None:
+        return min(options.before + options.after, enough)
     return enough
 
 
@@ -149,12 +149,12 @@ def least_multipliers(window: Window) -> FloatArray | None:
     rows, columns = window.scales
     prescribed = np.flatnonzero(window.free | (np.arange(len(window.bar)) == 0))
     matrix = np.ldexp(np.ldexp(window.matrix[:, prescribed].toarray(), columns[prescribed]), rows[:, None]).T
-    wanted = np.zeros(len(prescribed))
-    wanted[0] = float(np.ldexp(1.0, int(columns[0])))
-    found = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
-    if np.max(np.abs(matrix @ found - wanted)) > SEEN * wanted[0]:
+    target = np.zeros(len(prescribed))
+    target[0] = float(np.ldexp(1.0, int(columns[0])))
+    multipliers = np.linalg.lstsq(matrix, target, rcond=None)[0]
+    if np.max(np.abs(matrix @ multipliers - target)) > SEEN * target[0]:
         return None
-    return np.asarray(np.ldexp(found, rows))
+    return np.asarray(np.ldexp(multipliers, rows))
 
 
 def detectability_condition(window: Window, holds: bool, detail: str) -> Condition:
@@ -172,32 +172,32 @@ def detectability_condition(window: Window, holds: bool, detail: str) -> Conditi
     )
 
 
-def _why(problem: WindowProblem, asked: TestOptions, window: Window) -> str:
+def _why(problem: WindowProblem, options: TestOptions, window: Window) -> str:
     """Return in words what hides the fault."""
     fault, varies = problem.fault, isinstance(problem.plant, TimeVaryingDescriptorSystem)
-    found = proved_ray(window)
+    point = proved_ray(window)
     samples = window.question.samples
-    if found is None and varies:
+    if point is None and varies:
         return (
             f"no weights of {samples} samples respond to {fault} and to nothing that is free at the rows that were "
             "tried."
         )
-    if found is None:
+    if point is None:
         return (
             f"no test on {samples} samples responds to {fault} and to nothing that is free, but a time course that "
             "hides it could not be "
             "proved: this is at the edge of double precision. Bounds of the states (state_bounds) help, even wide ones."
         )
     where = f"the window that ends at k = {samples}" if varies else f"{samples} samples"
-    text = f"{hidden(window, found)} (proved for {where}: every equation holds exactly)."
+    text = f"{hidden(window, point)} (proved for {where}: every equation holds exactly)."
     if varies:
         return text
     lag = window.question.lag
-    if problem.question.course == "any" and asked.lag is not None:
+    if problem.question.course == "any" and options.lag is not None:
         for more in range(lag + 1, problem.plant.nx + 2):
             if has_test(problem.window(max(samples, problem.enough(more)), lag=more)):
                 return f"{text} The least lag for which there is a test is {more}."
-    if asked.samples != "auto" and samples < problem.enough(lag):
+    if options.samples != "auto" and samples < problem.enough(lag):
         for more in range(samples + 1, problem.enough(lag) + 1):
             if has_test(problem.window(more, lag=lag)):
                 return f"{text} The least number of samples for which there is a test is {more}."
@@ -210,18 +210,18 @@ def hidden(window: Window, point: FloatArray) -> str:
     names = fault_names(plant)
     fault = names[question.fault]
     largest = float(np.max(np.abs(point)))
-    others = []
+    other_faults = []
     for label, value in zip(window.labels, point, strict=True):
         if label[0] == "f" and label[2] != question.fault and abs(value) > TOLD_COURSE * largest:
             name = names[label[2]]
-            if name not in others:
-                others.append(name)
+            if name not in other_faults:
+                other_faults.append(name)
     states = {
         plant.state_names[label[2]]
         for label, value in zip(window.labels, point, strict=True)
         if label[0] == "x" and abs(value) > TOLD_COURSE * largest
     }
     moving = f", while {', '.join(sorted(states))} move" if states and len(states) <= MOST_NAMED_STATES else ""
-    if others:
-        return f"{fault} and {' and '.join(others)} together give the same outputs as neither of them{moving}"
+    if other_faults:
+        return f"{fault} and {' and '.join(other_faults)} together give the same outputs as neither of them{moving}"
     return f"{fault} gives the same outputs as no fault{moving or ', from another start of the states'}"

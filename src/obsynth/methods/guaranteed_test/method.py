@@ -186,8 +186,8 @@ class GuaranteedTestMethod(TestOptions, Method):
             yield f"lag is for the courses any, ramp and rate: a {self.course} uses all samples of the window."
         if self.isolate and (self.fault is not None or self.free != "others"):
             yield "isolate makes a test for each fault: leave fault and free out."
-        for name, asked in (("exact", self.exact), ("missing solve", self.missing == "solve")):
-            if asked and self.norm != "box":
+        for name, is_chosen in (("exact", self.exact), ("missing solve", self.missing == "solve")):
+            if is_chosen and self.norm != "box":
                 yield f"{name} is for norm box: in ellipsoids the programmes of a row are no linear ones."
         if self.samples == "auto":
             return
@@ -230,8 +230,8 @@ class GuaranteedTestMethod(TestOptions, Method):
         if self.isolate and isinstance(plant, DescriptorSystem):
             from obsynth.methods.guaranteed_test.bank_synthesis import synthesise_bank
 
-            found = synthesise_bank(plant, self, progress=progress)
-            return found if scenario is None else replace(found, notes=(*found.notes, NOMINAL_BANK))
+            bank = synthesise_bank(plant, self, progress=progress)
+            return bank if scenario is None else replace(bank, notes=(*bank.notes, NOMINAL_BANK))
         from obsynth.methods.guaranteed_test.synthesis import synthesise
 
         return synthesise(plant, self, progress=progress, scenario=scenario)
@@ -273,8 +273,8 @@ class GuaranteedTestMethod(TestOptions, Method):
         window = window_as_designed(plant, cls.of(design.options))
         if "state_tracking" not in shipped:
             return ErrorModel(plant, observer, *window.followed(shipped["multipliers"].ravel()))
-        both = tracked(window, shipped["multipliers"].ravel(), shipped["state_tracking"], shipped["state_rows"])
-        return ErrorModel(plant, observer, *both)
+        maps = tracked(window, shipped["multipliers"].ravel(), shipped["state_tracking"], shipped["state_rows"])
+        return ErrorModel(plant, observer, *maps)
 
 
 def is_guaranteed(design: ObserverDesign) -> bool:

@@ -94,8 +94,8 @@ class WindowProblem:
         """Return the numbers of samples to try; of a large plant fewer."""
         most = max(MOST_WINDOW_STATES // max(self.plant.nx, 1), self.shortest)
         most = most if self.horizon is None else min(most, self.horizon)
-        asked = [self.question.before + rung for rung in CANDIDATE_LENGTHS]
-        return tuple(rung for rung in asked if self.shortest <= rung <= most) or (self.shortest,)
+        lengths = [self.question.before + rung for rung in CANDIDATE_LENGTHS]
+        return tuple(rung for rung in lengths if self.shortest <= rung <= most) or (self.shortest,)
 
     def rows(self, samples: int) -> range:
         """Return the rows that have a window; without a horizon 0, which stands for all."""
@@ -114,10 +114,10 @@ class WindowProblem:
             # What follows the window is in its equations (`Question.closing`).
             return np.ones(1, dtype=bool)
         last = 2 if plant.horizon is None else plant.horizon
-        found = np.ones(last + 1, dtype=bool)
+        continuing = np.ones(last + 1, dtype=bool)
         for k in range(last - 1, 0, -1):
-            found[k] = found[k + 1] and _continues(plant.E.at(k), plant.A.at(k), plant.E.at(k + 1))
-        return found
+            continuing[k] = continuing[k + 1] and _continues(plant.E.at(k), plant.A.at(k), plant.E.at(k + 1))
+        return continuing
 
     @cached_property
     def _preceded(self) -> np.ndarray:
@@ -140,14 +140,14 @@ class WindowProblem:
         """
         if np.isfinite(self.bounds.first).any():
             return True
-        found = self._preceded
-        return bool(found[0 if self.horizon is None else min(row - samples + 1, len(found) - 1)])
+        preceded = self._preceded
+        return bool(preceded[0 if self.horizon is None else min(row - samples + 1, len(preceded) - 1)])
 
     def continues(self, window: Window, row: int) -> bool:
         """Whether what satisfies the equations of a window satisfies those after it, with some later states."""
-        found = self._continuing
+        continuing = self._continuing
         after = 1 if self.horizon is None else row - window.question.samples + 1 + window.equations
-        return bool(found[min(after, len(found) - 1)])
+        return bool(continuing[min(after, len(continuing) - 1)])
 
     def is_of_a_running_plant(self, window: Window, row: int, point: FloatArray, radius: FloatArray) -> bool:
         """Whether a point within a radius of this one ``(columns,)`` satisfies equations before and after a window."""
@@ -166,37 +166,41 @@ def _continues(before: FloatArray, a: FloatArray, after: FloatArray) -> bool:
     return decide_rank(np.vstack([before, without @ a])).rank == decide_rank(before).rank + len(without)
 
 
-def question_of(asked: TestOptions, plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> TestProblem:
+def question_of(options: TestOptions, plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> TestProblem:
     """Return what is looked for, of one sample more than its course needs."""
-    names, before = fault_names(plant), asked.before if asked.course == "step" else 0
-    fault, rates = fault_of(names, asked.fault), np.zeros(0)
-    if asked.disturbance == "rate":
-        rates = by_name(asked.disturbance_rate, disturbance_names(plant), "disturbance_rate", every=True)
+    names, before = fault_names(plant), options.before if options.course == "step" else 0
+    fault, rates = fault_of(names, options.fault), np.zeros(0)
+    if options.disturbance == "rate":
+        rates = by_name(options.disturbance_rate, disturbance_names(plant), "disturbance_rate", every=True)
     index = None
     if isinstance(plant, DescriptorSystem) and not decide_rank(plant.E).full:
         index = ExactPencil.written(plant.E, plant.A).index
     return TestProblem(
         fault=fault,
-        course=asked.course,
+        course=options.course,
         samples=before + 1,
-        lag=asked.lag or 0,
+        lag=options.lag or 0,
         before=before,
-        free=free_faults(names, asked.free, fault),
-        free_course=asked.free_course,
-        disturbance=asked.disturbance,
+        free=free_faults(names, options.free, fault),
+        free_course=options.free_course,
+        disturbance=options.disturbance,
         disturbance_rate=rates,
-        fault_rate=float(asked.fault_rate or 0.0),
-        ellipsoid=asked.norm == "ellipsoid",
+        fault_rate=float(options.fault_rate or 0.0),
+        ellipsoid=options.norm == "ellipsoid",
         closing=max((index or 0) - 1, 0),
     )
 
 
-def problem_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: TestOptions) -> WindowProblem:
+def problem_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: TestOptions) -> WindowProblem:
     """Return what is asked of a plant; raise `SpecError` for what it cannot be asked, unknown signals, missing bounds
     and courses that do not fit."""
     if isinstance(plant, TimeVaryingDescriptorSystem):
-        for name, given in (("isolate", asked.isolate), ("exact", asked.exact), ("missing", asked.missing == "solve")):
-            if given:
+        for name, is_chosen in (
+            ("isolate", options.isolate),
+            ("exact", options.exact),
+            ("missing", options.missing == "solve"),
+        ):
+            if is_chosen:
                 raise SpecError(
                     f"{name} is for plants whose matrices do not change with k: {REFUSED[name]}.",
                     path=f"method.options.{name}",
@@ -207,20 +211,20 @@ def problem_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Tes
                 "as many steps as the log has.",
                 path="plant.horizon",
             )
-    question = question_of(asked, plant)
-    return WindowProblem(plant, bounds_of(plant, asked), question)
+    question = question_of(options, plant)
+    return WindowProblem(plant, bounds_of(plant, options), question)
 
 
-def require_linear_options(asked: TestOptions) -> None:
+def require_linear_options(options: TestOptions) -> None:
     """Raise `SpecError` for options of nonlinear plants."""
     for option in ("region", "sample_time", "given", "model"):
-        if getattr(asked, option) is not None:
+        if getattr(options, option) is not None:
             raise SpecError(f"{option} is for nonlinear plants: leave it out.", path=f"method.options.{option}")
 
 
-def samples_given(asked: TestOptions) -> Any:
+def samples_given(options: TestOptions) -> Any:
     """Return the number of samples, or ``auto``."""
-    return asked.before + asked.after if asked.after is not None else asked.samples
+    return options.before + options.after if options.after is not None else options.samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,12 +258,12 @@ class WindowProgrammes:
         return cls(tuple(windows), tuple(first), np.array(of_row, dtype=np.int64))
 
 
-def problem_as_designed(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: TestOptions) -> WindowProblem:
+def problem_as_designed(plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: TestOptions) -> WindowProblem:
     """Return the problem of options as a design ships them: with the lag."""
-    problem = problem_of(plant, asked)
-    return replace(problem, question=replace(problem.question, lag=asked.lag or 0))
+    problem = problem_of(plant, options)
+    return replace(problem, question=replace(problem.question, lag=options.lag or 0))
 
 
-def window_as_designed(plant: DescriptorSystem, asked: TestOptions) -> Window:
+def window_as_designed(plant: DescriptorSystem, options: TestOptions) -> Window:
     """Return the stacked equations of options as a design ships them: with the number of samples and the lag."""
-    return problem_as_designed(plant, asked).window(int(asked.samples))
+    return problem_as_designed(plant, options).window(int(options.samples))

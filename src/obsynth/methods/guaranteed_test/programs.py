@@ -58,22 +58,22 @@ def largest_hidden_fault(window: Window) -> Optimum:
     cost[0] = -1.0
     ends = np.ldexp(window.bar, -columns)
 
-    given = {"A_eq": matrix.tocsr(), "b_eq": np.zeros(window.rows), "bounds": np.stack([-ends, ends], axis=1)}
+    programme = {"A_eq": matrix.tocsr(), "b_eq": np.zeros(window.rows), "bounds": np.stack([-ends, ends], axis=1)}
     for method, options in ATTEMPTS:
-        found = linprog(cost, method=method, options=options, **given)
-        if found.status in (SOLVED_STATUS, UNBOUNDED):
+        solution = linprog(cost, method=method, options=options, **programme)
+        if solution.status in (SOLVED_STATUS, UNBOUNDED):
             break
-    if found.status == UNBOUNDED:
+    if solution.status == UNBOUNDED:
         return Optimum(np.inf)
-    if found.status != SOLVED_STATUS:
+    if solution.status != SOLVED_STATUS:
         raise SolverError(
             f"HiGHS has no answer for the linear programme of {window.question.samples} samples (status "
-            f"{found.status}): the result is inconclusive. "
+            f"{solution.status}): the result is inconclusive. "
             "Fewer samples, or signals in units in which they are near one, may help."
         )
-    multipliers = np.ldexp(-np.asarray(found.eqlin.marginals), rows)
+    multipliers = np.ldexp(-np.asarray(solution.eqlin.marginals), rows)
     scale = float(window.matrix[:, [0]].toarray().ravel() @ multipliers)
-    point = np.ldexp(np.asarray(found.x), columns)
+    point = np.ldexp(np.asarray(solution.x), columns)
     if abs(scale) > 0.0:
         multipliers = multipliers / scale
     return Optimum(max(float(point[0]), 0.0), multipliers, point)

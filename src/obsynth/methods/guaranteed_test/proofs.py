@@ -43,10 +43,10 @@ def _sums(
     """Return exact sums of entries times doubles."""
     (values, exponent), (factors, more) = entries, scaled_integers(doubles)
     totals = [0] * count
-    for there, product in zip(onto.tolist(), (values * factors[places]).tolist(), strict=True):
-        totals[there] += product
-    one = Fraction(2) ** (exponent + more)
-    return [value * one for value in totals]
+    for place, product in zip(onto.tolist(), (values * factors[places]).tolist(), strict=True):
+        totals[place] += product
+    unit = Fraction(2) ** (exponent + more)
+    return [value * unit for value in totals]
 
 
 def columns_of(window: Window, multipliers: FloatArray) -> list[Fraction]:
@@ -61,17 +61,17 @@ def rows_of(window: Window, point: FloatArray) -> list[Fraction]:
 
 def columns_of_exact(window: Window, multipliers: Sequence[Fraction]) -> list[Fraction]:
     """Return the matrix transposed times multipliers that are fractions, exactly ``(columns,)``."""
-    (values, exponent), found = _entries(window), [Fraction(0)] * len(window.bar)
-    one = Fraction(2) ** exponent
+    (values, exponent), columns = _entries(window), [Fraction(0)] * len(window.bar)
+    unit = Fraction(2) ** exponent
     for row, column, entry in zip(window.i.tolist(), window.j.tolist(), values.tolist(), strict=True):
         if multipliers[row]:
-            found[column] += multipliers[row] * entry
-    return [value * one for value in found]
+            columns[column] += multipliers[row] * entry
+    return [value * unit for value in columns]
 
 
 def exact_right_sides(window: Window, y: FloatArray, u: FloatArray) -> list[Fraction]:
     """Return the right sides of a window of samples, exactly: ``B u`` and ``y - D u``."""
-    plant, found = window.plant, [Fraction(0)] * window.rows
+    plant, sides = window.plant, [Fraction(0)] * window.rows
 
     def times(row: FloatArray, known: FloatArray) -> Fraction:
         return sum(
@@ -80,14 +80,14 @@ def exact_right_sides(window: Window, y: FloatArray, u: FloatArray) -> list[Frac
 
     for k in range(window.equations):
         for r in range(plant.nx):
-            found[k * plant.nx + r] = times(plant.B[r], u[k])
+            sides[k * plant.nx + r] = times(plant.B[r], u[k])
     for k in range(window.question.samples):
         for r in range(plant.ny):
             place = window.outputs_at + k * plant.ny + r
-            found[place] = Fraction(float(y[k, r])) - times(plant.D[r], u[k])
+            sides[place] = Fraction(float(y[k, r])) - times(plant.D[r], u[k])
     if window.standing:
-        found = [side - middle for side, middle in zip(found, window.standing, strict=True)]
-    return found
+        sides = [side - middle for side, middle in zip(sides, window.standing, strict=True)]
+    return sides
 
 
 def _weights(window: Window, multipliers: FloatArray) -> FloatArray:
@@ -100,16 +100,16 @@ def _weights(window: Window, multipliers: FloatArray) -> FloatArray:
 def exact_multipliers(window: Window, multipliers: FloatArray) -> list[Fraction] | None:
     """Return fractions next to multipliers that see no free column at all; ``None`` where none are found."""
     prescribed = np.flatnonzero(window.free)
-    seen = columns_of(window, multipliers)
+    columns = columns_of(window, multipliers)
     weight = _weights(window, multipliers)
     dense, _ = _dense(window, prescribed)
-    corrected = rational_correction(dense.T, weight, [-seen[column] for column in prescribed])
+    corrected = rational_correction(dense.T, weight, [-columns[column] for column in prescribed])
     if corrected is None:
         return None
-    found = [Fraction(float(value)) for value in multipliers]
+    exact = [Fraction(float(value)) for value in multipliers]
     for place, step in zip(*corrected, strict=True):
-        found[place] += step
-    return found
+        exact[place] += step
+    return exact
 
 
 def down(value: Fraction) -> float:
@@ -120,8 +120,8 @@ def down(value: Fraction) -> float:
 def _dense(window: Window, columns: np.ndarray) -> tuple[FloatArray, FloatArray]:
     """Return columns of the matrix, and what rounding of their products may be."""
     matrix = window.matrix[:, columns].toarray()
-    several = np.abs(window.times).max(initial=1) > 1
-    radius = UNIT_ROUNDOFF * np.abs(matrix) * (2.0 if several else 0.0)
+    multiplied = np.abs(window.times).max(initial=1) > 1
+    radius = UNIT_ROUNDOFF * np.abs(matrix) * (2.0 if multiplied else 0.0)
     return matrix, radius
 
 
@@ -135,16 +135,16 @@ def repaired_multipliers(
     """
     condensed = None if exact_zero else Condensed.of(window)
     if condensed is not None:
-        found = condensed.multipliers(multipliers, refine=refine, among=among)
-        if found is not None:
-            return NearbySolution(*found)
+        repaired = condensed.multipliers(multipliers, refine=refine, among=among)
+        if repaired is not None:
+            return NearbySolution(*repaired)
     # The columns whose products with multipliers are prescribed: 0, or 1 for that of theta.
     prescribed = [0, *(range(1, len(window.bar)) if exact_zero else np.flatnonzero(window.free).tolist())]
-    wanted = [Fraction(int(column == 0)) for column in prescribed]
+    targets = [Fraction(int(column == 0)) for column in prescribed]
 
     def missing(values: FloatArray) -> list[Fraction]:
-        seen = columns_of(window, values)
-        return [want - seen[column] for want, column in zip(wanted, prescribed, strict=True)]
+        columns = columns_of(window, values)
+        return [want - columns[column] for want, column in zip(targets, prescribed, strict=True)]
 
     matrix, radius = _dense(window, np.array(prescribed))
     rows, _ = window.scales
@@ -164,14 +164,14 @@ def repaired_point(
         values[near] = np.copysign(bar[near], values[near])
     condensed = Condensed.of(window)
     if condensed is not None:
-        found = condensed.point(values)
-        if found is not None:
-            return NearbySolution(*found) if refine else NearbySolution(values, _distances(*found, values))
+        repaired = condensed.point(values)
+        if repaired is not None:
+            return NearbySolution(*repaired) if refine else NearbySolution(values, _distances(*repaired, values))
     _, columns = window.scales
     sizes = np.ldexp(np.abs(values), -columns)
     room = np.ldexp(np.maximum(1.0, sizes), columns)
-    held = np.where(bounded, bar, 0.0)
-    weight = np.where(bounded, np.maximum(held - np.abs(values), LEAST_ROOM * held), room)
+    bound = np.where(bounded, bar, 0.0)
+    weight = np.where(bounded, np.maximum(bound - np.abs(values), LEAST_ROOM * bound), room)
     weight[0] = 0.0
     weight = weight if among is None else np.where(among > 0.0, weight, 0.0)
     matrix, radius = _dense(window, np.arange(len(bar)))
@@ -182,9 +182,9 @@ def repaired_point(
     return nearby_solution(matrix, radius, (weight, columns), values, missing, refine=refine)
 
 
-def _distances(found: FloatArray, distance: FloatArray, values: FloatArray) -> FloatArray:
+def _distances(exact: FloatArray, distance: FloatArray, values: FloatArray) -> FloatArray:
     """Return how far values are from what lies within a distance of others."""
-    return np.where(distance > 0.0, rounded_up(np.abs(found - values) + distance, 3), 0.0)
+    return np.where(distance > 0.0, rounded_up(np.abs(exact - values) + distance, 3), 0.0)
 
 
 def proved_threshold(window: Window, repaired: NearbySolution, *, exact_zero: bool = False) -> float:
@@ -192,10 +192,10 @@ def proved_threshold(window: Window, repaired: NearbySolution, *, exact_zero: bo
     if exact_zero:
         return 0.0
     standing = Fraction(window.standing_room(repaired.values, repaired.radius))
-    seen = columns_of(window, repaired.values)
+    columns = columns_of(window, repaired.values)
     away = _absolute(window, repaired.radius)
     bounded = np.flatnonzero(window.bounded)
-    parts = [Fraction(float(window.bar[j])) * (abs(seen[j]) + away[j]) for j in bounded]
+    parts = [Fraction(float(window.bar[j])) * (abs(columns[j]) + away[j]) for j in bounded]
     if not window.question.ellipsoid:
         return rounded_outward(sum(parts, start=standing))
     return sum_in_ellipsoids(window, parts, rounded_outward(standing))
@@ -242,19 +242,19 @@ def proved_ray(window: Window) -> FloatArray | None:
     matrix, radius = _dense(window, prescribed)
     theta = window.matrix[:, [0]].toarray().ravel()
     scaled = np.ldexp(np.ldexp(matrix, columns[prescribed]), rows[:, None])
-    found = np.linalg.lstsq(scaled, -np.ldexp(theta, rows), rcond=None)[0]
-    size = 1.0 + float(np.max(np.abs(found), initial=0.0))
-    if np.max(np.abs(scaled @ found + np.ldexp(theta, rows)), initial=0.0) > HIDDEN * size:
+    solution = np.linalg.lstsq(scaled, -np.ldexp(theta, rows), rcond=None)[0]
+    size = 1.0 + float(np.max(np.abs(solution), initial=0.0))
+    if np.max(np.abs(scaled @ solution + np.ldexp(theta, rows)), initial=0.0) > HIDDEN * size:
         return None
     point = np.zeros(len(window.bar))
-    point[0], point[prescribed] = 1.0, np.ldexp(found, columns[prescribed])
+    point[0], point[prescribed] = 1.0, np.ldexp(solution, columns[prescribed])
 
     def missing(values: FloatArray) -> list[Fraction]:
-        whole = point.copy()
-        whole[prescribed] = values
-        return [-value for value in rows_of(window, whole)]
+        full_point = point.copy()
+        full_point[prescribed] = values
+        return [-value for value in rows_of(window, full_point)]
 
-    weight = np.ldexp(np.maximum(np.abs(found), 1.0), columns[prescribed])
+    weight = np.ldexp(np.maximum(np.abs(solution), 1.0), columns[prescribed])
     repaired = nearby_solution(
         matrix, radius, (weight, columns[prescribed]), point[prescribed].copy(), missing, refine=True
     )

@@ -21,11 +21,11 @@ def while_inside(design: ObserverDesign) -> str:
     if not region or model is None:
         return ""
     units = model["units"]
-    told = [
+    ranges = [
         f"{name} stays within {shown(low)} to {shown(high, units.get(name, ''))}"
         for name, (low, high) in region.items()
     ]
-    return f", while {', '.join(told)}, between samples too"
+    return f", while {', '.join(ranges)}, between samples too"
 
 
 def remainder_check(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]) -> Check:
@@ -33,20 +33,20 @@ def remainder_check(design: ObserverDesign, read: Callable[[Mapping[str, Any]], 
     plant, _ = design.linear
     reason, worst = "", np.inf
     try:
-        asked = read(design.options)
-        own = [name for name in plant.disturbance_names if name in asked.model["inputs"]]
-        _, found = bounded_model(
-            DAEModel(**asked.model),
-            asked.region,
-            asked.sample_time,
+        options = read(design.options)
+        own = [name for name in plant.disturbance_names if name in options.model["inputs"]]
+        _, bounds = bounded_model(
+            DAEModel(**options.model),
+            options.region,
+            options.sample_time,
             faults=plant.fault_names,
             disturbances=own,
-            given=asked.given,
+            given=options.given,
             shipped=plant,
         )
-        kept = plant.disturbance_names[len(own) :] == tuple(found) and plant.dt == asked.sample_time
-        ratios = [value / max(asked.disturbance_bounds[name], np.finfo(float).tiny) for name, value in found.items()]
-        worst = max(ratios) if kept and _apart(design, len(own)) else np.inf
+        fits = plant.disturbance_names[len(own) :] == tuple(bounds) and plant.dt == options.sample_time
+        ratios = [value / max(options.disturbance_bounds[name], np.finfo(float).tiny) for name, value in bounds.items()]
+        worst = max(ratios) if fits and _apart(design, len(own)) else np.inf
     except (ObsynthError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         reason = str(error)
     return upper_bound_check(
@@ -66,6 +66,6 @@ def _apart(design: ObserverDesign, own: int) -> bool:
     plant, _ = design.linear
     nx, ny = plant.nx, plant.ny
     into = np.hstack([np.eye(nx), np.zeros((nx, ny))])
-    seen = np.hstack([np.zeros((ny, nx)), np.eye(ny)])
-    same = np.array_equal(plant.Bd[:, own:], into) and np.array_equal(plant.Dd[:, own:], seen)
+    onto_outputs = np.hstack([np.zeros((ny, nx)), np.eye(ny)])
+    same = np.array_equal(plant.Bd[:, own:], into) and np.array_equal(plant.Dd[:, own:], onto_outputs)
     return bool(same and np.array_equal(plant.E, np.eye(nx)))

@@ -92,8 +92,8 @@ class GuaranteedTest(ObserverDesign):
         Infinite where there is none, which is proved: the second then hides the first.
         """
         names, table = self.linear[0].fault_names, self.certificate.matrices.get("pairs", np.zeros((0, 0)))
-        both = [(i, j) for i in range(len(table)) for j in range(len(table)) if i != j]
-        return {(names[i], names[j]): float(table[i, j]) for i, j in both}
+        indices = [(i, j) for i in range(len(table)) for j in range(len(table)) if i != j]
+        return {(names[i], names[j]): float(table[i, j]) for i, j in indices}
 
     @property
     def fault_names(self) -> tuple[str, ...]:
@@ -123,11 +123,11 @@ class GuaranteedTest(ObserverDesign):
             raise SpecError(f"u has shape {inputs.shape}, but {needed} is needed (samples by signals).", path="u")
         return outputs, inputs
 
-    def _single(self, what: str) -> GuaranteedTest:
+    def _single(self, property_name: str) -> GuaranteedTest:
         """Return this test; raise `SpecError` for a bank, whose tests have that each."""
         if self.options.get("isolate"):
             raise SpecError(
-                f"{self.name!r} is a bank: each of its tests has {what} of its own (tests).", path="isolate"
+                f"{self.name!r} is a bank: each of its tests has {property_name} of its own (tests).", path="isolate"
             )
         return self
 
@@ -226,8 +226,8 @@ class GuaranteedTest(ObserverDesign):
         whole_number(rows, "rows")
         if not isinstance(self.observer, WindowObserver):
             return np.full(rows, self.threshold)
-        found = np.append(self.certificate.matrices["thresholds"].ravel(), np.inf)
-        return np.asarray(found[[self.observer.programme_at(k) for k in range(rows)]])
+        thresholds = np.append(self.certificate.matrices["thresholds"].ravel(), np.inf)
+        return np.asarray(thresholds[[self.observer.programme_at(k) for k in range(rows)]])
 
     def interval(self, estimates: Estimates) -> tuple[FloatArray, FloatArray]:
         """Return the ends between which the fault lies at each row, ``(steps,)`` each; NaN where none is known.
@@ -299,8 +299,8 @@ class GuaranteedTest(ObserverDesign):
         length, programmes = rows_before(self) + 1, Programmes.of(self)
         for k in range(length - 1, len(outputs)):
             rows = slice(k + 1 - length, k + 1)
-            found = programmes.interval(outputs[rows], inputs[rows])
-            low[k], high[k] = max(low[k], found[0]), min(high[k], found[1])
+            ends = programmes.interval(outputs[rows], inputs[rows])
+            low[k], high[k] = max(low[k], ends[0]), min(high[k], ends[1])
         return low, high
 
     def plot(self, axes: Axes | None = None) -> Axes:
@@ -316,8 +316,8 @@ class GuaranteedTest(ObserverDesign):
         Axes
             In seconds and in the fault's unit; what is chosen is marked.
         """
-        found: Axes = registered("plot_least_thresholds")(self, axes=axes)
-        return found
+        drawn: Axes = registered("plot_least_thresholds")(self, axes=axes)
+        return drawn
 
 
 guaranteed_test = design_function(GuaranteedTestMethod, GuaranteedTest, positional=("fault",))

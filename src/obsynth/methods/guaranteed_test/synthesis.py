@@ -83,7 +83,7 @@ SHORT_SECONDS, MINUTES = 5.0, 120.0
 
 def synthesise(
     plant: DescriptorSystem | TimeVaryingDescriptorSystem,
-    asked: TestOptions,
+    options: TestOptions,
     *,
     progress: Callable[[str], None],
     scenario: Scenario | None = None,
@@ -93,21 +93,21 @@ def synthesise(
     beside, notes = None, []
     if scenario is not None and isinstance(plant, DescriptorSystem):
         try:
-            beside = _observer_beside(asked, scenario, plant, progress)
+            beside = _observer_beside(options, scenario, plant, progress)
         except ObsynthError as error:
             notes.append(f"There is no threshold over the tolerances: {error}")
-    problem = problem_of(plant, asked)
-    require_all(conditions(plant, asked, with_windows=False))
-    condition, lag = detectability(problem, asked)
+    problem = problem_of(plant, options)
+    require_all(conditions(plant, options, with_windows=False))
+    condition, lag = detectability(problem, options)
     condition.require()
     problem = replace(problem, question=replace(problem.question, lag=lag))
-    given = samples_given(asked)
-    most = problem.ladder()[-1] if given == "auto" else int(given)
+    stated_samples = samples_given(options)
+    most = problem.ladder()[-1] if stated_samples == "auto" else int(stated_samples)
     progress(f"solving linear programmes of up to {most} samples, which take {in_time(plant.nx, most)}")
-    samples, table, known = chosen_samples(problem, asked, beside)
+    samples, table, known = chosen_samples(problem, options, beside)
     programmes = WindowProgrammes.of(problem, samples)
-    several = f", one for each of {len(programmes.windows)} different windows" if len(programmes.windows) > 1 else ""
-    progress(f"proving the threshold on {samples} samples{several}")
+    per_window = f", one for each of {len(programmes.windows)} different windows" if len(programmes.windows) > 1 else ""
+    progress(f"proving the threshold on {samples} samples{per_window}")
     shipped = []
     for window, row in zip(programmes.windows, programmes.first, strict=True):
         optimum = known.get(row) or largest_hidden_fault(window)
@@ -117,24 +117,24 @@ def synthesise(
             f"HiGHS finds no test on {samples} samples at any row, but there is one: inconclusive. Other units may "
             "help."
         )
-    found = _synthesis(problem, asked, programmes, shipped, table, beside)
-    return replace(found, notes=(*found.notes, *notes))
+    synthesis = _synthesis(problem, options, programmes, shipped, table, beside)
+    return replace(synthesis, notes=(*synthesis.notes, *notes))
 
 
 def _observer_beside(
-    asked: TestOptions, scenario: Scenario, plant: DescriptorSystem, progress: Callable[[str], None]
+    options: TestOptions, scenario: Scenario, plant: DescriptorSystem, progress: Callable[[str], None]
 ) -> Beside:
     """Return the observer of the state, and what it says of a scenario without its faults."""
-    if asked.state_bounds or asked.initial_bounds:
+    if options.state_bounds or options.initial_bounds:
         raise PreconditionError(
             "Bounds of states and tolerances do not go together: leave state_bounds and initial_bounds out.",
             condition="tolerances",
         )
-    if asked.exact:
+    if options.exact:
         raise PreconditionError(
             "exact is for an exact model: leave it out for a threshold over the tolerances.", condition="tolerances"
         )
-    if list(problem_of(plant, asked).bounds.middles):
+    if list(problem_of(plant, options).bounds.middles):
         raise PreconditionError(
             "Bounds [low, high] and tolerances do not go together: the effect of the constants on the middle is not "
             "known. Give the larger end.",
@@ -142,7 +142,7 @@ def _observer_beside(
         )
     progress("designing the observer of the state beside the test")
     own = design(plant, BESIDE)
-    affine = over_the_box(plant, asked.disturbance)
+    affine = over_the_box(plant, options.disturbance)
     tracking = tracking_of(own, affine)
     observer = own.linear[1]
     quiet = scenario.replace(faults={}, sensors={}, horizon=min(scenario.horizon, MOST_COMPARED_SAMPLES * plant.dt))
@@ -152,18 +152,18 @@ def _observer_beside(
         *scenario_stepper(own.linear[0], quiet, start), (nu, nu + plant.nf), [quiet.seed]
     )
     record = np.hstack([inputs[:, 0], outputs[:, 0]])
-    problem = problem_of(plant, asked)
+    problem = problem_of(plant, options)
     noisy = noisy_as_bounded(problem.window(problem.shortest + 1))
     bounded = replace(affine, plant=noisy)
     sizes = affine.disturbance_bounds(problem.bounds.disturbance)
     structure = error_structure(observer, bounded, tracking, sizes, 1.0, states=True)
-    found, states = thresholds_over_record(structure, observer, record, varying=affine.box.variation == "varying")
+    thresholds, states = thresholds_over_record(structure, observer, record, varying=affine.box.variation == "varying")
     n = plant.nx
-    return Beside(observer, tracking.T, tracking.T0[:n], affine, record, states[:, :n], found.total[0])
+    return Beside(observer, tracking.T, tracking.T0[:n], affine, record, states[:, :n], thresholds.total[0])
 
 
 def chosen_samples(
-    problem: WindowProblem, asked: TestOptions, beside: Beside | None
+    problem: WindowProblem, options: TestOptions, beside: Beside | None
 ) -> tuple[int, FloatArray, Mapping[int, Optimum]]:
     """Return the number of samples, the table of those tried with their thresholds ``(tried, 2)``, and the optima by
     row; where each row has a window of its own some rows are tried, and the worst one counts.
@@ -171,20 +171,22 @@ def chosen_samples(
     With tolerances the table has a third column, the mean threshold over the record, which decides, and the
     multipliers are those that make it least.
     """
-    given = samples_given(asked)
-    tried = problem.ladder() if given == "auto" else (int(given),)
+    stated_samples = samples_given(options)
+    tried = problem.ladder() if stated_samples == "auto" else (int(stated_samples),)
     if beside is not None:
         tried = tuple(rung for rung in tried if rung <= beside.longest()) or tried[:1]
     # Rows that have a window of every length.
     rows = problem.tried(tried[-1])
-    found: list[list[Optimum]] = []
+    optima_by_length: list[list[Optimum]] = []
     for rung in reversed(tried):
         # More samples never raise a threshold: where there is no test, there is none on fewer.
-        hopeless = bool(found) and problem.horizon is None and not np.isfinite(found[0][0].size)
+        hopeless = bool(optima_by_length) and problem.horizon is None and not np.isfinite(optima_by_length[0][0].size)
         windows = (problem.window(rung, row=row) for row in rows)
-        found.insert(0, [Optimum(np.inf) if hopeless else largest_hidden_fault(window) for window in windows])
+        optima_by_length.insert(
+            0, [Optimum(np.inf) if hopeless else largest_hidden_fault(window) for window in windows]
+        )
     table = np.array(
-        [[rung, max(optimum.size for optimum in optima)] for rung, optima in zip(tried, found, strict=True)]
+        [[rung, max(optimum.size for optimum in optima)] for rung, optima in zip(tried, optima_by_length, strict=True)]
     )
     if not np.isfinite(table[:, 1]).any():
         if problem.horizon is None:
@@ -192,18 +194,20 @@ def chosen_samples(
                 f"HiGHS finds no test on {tried[-1]} samples, but there is one: inconclusive. Other units may help."
             )
         # No length tells the fault at all of these rows: the longest tells it at most of them.
-        return tried[-1], table, dict(zip(rows, found[-1], strict=True))
+        return tried[-1], table, dict(zip(rows, optima_by_length[-1], strict=True))
     if beside is not None:
         wider = [
             largest_hidden_fault(with_tolerances(problem.window(rung), beside)) if np.isfinite(own.size) else own
-            for rung, (own,) in zip(tried, found, strict=True)
+            for rung, (own,) in zip(tried, optima_by_length, strict=True)
         ]
         table = np.column_stack([table, [optimum.size for optimum in wider]])
-        found = [[replace(own, multipliers=more.multipliers)] for (own,), more in zip(found, wider, strict=True)]
+        optima_by_length = [
+            [replace(own, multipliers=more.multipliers)] for (own,), more in zip(optima_by_length, wider, strict=True)
+        ]
     # With tolerances more samples may be worse.
     good = table[:, -1] <= (1.0 + WITHIN) * np.min(table[:, -1])
     place = int(np.flatnonzero(good)[0])
-    return tried[place], table, dict(zip(rows, found[place], strict=True))
+    return tried[place], table, dict(zip(rows, optima_by_length[place], strict=True))
 
 
 def in_time(states: int, samples: int) -> str:
@@ -221,18 +225,18 @@ class Shipped:
         self.test, self.threshold, self.witness, self.least = test, threshold, witness, least
 
 
-def proved_test(window: Window, found: Optimum) -> Shipped:
+def proved_test(window: Window, optimum: Optimum) -> Shipped:
     """Return the proved test next to a solution; raise `SolverError` where nothing can be proved."""
-    if found.multipliers is None or found.point is None:
+    if optimum.multipliers is None or optimum.point is None:
         raise SolverError("The linear programme is unbounded on this window: the result is inconclusive.")
     rows, _ = window.scales
     # What all bounds together could do to these weights.
-    able = float(np.abs(window.matrix[:, window.bounded]).T @ np.abs(found.multipliers) @ window.bar[window.bounded])
-    if found.size <= ZERO_THRESHOLD * able and not window.standing:
-        exact = repaired_multipliers(window.outer, found.multipliers, refine=True, exact_zero=True)
+    able = float(np.abs(window.matrix[:, window.bounded]).T @ np.abs(optimum.multipliers) @ window.bar[window.bounded])
+    if optimum.size <= ZERO_THRESHOLD * able and not window.standing:
+        exact = repaired_multipliers(window.outer, optimum.multipliers, refine=True, exact_zero=True)
         if exact is not None:
             return Shipped(exact.with_room(rows), 0.0, None, 0.0)
-    test = repaired_multipliers(window, found.multipliers, refine=True)
+    test = repaired_multipliers(window, optimum.multipliers, refine=True)
     if test is None:
         raise SolverError(
             f"Weights of {window.question.samples} samples were found, but double precision cannot tell how far they "
@@ -240,7 +244,7 @@ def proved_test(window: Window, found: Optimum) -> Shipped:
         )
     test = test.with_room(rows)
     inner = window.inner
-    point = found.point if inner is window else largest_hidden_fault(inner).point
+    point = optimum.point if inner is window else largest_hidden_fault(inner).point
     witness = None if point is None else repaired_point(inner, point, refine=True)
     witness = None if witness is None else witness.with_room(inner.scales[1])
     least = np.nan if witness is None else proved_least(inner, witness)
@@ -251,7 +255,7 @@ def proved_test(window: Window, found: Optimum) -> Shipped:
 
 def _synthesis(
     problem: WindowProblem,
-    asked: TestOptions,
+    options: TestOptions,
     programmes: WindowProgrammes,
     shipped: list[Shipped | None],
     table: FloatArray,
@@ -259,8 +263,8 @@ def _synthesis(
 ) -> Synthesis:
     first, question = programmes.windows[0], programmes.windows[0].question
     multipliers = [
-        np.zeros(window.rows) if one is None else one.test.values
-        for window, one in zip(programmes.windows, shipped, strict=True)
+        np.zeros(window.rows) if proved is None else proved.test.values
+        for window, proved in zip(programmes.windows, shipped, strict=True)
     ]
     matrices = _by_programme(problem, programmes, shipped)
     of_row, thresholds, leasts = (matrices[name].ravel() for name in ("programmes", "thresholds", "leasts"))
@@ -273,17 +277,17 @@ def _synthesis(
     }
     if np.isfinite(leasts[used]).any():
         claims["least"] = float(np.nanmax(leasts[used]))
-    options: dict[str, Any] = {option.name: getattr(asked, option.name) for option in fields(TestOptions)} | {
+    shipped_options: dict[str, Any] = {option.name: getattr(options, option.name) for option in fields(TestOptions)} | {
         "samples": question.samples,
         "lag": question.lag if question.course in ("any", "ramp", "rate") else None,
         "fault": problem.fault,
     }
     if not isinstance(problem.plant, DescriptorSystem):
-        has_test = np.array([one is not None for one in shipped])
+        has_test = np.array([proved is not None for proved in shipped])
         weighing = observer_of_rows(problem, programmes, has_test, multipliers)
         by_row = tuple(_notes_of_rows(problem, claims, matrices, question))
         certificate = Certificate(matrices | {TRADE_OFF: table}, claims)
-        return Synthesis(options, {"weights": weighing.weights}, weighing, certificate, notes=by_row)
+        return Synthesis(shipped_options, {"weights": weighing.weights}, weighing, certificate, notes=by_row)
     observer = observer_of(first, multipliers[0], None if beside is None else beside.observer)
     alone = {name: matrices[name][0] for name in ("multipliers", "multiplier_radius", "rounding")}
     if matrices["witness"].any():
@@ -292,9 +296,9 @@ def _synthesis(
         alone |= {"state_tracking": beside.T, "state_rows": beside.T0, "record": beside.record}
         mean = mean_over_record(first, observer, multipliers[0], beside.T, beside.T0, beside.record)
         claims["mean_threshold"] = mean
-    notes = tuple(_notes(problem, asked, first, claims, table))
+    notes = tuple(_notes(problem, options, first, claims, table))
     certificate = Certificate(alone | {TRADE_OFF: table}, claims)
-    return Synthesis(options, {"h": on_y, "g": on_u}, observer, certificate, notes=notes)
+    return Synthesis(shipped_options, {"h": on_y, "g": on_u}, observer, certificate, notes=notes)
 
 
 def _by_programme(
@@ -302,17 +306,17 @@ def _by_programme(
 ) -> dict[str, FloatArray]:
     """Return what is proved of each different window, a row for each, and which of them each row of a record has."""
     windows, empty = programmes.windows, NearbySolution(np.zeros(1), np.zeros(1))
-    tests = [empty if one is None else one.test for one in shipped]
+    tests = [empty if proved is None else proved.test for proved in shipped]
     continued = [
-        one if one is not None and _is_lasting(problem, window, row, one.witness) else None
-        for window, one, row in zip(windows, shipped, programmes.first, strict=True)
+        proved if proved is not None and _is_lasting(problem, window, row, proved.witness) else None
+        for window, proved, row in zip(windows, shipped, programmes.first, strict=True)
     ]
-    witnesses = [empty if one is None or one.witness is None else one.witness for one in continued]
-    has_test = np.array([one is not None for one in shipped])
+    witnesses = [empty if proved is None or proved.witness is None else proved.witness for proved in continued]
+    has_test = np.array([proved is not None for proved in shipped])
     _, _, nu, ny = windows[0].model.sizes
     rounding = [
-        np.zeros(nu + ny) if one is None else rounding_of(window, one.test.values, one.test.radius)
-        for window, one in zip(windows, shipped, strict=True)
+        np.zeros(nu + ny) if proved is None else rounding_of(window, proved.test.values, proved.test.radius)
+        for window, proved in zip(windows, shipped, strict=True)
     ]
     rows = max(window.rows for window in windows)
     return {
@@ -321,8 +325,8 @@ def _by_programme(
         "rounding": np.array(rounding),
         "witness": padded([witness.values for witness in witnesses]),
         "witness_radius": padded([witness.radius for witness in witnesses]),
-        "thresholds": np.array([[np.inf if one is None else one.threshold] for one in shipped]),
-        "leasts": np.array([[np.nan if one is None else one.least] for one in continued]),
+        "thresholds": np.array([[np.inf if proved is None else proved.threshold] for proved in shipped]),
+        "leasts": np.array([[np.nan if proved is None else proved.least] for proved in continued]),
         "programmes": np.where(has_test[programmes.of_row], programmes.of_row, -1).astype(np.float64)[:, None],
     }
 
@@ -341,7 +345,7 @@ def _is_lasting(problem: WindowProblem, window: Window, row: int, witness: Nearb
 
 
 def _notes(
-    problem: WindowProblem, asked: TestOptions, window: Window, claims: Mapping[str, float], table: FloatArray
+    problem: WindowProblem, options: TestOptions, window: Window, claims: Mapping[str, float], table: FloatArray
 ) -> list[str]:
     question, threshold, least = window.question, claims["threshold"], claims.get("least")
     words, mean = [], claims.get("mean_threshold")
@@ -372,7 +376,7 @@ def _notes(
     else:
         words.append("That there is no smaller threshold could not be proved on these numbers: least is not claimed.")
     words.append(f"The course {question.course} is {COURSES[question.course]}.")
-    if question.course == "any" and asked.lag is None:
+    if question.course == "any" and options.lag is None:
         words.append(f"The least lag with which {problem.fault} can be estimated is {question.lag}.")
     if mean is not None:
         words.append(

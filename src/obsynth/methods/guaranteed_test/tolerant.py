@@ -86,17 +86,17 @@ def side_by_side(test: LinearObserver, beside: LinearObserver) -> LinearObserver
     )
 
 
-def part_beside(both: LinearObserver, order: int) -> LinearObserver:
+def part_beside(joint: LinearObserver, order: int) -> LinearObserver:
     """Return the observer of the state, of this order, out of what `side_by_side` made."""
-    n, first = len(both.state_names), both.order - order
+    n, first = len(joint.state_names), joint.order - order
     return replace(
-        both,
-        Az=both.Az[first:, first:],
-        Bu=both.Bu[first:],
-        By=both.By[first:],
-        Cz=both.Cz[:n, first:],
-        Du=both.Du[:n],
-        Dy=both.Dy[:n],
+        joint,
+        Az=joint.Az[first:, first:],
+        Bu=joint.Bu[first:],
+        By=joint.By[first:],
+        Cz=joint.Cz[:n, first:],
+        Du=joint.Du[:n],
+        Dy=joint.Dy[:n],
         fault_names=(),
         fault_delays=(),
         residual_names=(),
@@ -137,10 +137,10 @@ def with_tolerances(window: Window, beside: Beside) -> Window:
         for j, span in enumerate(spans):
             into = x[1 : window.equations + 1] @ affine.E.parts[j].T
             into = into - x[: window.equations] @ affine.A.parts[j].T - u[: window.equations] @ affine.B.parts[j].T
-            seen = x[: window.question.samples] @ affine.C.parts[j].T
-            seen = seen + u[: window.question.samples] @ affine.D.parts[j].T
+            onto_outputs = x[: window.question.samples] @ affine.C.parts[j].T
+            onto_outputs = onto_outputs + u[: window.question.samples] @ affine.D.parts[j].T
             column = builder.columns([("tolerance", start, j)], [span / len(starts)])
-            builder.put(0, np.concatenate([into.ravel(), seen.ravel()])[:, None], column)
+            builder.put(0, np.concatenate([into.ravel(), onto_outputs.ravel()])[:, None], column)
     # What multiplies the error of the state, and disturbances; remainders.
     known = np.abs(beside.states) + beside.errors
     for k in range(length):
@@ -154,9 +154,9 @@ def with_tolerances(window: Window, beside: Beside) -> Window:
         inputs = np.abs(beside.record[starts + k, :nu]).mean(axis=0)
         into = affine.A.radius @ sizes + affine.B.radius @ inputs + affine.Bd.radius @ sizes_of_d
         later = known[np.minimum(starts + k + 1, len(known) - 1)].mean(axis=0)
-        seen = affine.C.radius @ sizes + affine.D.radius @ inputs + affine.Dd.radius @ sizes_of_d
+        onto_outputs = affine.C.radius @ sizes + affine.D.radius @ inputs + affine.Dd.radius @ sizes_of_d
         put((np.zeros((0, 0)), np.eye(window.plant.nx), np.zeros((0, 0))), k, (into + affine.E.radius @ later).tolist())
-        put((np.zeros((0, 0)), np.zeros((0, 0)), np.eye(window.plant.ny)), k, seen.tolist())
+        put((np.zeros((0, 0)), np.zeros((0, 0)), np.eye(window.plant.ny)), k, onto_outputs.tolist())
     return window.with_columns(builder)
 
 
@@ -200,8 +200,8 @@ def thresholds_over_record(
     """Return thresholds on a record ``(steps, nu + ny)`` and what the observer says, as the error system reads it."""
     nu = len(observer.input_names)
     u, y = record[:, :nu], record[:, nu:]
-    said = observer.run(y, u)
-    rows = np.hstack([said.states, said.faults, said.residuals])
+    estimates = observer.run(y, u)
+    rows = np.hstack([estimates.states, estimates.faults, estimates.residuals])
     states = rows @ structure.reading.T
     bound = adaptive_bound(structure, observer, Start(observer.order), varying=varying)
     return thresholds_of_records(bound, states[None], u[None], y[None]), states
@@ -216,5 +216,5 @@ def thresholds_over_tolerances(
 ) -> FloatArray:
     """Return thresholds ``(steps, rows)`` on a record ``(steps, nu + ny)``; noise columns of the plant within one."""
     structure = error_structure(observer, affine, Tracking(*tracking), affine.disturbance_bounds(bounds), 1.0)
-    found, _ = thresholds_over_record(structure, observer, record, varying=affine.box.variation == "varying")
-    return np.asarray(found.total[0])
+    thresholds, _ = thresholds_over_record(structure, observer, record, varying=affine.box.variation == "varying")
+    return np.asarray(thresholds.total[0])

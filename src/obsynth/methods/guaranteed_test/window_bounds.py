@@ -25,25 +25,25 @@ def fault_of(names: tuple[str, ...], name: str | None) -> int:
     if name is None and len(names) == 1:
         return 0
     if name is None or name not in names:
-        given = "No fault is named" if name is None else f"There is no fault {name!r}"
+        complaint = "No fault is named" if name is None else f"There is no fault {name!r}"
         listed = (
             f"name one of {', '.join(names)}"
             if names
             else "the plant has none (Bf, Df; for a plant that changes with k: Phi, Psi)"
         )
-        raise SpecError(f"{given}: {listed}.", path="method.options.fault")
+        raise SpecError(f"{complaint}: {listed}.", path="method.options.fault")
     return names.index(name)
 
 
-def free_faults(names: tuple[str, ...], given: Any, fault: int) -> tuple[int, ...]:
+def free_faults(names: tuple[str, ...], free: Any, fault: int) -> tuple[int, ...]:
     """Return the numbers of the faults that may do anything besides."""
-    if isinstance(given, str) and given not in names:
-        if given not in ("others", "none"):
+    if isinstance(free, str) and free not in names:
+        if free not in ("others", "none"):
             raise SpecError(
-                f"free is {given!r}: use others, none, or a list of {', '.join(names)}.", path="method.options.free"
+                f"free is {free!r}: use others, none, or a list of {', '.join(names)}.", path="method.options.free"
             )
-        return tuple(k for k in range(len(names)) if k != fault) if given == "others" else ()
-    listed = [given] if isinstance(given, str) else list(given or ())
+        return tuple(k for k in range(len(names)) if k != fault) if free == "others" else ()
+    listed = [free] if isinstance(free, str) else list(free or ())
     wrong = [str(name) for name in listed if name not in names or names.index(name) == fault]
     if wrong:
         raise SpecError(
@@ -53,16 +53,16 @@ def free_faults(names: tuple[str, ...], given: Any, fault: int) -> tuple[int, ..
     return tuple(sorted({names.index(name) for name in listed}))
 
 
-def missing_bounds(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: TestOptions) -> Iterator[str]:
+def missing_bounds(plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: TestOptions) -> Iterator[str]:
     """Yield a sentence for each bound that is missing."""
-    known, names = asked.disturbance_bounds, disturbance_names(plant)
+    known, names = options.disturbance_bounds, disturbance_names(plant)
     if isinstance(plant, TimeVaryingDescriptorSystem):
         if known is None:
             yield (
                 "disturbance_bounds: the largest absolute value of mu(k) in each equation is missing: give it "
                 f"for {', '.join(names)}, and 0 where an equation holds exactly."
             )
-        if not isinstance(asked.noise_bound, Mapping):
+        if not isinstance(options.noise_bound, Mapping):
             yield (
                 "noise_bound: a plant that changes with k states no deviations; give the bound of each output by name: "
                 f"{', '.join(plant.output_names)}."
@@ -74,29 +74,29 @@ def missing_bounds(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked:
         if lacking:
             yield f"disturbance_bounds: the largest absolute value of {', '.join(lacking)} is missing."
     noisy = bool(plant.Bw.any() or plant.Dw.any())
-    if asked.noise_bound and not isinstance(asked.noise_bound, Mapping) and not noisy:
+    if options.noise_bound and not isinstance(options.noise_bound, Mapping) and not noisy:
         yield (
             "noise_bound: the plant states no noise of which this is a number of deviations; give sensor_noise, or the "
             "bound of each output by name."
         )
-    if asked.noise_bound is None and noisy:
+    if options.noise_bound is None and noisy:
         yield (
             "noise_bound: a standard deviation is no bound; state how many of them the noise never exceeds, or the "
             "bound of each output by name."
         )
 
 
-def bounds_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: TestOptions) -> Bounds:
+def bounds_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: TestOptions) -> Bounds:
     """Return the bounds that are given; raise `SpecError` where some are missing."""
-    lacking = list(missing_bounds(plant, asked))
+    lacking = list(missing_bounds(plant, options))
     if lacking:
         first = lacking[0].partition(":")[0]
         raise SpecError("A guaranteed test needs bounds.", path=f"method.options.{first}", problems=lacking)
     every, names = isinstance(plant, TimeVaryingDescriptorSystem), disturbance_names(plant)
-    disturbance, disturbance_middle = between(asked.disturbance_bounds, names, "disturbance_bounds", every=every)
-    if isinstance(asked.noise_bound, Mapping) or not isinstance(plant, DescriptorSystem):
+    disturbance, disturbance_middle = between(options.disturbance_bounds, names, "disturbance_bounds", every=every)
+    if isinstance(options.noise_bound, Mapping) or not isinstance(plant, DescriptorSystem):
         state, output = np.zeros((plant.nx, plant.ny)), np.eye(plant.ny)
-        noise, middle = between(asked.noise_bound, plant.output_names, "noise_bound", every=True)
+        noise, middle = between(options.noise_bound, plant.output_names, "noise_bound", every=True)
         if isinstance(plant, DescriptorSystem) and plant.Bw.any():
             raise SpecError(
                 "noise_bound is given by output, but noise enters the equations too: give a number of deviations.",
@@ -104,35 +104,37 @@ def bounds_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Test
             )
     else:
         state, output, middle = plant.Bw, plant.Dw, np.zeros(plant.nw)
-        noise = by_name(asked.noise_bound, plant.noise_names, "noise_bound", every=False)
-    always = by_name(asked.state_bounds, plant.state_names, "state_bounds", every=False, missing=np.inf)
-    at_first = by_name(asked.initial_bounds, plant.state_names, "initial_bounds", every=False, missing=np.inf)
-    found = Bounds(disturbance, state, output, noise, always, at_first, disturbance_middle, middle)
-    return _between_samples(plant, asked, found) if isinstance(plant, DescriptorSystem) else found
+        noise = by_name(options.noise_bound, plant.noise_names, "noise_bound", every=False)
+    always = by_name(options.state_bounds, plant.state_names, "state_bounds", every=False, missing=np.inf)
+    at_first = by_name(options.initial_bounds, plant.state_names, "initial_bounds", every=False, missing=np.inf)
+    bounds = Bounds(disturbance, state, output, noise, always, at_first, disturbance_middle, middle)
+    return _between_samples(plant, options, bounds) if isinstance(plant, DescriptorSystem) else bounds
 
 
-def _between_samples(plant: DescriptorSystem, asked: TestOptions, bounds: Bounds) -> Bounds:
+def _between_samples(plant: DescriptorSystem, options: TestOptions, bounds: Bounds) -> Bounds:
     """Return bounds with what disturbances do between the samples of a plant whose continuous one is known."""
-    if asked.disturbance not in ("any", "rate") or not bounds.disturbance.any():
+    if options.disturbance not in ("any", "rate") or not bounds.disturbance.any():
         return bounds
-    moving = moving_columns(plant, None if asked.model is None else continuous_model(plant, asked.model, asked.given))
+    moving = moving_columns(
+        plant, None if options.model is None else continuous_model(plant, options.model, options.given)
+    )
     if moving is None:
         return bounds
     sizes = bounds.disturbance
-    if asked.disturbance == "rate":
+    if options.disturbance == "rate":
         # Beside its value at the sample before a disturbance has changed by no more than its rate.
-        rates = by_name(asked.disturbance_rate, plant.disturbance_names, "disturbance_rate", every=True)
+        rates = by_name(options.disturbance_rate, plant.disturbance_names, "disturbance_rate", every=True)
         sizes = np.minimum(rates, 2.0 * sizes)
     return replace(bounds, moving=moving, moving_bounds=sizes)
 
 
-def between(given: Any, names: tuple[str, ...], option: str, *, every: bool) -> tuple[FloatArray, FloatArray]:
+def between(bounds: Any, names: tuple[str, ...], option: str, *, every: bool) -> tuple[FloatArray, FloatArray]:
     """Return half widths, rounded up, and middles of bounds that are numbers, or ``[low, high]`` by name."""
     low, high = {}, {}
-    for name, value in given.items() if isinstance(given, Mapping) else ():
+    for name, value in bounds.items() if isinstance(bounds, Mapping) else ():
         if isinstance(value, (list, tuple, np.ndarray)):
             low[name], high[name] = float(value[0]), float(value[1])
-    plain = {name: 0.0 if name in low else value for name, value in given.items()} if low else given
+    plain = {name: 0.0 if name in low else value for name, value in bounds.items()} if low else bounds
     half, middle = by_name(plain, names, option, every=every), np.zeros(len(names))
     for place, name in enumerate(names):
         if name in low:
@@ -142,14 +144,14 @@ def between(given: Any, names: tuple[str, ...], option: str, *, every: bool) -> 
     return half, middle
 
 
-def by_name(given: Any, names: tuple[str, ...], option: str, *, every: bool, missing: float = 0.0) -> FloatArray:
+def by_name(numbers: Any, names: tuple[str, ...], option: str, *, every: bool, missing: float = 0.0) -> FloatArray:
     """Return a number, 0 or more, for each name, from one number for all or a mapping."""
     path = f"method.options.{option}"
-    if given is None:
+    if numbers is None:
         if every and names:
             raise SpecError(f"{option} is missing: give a number for each of {', '.join(names)}.", path=path)
         return np.full(len(names), missing)
-    by_name = dict(given) if isinstance(given, Mapping) else dict.fromkeys(names, given)
+    by_name = dict(numbers) if isinstance(numbers, Mapping) else dict.fromkeys(names, numbers)
     unknown = [str(name) for name in by_name if name not in names]
     lacking = [name for name in names if name not in by_name] if every else []
     if unknown or lacking:

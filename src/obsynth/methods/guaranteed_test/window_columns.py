@@ -38,21 +38,21 @@ def disturbance_columns(
     bounds: Bounds, question: TestProblem, builder: Builder, acting: Any, span: range, rows: int
 ) -> int:
     """Enter the disturbances; return the number of rows."""
-    one = np.ones((1, 1))
+    entry = np.ones((1, 1))
     kind = "d at samples" if bounds.moving is not None and question.disturbance == "any" else "d"
     for i in np.flatnonzero(bounds.disturbance > 0.0).tolist():
-        which, bar = np.array([i]), bounds.disturbance[i]
+        signal, bar = np.array([i]), bounds.disturbance[i]
         column = before = -1
         for k in span:
             if question.disturbance != "held" or column < 0:
                 label = ("d", None if question.disturbance == "held" else k, i)
                 free = question.disturbance in ("any", "jump")
                 column = builder.columns([label], [bar], 2 * k + 1 if free else -1)
-            acting(kind, which, k, column)
+            acting(kind, signal, k, column)
             if question.disturbance == "rate" and before >= 0:
                 change = builder.columns([("change of d", k, i)], [question.disturbance_rate[i]])
                 for place, times in ((column, 1), (before, -1), (change, -1)):
-                    builder.put(rows, one, place, times)
+                    builder.put(rows, entry, place, times)
                 rows += 1
             before = column
     return rows
@@ -79,40 +79,40 @@ def columns_between_samples(bounds: Bounds) -> list[tuple[tuple[str, int], Float
         return []
     nd, sizes = len(bounds.moving_bounds), bounds.moving_bounds.tolist()
     columns = moving.columns if bounds.every else moving.resting
-    found: list[tuple[tuple[str, int], FloatArray, float, int | None]] = [
+    listed: list[tuple[tuple[str, int], FloatArray, float, int | None]] = [
         (("moving d", i), columns[:, block * nd + i], sizes[i], block)
         for block in range(columns.shape[1] // nd)
         for i in range(nd)
         if sizes[i] > 0.0 and moving.moved[i]
     ]
-    rest = bounds.times_rest * moving.rest(bounds.moving_bounds) if bounds.every else np.zeros(0)
-    for i in np.flatnonzero(rest > 0.0).tolist():
-        found.append((("left by d", i), moving.directions[:, i], float(rest[i]), None))
-    return found
+    remainders = bounds.times_rest * moving.rest(bounds.moving_bounds) if bounds.every else np.zeros(0)
+    for i in np.flatnonzero(remainders > 0.0).tolist():
+        listed.append((("left by d", i), moving.directions[:, i], float(remainders[i]), None))
+    return listed
 
 
 def fault_columns(question: TestProblem, builder: Builder, acting: Any, span: range) -> None:
     """Enter the fault that is looked for."""
-    which = np.array([question.fault])
+    fault = np.array([question.fault])
     target = question.samples - 1 - question.lag
     if question.course in ("constant", "step"):
         for k in span:
             if k >= question.before or question.course == "constant":
-                acting("f", which, k, 0)
+                acting("f", fault, k, 0)
     elif question.course == "ramp":
         slope = builder.columns([("slope", None, question.fault)], [np.inf])
         for k in span:
-            acting("f", which, k, 0)
-            acting("f", which, k, slope, k - target)
+            acting("f", fault, k, 0)
+            acting("f", fault, k, slope, k - target)
     elif question.course == "any":
         for k in span:
             column = 0 if k == target else builder.columns([("f", k, question.fault)], [np.inf])
-            acting("f", which, k, column)
+            acting("f", fault, k, column)
     else:
         for k in span:
-            acting("f", which, k, 0)
+            acting("f", fault, k, 0)
         for k in span[1:]:
             change = builder.columns([("change of f", k, question.fault)], [question.fault_rate])
             later = range(k, len(span)) if k > target else range(k)
-            for there in later:
-                acting("f", which, there, change, 1 if k > target else -1)
+            for later_sample in later:
+                acting("f", fault, later_sample, change, 1 if k > target else -1)

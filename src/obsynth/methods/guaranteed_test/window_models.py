@@ -43,8 +43,8 @@ class Bounds:
     @property
     def middles(self) -> Iterator[tuple[str, int, float]]:
         """Kind, number and middle of what does not move about zero."""
-        for kind, given in (("d", self.disturbance_middle), ("w", self.noise_middle)):
-            for i, value in enumerate(() if given is None else given.tolist()):
+        for kind, middle in (("d", self.disturbance_middle), ("w", self.noise_middle)):
+            for i, value in enumerate(() if middle is None else middle.tolist()):
                 if value:
                     yield kind, i, value
 
@@ -79,7 +79,7 @@ class Model:
 
     plant: DescriptorSystem | TimeVaryingDescriptorSystem
     equations: tuple[tuple[FloatArray, FloatArray, FloatArray], ...]
-    seen: tuple[FloatArray, ...]
+    output_maps: tuple[FloatArray, ...]
     columns: Mapping[str, Sequence[tuple[int, FloatArray, FloatArray]]]
     #: Whether E leads from each state to the next.
     regular: bool
@@ -121,7 +121,7 @@ def constant_model(plant: DescriptorSystem, bounds: Bounds, question: TestProble
         "w": (bounds.noise_state, bounds.noise_output),
     }
     span = range(max(count, question.samples))
-    columns = {kind: [(k, *both) for k in span] for kind, both in kinds.items()}
+    columns = {kind: [(k, *matrices) for k in span] for kind, matrices in kinds.items()}
     return Model(plant, ((plant.E, plant.A, plant.B),) * count, (plant.C,) * question.samples, columns, regular)
 
 

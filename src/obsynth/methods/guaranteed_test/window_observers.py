@@ -61,8 +61,8 @@ def observer_of_rows(
     weights = []
     for window, values, has_test in zip(programmes.windows, multipliers, tested, strict=True):
         on_y, on_u, _ = window.weights(values)
-        both = np.hstack([on_u, on_y]).ravel()
-        weights.append(both if has_test else np.zeros_like(both))
+        row_weights = np.hstack([on_u, on_y]).ravel()
+        weights.append(row_weights if has_test else np.zeros_like(row_weights))
     constants = [
         window.constant(values) if has_test else 0.0
         for window, values, has_test in zip(programmes.windows, multipliers, tested, strict=True)

@@ -118,9 +118,9 @@ class Window:
         The window's own columns are of disturbances that rest in each piece of a sample."""
         if self.bounds.moving is None or self.bounds.every:
             return self
-        found = window_of(self.model.plant, replace(self.bounds, every=True), self.question)
+        outer = window_of(self.model.plant, replace(self.bounds, every=True), self.question)
         lost = [label[2] for label in self.labels if label[0] == "missing"]
-        return found.without(np.array(lost, dtype=np.int64)) if lost else found
+        return outer.without(np.array(lost, dtype=np.int64)) if lost else outer
 
     @cached_property
     def outer_with_room(self) -> Window:
@@ -186,9 +186,9 @@ class Window:
     @cached_property
     def free(self) -> np.ndarray:
         """Which columns have no bound, theta not among them."""
-        found = np.isinf(self.bar)
-        found[0] = False
-        return found
+        free = np.isinf(self.bar)
+        free[0] = False
+        return free
 
     @cached_property
     def bounded(self) -> np.ndarray:
@@ -223,7 +223,7 @@ class Window:
         middles = list(self.bounds.middles)
         if not middles:
             return ()
-        found = [Fraction(0)] * self.rows
+        standing = [Fraction(0)] * self.rows
         _, ne, _, ny = self.model.sizes
         for kind, i, middle in middles:
             exact = Fraction(middle)
@@ -231,11 +231,11 @@ class Window:
                 equation, state, output = self.model.columns[kind][k]
                 if 0 <= equation < self.equations:
                     for row in np.flatnonzero(state[:, i]).tolist():
-                        found[equation * ne + row] -= exact * Fraction(float(state[row, i]))
+                        standing[equation * ne + row] -= exact * Fraction(float(state[row, i]))
                 if k < self.question.samples:
                     for row in np.flatnonzero(output[:, i]).tolist():
-                        found[self.outputs_at + k * ny + row] += exact * Fraction(float(output[row, i]))
-        return tuple(found)
+                        standing[self.outputs_at + k * ny + row] += exact * Fraction(float(output[row, i]))
+        return tuple(standing)
 
     @cached_property
     def moved(self) -> FloatArray:
@@ -267,8 +267,8 @@ class Window:
         # The equations after the last sample that are used have known inputs, and a state that they lead to.
         later = np.flatnonzero(equations[question.samples :].any(axis=1))
         delay = int(later[-1]) + 1 if later.size else 0
-        kept = question.samples + delay
-        return on_y[:kept][::-1].copy(), on_u[:kept][::-1].copy(), delay
+        used = question.samples + delay
+        return on_y[:used][::-1].copy(), on_u[:used][::-1].copy(), delay
 
     def errors(self, multipliers: FloatArray, radius: FloatArray) -> FloatArray:
         """Return what shipped multipliers and sums of their products may err, in each row ``(rows,)``."""
@@ -299,10 +299,10 @@ class Window:
         """
         equations = multipliers[: self.outputs_at].reshape(self.equations, self.plant.nx)
         length = len(self.weights(multipliers)[0])
-        whole = np.zeros((length, self.plant.nx))
-        kept = min(length, self.equations)
-        whole[:kept] = equations[:kept]
-        return whole[:-1][::-1].copy(), -whole[-1:]
+        registers = np.zeros((length, self.plant.nx))
+        filled = min(length, self.equations)
+        registers[:filled] = equations[:filled]
+        return registers[:-1][::-1].copy(), -registers[-1:]
 
     def data(self, y: FloatArray, u: FloatArray) -> FloatArray:
         """Return the right sides of a window: ``y (samples, ny)``, ``u (equations or more, nu)``."""
@@ -318,18 +318,18 @@ def courses_of(window: Window, point: FloatArray) -> dict[str, FloatArray]:
     plant, question = window.model.plant, window.question
     length = max(window.equations + 1, question.samples)
     names = {"x": plant.state_names, "d": disturbance_names(plant), "f": fault_names(plant)}
-    found: dict[str, FloatArray] = {}
+    signals: dict[str, FloatArray] = {}
     own = np.zeros(length)
     own[question.before :] = point[0]
-    found[names["f"][question.fault]] = own
+    signals[names["f"][question.fault]] = own
     for label, value in zip(window.labels, point, strict=True):
         if label[0] == "moving d" and window.bounds.moving is not None:
             # The mean over the sample.
-            course = found.setdefault(names["d"][label[2]], np.zeros(length))
-            course[label[1]] += value * window.bounds.moving.shares[label[3]]
+            signal = signals.setdefault(names["d"][label[2]], np.zeros(length))
+            signal[label[1]] += value * window.bounds.moving.shares[label[3]]
         elif label[0] in names:
-            course = found.setdefault(names[label[0]][label[2]], np.zeros(length))
-            course[slice(None) if label[1] is None else label[1]] = value
+            signal = signals.setdefault(names[label[0]][label[2]], np.zeros(length))
+            signal[slice(None) if label[1] is None else label[1]] = value
         elif label[0] == "slope":
             own += value * (np.arange(length) - (question.samples - 1 - question.lag))
         elif label[0] == "change of f":
@@ -340,9 +340,9 @@ def courses_of(window: Window, point: FloatArray) -> dict[str, FloatArray]:
         # Column 0 is the sample that is told, the others have columns of their own.
         target = question.samples - 1 - question.lag
         own[np.arange(length) == target] = point[0]
-        told = {label[1] for label in window.labels if label[0] == "f" and label[2] == question.fault}
-        own[[k for k in range(length) if k != target and k not in told]] = 0.0
-    return found
+        own_samples = {label[1] for label in window.labels if label[0] == "f" and label[2] == question.fault}
+        own[[k for k in range(length) if k != target and k not in own_samples]] = 0.0
+    return signals
 
 
 def window_of(
@@ -359,13 +359,13 @@ def window_of(
     rows = equations * ne + samples * ny
     builder.columns([("theta",)], [np.inf])
 
-    def acting(kind: str, which: np.ndarray, k: int, column: int, times: int = 1) -> None:
+    def acting(kind: str, signals: np.ndarray, k: int, column: int, times: int = 1) -> None:
         """Enter columns that act at sample k, in both kinds of rows."""
         equation, state, output = model.columns[kind][k]
         if 0 <= equation < equations:
-            builder.put(equation * ne, -state[:, which], column, times)
+            builder.put(equation * ne, -state[:, signals], column, times)
         if k < samples:
-            builder.put(equations * ne + k * ny, output[:, which], column, times)
+            builder.put(equations * ne + k * ny, output[:, signals], column, times)
 
     first = builder.columns(
         [("x", k, i) for k in range(equations + 1) for i in range(nx)],
@@ -375,7 +375,7 @@ def window_of(
         builder.put(k * ne, after, first + (k + 1) * nx)
         builder.put(k * ne, -before, first + k * nx)
     for k in range(samples):
-        builder.put(equations * ne + k * ny, model.seen[k], first + k * nx)
+        builder.put(equations * ne + k * ny, model.output_maps[k], first + k * nx)
     span = range(len(model.columns["f"]))
     moving = np.flatnonzero(bounds.noise > 0.0)
     for k in range(max(equations, samples)):
@@ -391,7 +391,7 @@ def window_of(
             if question.free_course == "any" or column < 0:
                 column = builder.columns([("f", k if question.free_course == "any" else None, fault)], [np.inf])
             acting("f", np.array([fault]), k, column)
-    whole = [np.concatenate(parts) for parts in zip(*builder.parts, strict=True)]
+    entries = [np.concatenate(parts) for parts in zip(*builder.parts, strict=True)]
     return Window(
         model,
         bounds,
@@ -400,7 +400,7 @@ def window_of(
         tuple(builder.labels),
         np.array(builder.bar),
         np.array(builder.group),
-        *whole,
+        *entries,
     )
 
 
