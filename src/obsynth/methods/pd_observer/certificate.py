@@ -41,11 +41,11 @@ def explicit_certificate(
     try:
         p = _gram(balanced)
         # A delta for which -1 / delta is far from the eigenvalues.
-        one = np.eye(len(balanced))
+        identity = np.eye(len(balanced))
         middle = 1.0 / float(np.exp(np.mean(np.log(np.abs(np.linalg.eigvals(balanced))))))
         steps = sorted(range(-DELTA_TRIES // 2, DELTA_TRIES // 2), key=abs)
         candidates = [middle * DELTA_STEP**step for step in steps]
-        conditions = [float(np.linalg.cond(one + delta * balanced)) for delta in candidates]
+        conditions = [float(np.linalg.cond(identity + delta * balanced)) for delta in candidates]
         good = [i for i, condition in enumerate(conditions) if condition <= GOOD_CONDITION]
         delta = candidates[good[0] if good else int(np.argmin(conditions))]
         x = _coupling(balanced, p, delta)
@@ -91,22 +91,22 @@ def coupled_certificate(a: FloatArray, delta: float) -> tuple[FloatArray, FloatA
 def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> FloatArray | None:
     """Return P ``(n, n)`` that proves the l2 gain of ``x' = a x + b v``, ``z = c x`` below ``gain``, or ``None``."""
     balanced, units = balanced_matrix(a)
-    entering, shown = b.midpoint / units[:, None], c * units
-    weight = max(largest_singular_value(shown) ** 2, np.finfo(np.float64).tiny)
+    driving, output_map = b.midpoint / units[:, None], c * units
+    weight = max(largest_singular_value(output_map) ** 2, np.finfo(np.float64).tiny)
     spare = None
     for slack in PD_SLACKS:  # the largest that gives a proof
-        out = shown.T @ shown + slack * weight * np.eye(len(a))
-        p = continuous_solution(balanced.T, entering.T, out, -(gain**2) * np.eye(entering.shape[1]))
+        out = output_map.T @ output_map + slack * weight * np.eye(len(a))
+        p = continuous_solution(balanced.T, driving.T, out, -(gain**2) * np.eye(driving.shape[1]))
         if p is None:
             continue
-        found = 0.5 * (p + p.T) / units[:, None] / units
-        found = np.asarray(0.5 * (found + found.T))
-        if not np.all(np.isfinite(found)):
+        witness = 0.5 * (p + p.T) / units[:, None] / units
+        witness = np.asarray(0.5 * (witness + witness.T))
+        if not np.all(np.isfinite(witness)):
             continue
-        proof = prove_gain(a, b, c, found, gain)
+        proof = prove_gain(a, b, c, witness, gain)
         if proof.in_double_precision:
-            return found
-        spare = found if proof.proved and spare is None else spare
+            return witness
+        spare = witness if proof.proved and spare is None else spare
     return spare
 
 
@@ -123,7 +123,7 @@ def _coupling(a: FloatArray, p: FloatArray, delta: float) -> FloatArray:
     """Return X with ``He([a'; -I] X [I, delta I]) + [0, p; p, 0] < 0`` for a stable ``a`` with Gram matrix p."""
     # With alpha = a xi1 - xi2, beta = xi1 + delta xi2 the first term is 2 alpha' X beta; the second is negative on
     # alpha = 0 and on beta = 0, whatever delta is.
-    n, one = len(a), np.eye(len(a))
-    change = np.linalg.inv(np.block([[a, -one], [one, delta * one]]))
+    n, identity = len(a), np.eye(len(a))
+    change = np.linalg.inv(np.block([[a, -identity], [identity, delta * identity]]))
     form = change.T @ np.block([[np.zeros((n, n)), p], [p, np.zeros((n, n))]]) @ change
     return np.asarray(-form[:n, n:])

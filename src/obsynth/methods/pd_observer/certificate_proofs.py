@@ -139,10 +139,10 @@ def proof_rows(design: ObserverDesign) -> Iterator[Check]:
     yield _proof("P1", "P1 is symmetric and positive definite", prove_symmetric_positive(p1), labels[0])
     if theorem == 2:
         yield _proof("Q", "Q = P3 is symmetric and positive definite", prove_symmetric_positive(p3), labels[0])
-    found = prove_shipped_stability(design.linear[1], p1, p3, delta=delta, decay=decay)
+    proof = prove_shipped_stability(design.linear[1], p1, p3, delta=delta, decay=decay)
     rate = f"errors decay faster than exp(-{decay:.6g} t)" if decay > 0.0 else "the observer is stable"
     yield _proof(
-        "LMI", f"Theorem {theorem} holds for the shipped realisation (delta = {delta:.6g} s): {rate}", found, labels[1]
+        "LMI", f"Theorem {theorem} holds for the shipped realisation (delta = {delta:.6g} s): {rate}", proof, labels[1]
     )
     for claim, kind in GAIN_CLAIMS.items():
         if claim in claims:
@@ -153,17 +153,17 @@ def proof_rows(design: ObserverDesign) -> Iterator[Check]:
 
 def _gain_row(design: ObserverDesign, kind: Literal["rate", "noise"], gain: float) -> Check:
     plant, observer = design.linear
-    entering = error_inputs(with_sensor_noise(plant), *stacked_gains(design), kind)
-    found = prove_gain(
-        observer.Az, entering, observer.Cz[observer.fault_rows], design.certificate.matrices[f"P_{kind}"], gain
+    inputs = error_inputs(with_sensor_noise(plant), *stacked_gains(design), kind)
+    proof = prove_gain(
+        observer.Az, inputs, observer.Cz[observer.fault_rows], design.certificate.matrices[f"P_{kind}"], gain
     )
     source = {"rate": "the rate of the faults", "noise": "noise and its derivative, as free inputs,"}[kind]
     claim = f"l2 gain from {source} to the fault error < {gain:.6g}"
-    return proof_row(f"LMI, {kind}", claim, found, "ours: bounded real lemma")
+    return proof_row(f"LMI, {kind}", claim, proof, "ours: bounded real lemma")
 
 
-def _proof(name: str, claim: str, found: DefinitenessProof, label: str) -> Check:
-    return proof_row(name, claim, found, f"Filasova et al., eq. {label}")
+def _proof(name: str, claim: str, proof: DefinitenessProof, label: str) -> Check:
+    return proof_row(name, claim, proof, f"Filasova et al., eq. {label}")
 
 
 def _range_row(design: ObserverDesign) -> Check:

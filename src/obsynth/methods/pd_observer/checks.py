@@ -65,10 +65,10 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     noisy = with_sensor_noise(plant)
     augmented = with_faults_as_states(noisy)
     # The faults are states of the augmented plant, so that their estimates are state estimates of it.
-    whole = replace(
+    as_states = replace(
         observer, state_names=augmented.state_names, fault_names=(), state_delays=(0,) * augmented.nx, fault_delays=()
     )
-    for key, identity in tracking_identities(ErrorModel(augmented, whole, np.eye(augmented.nx))).items():
+    for key, identity in tracking_identities(ErrorModel(augmented, as_states, np.eye(augmented.nx))).items():
         if key in _PD_IDENTITIES:
             name, claim, source = _PD_IDENTITIES[key]
             yield equality(name, claim, identity.residual(), source, bound=tolerance)
@@ -77,9 +77,9 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield from _spectra(design, errors)
     gain_j, gain_l = stacked_gains(design)
     # E* = [I 0; 0 0], A* = [0 I; A - J C, -(I + L C)]: impulse-free where the lower right block is nonsingular.
-    moved, shown = augmented.A - gain_j @ augmented.C, np.eye(augmented.nx) + gain_l @ augmented.C
-    impulse_free = rounding_rank(_balanced(shown)) == augmented.nx
-    slowest = abscissa(_balanced(solved(shown, moved)), 0.0) if impulse_free else float("nan")
+    moved, descriptor = augmented.A - gain_j @ augmented.C, np.eye(augmented.nx) + gain_l @ augmented.C
+    impulse_free = rounding_rank(_balanced(descriptor)) == augmented.nx
+    slowest = abscissa(_balanced(solved(descriptor, moved)), 0.0) if impulse_free else float("nan")
     yield _negative(
         "descriptor pair",
         "(E*, A*) of the listed gains is admissible: regular, impulse-free, stable",
@@ -114,7 +114,7 @@ def _gains_row(design: ObserverDesign, augmented: DescriptorSystem, tolerance: f
     # A gain on an output in small units must not hide behind one on an output in large units.
     units = 1.0 / natural_scaling(augmented).outputs
     # S = I - T C is stored to rounding of T C, so S L is known to rounding of T C L.
-    found = [
+    residuals = [
         residual(estimate @ gain_l, -direct, factors=((estimate, gain_l), (direct, augmented.C, gain_l)), units=units),
         residual(
             gain_j,
@@ -132,7 +132,7 @@ def _gains_row(design: ObserverDesign, augmented: DescriptorSystem, tolerance: f
     return equality(
         "gains",
         "the realisation is that of the listed J, L, M, N (and G)",
-        worst(found),
+        worst(residuals),
         "Filasova et al., eqs. (4)-(6), (31)",
         bound=tolerance,
     )
@@ -218,8 +218,8 @@ def spectrum_text(values: ComplexArray) -> str:
     if np.any(np.isnan(values)):
         return "not finite"
     ordered = sorted((complex(value) for value in values), key=lambda v: (-v.real, v.imag))
-    shown = [pole_text(value, pair=True) for value in ordered if value.imag >= 0.0]
-    return listed(shown, most=LISTED_EIGENVALUES)
+    texts = [pole_text(value, pair=True) for value in ordered if value.imag >= 0.0]
+    return listed(texts, most=LISTED_EIGENVALUES)
 
 
 def norm_rows(design: ObserverDesign, errors: PdErrorSystem, noisy: DescriptorSystem) -> Iterator[Check]:

@@ -47,10 +47,10 @@ def closed_form(task: PdTask, *, free_delta: bool, once: bool = False) -> tuple[
     a, c = task.plants[0]
     states = inverse = np.eye(len(a))
     for _ in range(MOST_NORMALISATIONS):
-        found = _normalising(inverse @ a @ states, c @ states)
-        if found is None:
+        change = _normalising(inverse @ a @ states, c @ states)
+        if change is None:
             raise failure
-        states, inverse = states @ found[0], found[1] @ inverse
+        states, inverse = states @ change[0], change[1] @ inverse
         moved = replace(task, plants=((inverse @ a @ states, c @ states),))
         try:
             own, delta = _closed_form(moved, free_delta=free_delta)
@@ -79,12 +79,12 @@ def _closed_form(task: PdTask, *, free_delta: bool) -> tuple[PdSolution, float]:
     record = {"what": _WHAT, "solver": "Riccati equation, LAPACK"}
     gain = _riccati_gain(shifted, c, record)
     moving = shifted - gain @ c
-    found = symmetric_certificate(moving)
-    if found is None:
+    certificate = symmetric_certificate(moving)
+    if certificate is None:
         raise SolverError(
             "A Riccati equation gave gains that are not stable: the result is inconclusive.", record=record
         )
-    p3, weight, limit = found
+    p3, weight, limit = certificate
     delta = min(task.delta, DELTA_SHARE * limit) if free_delta else task.delta
     if delta < limit:
         p1 = p3 + 0.5 * delta * weight
@@ -105,19 +105,19 @@ def _riccati_gain(a: FloatArray, c: FloatArray, record: Mapping[str, Any]) -> Fl
     """
     from scipy.linalg import schur
 
-    n, one = len(a), np.eye(len(a))
+    n, identity = len(a), np.eye(len(a))
     p = _doubled(a, c)
     if p is not None and abscissa(a - p @ c.T @ c, 0.0) < 0.0:
         return np.asarray(p @ c.T)
     try:
-        _, basis, stable = schur(np.block([[a.T, -c.T @ c], [-one, -a]]), sort="lhp")
+        _, basis, stable = schur(np.block([[a.T, -c.T @ c], [-identity, -a]]), sort="lhp")
         p = np.linalg.solve(basis[:n, :n].T, basis[n:, :n].T)
         gain = np.asarray(0.5 * (p + p.T) @ c.T)
         if stable == n and abscissa(a - gain @ c, 0.0) < 0.0:
             return gain
     except np.linalg.LinAlgError:
         pass
-    p = None if n > QZ_METHOD_UP_TO else continuous_solution(a, c, one, np.eye(len(c)))
+    p = None if n > QZ_METHOD_UP_TO else continuous_solution(a, c, identity, np.eye(len(c)))
     if p is None:
         raise SolverError("The Riccati equation was not solved: the result is inconclusive.", record=record)
     return np.asarray(p @ c.T)
@@ -131,5 +131,5 @@ def _doubled(a: FloatArray, c: FloatArray) -> FloatArray | None:
     if p is None:
         return None
     terms = (a @ p, p @ c.T @ c @ p, np.eye(len(a)))
-    left = float(np.linalg.norm(terms[0] + terms[0].T - terms[1] + terms[2]))
-    return p if left <= EQUATION_TOLERANCE * sum(float(np.linalg.norm(term)) for term in terms) else None
+    missed = float(np.linalg.norm(terms[0] + terms[0].T - terms[1] + terms[2]))
+    return p if missed <= EQUATION_TOLERANCE * sum(float(np.linalg.norm(term)) for term in terms) else None

@@ -53,56 +53,56 @@ class PdGains:
 
 
 def certified(
-    plant: DescriptorSystem, asked: PdObserver, found: PdSolution, *, delta: float, decay: float
+    plant: DescriptorSystem, method: PdObserver, solution: PdSolution, *, delta: float, decay: float
 ) -> PdGains | None:
     """Return the gains with the solver's certificate or a computed one; ``None`` without a realisation."""
     augmented = with_faults_as_states(plant)
     try:
-        observer = realise_pd_observer(plant, augmented, found.J, found.L)
+        observer = realise_pd_observer(plant, augmented, solution.J, solution.L)
     except np.linalg.LinAlgError:
         return None
-    ends = asked.range_numbers
-    p1, p3 = symmetric(found.P1[0]), symmetric(found.P3) if asked.theorem == 2 else found.P3
+    ends = method.range_numbers
+    p1, p3 = symmetric(solution.P1[0]), symmetric(solution.P3) if method.theorem == 2 else solution.P3
     gains = PdGains(
-        J=found.J,
-        L=found.L,
+        J=solution.J,
+        L=solution.L,
         P1=p1,
         P3=p3,
-        theorem=asked.theorem,
+        theorem=method.theorem,
         asked_delta=delta,
         delta=delta,
         decay=decay,
         observer=observer,
-        record=found.record,
+        record=solution.record,
     )
     if ends is not None:
-        return _certified_range(plant, replace(gains, ends=found.P1), ends)
-    certificates = _gain_certificates(plant, asked, gains)
+        return _certified_range(plant, replace(gains, ends=solution.P1), ends)
+    certificates = _gain_certificates(plant, method, gains)
     if certificates is None:
         return gains
     gains = _judged(replace(gains, gain_certificates=certificates))
     if gains.proved_in_double_precision:
         return gains
-    own = explicit_certificate(observer.Az, observer.Cz[: observer.order], decay=decay) if asked.theorem == 1 else None
+    own = explicit_certificate(observer.Az, observer.Cz[: observer.order], decay=decay) if method.theorem == 1 else None
     if own is None:
         return gains
     other = _judged(replace(gains, P1=own[0], P3=own[1], delta=own[2]))
     return gains if gains.proved and not other.proved_in_double_precision else other
 
 
-def _gain_certificates(plant: DescriptorSystem, asked: PdObserver, gains: PdGains) -> dict[str, FloatArray] | None:
+def _gain_certificates(plant: DescriptorSystem, method: PdObserver, gains: PdGains) -> dict[str, FloatArray] | None:
     """Return the certificates of the bounds on l2 gains that are asked for; ``None`` when one is not found."""
-    observer, found = gains.observer, {}
+    observer, certificates = gains.observer, {}
     for option, kind in GAIN_CLAIMS.items():
-        bound = getattr(asked, option)
+        bound = getattr(method, option)
         if bound is None:
             continue
-        entering = error_inputs(with_sensor_noise(plant), gains.J, gains.L, kind)
-        certificate = gain_certificate(observer.Az, entering, observer.Cz[observer.fault_rows], float(bound))
+        driving = error_inputs(with_sensor_noise(plant), gains.J, gains.L, kind)
+        certificate = gain_certificate(observer.Az, driving, observer.Cz[observer.fault_rows], float(bound))
         if certificate is None:
             return None
-        found[f"P_{kind}"] = certificate
-    return found
+        certificates[f"P_{kind}"] = certificate
+    return certificates
 
 
 def _judged(gains: PdGains) -> PdGains:

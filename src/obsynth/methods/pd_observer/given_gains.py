@@ -52,14 +52,17 @@ def synthesis_from_gains(
     pairs = (("J", "M"), ("L", "N"))
     gain_j, gain_l = (np.vstack([matrices[top], inner @ matrices[bottom]]) for top, bottom in pairs)
     observer = _realised(work, gain_j, gain_l)
-    found = explicit_certificate(observer.Az, observer.Cz[: observer.order], decay=decay)
-    if found is None:  # not stable, or too slow: the report will say so
-        found = np.eye(observer.order), np.eye(observer.order), 1.0
+    certificate = explicit_certificate(observer.Az, observer.Cz[: observer.order], decay=decay)
+    if certificate is None:  # not stable, or too slow: the report will say so
+        certificate = np.eye(observer.order), np.eye(observer.order), 1.0
     return Synthesis(
         {"from_gains": True, "decay": decay},
         matrices if g is None else {**matrices, "G": g},
         observer,
-        Certificate({"P1": found[0], "P3": found[1]}, {"theorem": 1.0, "delta": found[2], "decay": float(decay)}),
+        Certificate(
+            {"P1": certificate[0], "P3": certificate[1]},
+            {"theorem": 1.0, "delta": certificate[2], "decay": float(decay)},
+        ),
         {"runs": []},
         transformation=form,
     )

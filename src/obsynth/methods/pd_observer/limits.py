@@ -37,15 +37,15 @@ def fastest_mode(a: FloatArray) -> float:
     return float(np.max(sizes[(sizes <= FAR_BEYOND * pace) | ~damped]))
 
 
-def default_delta(plant: DescriptorSystem, asked: PdObserver, decay: float) -> float:
+def default_delta(plant: DescriptorSystem, method: PdObserver, decay: float) -> float:
     """Return the delta to use, in seconds: as asked, or the inverse of the plant's fastest mode where that serves."""
-    if asked.delta is not None:
-        return float(asked.delta)
-    if asked.disk_numbers is not None:
-        centre, radius = asked.disk_numbers
+    if method.delta is not None:
+        return float(method.delta)
+    if method.disk_numbers is not None:
+        centre, radius = method.disk_numbers
         return 1.0 / centre if centre > 0.0 else 2.0 / (centre + radius)
     delta = 1.0 / fastest_mode(plant.A)
-    limit = theorem_2_limit(plant, decay) if asked.theorem == 2 else math.inf
+    limit = theorem_2_limit(plant, decay) if method.theorem == 2 else math.inf
     return min(delta, 0.5 * limit)
 
 
@@ -55,7 +55,7 @@ def theorem_2_limit(plant: DescriptorSystem, decay: float) -> float:
     return min((4.0 * abs(mode.real + decay) / mode.imag**2 for mode in pairs), default=math.inf)
 
 
-def require_possible(plant: DescriptorSystem, asked: PdObserver, *, delta: float, decay: float) -> None:
+def require_possible(plant: DescriptorSystem, method: PdObserver, *, delta: float, decay: float) -> None:
     """Refuse what no gains, or no solution of these inequalities, can give."""
     hidden = analyse_structure(plant).unobservable_modes
     slowest = max((mode.real for mode in hidden), default=-math.inf)
@@ -65,8 +65,8 @@ def require_possible(plant: DescriptorSystem, asked: PdObserver, *, delta: float
             "unobservable, so that no gain moves it. Ask for less, or measure something it moves.",
             necessary=True,
         )
-    if asked.disk_numbers is not None:
-        centre, radius = asked.disk_numbers
+    if method.disk_numbers is not None:
+        centre, radius = method.disk_numbers
         outside = [mode for mode in hidden if abs(mode + centre) >= radius]
         if outside:
             raise InfeasibleError(
@@ -80,7 +80,7 @@ def require_possible(plant: DescriptorSystem, asked: PdObserver, *, delta: float
                 f"disk. Leave delta out, or take {1.0 / centre if centre > 0.0 else 2.0 / (centre + radius):.6g} s.",
                 necessary=False,
             )
-    limit = theorem_2_limit(plant, decay) if asked.theorem == 2 else math.inf
+    limit = theorem_2_limit(plant, decay) if method.theorem == 2 else math.inf
     if delta >= limit:
         raise InfeasibleError(
             f"Theorem 2 has no solution with delta = {delta:.6g} s: an unobservable pair of modes needs delta < "
@@ -88,11 +88,11 @@ def require_possible(plant: DescriptorSystem, asked: PdObserver, *, delta: float
             necessary=False,
             lower_bound=None,
         )
-    if asked.noise_gain is not None:
+    if method.noise_gain is not None:
         least = least_noise_gain(plant)
-        if asked.noise_gain <= least:
+        if method.noise_gain <= least:
             raise InfeasibleError(
-                f"No observer has a noise gain of {asked.noise_gain:.6g}: already in steady state the fault has to be "
+                f"No observer has a noise gain of {method.noise_gain:.6g}: already in steady state the fault has to be "
                 f"computed from the outputs, which multiplies errors by {least:.6g} or more. Raise noise_gain.",
                 necessary=True,
                 lower_bound=least,
@@ -113,5 +113,5 @@ def least_noise_gain(plant: DescriptorSystem) -> float:
     scaled = equilibrate_pencil(np.zeros_like(equations), equations)
     rank = decide_rank(scaled.A, equilibrated=False).rank
     still = scaled.columns[:, None] * np.linalg.svd(scaled.A)[2][rank:].T
-    seen, faults = np.hstack([plant.C, plant.Df]) @ still, still[plant.nx :]
-    return largest_singular_value(faults @ np.linalg.pinv(np.linalg.pinv(noise) @ seen)) if still.size else 0.0
+    outputs, faults = np.hstack([plant.C, plant.Df]) @ still, still[plant.nx :]
+    return largest_singular_value(faults @ np.linalg.pinv(np.linalg.pinv(noise) @ outputs)) if still.size else 0.0

@@ -177,11 +177,11 @@ class PdObserver(Method):
                 f"engine {self.engine!r} gives stability and a decay rate alone: take engine 'lmi', or leave out "
                 f"{', '.join(self.further)}."
             )
-        found = {name: _pair(getattr(self, name)) for name in ("disk", "adaptation_range")}
-        for name, numbers in found.items():
+        pairs = {name: _pair(getattr(self, name)) for name in ("disk", "adaptation_range")}
+        for name, numbers in pairs.items():
             if getattr(self, name) is not None and numbers is None:
                 yield f"{name} is {getattr(self, name)!r}: give a list of 2 numbers."
-        disk, low_high = found["disk"], found["adaptation_range"]
+        disk, low_high = pairs["disk"], pairs["adaptation_range"]
         if disk is not None and not disk[1] > max(-disk[0], 0.0):
             yield f"disk is {disk}: give [c, r] for |s + c| < r, with r > 0 and part of the disk left of the axis."
         if low_high is not None and not 0.0 < low_high[0] < low_high[1]:
@@ -190,8 +190,8 @@ class PdObserver(Method):
             yield f"objective is {shown(self.objective)}: give a function of the variables."
         beside = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain", "adaptation_range")
         yield from own_term_conflicts(self, beside=beside, engines=("riccati",))
-        others = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain")
-        clash = [name for name in others if getattr(self, name) is not None]
+        exclusive = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain")
+        clash = [name for name in exclusive if getattr(self, name) is not None]
         if self.adaptation_range is not None and clash:
             yield f"adaptation_range cannot be combined with {', '.join(clash)}."
 

@@ -137,8 +137,8 @@ class PdErrorSystem:
         # (I + L C) e' = Ae e + Bw w - J Dw w - L Dw w', and eps = (I + L C) e.
         b = np.hstack([padded - self.J @ sensor, -self.L @ sensor])
         # The estimate is S of eps + L noise: in terms of the error itself no feedthrough is left.
-        shown = self.estimate[self.nx :]
-        return self._norms.between(b, shown, np.zeros((len(shown), b.shape[1])))
+        fault_rows = self.estimate[self.nx :]
+        return self._norms.between(b, fault_rows, np.zeros((len(fault_rows), b.shape[1])))
 
 
 def solved(matrix: FloatArray, right: FloatArray) -> FloatArray:

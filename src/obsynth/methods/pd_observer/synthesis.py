@@ -76,50 +76,50 @@ class _Units(NamedTuple):
         return largest_singular_value(np.hstack([part * self.outputs for part in parts]) / self.states[:, None])
 
 
-def design_gains(plant: DescriptorSystem, asked: PdObserver) -> tuple[PdGains, list[Mapping[str, Any]]]:
+def design_gains(plant: DescriptorSystem, method: PdObserver) -> tuple[PdGains, list[Mapping[str, Any]]]:
     """Return the gains to ship and the records of all solver runs.
 
     Dependent outputs are merged; nearly dependent ones where that is as fast (with a stated ``decay``: reaches it) and
     less noisy. Bounds on gains and noise are about the outputs as they are.
     """
-    as_they_are = asked.gain_bound is not None or asked.noise_gain is not None
+    as_they_are = method.gain_bound is not None or method.noise_gain is not None
     choices = [None] if as_they_are else [merged_outputs(plant), nearly_merged_outputs(plant)]
-    first, records = _of_merged(plant, asked, choices[0])
+    first, records = _of_merged(plant, method, choices[0])
     for merged in choices[1:]:
         if merged is None:
             continue
         try:
-            other, more = _of_merged(plant, asked, merged)
+            other, more = _of_merged(plant, method, merged)
         except ObsynthError:
             continue  # what the merged outputs leave unused is needed
         # A rate that is stated is reached by both: a faster one was not asked for.
-        as_fast = bool(asked.decay) or AS_FAST * other.abscissa <= first.abscissa
+        as_fast = bool(method.decay) or AS_FAST * other.abscissa <= first.abscissa
         if as_fast and fault_deviation(plant, other.observer) < fault_deviation(plant, first.observer):
             first, records = other, [*records, *more]
     return first, records
 
 
 def _of_merged(
-    plant: DescriptorSystem, asked: PdObserver, merged: MergedOutputs | None
+    plant: DescriptorSystem, method: PdObserver, merged: MergedOutputs | None
 ) -> tuple[PdGains, list[Mapping[str, Any]]]:
     """Return the gains of a plant from those of it with outputs merged."""
     if merged is None:
-        return _gains_and_records(plant, asked)
-    found, records = _gains_and_records(merged.plant, asked)
-    J, L = found.J @ merged.weights, found.L @ merged.weights
+        return _gains_and_records(plant, method)
+    gains, records = _gains_and_records(merged.plant, method)
+    J, L = gains.J @ merged.weights, gains.L @ merged.weights
     observer = realise_pd_observer(plant, with_faults_as_states(plant), J, L)
-    return replace(found, J=J, L=L, observer=observer), records
+    return replace(gains, J=J, L=L, observer=observer), records
 
 
-def _gains_and_records(plant: DescriptorSystem, asked: PdObserver) -> tuple[PdGains, list[Mapping[str, Any]]]:
+def _gains_and_records(plant: DescriptorSystem, method: PdObserver) -> tuple[PdGains, list[Mapping[str, Any]]]:
     """Return the gains and the records of all solver runs.
 
     What decays as asked is small in the given units.  A rate that is ours to choose is chosen, with its gains, in the
     plant's own units, so that it is the same in any; only a higher one may come from the given units.
     """
-    free = asked.decay is None and asked.disk is None
-    own = free and asked.gain_bound is None and asked.engines_for(plant.nx + plant.nf)[0] == "lmi"
-    plain = gains_for(plant, asked, decay=0.0 if asked.decay is None else float(asked.decay), own=own)
+    free = method.decay is None and method.disk is None
+    own = free and method.gain_bound is None and method.engines_for(plant.nx + plant.nf)[0] == "lmi"
+    plain = gains_for(plant, method, decay=0.0 if method.decay is None else float(method.decay), own=own)
     records = [plain.record]
     slowest = max((mode.real for mode in analyse_structure(plant).unobservable_modes), default=-np.inf)
     target = float(min(DECAY_SHARE * fastest_mode(plant.A), -HIDDEN_SHARE * slowest))
@@ -132,25 +132,25 @@ def _gains_and_records(plant: DescriptorSystem, asked: PdObserver) -> tuple[PdGa
             if share * target <= -plain.abscissa:
                 continue
             try:
-                faster = gains_for(plant, asked, decay=share * target, most=most)
+                faster = gains_for(plant, method, decay=share * target, most=most)
             except (SolverError, InfeasibleError):
                 break  # this rate was not asked for
         return faster, records
-    found = _faster(plant, asked, plain, target, records, own=own)
-    if own and found.decay < target:
+    gains = _faster(plant, method, plain, target, records, own=own)
+    if own and gains.decay < target:
         try:
-            given = gains_for(plant, asked, decay=0.0)
+            in_given_units = gains_for(plant, method, decay=0.0)
         except (SolverError, InfeasibleError):
-            return found, records
-        records.append(given.record)
-        other = _faster(plant, asked, given, target, records, own=False)
-        found = other if other.decay > found.decay else found
-    return found, records
+            return gains, records
+        records.append(in_given_units.record)
+        other = _faster(plant, method, in_given_units, target, records, own=False)
+        gains = other if other.decay > gains.decay else gains
+    return gains, records
 
 
 def _faster(
     plant: DescriptorSystem,
-    asked: PdObserver,
+    method: PdObserver,
     plain: PdGains,
     target: float,
     records: list[Mapping[str, Any]],
@@ -164,7 +164,7 @@ def _faster(
         if share * target <= -plain.abscissa:
             break
         try:
-            faster = gains_for(plant, asked, decay=share * target, own=own)
+            faster = gains_for(plant, method, decay=share * target, own=own)
         except SolverError as error:
             records.append(error.record)
             continue
@@ -177,56 +177,56 @@ def _faster(
 
 
 def gains_for(
-    plant: DescriptorSystem, asked: PdObserver, *, decay: float, most: float | None = None, own: bool = False
+    plant: DescriptorSystem, method: PdObserver, *, decay: float, most: float | None = None, own: bool = False
 ) -> PdGains:
     """Return gains of the first coordinates whose answer is proved; with a bound ``most``, of the first alone.
     The plant's ``own`` units come first, or those that suit the engine."""
-    delta = default_delta(plant, asked, decay)
-    require_possible(plant, asked, delta=delta, decay=decay)
+    delta = default_delta(plant, method, decay)
+    require_possible(plant, method, delta=delta, decay=decay)
     failure = SolverError(
         "The gains that the solver returned could not be proved to be stable: the result is inconclusive."
     )
-    engine, *spare = asked.engines_for(plant.nx + plant.nf)
+    engine, *spare = method.engines_for(plant.nx + plant.nf)
     for name in (engine, *spare):
-        tried = _units(plant, asked, balanced_first=name != "lmi", own_first=own)
+        tried = _units(plant, method, balanced_first=name != "lmi", own_first=own)
         for units in islice(tried, None if most is None else 1):
             try:
-                found = _solved(plant, asked, name, delta, decay, units, most)
+                gains = _solved(plant, method, name, delta, decay, units, most)
             except SolverError as error:
                 # What the spare engine meets says less than why it was needed.
                 failure = error if name == engine else failure
                 continue
-            if found is not None and found.proved:
-                return replace(found, engine=name)
+            if gains is not None and gains.proved:
+                return replace(gains, engine=name)
     raise SolverError(
-        f"{failure} {_advice(asked)}", record={**failure.record, "delta": delta, "decay": decay}
+        f"{failure} {_advice(method)}", record={**failure.record, "delta": delta, "decay": decay}
     ) from failure
 
 
-def _advice(asked: PdObserver) -> str:
+def _advice(method: PdObserver) -> str:
     wishes = ("decay", "disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain", "adaptation_range")
-    given = [name for name in wishes if getattr(asked, name) is not None]
-    if not given:
+    stated = [name for name in wishes if getattr(method, name) is not None]
+    if not stated:
         return "Rescale the plant, or try another delta or solver."
-    return f"Gains exist without {', '.join(given)}: ask for less there, or try another delta."
+    return f"Gains exist without {', '.join(stated)}: ask for less there, or try another delta."
 
 
-def _units(plant: DescriptorSystem, asked: PdObserver, *, balanced_first: bool, own_first: bool) -> Iterable[_Units]:
+def _units(plant: DescriptorSystem, method: PdObserver, *, balanced_first: bool, own_first: bool) -> Iterable[_Units]:
     """Return units of augmented states and outputs: the user's, balancing ones, those with the plant near one."""
-    found = [*_candidate_units(plant, asked)]
-    if asked.gain_bound is not None:
-        return found
-    users, *others = found
+    candidates = [*_candidate_units(plant, method)]
+    if method.gain_bound is not None:
+        return candidates
+    users, *alternatives = candidates
     if own_first:
-        return [_own_units(plant), *others, users]
+        return [_own_units(plant), *alternatives, users]
     rounded = PlantUnits.of(plant).rounded()
     natural = _with_faults(rounded, users.time)
     if rounded.spread > FAR_UNITS:
-        return [users, natural, *others]
+        return [users, natural, *alternatives]
     # A Riccati equation has no objective that would weigh gains in the user's units.
-    if balanced_first and len(others) == 2:
-        return [others[0], users, others[1], natural]
-    return [users, *others, natural]
+    if balanced_first and len(alternatives) == 2:
+        return [alternatives[0], users, alternatives[1], natural]
+    return [users, *alternatives, natural]
 
 
 def _own_units(plant: DescriptorSystem) -> _Units:
@@ -236,10 +236,10 @@ def _own_units(plant: DescriptorSystem) -> _Units:
     noise then reaches the estimates several times larger.  So it does by an output that hardly shows the states but for
     its noise, where that is stated: beside the others its unit is no less than its noise has it.
     """
-    found = _with_faults(PlantUnits.of(plant), 1.0 / fastest_mode(plant.A))
+    units = _with_faults(PlantUnits.of(plant), 1.0 / fastest_mode(plant.A))
     noise = np.linalg.norm(plant.Dw, axis=1)
-    shown = float(np.max(found.outputs[noise > 0.0] / noise[noise > 0.0], initial=0.0))
-    return found._replace(outputs=np.maximum(found.outputs, shown * noise))
+    largest_ratio = float(np.max(units.outputs[noise > 0.0] / noise[noise > 0.0], initial=0.0))
+    return units._replace(outputs=np.maximum(units.outputs, largest_ratio * noise))
 
 
 def _with_faults(units: PlantUnits, time: float) -> _Units:
@@ -250,13 +250,13 @@ def _given_units(plant: DescriptorSystem) -> _Units:
     return _Units(np.ones(plant.nx + plant.nf), np.ones(plant.ny), 1.0)
 
 
-def _candidate_units(plant: DescriptorSystem, asked: PdObserver) -> Iterator[_Units]:
+def _candidate_units(plant: DescriptorSystem, method: PdObserver) -> Iterator[_Units]:
     n, ny = plant.nx + plant.nf, plant.ny
     time = float(np.exp2(np.round(np.log2(TIME_UNITS / fastest_mode(plant.A)))))
     yield _given_units(plant)._replace(time=time)
-    if asked.gain_bound is not None:
+    if method.gain_bound is not None:
         return  # it is a bound in the user's units
-    augmented = with_faults_as_states(plant, _inner_gain(plant, asked))
+    augmented = with_faults_as_states(plant, _inner_gain(plant, method))
     system = np.zeros((n + ny, n + ny))
     system[:n, :n], system[n:, :n] = augmented.A, augmented.C
     factors = balancing_factors(system)
@@ -268,14 +268,14 @@ def _candidate_units(plant: DescriptorSystem, asked: PdObserver) -> Iterator[_Un
     yield _Units(columns, np.exp2(np.round(np.log2(np.where(rows > 0.0, rows, 1.0)))), time)
 
 
-def _inner_gain(plant: DescriptorSystem, asked: PdObserver) -> FloatArray | None:
+def _inner_gain(plant: DescriptorSystem, method: PdObserver) -> FloatArray | None:
     """Return the G to design with; a bound on the gains is on those in the loop, in the fault's own coordinates."""
-    return None if asked.gain_bound is not None else asked.gain_matrix(plant.nf)
+    return None if method.gain_bound is not None else method.gain_matrix(plant.nf)
 
 
 def _solved(
     plant: DescriptorSystem,
-    asked: PdObserver,
+    method: PdObserver,
     engine: str,
     delta: float,
     decay: float,
@@ -284,107 +284,109 @@ def _solved(
 ) -> PdGains | None:
     """Return the gains found in some units, with a proved certificate where there is one."""
     states, outputs, unit = units
-    task = _task(plant, asked, delta, decay, units)
+    task = _task(plant, method, delta, decay, units)
     if engine == "riccati":
-        found, used = closed_form(task, free_delta=asked.delta is None, once=most is not None)
+        solution, used = closed_form(task, free_delta=method.delta is None, once=most is not None)
         delta = delta if used == task.delta else used * unit
     else:
-        found = solve(task, solver=asked.solver)
-    g = _inner_gain(plant, asked)
+        solution = solve(task, solver=method.solver)
+    g = _inner_gain(plant, method)
     loop = np.eye(len(states))
     if g is not None:
         loop[plant.nx :, plant.nx :] = g
     back = np.linalg.inv(loop)
-    gain_j, gain_l = (loop @ (states[:, None] * part / outputs) for part in (found.J / unit, found.L))
+    gain_j, gain_l = (loop @ (states[:, None] * part / outputs) for part in (solution.J / unit, solution.L))
     if most is not None and not largest_singular_value(np.hstack([gain_j, gain_l])) <= most:
-        raise SolverError("The gains are very large, and no decay rate was asked for.", record=found.record)
-    p3, *p1 = (back.T @ (matrix / states[:, None] / states) @ back for matrix in (found.P3, *found.P1))
-    return certified(plant, asked, PdSolution(gain_j, gain_l, tuple(p1), p3, found.record), delta=delta, decay=decay)
+        raise SolverError("The gains are very large, and no decay rate was asked for.", record=solution.record)
+    p3, *p1 = (back.T @ (matrix / states[:, None] / states) @ back for matrix in (solution.P3, *solution.P1))
+    return certified(
+        plant, method, PdSolution(gain_j, gain_l, tuple(p1), p3, solution.record), delta=delta, decay=decay
+    )
 
 
 def _task(
     plant: DescriptorSystem,
-    asked: PdObserver,
+    method: PdObserver,
     delta: float,
     decay: float,
     units: _Units,
 ) -> PdTask:
     (states, outputs, unit), nx, nf = units, plant.nx, plant.nf
-    g = _inner_gain(plant, asked)
-    ends = asked.range_numbers
+    g = _inner_gain(plant, method)
+    ends = method.range_numbers
     gains = [g] if ends is None else [end * np.eye(nf) for end in ends]
     plants = [with_faults_as_states(plant, gain) for gain in gains]
     noisy = with_sensor_noise(plant)
-    shown, rate = np.zeros((nf, nx + nf)), np.zeros((nx + nf, nf))
-    shown[:, nx:], rate[nx:] = np.eye(nf) if g is None else g, np.eye(nf) if g is None else np.linalg.inv(g)
+    fault_rows, rate = np.zeros((nf, nx + nf)), np.zeros((nx + nf, nf))
+    fault_rows[:, nx:], rate[nx:] = np.eye(nf) if g is None else g, np.eye(nf) if g is None else np.linalg.inv(g)
     padded = np.vstack([noisy.Bw, np.zeros((nf, noisy.nw))])
     return PdTask(
         plants=tuple((unit * p.A * states / states[:, None], p.C * states / outputs[:, None]) for p in plants),
-        theorem=asked.theorem,
+        theorem=method.theorem,
         delta=delta / unit,
         decay=decay * unit,
-        disk=None if asked.disk_numbers is None else (asked.disk_numbers[0] * unit, asked.disk_numbers[1] * unit),
-        gain_bound=asked.gain_bound,
+        disk=None if method.disk_numbers is None else (method.disk_numbers[0] * unit, method.disk_numbers[1] * unit),
+        gain_bound=method.gain_bound,
         gain_unit=1.0 / unit,
-        rate_gain=asked.fault_rate_gain,
-        noise_gain=asked.noise_gain,
+        rate_gain=method.fault_rate_gain,
+        noise_gain=method.noise_gain,
         rate=unit * rate / states[:, None],
-        fault_error=shown * states,
+        fault_error=fault_rows * states,
         process=unit * padded / states[:, None],
         sensor=noisy.Dw / outputs[:, None],
         sensor_rate=unit * noisy.Dw / outputs[:, None],
     )
 
 
-def synthesise(plant: DescriptorSystem, asked: PdObserver, *, progress: Callable[[str], None]) -> Synthesis:
+def synthesise(plant: DescriptorSystem, method: PdObserver, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the observer; see `obsynth.pd_observer` for the options, results and errors."""
-    solver_of = chosen_solver(asked.solver, asked.solver_options)
-    if own_terms(asked) or asked.region is not None:
+    solver_of = chosen_solver(method.solver, method.solver_options)
+    if own_terms(method) or method.region is not None:
         from obsynth.methods.engines.own_terms import pd_by_inequality
 
-        return pd_by_inequality(plant, asked, progress=progress)
-    asked = replace(asked, solver=solver_of)
+        return pd_by_inequality(plant, method, progress=progress)
+    method = replace(method, solver=solver_of)
     progress("checking the existence conditions")
     require_all(pd_observer_conditions(plant))
     form = explicit_form(plant)
     work = plant if form is None else form.plant
-    g = asked.gain_matrix(work.nf)
+    g = method.gain_matrix(work.nf)
     progress("solving the matrix inequalities")
-    gains, records = design_gains(work, asked)
-    shipped = asked.range_numbers and min(max(1.0, asked.range_numbers[0]), asked.range_numbers[1])
+    gains, records = design_gains(work, method)
+    shipped = method.range_numbers and min(max(1.0, method.range_numbers[0]), method.range_numbers[1])
     loop = shipped * np.eye(work.nf) if shipped else g
     claims = {"theorem": float(gains.theorem), "delta": gains.delta, "decay": gains.decay}
     bounds: dict[str, float | None] = {
-        "gain_bound": asked.gain_bound,
-        "fault_rate_gain": asked.fault_rate_gain,
-        "noise_gain": asked.noise_gain,
+        "gain_bound": method.gain_bound,
+        "fault_rate_gain": method.fault_rate_gain,
+        "noise_gain": method.noise_gain,
     }
     claims |= {name: float(bound) for name, bound in bounds.items() if bound is not None}
     matrices = {"P1": gains.P1, "P3": gains.P3, **gains.gain_certificates}
-    if asked.disk_numbers is not None:
-        claims |= {"disk_centre": asked.disk_numbers[0], "disk_radius": asked.disk_numbers[1]}
-    if asked.range_numbers is not None:
-        claims |= {"adaptation_low": asked.range_numbers[0], "adaptation_high": asked.range_numbers[1]}
+    if method.disk_numbers is not None:
+        claims |= {"disk_centre": method.disk_numbers[0], "disk_radius": method.disk_numbers[1]}
+    if method.range_numbers is not None:
+        claims |= {"adaptation_low": method.range_numbers[0], "adaptation_high": method.range_numbers[1]}
         matrices |= {"P1_low": gains.ends[0], "P1_high": gains.ends[1]}
     return Synthesis(
-        _resolved(asked, gains, g),
+        _resolved(method, gains, g),
         listed_gains(work, gains.J, gains.L, loop),
         gains.observer,
         Certificate(matrices, claims),
         {"engine": gains.engine, "runs": records},
-        notes(work, asked, gains),
+        notes(work, method, gains),
         transformation=form,
     )
 
 
-def _resolved(asked: PdObserver, gains: PdGains, g: FloatArray | None) -> dict[str, Any]:
+def _resolved(method: PdObserver, gains: PdGains, g: FloatArray | None) -> dict[str, Any]:
     return {
-        **asked.as_plain(),
+        **method.as_plain(),
         "delta": gains.asked_delta,
         "decay": gains.decay,
-        "disk": None if asked.disk_numbers is None else list(asked.disk_numbers),
+        "disk": None if method.disk_numbers is None else list(method.disk_numbers),
         "adaptation_gain": None if g is None else g.tolist(),
-        "adaptation_range": None if asked.range_numbers is None else list(asked.range_numbers),
+        "adaptation_range": None if method.range_numbers is None else list(method.range_numbers),
     }
 
 
@@ -397,23 +399,23 @@ def listed_gains(plant: DescriptorSystem, J: FloatArray, L: FloatArray, g: Float
     return gains if g is None else {**gains, "G": g}
 
 
-def notes(plant: DescriptorSystem, asked: PdObserver, gains: PdGains) -> tuple[str, ...]:
+def notes(plant: DescriptorSystem, method: PdObserver, gains: PdGains) -> tuple[str, ...]:
     """Return what a user should know: how delta and the decay rate were chosen, slow or noisy estimates."""
-    found = []
-    if asked.delta is None:
+    texts = []
+    if method.delta is None:
         less = ", or as much of it as the closed form serves" if gains.engine == "riccati" else ""
-        found.append(f"delta = {gains.asked_delta:.4g} s was chosen, from the plant's fastest mode{less}.")
-    if asked.decay is None and gains.decay > 0.0:
-        found.append(
+        texts.append(f"delta = {gains.asked_delta:.4g} s was chosen, from the plant's fastest mode{less}.")
+    if method.decay is None and gains.decay > 0.0:
+        texts.append(
             f"A decay rate of {gains.decay:.4g} 1/s was imposed: a tenth of that of the plant's fastest mode, or as "
             "much of it as is "
             "reachable with moderate gains; without it errors would decay more slowly. decay: 0 takes the smallest "
             "gains."
         )
-    found += _engine_notes(asked, gains, plant.nx + plant.nf)
+    texts += _engine_notes(method, gains, plant.nx + plant.nf)
     direct = gains.observer.Dy[gains.observer.fault_rows]
     return (
-        *found,
+        *texts,
         *[
             f"The estimate of {name!r} amplifies high-frequency errors of the measurements by up to "
             f"{np.linalg.norm(row):.3g}."
@@ -423,13 +425,13 @@ def notes(plant: DescriptorSystem, asked: PdObserver, gains: PdGains) -> tuple[s
     )
 
 
-def _engine_notes(asked: PdObserver, gains: PdGains, states: int) -> list[str]:
-    wanted = asked.engines_for(states)[0]
-    if gains.engine != wanted:
+def _engine_notes(method: PdObserver, gains: PdGains, states: int) -> list[str]:
+    first_engine = method.engines_for(states)[0]
+    if gains.engine != first_engine:
         return [
-            f"The engine {wanted!r} failed: these gains come from "
+            f"The engine {first_engine!r} failed: these gains come from "
             + ("the inequality (engine 'lmi')." if gains.engine == "lmi" else _CLOSED_FORM)
         ]
-    if asked.engine == "auto" and wanted != "lmi":
+    if method.engine == "auto" and first_engine != "lmi":
         return [f"With {states} unknown states the gains come from {_CLOSED_FORM} Engine 'lmi' may find smaller ones."]
     return []

@@ -40,15 +40,15 @@ def synthesis_from_gains(plant: DescriptorSystem, *, U: Any, D: Any, K: Any, F: 
     """Return the realisation of given gains; see `obsynth.design_from_gains`."""
     model = exosystem(fault_model, plant.fault_names, plant.dt)
     nx, ny, count = plant.nx, plant.ny, model.order
-    given = {name: as_matrix(value, name) for name, value in (("U", U), ("D", D), ("K", K), ("F", F))}
+    matrices = {name: as_matrix(value, name) for name, value in (("U", U), ("D", D), ("K", K), ("F", F))}
     shapes = {"U": (nx, nx), "D": (nx, ny), "K": (nx, ny), "F": (count, ny)}
     for name, shape in shapes.items():
-        require_shape(given[name].shape, shape, name)
-    u, d = with_faults(given["U"], given["D"], plant, model)
-    gains = u, d, np.vstack([given["K"], given["F"]])
+        require_shape(matrices[name].shape, shape, name)
+    u, d = with_faults(matrices["U"], matrices["D"], plant, model)
+    gains = u, d, np.vstack([matrices["K"], matrices["F"]])
     options = {"from_gains": True, "fault_model": plain(fault_model)}
-    found = assembled(plant, model, gains, None, {}, structured=True)
-    return Synthesis(options, found.gains, found.observer, found.certificate)
+    synthesis = assembled(plant, model, gains, None, {}, structured=True)
+    return Synthesis(options, synthesis.gains, synthesis.observer, synthesis.certificate)
 
 
 def assembled(
@@ -84,23 +84,23 @@ def assembled(
     return Synthesis({}, letters, observer, Certificate(matrices, finite))
 
 
-def _shipped_poles(observer: LinearObserver, asked: ComplexArray | None) -> ComplexArray:
+def _shipped_poles(observer: LinearObserver, stated: ComplexArray | None) -> ComplexArray:
     """Return the poles as asked for where the stored numbers have them, else those that they have: what is shipped."""
-    found = eigenvalues(observer.Az)
-    if asked is not None and farthest_pole(found, asked, observer.dt) <= SAME_AS_ASKED:
-        return asked
+    computed = eigenvalues(observer.Az)
+    if stated is not None and farthest_pole(computed, stated, observer.dt) <= SAME_AS_ASKED:
+        return stated
     if (
-        asked is None
-        and len(found)
+        stated is None
+        and len(computed)
         and rounding_of_eigenvalues(observer.Az) <= KNOWN_POLES
-        and slowest_decay(observer.Az, observer.dt) == np.min(decay_rates(found, observer.dt), initial=np.inf)
+        and slowest_decay(observer.Az, observer.dt) == np.min(decay_rates(computed, observer.dt), initial=np.inf)
     ):
-        return found
+        return computed
     enclosed = enclosed_eigenvalues(observer.Az)
     if enclosed is None:
-        return found
+        return computed
     exact = np.array([middle_of(ball) for ball in enclosed])
-    return asked if asked is not None and farthest_pole(exact, asked, observer.dt) <= SAME_AS_ASKED else exact
+    return stated if stated is not None and farthest_pole(exact, stated, observer.dt) <= SAME_AS_ASKED else exact
 
 
 def noise_amplification(observer: LinearObserver) -> float:

@@ -62,8 +62,8 @@ def _realisation_rows(design: ObserverDesign, printed_digits: int | None) -> Ite
     else:
         yield from condition_rows([last])
     tolerance = relative_tolerance(printed_digits, plant.nx + len(phi) + plant.ny)
-    for name, claim, found, source in identities(plant, observer, model, tracking):
-        yield equality(name, claim, found, source, bound=tolerance)
+    for name, claim, miss, source in identities(plant, observer, model, tracking):
+        yield equality(name, claim, miss, source, bound=tolerance)
     yield from stability_rows(design, poles, factor)
     norm = decoupling_norm(plant, observer)
     yield upper_bound_check(

@@ -85,11 +85,11 @@ def _identity_rows(
     plant: PolytopicSystem, observer: ScheduledObserver, tracking: FloatArray, model: Exosystem
 ) -> Iterator[Check]:
     """Yield the rows of (19), each for the vertex where it misses most."""
-    found: dict[str, list[tuple[Residual, str, str]]] = {}
+    entries_by_name: dict[str, list[tuple[Residual, str, str]]] = {}
     for place, vertex in enumerate(plant.vertices):
         for name, claim, miss, source in identities(vertex, observer.at_vertex(place), model, tracking):
-            found.setdefault(name, []).append((miss, claim, source))
-    for name, entries in found.items():
+            entries_by_name.setdefault(name, []).append((miss, claim, source))
+    for name, entries in entries_by_name.items():
         misses = [miss for miss, _, _ in entries]
         place = misses.index(worst(misses))
         miss, claim, source = entries[place]
@@ -133,9 +133,9 @@ def _proved_rows(design: ObserverDesign, plant: PolytopicSystem, observer: Sched
     if plant.nf:
         level = claimed(claims, "region_gain")
         witness = witness_of_certificate(matrices, pairs, GAIN_WITNESSES)
-        what = "their change in a sample" if plant.is_discrete else "their derivative"
+        drive = "their change in a sample" if plant.is_discrete else "their derivative"
         claim = (
-            f"the l2 gain from what drives the fault models (for steps: {what}) to the errors of the fault estimates "
+            f"the l2 gain from what drives the fault models (for steps: {drive}) to the errors of the fault estimates "
         )
         rate = plant.scheduling.rate_of_weight if _moves(matrices) and not plant.is_discrete else None
         if rate is not None:

@@ -43,11 +43,11 @@ class DecouplingNorm:
     fault_gain: float  # error of a fault estimate for unit (x, d) in scaled units
     frequency: float  # where, rad/s
 
-    def worse(self, found: tuple[float, float] | None, frequency: float) -> DecouplingNorm:
+    def worse(self, errors: tuple[float, float] | None, frequency: float) -> DecouplingNorm:
         """Return the larger of this and the relative error and that of a fault at a frequency; ``None`` at a pole."""
-        if found is None:
+        if errors is None:
             return DecouplingNorm(np.inf, np.inf, frequency) if np.isfinite(self.relative) else self
-        relative, fault = found
+        relative, fault = errors
         if not relative <= self.relative:
             return DecouplingNorm(relative, max(fault, self.fault_gain), frequency)
         return DecouplingNorm(self.relative, max(fault, self.fault_gain), self.frequency)
@@ -75,7 +75,7 @@ def decoupling_norms(
     moved = trajectories_of(scaled, points, [inputs for _, inputs in groups])
     # How many trajectories there are at almost every frequency: where there seem to be more, rounding hides the rest.
     counts = [min(basis.shape[1] for basis in bases) for bases in moved]
-    found = [DecouplingNorm(0.0, 0.0, 0.0) for _ in groups]
+    norms = [DecouplingNorm(0.0, 0.0, 0.0) for _ in groups]
     for some in _parts(points, max(scaled.nx + scaled.nd, observer.order)):
         passing = _Passing.of(observer, units, points[some])
         for place, (rows, inputs) in enumerate(groups):
@@ -83,8 +83,8 @@ def decoupling_norms(
                 continue
             bases = np.stack([basis[:, -counts[place] :] for basis in moved[place][some]])
             for frequency, missed in zip(frequencies[some], passing.misses(scaled, bases, rows, inputs), strict=True):
-                found[place] = found[place].worse(missed, float(frequency))
-    return found
+                norms[place] = norms[place].worse(missed, float(frequency))
+    return norms
 
 
 def _parts(points: ComplexArray, order: int) -> list[slice]:
@@ -97,45 +97,49 @@ def trajectories_of(
     plant: DescriptorSystem, points: ComplexArray, groups: Sequence[Sequence[int]]
 ) -> list[list[ComplexArray]]:
     """Return, for each group of unknown inputs, trajectories ``(nx + inputs, count)`` at each point, of unit norm."""
-    found: list[list[ComplexArray]] = [[] for _ in groups]
+    bases_by_group: list[list[ComplexArray]] = [[] for _ in groups]
     for some in _parts(points, plant.nx + plant.nd):
         none = np.zeros_like(plant.Bd)
         pencils = pencils_at(np.hstack([plant.E, none]), np.hstack([plant.A, plant.Bd]), points[some])
-        whole, columns, sure = _null_spaces(pencils)
-        for bases, inputs in zip(found, groups, strict=True):
+        null_bases, columns, sure = _null_spaces(pencils)
+        for bases, inputs in zip(bases_by_group, groups, strict=True):
             own = [*range(plant.nx), *(plant.nx + np.array(inputs, dtype=np.intp))]
-            bases += _of_some(pencils, own, whole, columns, sure)
-    return found
+            bases += _of_some(pencils, own, null_bases, columns, sure)
+    return bases_by_group
 
 
 def _of_some(
-    pencils: ComplexArray, own: Sequence[int], whole: list[ComplexArray], columns: FloatArray, sure: NDArray[np.bool_]
+    pencils: ComplexArray,
+    own: Sequence[int],
+    null_bases: list[ComplexArray],
+    columns: FloatArray,
+    sure: NDArray[np.bool_],
 ) -> list[ComplexArray]:
     """Return the part of null spaces that is zero outside some columns: combinations without the others."""
-    others = np.setdiff1d(np.arange(pencils.shape[2]), own)
-    if not len(others):
-        return _of_unit_norm(whole, columns)
-    found: list[ComplexArray | None] = [None] * len(whole)
+    outside = np.setdiff1d(np.arange(pencils.shape[2]), own)
+    if not len(outside):
+        return _of_unit_norm(null_bases, columns)
+    restricted: list[ComplexArray | None] = [None] * len(null_bases)
     if sure.any():
         places = np.flatnonzero(sure)
-        sure_bases = np.stack([whole[place] for place in places])
-        _, values, right = np.linalg.svd(sure_bases[:, others])
+        sure_bases = np.stack([null_bases[place] for place in places])
+        _, values, right = np.linalg.svd(sure_bases[:, outside])
         # Independent as they are, the others can be left out; or the null space is looked for by itself.
         left_out = (
-            values[:, -1] > FAR_FROM_SINGULAR if 0 < values.shape[1] == len(others) else np.zeros(len(places), bool)
+            values[:, -1] > FAR_FROM_SINGULAR if 0 < values.shape[1] == len(outside) else np.zeros(len(places), bool)
         )
-        kept = np.conj(np.swapaxes(right[left_out, len(others) :], 1, 2))
-        combined = (sure_bases[left_out] @ kept)[:, own]
+        combinations = np.conj(np.swapaxes(right[left_out, len(outside) :], 1, 2))
+        combined = (sure_bases[left_out] @ combinations)[:, own]
         for place, basis in zip(
             places[left_out], _of_unit_norm([*combined], columns[places[left_out]][:, own]), strict=True
         ):
-            found[place] = basis
-    rest = [place for place, basis in enumerate(found) if basis is None]
-    if rest:
-        bases, scales, _ = _null_spaces(pencils[rest][:, :, own])
-        for place, basis in zip(rest, _of_unit_norm(bases, scales), strict=True):
-            found[place] = basis
-    return [basis for basis in found if basis is not None]
+            restricted[place] = basis
+    remaining = [place for place, basis in enumerate(restricted) if basis is None]
+    if remaining:
+        bases, scales, _ = _null_spaces(pencils[remaining][:, :, own])
+        for place, basis in zip(remaining, _of_unit_norm(bases, scales), strict=True):
+            restricted[place] = basis
+    return [basis for basis in restricted if basis is not None]
 
 
 def _of_unit_norm(bases: Sequence[ComplexArray], scales: FloatArray) -> list[ComplexArray]:
@@ -144,8 +148,8 @@ def _of_unit_norm(bases: Sequence[ComplexArray], scales: FloatArray) -> list[Com
         return [_of_unit_norm([basis], own[None])[0] for basis, own in zip(bases, scales, strict=True)]
     if not len(bases):
         return []
-    found = np.stack(bases) * scales[:, :, None]
-    return [*(found / np.linalg.norm(found, axis=1, keepdims=True))]
+    scaled = np.stack(bases) * scales[:, :, None]
+    return [*(scaled / np.linalg.norm(scaled, axis=1, keepdims=True))]
 
 
 def _null_spaces(pencils: ComplexArray) -> tuple[list[ComplexArray], FloatArray, NDArray[np.bool_]]:
@@ -155,7 +159,7 @@ def _null_spaces(pencils: ComplexArray) -> tuple[list[ComplexArray], FloatArray,
 
     scaled, columns = equilibrated(pencils)
     points, equations, count = scaled.shape
-    found, sure = list[ComplexArray](), np.zeros(points, dtype=bool)
+    bases, sure = list[ComplexArray](), np.zeros(points, dtype=bool)
     # Of independent equations a tenth of the work gives the same null space; the condition is estimated to a small
     # factor, and only for pencils far from the tolerance.
     if 0 < equations <= count:
@@ -169,13 +173,13 @@ def _null_spaces(pencils: ComplexArray) -> tuple[list[ComplexArray], FloatArray,
     for place in range(points):
         if sure[place] and last.size:
             room = LAPACK_BLOCK * last.shape[1]
-            found.append(zunmqr("L", "N", packed[place].T, factors[place], last, room)[0])
+            bases.append(zunmqr("L", "N", packed[place].T, factors[place], last, room)[0])
         elif sure[place]:
-            found.append(last)
+            bases.append(last)
         else:
             _, values, right = np.linalg.svd(scaled[place])
-            found.append(right[numerical_rank(values) :].conj().T)
-    return found, columns, sure
+            bases.append(right[numerical_rank(values) :].conj().T)
+    return bases, columns, sure
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,8 +248,8 @@ def _inverses(matrices: ComplexArray) -> ComplexArray:
         return np.asarray(np.linalg.inv(matrices))
     except np.linalg.LinAlgError:
         pass
-    found = np.full_like(matrices, np.nan)
+    inverses = np.full_like(matrices, np.nan)
     for place, matrix in enumerate(matrices):
         with suppress(np.linalg.LinAlgError):
-            found[place] = np.linalg.inv(matrix)
-    return found
+            inverses[place] = np.linalg.inv(matrix)
+    return inverses

@@ -99,7 +99,7 @@ def steady_errors(
     a, b, c, d = _system(plant, observer, tracking)
     shift = np.eye(len(a)) if plant.dt > 0.0 else np.zeros_like(a)
     step = plant.dt if plant.dt > 0.0 else 1.0
-    found = []
+    errors = []
     for fault in range(plant.nf):
         order = _constants(phi, cw[fault], shift=1.0 if plant.dt > 0.0 else 0.0)
         # T(s) = D + C (sI - A)^-1 B = D - C A^-1 B - C A^-2 B s - ...
@@ -107,8 +107,8 @@ def steady_errors(
         for _ in range(order + 1):
             vector = np.asarray(np.linalg.solve(a - shift, vector), dtype=np.float64)
         coefficient = -float(c[fault] @ vector) + (float(d[fault, fault]) - 1.0 if order == 0 else 0.0)
-        found.append((order, coefficient * step**order))
-    return found
+        errors.append((order, coefficient * step**order))
+    return errors
 
 
 def _constants(phi: FloatArray, row: FloatArray, *, shift: float) -> int:
@@ -147,10 +147,10 @@ def tracking_rows(
             detail=f"largest |fhat/f| {abs(own[peak]):.3g} at {frequencies[peak]:.3g} rad/s; |fhat/f| = 1 is faithful",
         )
         order, error = errors[fault]
-        course = {0: "a step of 1", 1: "a ramp of 1 per s"}.get(order, f"t^{order} / {order}!")
+        unmodelled = {0: "a step of 1", 1: "a ramp of 1 per s"}.get(order, f"t^{order} / {order}!")
         yield information(
             f"steady error[{name}]",
-            f"fhat - f in the end when the fault is {course}, one order above its model",
+            f"fhat - f in the end when the fault is {unmodelled}, one order above its model",
             error,
             source=source,
             detail=plant.units.get(name, ""),
@@ -163,18 +163,18 @@ def _limits(plant: DescriptorSystem, observer: LinearObserver, tracking: FloatAr
     units = PlantUnits.of(plant).rounded()
     scaled = units.scaled_plant(plant)
     inputs, direct = np.hstack([scaled.Bf, scaled.Bd]), np.hstack([scaled.Df, scaled.Dd])
-    padded, whole = system_pencil(scaled.E, scaled.A, inputs, scaled.C, direct)
+    padded, pencil = system_pencil(scaled.E, scaled.A, inputs, scaled.C, direct)
     if plant.nf == 0:
         return
-    found = system_zeros(padded, whole, nx=scaled.nx)
-    if found.normal_rank < whole.shape[1]:
+    zeros = system_zeros(padded, pencil, nx=scaled.nx)
+    if zeros.normal_rank < pencil.shape[1]:
         return
     slowest = float(np.min(decay_rates(poles_of(observer), plant.dt), initial=np.inf))
 
     def outside(value: complex) -> bool:
         return value.imag >= 0.0 and is_outside(value, plant.dt)
 
-    for zero in zeros_with_directions(padded, whole, found, nx=scaled.nx, selected=outside):
+    for zero in zeros_with_directions(padded, pencil, zeros, nx=scaled.nx, selected=outside):
         if float(np.linalg.norm(zero.input_direction[: plant.nf])) <= NEGLIGIBLE_INPUT:
             continue
         fault, place = units.faults * zero.input_direction[: plant.nf], units.eigenvalue(zero.value)

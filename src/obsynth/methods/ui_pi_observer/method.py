@@ -172,15 +172,15 @@ class UiPiObserver(Method):
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""
-        ways = [name for name in ("poles", "decay", "region") if getattr(self, name) is not None]
-        if len(ways) > 1:
-            yield f"{' and '.join(ways)} are given: use one of them."
+        placements = [name for name in ("poles", "decay", "region") if getattr(self, name) is not None]
+        if len(placements) > 1:
+            yield f"{' and '.join(placements)} are given: use one of them."
         if self.poles is not None and self.noise is not None:
             yield "noise weights do not act on given poles: leave one of the two out."
-        given = [getattr(self, name) is not None for name in ("E_sharp", "C_sharp", "G")]
-        if any(given) and not all(given):
+        stated = [getattr(self, name) is not None for name in ("E_sharp", "C_sharp", "G")]
+        if any(stated) and not all(stated):
             yield "E_sharp, C_sharp and G come together: give all three, or none."
-        if any(given) and self.joint:
+        if any(stated) and self.joint:
             yield "joint designs what E_sharp, C_sharp and G would fix: leave one of the two out."
         if not callable(self.objective) and not (isinstance(self.objective, str) and self.objective in OBJECTIVES):
             listed = ", ".join(OBJECTIVES)
@@ -218,17 +218,17 @@ class UiPiObserver(Method):
         if not isinstance(self.noise, Mapping):
             message = f"noise is {self.noise!r}: give measurement, process, fault by name."
             raise SpecError(message, path=f"{OPTIONS_PATH}.noise")
-        given = {key: value for key, value in self.noise.items() if value is not None}
-        problems = [f"unknown key {key!r}." for key in given if key not in ("measurement", "process", "fault")]
-        sizes = {key: given[key] for key in ("process", "fault") if key in given}
+        weights = {key: value for key, value in self.noise.items() if value is not None}
+        problems = [f"unknown key {key!r}." for key in weights if key not in ("measurement", "process", "fault")]
+        sizes = {key: weights[key] for key in ("process", "fault") if key in weights}
         problems += [text for key, size in sizes.items() if (text := problem_with(size, key, Positive))]
-        measurement = given.get("measurement")
+        measurement = weights.get("measurement")
         if isinstance(measurement, (list, tuple, np.ndarray)):
             if np.shape(measurement) != (len(output_names),):
                 problems.append(f"measurement has shape {np.shape(measurement)}: give one number for each output.")
                 measurement = None
             else:
-                measurement = given["measurement"] = dict(zip(output_names, measurement, strict=True))
+                measurement = weights["measurement"] = dict(zip(output_names, measurement, strict=True))
         if isinstance(measurement, Mapping):
             missing = [name for name in output_names if name not in measurement]
             unknown = [name for name in measurement if name not in output_names]
@@ -241,7 +241,7 @@ class UiPiObserver(Method):
             problems.append("measurement must be positive standard deviations: one number, a list, or by output.")
         if problems:
             raise SpecError("Option noise of ui-pi-observer:", path=f"{OPTIONS_PATH}.noise", problems=problems)
-        return given
+        return weights
 
     def slowest_asked(self, dt: float) -> float | None:
         """Return the least rate of decay that was asked for, in 1/s."""

@@ -57,18 +57,18 @@ def stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArray
     )
     if "decay" in claims:
         yield decay_row(observer, claims["decay"])
-    wanted = claims.get("digits", PRINTED_DIGITS)
-    digits = int(wanted) if 1 <= wanted <= DOUBLE_DIGITS else 1
+    claimed_digits = claims.get("digits", PRINTED_DIGITS)
+    digits = int(claimed_digits) if 1 <= claimed_digits <= DOUBLE_DIGITS else 1
     rounded = as_printed(observer.Az, digits)
     values, bound = eigenvalues(rounded), 1.0 if dt > 0.0 else 0.0
-    found = abscissa_of(values, dt)
+    largest = abscissa_of(values, dt)
     yield Check(
         "stable with the claimed digits" if "digits" in claims else f"stable with {PRINTED_DIGITS} digits",
         f"Ahat rounded to {digits} significant digits is still stable (strictly below the bound)",
-        found,
+        largest,
         bound,
-        bound - found,
-        bool(found < bound),
+        bound - largest,
+        bool(largest < bound),
         "ours: gains of high-order placements do not keep their poles when they are printed with few digits",
     )
     yield information(
@@ -125,13 +125,13 @@ def gain_rows(
     """Yield the row on the listed gains; nothing where none are listed, as the realisation stands for itself."""
     if not gains:
         return
-    found, unknown = [], sorted(set(gains) - set(_shapes(plant, observer, model)))
+    residuals, unknown = [], sorted(set(gains) - set(_shapes(plant, observer, model)))
     for letter, shape in _shapes(plant, observer, model).items():
         if letter in gains and (gains[letter].shape != shape or not np.all(np.isfinite(gains[letter]))):
             unknown.append(letter)
     if not unknown:
-        found = list(_residuals(gains, plant, observer, model, tracking))
-    missed = worst(found) if found else Residual(1.0 if unknown else 0.0, 1.0)
+        residuals = list(_residuals(gains, plant, observer, model, tracking))
+    missed = worst(residuals) if residuals else Residual(1.0 if unknown else 0.0, 1.0)
     claim = "the letters are known, and those of the realisation, the fault model and the certificate"
     row = equality("gains", claim, missed, "Share Pasand, eqs. (4), (12), (19), (20)", bound=tolerance)
     yield row if not unknown else Check(**{**row.__dict__, "detail": f"wrong: {', '.join(unknown)}"})
@@ -167,12 +167,12 @@ def _residuals(
     nx, count = plant.nx, observer.order
     augmented = AugmentedPlant.of(plant, model)
     same = {"U_a": tracking, "Ahat": observer.Az, "Bhat": observer.By, "Phi": model.Phi, "Cw": model.Cw}
-    whole = {"U": ("U_a", slice(0, nx), slice(0, nx)), "D": ("D_a", slice(0, nx), slice(None))}
-    whole |= {"K": ("K_a", slice(0, nx), slice(None)), "F": ("K_a", slice(nx, count), slice(None))}
+    blocks = {"U": ("U_a", slice(0, nx), slice(0, nx)), "D": ("D_a", slice(0, nx), slice(None))}
+    blocks |= {"K": ("K_a", slice(0, nx), slice(None)), "F": ("K_a", slice(nx, count), slice(None))}
     for letter, matrix in same.items():
         if letter in gains:
             yield _same(gains[letter], matrix)
-    for letter, (name, rows, columns) in whole.items():
+    for letter, (name, rows, columns) in blocks.items():
         if letter in gains and name in gains:
             yield _same(gains[letter], gains[name][rows, columns])
     if "Hhat" in gains and "U" in gains:
@@ -182,8 +182,8 @@ def _residuals(
     if "D_a" in gains:
         # The estimates are read from z + D_a y.
         estimates = slice(0, nx + plant.nf)
-        shown = np.vstack([np.eye(nx, count), np.hstack([np.zeros((plant.nf, nx)), model.Cw])])
-        yield residual(observer.Dy[estimates], -shown @ gains["D_a"], factors=((shown, gains["D_a"]),))
+        estimate_map = np.vstack([np.eye(nx, count), np.hstack([np.zeros((plant.nf, nx)), model.Cw])])
+        yield residual(observer.Dy[estimates], -estimate_map @ gains["D_a"], factors=((estimate_map, gains["D_a"]),))
         yield from _injection(gains, augmented, observer)
 
 

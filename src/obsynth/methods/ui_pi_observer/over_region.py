@@ -42,32 +42,32 @@ ANALYSIS_MARGIN = 1e-3
 
 
 def synthesise_over_region(
-    plant: PolytopicSystem, asked: UiPiObserver, *, progress: Callable[[str], None]
+    plant: PolytopicSystem, method: UiPiObserver, *, progress: Callable[[str], None]
 ) -> Synthesis:
     """Return a scheduled observer with its certificates; see `obsynth.ui_pi_observer`."""
-    _require_options(asked)
-    solver = chosen_solver(asked.solver, asked.solver_options)
-    model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
-    noise = asked.checked_noise(plant.output_names)
+    _require_options(method)
+    solver = chosen_solver(method.solver, method.solver_options)
+    model = exosystem(method.fault_model, plant.fault_names, plant.dt)
+    noise = method.checked_noise(plant.output_names)
     progress("checking the existence conditions over the region")
     require_all_conditions(pi_conditions_over_region(plant, model))
     parts = pi_over_region(plant, model, noise=noise)
     steps = _steps(plant)
     progress("solving the inequalities at the vertices")
-    found = certified(
+    certificate = certified(
         parts.errors,
         margin=DESIGN_MARGIN,
-        decay=_scaled_decay(asked.decay, parts, plant.dt),
+        decay=_scaled_decay(method.decay, parts, plant.dt),
         lyapunov="common" if steps is None else "vertex",
         steps=steps,
         solver=solver,
-        settings=asked.solver_options,
+        settings=method.solver_options,
     )
     rate = None if plant.is_discrete else plant.scheduling.rate_of_weight
-    found = found if rate is None else _for_slow_courses(parts, found, rate, asked)
+    certificate = certificate if rate is None else _for_slow_courses(parts, certificate, rate, method)
     progress("building the realisation and its certificates")
-    made = _synthesis(plant, model, parts, found, steps, decay=asked.decay, rate=rate)
-    return replace(made, options=asked.resolved(model, plant.fault_names))
+    made = _synthesis(plant, model, parts, certificate, steps, decay=method.decay, rate=rate)
+    return replace(made, options=method.resolved(model, plant.fault_names))
 
 
 def synthesis_of_gains(plant: PolytopicSystem, K_a: Sequence[FloatArray], fault_model: Any) -> Synthesis:
@@ -75,21 +75,21 @@ def synthesis_of_gains(plant: PolytopicSystem, K_a: Sequence[FloatArray], fault_
     model = exosystem(fault_model, plant.fault_names, plant.dt)
     require_all_conditions(pi_conditions_over_region(plant, model))
     parts = pi_over_region(plant, model)
-    found = certified(parts.errors, margin=ANALYSIS_MARGIN, gains=checked_free_gains(parts, list(K_a)))
-    asked = UiPiObserver(fault_model=fault_model)
-    made = _synthesis(plant, model, parts, found, None, decay=None)
-    return replace(made, options=asked.resolved(model, plant.fault_names))
+    certificate = certified(parts.errors, margin=ANALYSIS_MARGIN, gains=checked_free_gains(parts, list(K_a)))
+    method = UiPiObserver(fault_model=fault_model)
+    made = _synthesis(plant, model, parts, certificate, None, decay=None)
+    return replace(made, options=method.resolved(model, plant.fault_names))
 
 
-def _require_options(asked: UiPiObserver) -> None:
+def _require_options(method: UiPiObserver) -> None:
     plain = UiPiObserver()
-    given = [name for name in NOT_OVER_REGION if getattr(asked, name) is not getattr(plain, name)]
-    given += ["objective"] if asked.objective != plain.objective else []
-    if given:
+    unsupported = [name for name in NOT_OVER_REGION if getattr(method, name) is not getattr(plain, name)]
+    unsupported += ["objective"] if method.objective != plain.objective else []
+    if unsupported:
         raise SpecError(
-            f"An observer over a region has no {', '.join(given)}: leave it out. It takes fault_model, decay, noise, "
-            "solver and solver_options; for another objective change obsynth.conditions.sharepasand(plant).",
-            path=f"method.options.{given[0]}",
+            f"An observer over a region has no {', '.join(unsupported)}: leave it out. It takes fault_model, decay, "
+            "noise, solver and solver_options; for another objective change obsynth.conditions.sharepasand(plant).",
+            path=f"method.options.{unsupported[0]}",
         )
 
 
@@ -100,22 +100,22 @@ def _steps(plant: PolytopicSystem) -> float | None:
 
 
 def _for_slow_courses(
-    parts: PiOverRegion, found: VertexCertificate, rate: float, asked: UiPiObserver
+    parts: PiOverRegion, certificate: VertexCertificate, rate: float, method: UiPiObserver
 ) -> VertexCertificate:
     """Return gains that are better for a slow parameter in continuous time, where they are, with one P for a decay."""
     errors, scaled = parts.errors, rate * parts.units.time
-    decay = _scaled_decay(asked.decay, parts, 0.0)
-    solver: dict[str, Any] = {"solver": asked.solver, "settings": asked.solver_options}
+    decay = _scaled_decay(method.decay, parts, 0.0)
+    solver: dict[str, Any] = {"solver": method.solver, "settings": method.solver_options}
     try:
         gains = rated_gains(errors, scaled, decay=decay or 0.0, **solver)
-        slow = rated_certificate(errors, scaled, gains, scale=found.level, **solver)
-        if slow is None or slow.level >= found.level:
-            return found
+        slow = rated_certificate(errors, scaled, gains, scale=certificate.level, **solver)
+        if slow is None or slow.level >= certificate.level:
+            return certificate
         # A step of implicit Euler shrinks errors in the norm of one P, which these gains need too.
         own = certified(errors, margin=DESIGN_MARGIN, decay=decay, gains=gains, **solver)
     except SolverError:
-        return found
-    return replace(own, runs=(*found.runs, *slow.runs, *own.runs))
+        return certificate
+    return replace(own, runs=(*certificate.runs, *slow.runs, *own.runs))
 
 
 def _scaled_decay(decay: float | None, parts: PiOverRegion, dt: float) -> float | None:
@@ -129,27 +129,29 @@ def _synthesis(
     plant: PolytopicSystem,
     model: Exosystem,
     parts: PiOverRegion,
-    found: VertexCertificate,
+    certificate: VertexCertificate,
     steps: float | None,
     *,
     decay: float | None,
     rate: float | None = None,
 ) -> Synthesis:
-    U_a, D_a, K_a = parts.letters(found.gains)
-    seen = combinations_seen(plant.center)
-    made = [realise(vertex, model, (U_a, D_a, K), seen)[0] for vertex, K in zip(plant.vertices, K_a, strict=True)]
+    U_a, D_a, K_a = parts.letters(certificate.gains)
+    combinations = combinations_seen(plant.center)
+    made = [
+        realise(vertex, model, (U_a, D_a, K), combinations)[0] for vertex, K in zip(plant.vertices, K_a, strict=True)
+    ]
     shipped = _Shipped.of(made, U_a, plant.nx)
     states = parts.units.augmented_states
     witness = replace(
-        found.witness,
-        P=[_symmetric(P / states / states[:, None]) for P in found.witness.P],
-        G=None if found.witness.G is None else [G / states / states[:, None] for G in found.witness.G],
+        certificate.witness,
+        P=[_symmetric(P / states / states[:, None]) for P in certificate.witness.P],
+        G=None if certificate.witness.G is None else [G / states / states[:, None] for G in certificate.witness.G],
     )
-    wanted = None if not decay else float(np.exp(-decay * plant.dt)) if plant.dt > 0.0 else decay
-    shrinking = proved_decay(shipped.errors, shipped.none, witness, required=wanted)
+    required_decay = None if not decay else float(np.exp(-decay * plant.dt)) if plant.dt > 0.0 else decay
+    shrinking = proved_decay(shipped.errors, shipped.none, witness, required=required_decay)
     matrices: dict[str, FloatArray] = {"tracking": U_a, "Phi": model.Phi, "Cw": model.Cw}
     matrices |= _stored(witness, WITNESSES)
-    claims, runs, slow = {"region_decay": shrinking}, list(found.runs), None
+    claims, runs, slow = {"region_decay": shrinking}, list(certificate.runs), None
     if plant.nf:
         lyapunov = "common" if steps is None else "vertex"
         gain = certified(shipped.errors, margin=ANALYSIS_MARGIN, gains=shipped.none, lyapunov=lyapunov, steps=steps)
@@ -168,7 +170,7 @@ def _synthesis(
         _observer(plant, made, shrinking),
         Certificate(matrices, claims),
         {"engine": "lmi", "runs": runs},
-        _notes(plant, shrinking, used=steps is not None or slow is not None, constant=len(found.gains) == 1),
+        _notes(plant, shrinking, used=steps is not None or slow is not None, constant=len(certificate.gains) == 1),
     )
 
 
@@ -199,8 +201,8 @@ def _symmetric(matrix: FloatArray) -> FloatArray:
 
 
 def _stored(witness: Witness, names: tuple[str, str]) -> dict[str, FloatArray]:
-    found = {names[0]: np.array(witness.P)}
-    return found if witness.G is None else {**found, names[1]: np.array(witness.G)}
+    stored = {names[0]: np.array(witness.P)}
+    return stored if witness.G is None else {**stored, names[1]: np.array(witness.G)}
 
 
 def _observer(plant: PolytopicSystem, made: Sequence[LinearObserver], rate: float) -> ScheduledObserver:
@@ -229,8 +231,8 @@ def _observer(plant: PolytopicSystem, made: Sequence[LinearObserver], rate: floa
 
 
 def _notes(plant: PolytopicSystem, rate: float, *, used: bool, constant: bool) -> tuple[str, ...]:
-    left = forgetting_of(rate, discrete=plant.is_discrete)
-    for_how_long = f"{left} rows" if plant.is_discrete else f"{left:.4g} s"
+    forgetting = forgetting_of(rate, discrete=plant.is_discrete)
+    for_how_long = f"{forgetting} rows" if plant.is_discrete else f"{forgetting:.4g} s"
     notes = [
         f"One certificate at {plant.count} vertices, for the region {plant.scheduling.sentence()}. A row with a "
         "parameter outside or missing is out: the parameter is moved into its range, and nothing is claimed for "

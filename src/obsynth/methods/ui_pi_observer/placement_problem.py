@@ -76,15 +76,15 @@ def placement_problem(
     fixed_modes: ComplexArray,
     *,
     joint: bool = False,
-    given: Mapping[str, Any] | None = None,
+    paper_matrices: Mapping[str, Any] | None = None,
 ) -> PlacementProblem:
     """Return the pair to place; the existence conditions must hold."""
     units = PlantUnits.of(plant, model).for_decoupling(plant)
-    if given is not None:
+    if paper_matrices is not None:
         # Powers of two: the given numbers come back as they are.
         units = units.rounded()
     scaled, model = units.scaled_plant(plant), units.scaled_model(model)
-    decoupled = decouple(scaled) if given is None else _given_decoupling(plant, units, given)
+    decoupled = decouple(scaled) if paper_matrices is None else _given_decoupling(plant, units, paper_matrices)
     u, d = with_faults(decoupled.U, decoupled.Dhat, scaled, model)
     augmented = AugmentedPlant.of(scaled, model)
     injection = np.vstack([decoupled.injection, np.zeros((model.order, plant.ny))])
@@ -95,7 +95,7 @@ def placement_problem(
     if joint:
         more, _ = _free_part(decoupled, scaled, model)
         c, free = np.vstack([more @ injected, c]), len(more)
-    if given is not None:
+    if paper_matrices is not None:
         # Another U may have other unobservable modes than the plant's pencil.
         n = len(f)
         fixed_modes = finite_zeros(np.vstack([np.eye(n), np.zeros((len(c), n))]), np.vstack([f, c])).values
@@ -131,15 +131,15 @@ def _completed(problem: PlacementProblem, k: FloatArray) -> tuple[FloatArray, Fl
     return u, d, k[:, problem.free :] @ decoupled.undisturbed + u @ injection
 
 
-def _given_decoupling(plant: DescriptorSystem, units: PlantUnits, given: Mapping[str, Any]) -> Decoupled:
+def _given_decoupling(plant: DescriptorSystem, units: PlantUnits, paper_matrices: Mapping[str, Any]) -> Decoupled:
     if plant.Dd.any():
         raise SpecError("E_sharp, C_sharp and G are for plants without Dd: leave them out.", path="E_sharp")
-    matrices = [as_matrix(given[name], name) for name in ("E_sharp", "C_sharp", "G")]
+    matrices = [as_matrix(paper_matrices[name], name) for name in ("E_sharp", "C_sharp", "G")]
     _, u, d = paper_decoupling(plant, e_sharp=matrices[0], c_sharp=matrices[1], g=matrices[2])
-    seen, injection, _ = direct_part(plant)
+    undisturbed, injection, _ = direct_part(plant)
     u = u / units.states[:, None] / units.equations
     d = d / units.states[:, None] / units.outputs
-    return Decoupled(u, d, np.zeros((0, plant.nx)), np.zeros((0, plant.ny)), seen, injection)
+    return Decoupled(u, d, np.zeros((0, plant.nx)), np.zeros((0, plant.ny)), undisturbed, injection)
 
 
 def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
@@ -147,10 +147,10 @@ def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
     structure = structure_of(plant)
     size = largest_singular_value(f)
     for values in (structure.finite_eigenvalues, eigenvalues(f)):
-        found = moving_speeds(values, plant.dt, 1.0 / plant.dt if plant.dt > 0.0 else 0.0)
-        found = found[found > DEAD_BEAT]
-        if found.size and (plant.dt > 0.0 or np.max(found) > INTEGRATOR_SCATTER * size):
-            median = float(np.median(found))
+        speeds = moving_speeds(values, plant.dt, 1.0 / plant.dt if plant.dt > 0.0 else 0.0)
+        speeds = speeds[speeds > DEAD_BEAT]
+        if speeds.size and (plant.dt > 0.0 or np.max(speeds) > INTEGRATOR_SCATTER * size):
+            median = float(np.median(speeds))
             return min(median, MOST_PER_SAMPLE / plant.dt) if plant.dt > 0.0 else median
     return 1.0 / plant.dt if plant.dt > 0.0 else size or 1.0
 
@@ -167,13 +167,13 @@ def kalman_problem(problem: PlacementProblem, weights: Mapping[str, Any]) -> Kal
     bw, dw = _noise(problem, weights)
     augmented_bw = np.vstack([bw, np.zeros((order, bw.shape[1]))])
     injection = np.vstack([problem.decoupled.injection, np.zeros((order, plant.ny))])
-    entering = problem.U @ augmented_bw - problem.F @ problem.D @ dw - problem.U @ injection @ dw
-    shown = np.eye(plant.ny) - AugmentedPlant.of(plant, problem.model).C @ problem.D
-    measured = problem.decoupled.undisturbed @ shown @ dw
+    driving = problem.U @ augmented_bw - problem.F @ problem.D @ dw - problem.U @ injection @ dw
+    innovation_map = np.eye(plant.ny) - AugmentedPlant.of(plant, problem.model).C @ problem.D
+    measured = problem.decoupled.undisturbed @ innovation_map @ dw
     size = float(np.sqrt(np.mean(np.sum(dw**2, axis=1)))) if dw.any() else 1.0
     if problem.free:
         # The free outputs carry the noise of derivatives; as a stand-in they get the size of the others.
-        entering = np.hstack([entering, np.zeros((len(entering), problem.free))])
+        driving = np.hstack([driving, np.zeros((len(driving), problem.free))])
         measured = np.block(
             [
                 [np.zeros((problem.free, measured.shape[1])), size * np.eye(problem.free)],
@@ -188,7 +188,7 @@ def kalman_problem(problem: PlacementProblem, weights: Mapping[str, Any]) -> Kal
     return KalmanProblem(
         F=split.F,
         C=split.C,
-        B=split.observable_rows(entering),
+        B=split.observable_rows(driving),
         D=measured,
         drive=split.basis[:, : split.order].T @ np.diag(per_step * size * strength),
         background=INNOVATION_NOISE * size * np.eye(len(problem.C)),
@@ -200,11 +200,11 @@ def kalman_problem(problem: PlacementProblem, weights: Mapping[str, Any]) -> Kal
 def _noise(problem: PlacementProblem, weights: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
     """Return the noise inputs of the scaled plant."""
     plant, units = problem.plant, problem.units
-    given = weights.get("measurement")
-    if given is None and plant.Dw.any():
+    measurement = weights.get("measurement")
+    if measurement is None and plant.Dw.any():
         return plant.Bw, plant.Dw
     deviations, stated = np.ones(plant.ny), np.zeros((plant.ny, plant.nw))
-    if given is not None:
-        listed = [given[name] if isinstance(given, Mapping) else given for name in plant.output_names]
+    if measurement is not None:
+        listed = [measurement[name] if isinstance(measurement, Mapping) else measurement for name in plant.output_names]
         deviations = np.array(listed) * units.outputs / (1.0 if units.discrete else np.sqrt(units.time))
     return np.hstack([plant.Bw, np.zeros((plant.nx, plant.ny))]), np.hstack([stated, np.diag(deviations)])

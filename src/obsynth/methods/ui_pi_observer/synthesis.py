@@ -2,8 +2,6 @@
 
 Unlike the paper: existence by (D1)-(D3); each fault has its own exosystem; ``E#, C#, G`` (10), (11) only on request; K
 and the free part of the decoupling (the paper's G) can be designed together; where (D1) fails at index 1, elimination.
-
-What a user of the unknown-input PI observer should know besides the claims.
 """
 
 from __future__ import annotations
@@ -62,24 +60,24 @@ LEAST_RATE, RATE_SPREAD = 1.1, 1.0
 
 
 def notes(
-    found: Existence, problem: PlacementProblem, asked: UiPiObserver, claims: Mapping[str, float]
+    known: Existence, problem: PlacementProblem, method: UiPiObserver, claims: Mapping[str, float]
 ) -> Iterator[str]:
     """Yield notes on eliminated states, fixed poles, a slow default and digits, where these matter."""
-    if found.transformation is not None:
-        detail = next(condition.detail for condition in found.conditions if condition.name.startswith("(D1)"))
+    if known.transformation is not None:
+        detail = next(condition.detail for condition in known.conditions if condition.name.startswith("(D1)"))
         yield f"(D1) holds only without the algebraic states, which were eliminated: {detail}."
-    fixed, dt = problem.fixed_modes, found.plant.dt
+    fixed, dt = problem.fixed_modes, known.plant.dt
     if fixed.size:
-        slow, least = asked.slowest_asked(dt), np.min(decay_rates(fixed, dt))
+        slow, least = method.slowest_asked(dt), np.min(decay_rates(fixed, dt))
         behind = slow is not None and least < slow
         # A pole at z = 0 comes out as rounding has it.
-        told = np.where(np.abs(fixed) > NEGLIGIBLE_MODE, fixed, 0.0) if dt > 0.0 else fixed
+        printed = np.where(np.abs(fixed) > NEGLIGIBLE_MODE, fixed, 0.0) if dt > 0.0 else fixed
         yield (
-            f"{fixed.size} of {len(problem.F)} poles are fixed, whatever the gains: {', '.join(numbers(told))}"
+            f"{fixed.size} of {len(problem.F)} poles are fixed, whatever the gains: {', '.join(numbers(printed))}"
             + (f"; the slowest decays at {least:.3g} 1/s, slower than asked." if behind else ".")
         )
     own, decay = problem.rate / problem.units.time, claims.get("decay")
-    default = asked.poles is None and asked.decay is None and asked.region is None
+    default = method.poles is None and method.decay is None and method.region is None
     if default and decay is not None and not fixed.size and decay * SLOW_DEFAULT < own:
         yield (
             f"The slowest pole decays at {decay:.3g} 1/s, against {own:.3g} 1/s of the plant itself: a faster one has "
@@ -96,35 +94,35 @@ def notes(
 
 
 def synthesise(
-    plant: DescriptorSystem | PolytopicSystem, asked: UiPiObserver, *, progress: Callable[[str], None]
+    plant: DescriptorSystem | PolytopicSystem, method: UiPiObserver, *, progress: Callable[[str], None]
 ) -> Synthesis:
     """Design the observer; see `obsynth.ui_pi_observer` for the options, results and errors."""
     if isinstance(plant, PolytopicSystem):
         from obsynth.methods.ui_pi_observer.over_region import synthesise_over_region
 
-        return synthesise_over_region(plant, asked, progress=progress)
-    solver = chosen_solver(asked.solver, asked.solver_options)
-    if own_terms(asked):
+        return synthesise_over_region(plant, method, progress=progress)
+    solver = chosen_solver(method.solver, method.solver_options)
+    if own_terms(method):
         from obsynth.methods.engines.own_terms import ui_pi_by_inequality
 
-        return ui_pi_by_inequality(plant, asked, progress=progress)
-    asked = replace(asked, solver=solver)
-    model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
-    region = asked.checked_region(plant.dt)
-    weights = asked.checked_noise(plant.output_names)
+        return ui_pi_by_inequality(plant, method, progress=progress)
+    method = replace(method, solver=solver)
+    model = exosystem(method.fault_model, plant.fault_names, plant.dt)
+    region = method.checked_region(plant.dt)
+    weights = method.checked_noise(plant.output_names)
     progress("checking the existence conditions")
-    found = existence(plant, model)
-    require_all_conditions(found.conditions)
-    working = found.plant
+    known = existence(plant, model)
+    require_all_conditions(known.conditions)
+    working = known.plant
     progress("decoupling the unknown inputs")
-    given = asked.given_decoupling()
-    as_they_are = given is not None or isinstance(weights.get("measurement"), Mapping)
+    paper_matrices = method.given_decoupling()
+    as_they_are = paper_matrices is not None or isinstance(weights.get("measurement"), Mapping)
     merged = None if as_they_are else merged_outputs(working)
-    if asked.decay is None and region is None and not as_they_are:
-        merged = _without_likeness(found, model, asked, merged, weights)
+    if method.decay is None and region is None and not as_they_are:
+        merged = _without_likeness(known, model, method, merged, weights)
     designed = working if merged is None else merged.plant
-    problem = placement_problem(designed, model, found.fixed_modes, joint=asked.joint, given=given)
-    if asked.G is not None:
+    problem = placement_problem(designed, model, known.fixed_modes, joint=method.joint, paper_matrices=paper_matrices)
+    if method.G is not None:
         # On the boundary within rounding is not stable either: an equation that is lost leaves a mode at zero.
         modes = zip(problem.split.fixed_modes, problem.fixed_modes, strict=True)
         unstable = [complex(own) for scaled, own in modes if is_outside(complex(scaled), problem.plant.dt)]
@@ -136,67 +134,71 @@ def synthesise(
                 mode=unstable[0],
             )
     progress("choosing the gains")
-    gain, wanted, claims, runs = _chosen(asked, problem, region, weights, plant.dt)
+    gain, placed_poles, claims, runs = _chosen(method, problem, region, weights, plant.dt)
     progress("building the realisation and its certificate")
     gains = problem.gains(gain)
     if merged is not None:
         gains = gains[0], gains[1] @ merged.weights, gains[2] @ merged.weights
-    poles = None if wanted is None else np.array([*wanted, *problem.fixed_modes])
-    synthesis = assembled(working, model, gains, poles, dict(claims), structured=not asked.joint)
+    poles = None if placed_poles is None else np.array([*placed_poles, *problem.fixed_modes])
+    synthesis = assembled(working, model, gains, poles, dict(claims), structured=not method.joint)
     return Synthesis(
-        asked.resolved(model, plant.fault_names),
+        method.resolved(model, plant.fault_names),
         synthesis.gains,
         synthesis.observer,
         synthesis.certificate,
         {"runs": list(runs)},
-        tuple(notes(found, problem, asked, synthesis.certificate.claims)),
-        found.transformation,
+        tuple(notes(known, problem, method, synthesis.certificate.claims)),
+        known.transformation,
     )
 
 
 def _without_likeness(
-    found: Existence, model: Exosystem, asked: UiPiObserver, merged: MergedOutputs | None, weights: Mapping[str, Any]
+    known: Existence, model: Exosystem, method: UiPiObserver, merged: MergedOutputs | None, weights: Mapping[str, Any]
 ) -> MergedOutputs | None:
     """Return which outputs to merge where some nearly depend on others.  Placed poles do not see the noise: the quieter
     one is taken.  Of two defaults that are as fast as their noise allows, the one with the outputs as they are is taken
     where it is faster and no noisier, or far faster."""
-    near = nearly_merged_outputs(found.plant)
+    near = nearly_merged_outputs(known.plant)
     if near is None:
         return merged
-    found_costs = []
+    costs = []
     for choice in (merged, near):
         try:
             problem = placement_problem(
-                found.plant if choice is None else choice.plant, model, found.fixed_modes, joint=asked.joint, given=None
+                known.plant if choice is None else choice.plant,
+                model,
+                known.fixed_modes,
+                joint=method.joint,
+                paper_matrices=None,
             )
-            gain = _chosen(asked, problem, None, weights, found.plant.dt)[0]
+            gain = _chosen(method, problem, None, weights, known.plant.dt)[0]
         except (ObsynthError, np.linalg.LinAlgError):
-            found_costs.append((np.inf, np.inf))
+            costs.append((np.inf, np.inf))
             continue
         U, D, K = problem.gains(gain)
-        means = np.eye(found.plant.ny) if choice is None else choice.weights
+        means = np.eye(known.plant.ny) if choice is None else choice.weights
         observer = assembled(
-            found.plant, model, (U, D @ means, K @ means), None, {}, structured=not asked.joint
+            known.plant, model, (U, D @ means, K @ means), None, {}, structured=not method.joint
         ).linear_observer
         poles = np.linalg.eigvals(observer.Az).astype(np.complex128)
         settling = 1.0 / max(float(np.min(decay_rates(poles, observer.dt))), SLOWEST)
-        found_costs.append((fault_deviation(found.plant, observer), settling))
-    (noise, settling), (near_noise, near_settling) = found_costs
+        costs.append((fault_deviation(known.plant, observer), settling))
+    (noise, settling), (near_noise, near_settling) = costs
     if not np.isfinite(near_settling):
         return merged
-    if asked.poles is not None:
+    if method.poles is not None:
         return near if near_noise <= AS_FAST * noise else merged
     if near_settling <= AS_FAST * settling:
         return near
     return near if near_noise * AS_FAST < noise and near_settling < FAR_SLOWER * settling else merged
 
 
-def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str) -> Choice:
+def _placed(problem: PlacementProblem, poles: Sequence[complex], objective: str) -> Choice:
     """Return the gain for given poles; its size is that in the user's units where outputs are not mixed."""
     split, plant, units = problem.split, problem.plant, problem.units
     plain_outputs = problem.free == 0 and np.array_equal(problem.decoupled.undisturbed, np.eye(plant.ny))
     outputs = units.outputs if plain_outputs else np.ones(len(split.C))
-    scaled_poles = [units.rate * pole for pole in wanted]
+    scaled_poles = [units.rate * pole for pole in poles]
     gain, condition = place(
         split.F,
         split.C / outputs[:, None],
@@ -205,29 +207,29 @@ def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str
         objective=objective,
         weight=units.augmented_states[:, None] * split.lift(np.eye(split.order)),
     )
-    return gain / outputs, wanted, {"condition": condition}, ()
+    return gain / outputs, poles, {"condition": condition}, ()
 
 
 def _chosen(
-    asked: UiPiObserver, problem: PlacementProblem, region: Region | None, weights: Mapping[str, Any], dt: float
+    method: UiPiObserver, problem: PlacementProblem, region: Region | None, weights: Mapping[str, Any], dt: float
 ) -> Choice:
     """Return a gain of the observable part, its poles where they were asked for, what is claimed of it, and records."""
     split, time = problem.split, problem.units.time
-    if asked.poles is not None:
-        wanted = checked_poles(asked.poles, split.order, problem.fixed_modes, dt)
-        return _placed(problem, wanted, asked.objective)
+    if method.poles is not None:
+        poles = checked_poles(method.poles, split.order, problem.fixed_modes, dt)
+        return _placed(problem, poles, method.objective)
     kalman = kalman_problem(problem, weights)
     claims: dict[str, float] = {}
     runs: tuple[Mapping[str, Any], ...] = ()
     if region is not None:
-        gain, record = _in_region(kalman, region.in_time(time), problem.rate, asked)
+        gain, record = _in_region(kalman, region.in_time(time), problem.rate, method)
         runs = (record,)
-    elif asked.decay is not None:
-        gain = _for_decay(problem, kalman, asked.decay, asked.objective, dt)
+    elif method.decay is not None:
+        gain = _for_decay(problem, kalman, method.decay, method.objective, dt)
     elif (fair := compromise(kalman, problem.rate)) is not None:
         gain, claims = fair[0], {"noise_price": fair[2]}
     else:
-        gain = _for_decay(problem, kalman, problem.rate / time, asked.objective, dt)
+        gain = _for_decay(problem, kalman, problem.rate / time, method.objective, dt)
     return gain, None, claims, runs
 
 
@@ -235,9 +237,9 @@ def _for_decay(problem: PlacementProblem, kalman: KalmanProblem, decay: float, o
     """Return a gain ``(n, ny)`` whose poles all decay faster than ``decay`` (1/s): a Kalman filter's, or placed ones.
 
     Near the fastest rate, rounding ends the filter's equation on one processor and not on another."""
-    found = kalman.gain(problem.units.time * decay, persistent=True)
-    if found is not None:
-        return found
+    gain = kalman.gain(problem.units.time * decay, persistent=True)
+    if gain is not None:
+        return gain
     order = problem.split.order
     rates = decay * (LEAST_RATE + RATE_SPREAD * np.arange(order) / max(order, 1))
     poles = np.exp(-rates * dt) if dt > 0.0 else -rates
@@ -252,16 +254,16 @@ def _for_decay(problem: PlacementProblem, kalman: KalmanProblem, decay: float, o
 
 
 def _in_region(
-    kalman: KalmanProblem, region: Region, rate: float, asked: UiPiObserver
+    kalman: KalmanProblem, region: Region, rate: float, method: UiPiObserver
 ) -> tuple[FloatArray, dict[str, Any]]:
     """Return a gain for the region; without a decay, with that of the default: least noise alone hardly moves."""
-    if asked.region.get("decay") is None:
+    if method.region.get("decay") is None:
         fair = compromise(kalman, rate)
         most = np.inf if region.radius is None else RADIUS_SHARE * region.radius
-        wanted = replace(region, decay=float(min(fair[1], most)) if fair is not None else 0.0)
+        tried = replace(region, decay=float(min(fair[1], most)) if fair is not None else 0.0)
         try:
-            return region_gain(kalman, wanted, solver=asked.solver)
+            return region_gain(kalman, tried, solver=method.solver)
         except SolverError:
             # What was asked may be possible all the same.
             pass
-    return region_gain(kalman, region, solver=asked.solver)
+    return region_gain(kalman, region, solver=method.solver)
