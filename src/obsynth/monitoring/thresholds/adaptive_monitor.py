@@ -55,9 +55,9 @@ def adaptive_plan(
     """Return the plans from the first start on and after a later one, over the plant's box, if there is a bound."""
     plant, observer = design.linear
     if plant.uncertainty is not None and plant.uncertainty.box.names:
-        found = index_one_on_box(plant)
-        if found.verdict == "refuted" and found.at is not None:
-            values = values_at(plant.uncertainty.box, found.at)
+        proof = index_one_on_box(plant)
+        if proof.verdict == "refuted" and proof.at is not None:
+            values = values_at(plant.uncertainty.box, proof.at)
             where = ", ".join(f"{name} = {value:.6g}" for name, value in values.items())
             raise PreconditionError(
                 f"The plant is singular, or not of index 1, inside the box: at {where}. Give smaller tolerances.",
@@ -147,12 +147,12 @@ def _require_bounds(
     structure: ErrorStructure, affine: AffinePlant, bounds: FloatArray, plant: DescriptorSystem
 ) -> None:
     """Raise `SpecError` where a disturbance without a bound reaches the error."""
-    seen = structure.disturbances.magnitude.max(axis=0, initial=0.0) > 0.0
+    reaches_error = structure.disturbances.magnitude.max(axis=0, initial=0.0) > 0.0
     lacking = []
     for i in np.flatnonzero(~np.isfinite(bounds)).tolist():
         # The columns that this disturbance alone would move.
         own = affine.disturbance_bounds(np.eye(1, plant.nd, i).ravel()) > 0.0
-        if (seen[: len(own)] & own).any():
+        if (reaches_error[: len(own)] & own).any():
             lacking.append(i)
     if lacking:
         names = ", ".join(plant.disturbance_names[i] for i in lacking)
@@ -180,21 +180,21 @@ def start_of(
     return Start(len(z), center=z - offset, radius=size * (1.0 + RADIUS_OUTWARD), state=z)
 
 
-def initial_box(plant: DescriptorSystem, given: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
+def initial_box(plant: DescriptorSystem, initial_set: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
     """Return middle and half width ``(nx,)`` of the plant's start; states that E does not see need no entry."""
-    require_mapping(given, "initial_set")
+    require_mapping(initial_set, "initial_set")
     center, radius = np.zeros(plant.nx), np.zeros(plant.nx)
     needed = np.abs(plant.E).max(axis=0, initial=0.0) > 0.0
-    require_known(given, plant.state_names, what="initial_set", kind="state")
+    require_known(initial_set, plant.state_names, what="initial_set", kind="state")
     for i, name in enumerate(plant.state_names):
-        if name not in given:
+        if name not in initial_set:
             if needed[i]:
                 raise SpecError(
                     f"initial_set has no entry for the state {name!r}: give a bound, or [low, high].",
                     path="initial_set",
                 )
             continue
-        value = given[name]
+        value = initial_set[name]
         ends = list(value) if isinstance(value, (list, tuple, np.ndarray)) else [value]
         if len(ends) == 1 and is_finite_number(value):
             ends = [-value, value]
@@ -242,10 +242,10 @@ def tolerances_of(
     initial_error: float | None,
 ) -> tuple[ObserverDesign, bool]:
     """Return the design with the tolerances asked for, and whether its threshold adapts to the signals."""
-    asked = constants is not None or initial_set is not None
+    adapts = constants is not None or initial_set is not None
     if initial_set is not None and initial_error is not None:
         raise SpecError("Give initial_set or initial_error, not both.", path="initial_set")
-    return with_tolerances(design, constants)[0], asked
+    return with_tolerances(design, constants)[0], adapts
 
 
 def noisy_design(design: ObserverDesign, scenario: Scenario | None) -> ObserverDesign:

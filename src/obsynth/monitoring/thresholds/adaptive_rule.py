@@ -72,27 +72,27 @@ class AdaptiveRule(Rule):
             state = self.restart(state)._replace(waiting=FORGETTING_RINGS * self._later.bound.length)
         plan = self.plan if state.first else self._later
         signals, bound = (said.inputs, said.outputs), plan.bound
-        without, found = adaptive_step(bound, state.without, bound.structure.reading @ said.rows, *signals)
-        during, error = state.during, found
+        without, thresholds = adaptive_step(bound, state.without, bound.structure.reading @ said.rows, *signals)
+        during, error = state.during, thresholds
         if plan.faults is not None and during is not None:
             during, error = adaptive_step(plan.faults, during, plan.faults.structure.reading @ said.rows, *signals)
         state = state._replace(without=without, during=during, waiting=max(state.waiting - 1, 0))
-        values, at = said.rows[len(said.rows) - len(found.total) :], plan.residuals
+        values, at = said.rows[len(said.rows) - len(thresholds.total) :], plan.residuals
         if dt is None and self.nominal is not None and state.nominal is not None:
             nominal, (statistic, threshold, *_) = self.nominal.step(state.nominal, sample)
             state = state._replace(nominal=nominal)
             # What box, start and rounding add to the norm of the residual.
-            parts = [found.shift[at], found.rest[at], plan.bound.more[at], *found.first[:, at]]
+            parts = [thresholds.shift[at], thresholds.rest[at], plan.bound.more[at], *thresholds.first[:, at]]
             if plan.start_beyond_nominal:
-                parts.append(found.start[at])
+                parts.append(thresholds.start[at])
             threshold = (threshold + math.fsum(math.hypot(*part) for part in parts)) * THRESHOLD_ROUNDING
         else:
-            statistic, threshold = math.hypot(*values[at]), math.hypot(*found.total[at])
+            statistic, threshold = math.hypot(*values[at]), math.hypot(*thresholds.total[at])
         nf = len(plan.fault_names)
-        cells = self._cells(values[:nf], found, error)
+        cells = self._cells(values[:nf], thresholds, error)
         if state.waiting or not sample.deciding:
             return state, RuleOutput(math.nan, math.nan if state.waiting else threshold, None, cells)
-        ratios = np.abs(values) / found.total
+        ratios = np.abs(values) / thresholds.total
         worst = int(np.argmax(ratios)) if len(ratios) else 0
         if statistic <= threshold and len(ratios) and ratios[worst] > 1.0:
             # The row is passed although the norm is not: it decides, in the scale of the norm's threshold.
@@ -101,9 +101,9 @@ class AdaptiveRule(Rule):
         passed = int(np.argmax(ratios[:nf])) if nf and ratios[:nf].max() > 1.0 else None
         return state, RuleOutput(statistic, threshold, passed, cells)
 
-    def _cells(self, faults: FloatArray, found: Thresholds, error: Thresholds) -> tuple[float, ...]:
+    def _cells(self, faults: FloatArray, thresholds: Thresholds, error: Thresholds) -> tuple[float, ...]:
         nf = len(faults)
-        cells = found.total.tolist()
+        cells = thresholds.total.tolist()
         if self.plan.intervals:
             width = error.total[:nf] - np.abs(error.shift[:nf])
             middle = faults - error.shift[:nf]

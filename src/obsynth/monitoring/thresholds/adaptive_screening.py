@@ -78,19 +78,19 @@ class Screening:
         ny = bound.rounding.shape[1] - 1 - n - nu
         order = [*range(nu + ny, nu + ny + n), *range(nu)]
         # Columns: inputs, outputs, estimates, one.
-        entering, known = bound.rounding.copy(), np.zeros((bound.width, bound.rounding.shape[1]))
-        known[:, order] = _known(bound, n, nu)
+        per_signal, into_ring = bound.rounding.copy(), np.zeros((bound.width, bound.rounding.shape[1]))
+        into_ring[:, order] = _known(bound, n, nu)
         largest_start = np.maximum(bound.start.max(axis=0, initial=0.0), bound.start_later[1])
-        entering[:m, order] += bound.solved @ structure.channel_sizes(first[:rows])
-        entering += bound.same.T @ known
-        entering[:, -1] += bound.nominal + largest_start
+        per_signal[:m, order] += bound.solved @ structure.channel_sizes(first[:rows])
+        per_signal += bound.same.T @ into_ring
+        per_signal[:, -1] += bound.nominal + largest_start
         gathered = bound.kernels.reshape(bound.length, bound.width, -1).sum(axis=0).T
         gathered = gathered[: m + no] + bound.tail[: m + no] @ (responses.repeated @ gathered[m + no :])
         closed = inverse_bound(gathered[:m, :m])
         if closed is None:
-            return cls(plan, np.full((no, entering.shape[1]), np.inf), slack)
-        ring = known.copy()
-        ring[:m] = closed @ (entering[:m] + known[:m] + gathered[:m, m:] @ known[m:])
+            return cls(plan, np.full((no, per_signal.shape[1]), np.inf), slack)
+        ring = into_ring.copy()
+        ring[:m] = closed @ (per_signal[:m] + into_ring[:m] + gathered[:m, m:] @ into_ring[m:])
         return cls(plan, gathered[m:] @ ring + bound.rounding[m:] + bound.same[:, m:].T @ ring, slack)
 
     def sides(self, records: Records, begin: int, end: int, psi: FloatArray) -> tuple[Sides, FloatArray]:
@@ -131,11 +131,11 @@ class Screening:
         p, nz, *_ = bound.counts
         length = min(k, REMEMBERED_RINGS * bound.length)
         if length not in self._memory:
-            effect, found = bound.drive[:, :nz], []
+            effect, responses = bound.drive[:, :nz], []
             for _ in range(length):
-                found.append(effect.reshape(p * nz, -1).T)
+                responses.append(effect.reshape(p * nz, -1).T)
                 effect = bound.structure.Az @ effect
-            self._memory[length] = np.vstack([*found[::-1], np.zeros((0, p * nz))])
+            self._memory[length] = np.vstack([*responses[::-1], np.zeros((0, p * nz))])
         v = np.concatenate([records.estimates[k - length : k], records.inputs[k - length : k]], axis=2)
         flat = np.moveaxis(v, 1, 0).reshape(v.shape[1], -1)
         return np.asarray(flat @ self._memory[length]).reshape(-1, p, nz)
@@ -176,12 +176,12 @@ class Screening:
             norm[:, chosen],
             limits,
         )
-        sure, left = first_passed(self, records, candidates[:, chosen], onset)
-        passed[:, chosen] = sure
-        if left.any():
+        passing, open_rows = first_passed(self, records, candidates[:, chosen], onset)
+        passed[:, chosen] = passing
+        if open_rows.any():
             undecided = np.zeros_like(passed)
-            undecided[:, chosen] = left
-            length = int(np.flatnonzero(left.any(axis=1))[-1]) + 1
+            undecided[:, chosen] = open_rows
+            length = int(np.flatnonzero(open_rows.any(axis=1))[-1]) + 1
             passed |= self._all_passed(runs, values, norm, limits[:length], undecided)
         return passed
 
@@ -198,17 +198,17 @@ class Screening:
             np.ascontiguousarray(np.moveaxis(signals[:, chosen], 1, 0))[:, :length]
             for signals in (runs.rows, runs.inputs, runs.outputs)
         )
-        found = thresholds_of_records(plan.bound, rows @ plan.bound.structure.reading.T, inputs, outputs)
+        thresholds = thresholds_of_records(plan.bound, rows @ plan.bound.structure.reading.T, inputs, outputs)
         at = plan.residuals
-        parts = [found.shift[..., at], found.rest[..., at], *np.moveaxis(found.first[..., at], 2, 0)]
+        parts = [thresholds.shift[..., at], thresholds.rest[..., at], *np.moveaxis(thresholds.first[..., at], 2, 0)]
         if plan.start_beyond_nominal:
-            parts.append(found.start[..., at])
+            parts.append(thresholds.start[..., at])
         beside = sum(np.linalg.norm(part, axis=2) for part in parts) + np.linalg.norm(plan.bound.more[at])
         limit = (limits[:, None] + np.asarray(beside).T) * THRESHOLD_ROUNDING
         if plan.sample_time is not None:
             # Where the norm passes, one of the rows does.
             limit = np.full_like(limit, np.inf)
-        beyond = (values[:length, chosen] > np.moveaxis(found.total, 0, 1)).any(axis=2)
+        beyond = (values[:length, chosen] > np.moveaxis(thresholds.total, 0, 1)).any(axis=2)
         passed[:length, chosen] = (norm[:length, chosen] > limit) | beyond
         return np.asarray(passed & candidates)
 
@@ -217,45 +217,45 @@ def _known(bound: AdaptiveBound, n: int, nu: int) -> FloatArray:
     """Return what signals put into the ring at most, per largest estimate and input ``(w, n + nu)``."""
     structure = bound.structure
     own, m = len(structure.owner), structure.channels
-    found = np.zeros((bound.width, n + nu))
+    sizes = np.zeros((bound.width, n + nu))
     rows = np.abs(structure.channel_rows[own:])
     single = structure.single - own
-    found[own : structure.single, :n] = rows[:single]
+    sizes[own : structure.single, :n] = rows[:single]
     if len(rows) > single:
-        found[structure.single, :n] = rows[single:].max(axis=0)
+        sizes[structure.single, :n] = rows[single:].max(axis=0)
     for place, number in enumerate(bound.remainder_inputs):
-        found[m + place, n + number] = 1.0
-    return found
+        sizes[m + place, n + number] = 1.0
+    return sizes
 
 
 def first_passed(
     screening: Screening, records: Records, candidates: np.ndarray, begin: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return samples ``(steps, runs)`` that surely pass, and those to be computed in full: the first one counts."""
-    above, left = np.zeros(candidates.shape, dtype=bool), np.zeros(candidates.shape, dtype=bool)
+    above, open_rows = np.zeros(candidates.shape, dtype=bool), np.zeros(candidates.shape, dtype=bool)
     p, nz, *_ = screening.plan.bound.counts
     early = np.flatnonzero(candidates[:begin].any(axis=0))
     if len(early):
         (passed, below), _ = screening.sides(records.of(early), 0, begin, np.zeros((len(early), p, nz)))
         above[:begin, early] = passed & candidates[:begin, early]
         open_runs = ~above[:begin, early].any(axis=0)
-        left[:begin, early] = candidates[:begin, early] & ~below & open_runs
+        open_rows[:begin, early] = candidates[:begin, early] & ~below & open_runs
     todo = np.flatnonzero(candidates[begin:].any(axis=0))
     if not len(todo):
-        return above, left
+        return above, open_rows
     psi, at, size = screening.sensitivities(records.of(todo), begin), begin, FIRST_WINDOW
     while len(todo) and at < len(candidates):
         end = min(at + size, len(candidates))
         (passed, below), psi = screening.sides(records.of(todo), at, end, psi)
         above[at:end, todo] = passed & candidates[at:end, todo]
-        left[at:end, todo] = candidates[at:end, todo] & ~below & ~passed
+        open_rows[at:end, todo] = candidates[at:end, todo] & ~below & ~passed
         going = ~above[at:end, todo].any(axis=0)
         todo, psi, at, size = todo[going], psi[going], end, 2 * size
     first = np.argmax(above[begin:], axis=0) + begin
     first[~above[begin:].any(axis=0)] = len(candidates)
     # What comes after the first that surely passes does not count.
-    left &= np.arange(len(candidates))[:, None] < first
-    return above, left
+    open_rows &= np.arange(len(candidates))[:, None] < first
+    return above, open_rows
 
 
 def filtered(az: FloatArray, w: FloatArray) -> FloatArray:
@@ -266,18 +266,18 @@ def filtered(az: FloatArray, w: FloatArray) -> FloatArray:
     padded = np.zeros((runs, blocks * size, p, nz))
     padded[:, :steps] = w
     inside = np.ascontiguousarray(padded.reshape(runs, blocks, size, p, nz).transpose(2, 0, 1, 3, 4))
-    found = np.zeros((size + 1, runs, blocks, p, nz))
+    states = np.zeros((size + 1, runs, blocks, p, nz))
     turned = np.ascontiguousarray(az.T)
     for k in range(size):
-        found[k + 1] = inside[k]
-        found[k + 1] += (found[k].reshape(-1, nz) @ turned).reshape(found[k].shape)
+        states[k + 1] = inside[k]
+        states[k + 1] += (states[k].reshape(-1, nz) @ turned).reshape(states[k].shape)
     power = np.linalg.matrix_power(turned, size)
     begins = np.zeros((runs, blocks, p, nz))
     for b in range(1, blocks):
-        begins[:, b] = (begins[:, b - 1].reshape(-1, nz) @ power).reshape(runs, p, nz) + found[size, :, b - 1]
+        begins[:, b] = (begins[:, b - 1].reshape(-1, nz) @ power).reshape(runs, p, nz) + states[size, :, b - 1]
     step = begins
     for k in range(size):
-        found[k] += step
+        states[k] += step
         step = (step.reshape(-1, nz) @ turned).reshape(step.shape)
-    whole = found[:size].transpose(1, 2, 0, 3, 4).reshape(runs, blocks * size, p, nz)
-    return np.ascontiguousarray(whole[:, :steps])
+    joined = states[:size].transpose(1, 2, 0, 3, 4).reshape(runs, blocks * size, p, nz)
+    return np.ascontiguousarray(joined[:, :steps])

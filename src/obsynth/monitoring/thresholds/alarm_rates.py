@@ -28,24 +28,24 @@ _WRITTEN_RATE = re.compile(r"\s*([0-9.eE+-]+)\s*(?:per|/)\s*([0-9.eE+]*)\s*([a-z
 def rows_per_alarm(rate: str | float, dt: float) -> float:
     """Return how many rows, ``dt`` seconds apart, there are for each false alarm of a rate such as ``1 per week``,
     ``2 per 1000 rows``, or a number of alarms per row."""
-    found: float | None = None
+    per_alarm: float | None = None
     if is_finite_number(rate):
-        found = 1.0 / float(rate) if float(rate) > 0.0 else None
+        per_alarm = 1.0 / float(rate) if float(rate) > 0.0 else None
     elif isinstance(rate, str) and (match := _WRITTEN_RATE.fullmatch(rate.lower())) is not None:
         unit = 1.0 if match.group(3) in ("row", "sample") else UNITS.get(match.group(3), 0.0) / dt
         try:
             alarms, count = float(match.group(1)), float(match.group(2) or 1.0)
         except ValueError:
             alarms, count = 0.0, 0.0
-        found = count * unit / alarms if alarms > 0.0 and math.isfinite(alarms) and count * unit > 0.0 else None
-    if found is None or not math.isfinite(found):
+        per_alarm = count * unit / alarms if alarms > 0.0 and math.isfinite(alarms) and count * unit > 0.0 else None
+    if per_alarm is None or not math.isfinite(per_alarm):
         raise SpecError(
             f"false_alarms is {rate!r}: give a rate, such as '1 per week' or '1 per 1000 rows'.", path="false_alarms"
         )
-    if found < 2 * HOLD:
+    if per_alarm < 2 * HOLD:
         raise SpecError(
-            f"false_alarms is {rate!r}, one per {found:.3g} rows, but an alarm lasts {HOLD} rows at least: "
+            f"false_alarms is {rate!r}, one per {per_alarm:.3g} rows, but an alarm lasts {HOLD} rows at least: "
             "ask for a lower rate.",
             path="false_alarms",
         )
-    return found
+    return per_alarm

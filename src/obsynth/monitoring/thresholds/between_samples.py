@@ -91,8 +91,8 @@ class IntersampleErrorSystem:
         into = exact(g1) @ c - exact(t)
 
         def split(kept: FloatArray, *, decays: bool) -> IntersampleErrorSystem:
-            found = _split(phi, k, j, into, kept, az, observer.Cz[rows], endless=decays)
-            return cls(smooth, dt, *found[:4], g1, earlier.midpoint, observer.Dy[rows], rows, found[4])
+            parts = _split(phi, k, j, into, kept, az, observer.Cz[rows], endless=decays)
+            return cls(smooth, dt, *parts[:4], g1, earlier.midpoint, observer.Dy[rows], rows, parts[4])
 
         try:
             return split(_kept(smooth, dt, k, terms), decays=True)
@@ -118,13 +118,13 @@ class IntersampleErrorSystem:
         tracking = tracking[:, : smooth.nx]
         n, nz, exact = smooth.nx, observer.order, Ball.exact
         m = block([[exact(np.zeros((n, n))), exact(np.zeros((n, nz)))], [exact(np.zeros((nz, n))), exact(observer.Az)]])
-        shown = np.hstack([np.zeros((len(observer.Cz[rows]), n)), observer.Cz[rows]])
+        c = np.hstack([np.zeros((len(observer.Cz[rows]), n)), observer.Cz[rows]])
         into = Ball.exact(np.vstack([np.zeros((n, n)), -tracking]))
         return cls(
             smooth,
             plant.dt,
             m,
-            shown,
+            c,
             prove_contraction(m, discrete=True),
             into,
             np.zeros((nz, plant.ny)),
@@ -153,24 +153,24 @@ class IntersampleErrorSystem:
         if not count:
             return np.zeros(steps), np.zeros(0)
         pieces = interval_pieces(plant.A, plant.Bd, self.into, self.dt)
-        partial, whole = self._sums(pieces.columns, steps)
+        partial, for_ever = self._sums(pieces.columns, steps)
         # What the values at the samples do: at once, by later samples, and by all.
         above = np.zeros((len(plant.A), count))
         now, later = np.vstack([above, self.first @ plant.Dd]), Ball.exact(np.vstack([above, self.second @ plant.Dd]))
         at_once = column_norms(Ball.exact(self.direct) @ Ball.exact(plant.Dd) + Ball.exact(self.c) @ Ball.exact(now))
         by_later, by_all = self._sums(self.M @ Ball.exact(now) + later, steps)
         table = gathered(pieces, partial, count)[: max(steps - 1, 0)] + by_later[: max(steps - 1, 0)]
-        whole = rounded_up((gathered(pieces, whole, count) + by_all + at_once) * sizes, 6)
+        for_ever = rounded_up((gathered(pieces, for_ever, count) + by_all + at_once) * sizes, 6)
         earlier = np.vstack([np.zeros((1, count)), table])[:steps]
-        return np.asarray(rounded_up(np.sum((earlier + at_once) * sizes, axis=1), count + 6)), np.asarray(whole)
+        return np.asarray(rounded_up(np.sum((earlier + at_once) * sizes, axis=1), count + 6)), np.asarray(for_ever)
 
     def of_process_noise(self, columns: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
         """Return the same for what is gathered in each sample, columns ``(n, m)`` of x of at most one each."""
         if not columns.shape[1]:
             return np.zeros(steps), np.zeros(0)
-        partial, whole = self._sums(self.into @ Ball.exact(columns), steps)
+        partial, for_ever = self._sums(self.into @ Ball.exact(columns), steps)
         earlier = np.vstack([np.zeros((1, columns.shape[1])), partial])[:steps]
-        return np.asarray(np.sum(earlier, axis=1)), np.asarray(whole)
+        return np.asarray(np.sum(earlier, axis=1)), np.asarray(for_ever)
 
     def _sums(self, columns: Ball, steps: int) -> tuple[FloatArray, FloatArray]:
         if self.contraction is not None:
@@ -209,12 +209,12 @@ class IntersampleErrorSystem:
         projector = _dying(plant.A, h)
         if projector is None:
             return np.inf
-        others = np.eye(plant.nx) - projector
+        lasting = np.eye(plant.nx) - projector
         second = plant.C @ plant.A @ plant.A
-        if np.any(np.abs(second @ others) > TERM_ROUNDING * (np.abs(second) @ np.abs(others))):
+        if np.any(np.abs(second @ lasting) > TERM_ROUNDING * (np.abs(second) @ np.abs(lasting))):
             return np.inf
         # The modes that last are straight: they are moved to where they decay, and nothing enters them.
-        stable = plant.A @ projector - others
+        stable = plant.A @ projector - lasting
         bent = np.array([np.sum(peak_gain(stable, projector @ plant.Bd * sizes, row[None])) for row in second])
         slope, turn = np.abs(plant.C @ plant.Bd) @ sizes, np.abs(plant.C @ plant.A @ plant.Bd) @ sizes
         missed = 0.25 * h * (2.0 * slope + h * (bent + turn)) + 2.0 * np.abs(plant.Dd) @ sizes
@@ -250,9 +250,9 @@ def _kept(plant: DescriptorSystem, dt: float, k: Ball, terms: FloatArray) -> Flo
     if not np.any(np.abs(k.midpoint) + k.radius > TERM_ROUNDING * terms):
         return np.zeros((n, n))
     projector = _dying(plant.A, dt)
-    others = np.eye(n) if projector is None else np.eye(n) - projector
-    missed = np.abs(k.midpoint @ others)
-    if np.any(missed > TERM_ROUNDING * (terms @ np.abs(others))):
+    lasting = np.eye(n) if projector is None else np.eye(n) - projector
+    missed = np.abs(k.midpoint @ lasting)
+    if np.any(missed > TERM_ROUNDING * (terms @ np.abs(lasting))):
         slow = np.linalg.eigvals(plant.A)
         slow = slow[slow.real > -LEAST_EXPONENT / dt]
         pole = complex(slow[int(np.argmax(np.abs(slow)))]) if slow.size else 0j
@@ -283,13 +283,14 @@ def _dying(a: FloatArray, dt: float) -> FloatArray | None:
 def _split(
     phi: Ball, k: Ball, j: Ball, into: Ball, kept: FloatArray, az: FloatArray, cz: FloatArray, *, endless: bool
 ) -> tuple[Ball, FloatArray, Contraction | None, Ball, float]:
-    """Return ``M, c, contraction, into, left`` for the projector ``kept (n, n)`` onto the modes that are followed."""
+    """Return ``M, c, contraction, into`` and the gain of the modes left out, for the projector ``kept (n, n)`` onto
+    the modes that are followed."""
     n, exact = len(kept), Ball.exact
     followed = kept.any()
-    projector, others = exact(kept), exact(np.eye(n)) - exact(kept)
+    projector, lasting = exact(kept), exact(np.eye(n)) - exact(kept)
     moving = phi @ projector
     m = block([[moving, exact(np.zeros((n, len(az))))], [k if followed else exact(np.zeros(k.shape)), exact(az)]])
-    shown = np.hstack([j.midpoint if followed else np.zeros(j.shape), cz])
+    c = np.hstack([j.midpoint if followed else np.zeros(j.shape), cz])
     contraction = prove_contraction(m, discrete=True) if endless else None
     if contraction is None and endless:
         raise SpecError(
@@ -300,12 +301,12 @@ def _split(
         )
     # What the split misses, and the modes that it leaves: driven by the state, whatever it is.
     defect = projector @ phi - moving @ projector if followed else exact(np.zeros((n, n)))
-    rest = block([[defect], [k @ others if followed else k]])
-    direct = j @ others if followed else j
+    remainder = block([[defect], [k @ lasting if followed else k]])
+    direct = j @ lasting if followed else j
     sizes = np.abs(direct.midpoint) + (direct.radius + (j.radius if followed else 0.0))
-    driven = np.zeros_like(sizes) if contraction is None else contraction.gain(shown, rest.midpoint, rest.radius)
-    left = float(np.linalg.norm(np.sum(rounded_up(driven + sizes, 4), axis=1)))
-    return m, shown, contraction, block([[projector], [into]]), left
+    driven = np.zeros_like(sizes) if contraction is None else contraction.gain(c, remainder.midpoint, remainder.radius)
+    remaining_gain = float(np.linalg.norm(np.sum(rounded_up(driven + sizes, 4), axis=1)))
+    return m, c, contraction, block([[projector], [into]]), remaining_gain
 
 
 def _require_readings_at_samples(smooth: DescriptorSystem, step: float) -> None:

@@ -56,12 +56,12 @@ class HealthyTime(NamedTuple):
 
 def room_for_other_logs(statistics: Statistics, logs: Sequence[slice]) -> FloatArray:
     """Return by how much the level of each statistic is raised ``(k,)`` as nothing shows how logs differ."""
-    found = np.ones(len(statistics.names))
+    factors = np.ones(len(statistics.names))
     if len(logs) < 2:
-        found[:] = ONE_LOG_FACTOR
+        factors[:] = ONE_LOG_FACTOR
         if statistics.estimates:
-            found[-2 * len(statistics.estimates) :] = ONE_LOG_FACTOR_OF_FAULTS
-    return found
+            factors[-2 * len(statistics.estimates) :] = ONE_LOG_FACTOR_OF_FAULTS
+    return factors
 
 
 def held_out(x: FloatArray, statistics: Statistics, scores: Scores | None, logs: Sequence[slice]) -> HeldOut:
@@ -70,18 +70,18 @@ def held_out(x: FloatArray, statistics: Statistics, scores: Scores | None, logs:
     n = len(x)
     ends = np.linspace(0, n, PARTS_OF_ONE_LOG + 1).astype(np.int64).tolist()
     parts = tuple(logs) if len(logs) > 1 else tuple(slice(a, b) for a, b in pairwise(ends))
-    found = np.zeros((len(statistics.names), n))
+    values = np.zeros((len(statistics.names), n))
     for part in parts:
-        others = np.ones(n, dtype=bool)
-        others[part] = False
-        model = fitted_autoregression(np.where(others[:, None], x, np.nan), order=statistics.model.order)
+        is_other = np.ones(n, dtype=bool)
+        is_other[part] = False
+        model = fitted_autoregression(np.where(is_other[:, None], x, np.nan), order=statistics.model.order)
         usual = None
         if scores is not None:
-            left = scores.chosen(others)
-            centre = left.centre() if left.determine else scores.centre()
+            other_scores = scores.chosen(is_other)
+            centre = other_scores.centre() if other_scores.determine else scores.centre()
             usual = centre, np.ones(len(centre))
-        found[:, part] = normal_statistics(x, replace(statistics, model=model), scores, usual)[:, part]
-    return HeldOut(found, parts)
+        values[:, part] = normal_statistics(x, replace(statistics, model=model), scores, usual)[:, part]
+    return HeldOut(values, parts)
 
 
 def not_held_out(x: FloatArray, statistics: Statistics, scores: Scores | None) -> HeldOut:
@@ -90,32 +90,32 @@ def not_held_out(x: FloatArray, statistics: Statistics, scores: Scores | None) -
     return HeldOut(normal_statistics(x, statistics, scores, usual), (slice(0, len(x)),))
 
 
-def levels_of_other_parts(levels: FloatArray, left: HeldOut, every: float) -> FloatArray:
+def levels_of_other_parts(levels: FloatArray, held: HeldOut, every: float) -> FloatArray:
     """Return levels ``(k,)``, none below ``levels``, that rows keep which nothing was learned from: each statistic the
     largest that is to be expected in another part, and all of them together one alarm per ``every`` rows."""
     from scipy.special import stdtrit
 
-    largest = np.sqrt([left.values[:, part].max(axis=1) for part in left.parts])
+    largest = np.sqrt([held.values[:, part].max(axis=1) for part in held.parts])
     count = len(largest)
-    found = levels
+    raised = levels
     if count > 1:
         reach = float(stdtrit(count - 1, PART_CONFIDENCE)) * float(np.sqrt(1.0 + 1.0 / count))
-        found = np.maximum(levels, (largest.mean(axis=0) + reach * largest.std(axis=0, ddof=1)) ** 2)
-    union = np.concatenate([(left.values[:, part] / found[:, None]).max(axis=0) for part in left.parts])[None]
+        raised = np.maximum(levels, (largest.mean(axis=0) + reach * largest.std(axis=0, ddof=1)) ** 2)
+    union = np.concatenate([(held.values[:, part] / raised[:, None]).max(axis=0) for part in held.parts])[None]
     rows = max(union.shape[1] - SETTLING, 1)
-    return read_only(found * max(1.0, exchangeable_level(union, rows, every)))
+    return read_only(raised * max(1.0, exchangeable_level(union, rows, every)))
 
 
-def healthy_time(levels: FloatArray, left: HeldOut, every: float, factors: FloatArray) -> HealthyTime:
+def healthy_time(levels: FloatArray, held: HeldOut, every: float, factors: FloatArray) -> HealthyTime:
     """Return the share of the rows of another part in alarm, by levels ``(k,)`` and those parts whose level comes from
     the others; ``factors (k,)``: by how much they are raised after that."""
     from scipy.special import stdtrit
 
     shares, rows = [], 0
-    for i, part in enumerate(left.parts):
-        own = factors * levels_of_other_parts(levels, left.without(i), every)
-        shares.append(float(((left.values[:, part] / own[:, None]).max(axis=0) > 1.0).mean()))
-        rows += left.values[:, part].shape[1]
+    for i, part in enumerate(held.parts):
+        own = factors * levels_of_other_parts(levels, held.without(i), every)
+        shares.append(float(((held.values[:, part] / own[:, None]).max(axis=0) > 1.0).mean()))
+        rows += held.values[:, part].shape[1]
     count, expected = len(shares), float(np.mean(shares))
     reach = float(stdtrit(count - 1, SHARE_CONFIDENCE)) * float(np.std(shares, ddof=1)) / float(np.sqrt(count))
     unseen = UNSEEN_ROWS / rows

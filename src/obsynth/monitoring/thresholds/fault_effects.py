@@ -96,8 +96,8 @@ class FaultEffects(ABC):
     @property
     def numbers(self) -> int:
         """How many numbers are followed in each row."""
-        each = self.model.channels + self.sizes[0] + self.sizes[1] * self.model.channels
-        return (BEGINS + HELD) * len(self.hypotheses) * each
+        per_hypothesis = self.model.channels + self.sizes[0] + self.sizes[1] * self.model.channels
+        return (BEGINS + HELD) * len(self.hypotheses) * per_hypothesis
 
     def init(self) -> EffectState:
         """Return the state before the first sample."""
@@ -122,13 +122,13 @@ class FaultEffects(ABC):
             error = error * followed[:, None, None]
             score, information, sums, count = state.score, state.information, state.sums, state.counts
             if counts and seen is not None:
-                told = followed & (rows <= COUNTED)
-                added = added * told[:, None, None]
+                counted = followed & (rows <= COUNTED)
+                added = added * counted[:, None, None]
                 score = score + np.einsum("bmh,m->bh", added, white)
                 information = information + np.einsum("bmh,bmh->bh", added, added)
-                sums, count = sums + told[:, None] * white, count + told
-        found = state._replace(error=error, past=past, score=score, information=information, sums=sums, counts=count)
-        return found if all(np.isfinite(part).all() for part in found[2:8]) else self.init()
+                sums, count = sums + counted[:, None] * white, count + counted
+        after = state._replace(error=error, past=past, score=score, information=information, sums=sums, counts=count)
+        return after if all(np.isfinite(part).all() for part in after[2:8]) else self.init()
 
     @abstractmethod
     def _moved(
@@ -158,13 +158,13 @@ class FaultEffects(ABC):
 
     def explained(self, state: EffectState) -> tuple[EffectState, Explanation]:
         """Return what the hypotheses explain of the rows up to one in alarm, and the state that keeps their begins."""
-        parts, known = (state.score, state.information, state.sums, state.counts), state.held > 0.0
-        if state.alarmed >= LOOKED_FOR and known.any():
-            return state._replace(quiet=0.0), _explanation(*(part[known] for part in parts))[0]
-        found, best = _explanation(*parts)
+        parts, is_held = (state.score, state.information, state.sums, state.counts), state.held > 0.0
+        if state.alarmed >= LOOKED_FOR and is_held.any():
+            return state._replace(quiet=0.0), _explanation(*(part[is_held] for part in parts))[0]
+        explanation, best = _explanation(*parts)
         held = np.zeros_like(state.held)
-        held[best[np.argsort(-found.ratios)[:HELD]]] = 1.0
-        return state._replace(held=held, alarmed=state.alarmed + 1.0, quiet=0.0), found
+        held[best[np.argsort(-explanation.ratios)[:HELD]]] = 1.0
+        return state._replace(held=held, alarmed=state.alarmed + 1.0, quiet=0.0), explanation
 
 
 class FilterEffects(FaultEffects):
@@ -208,8 +208,8 @@ class FilterEffects(FaultEffects):
         estimates = -error[:, nx:]
         estimates[:, moved, moved] += 1.0
         estimates[:, moved, nq + moved] += rows[:, None]
-        whole = np.concatenate([estimates, effect], axis=1)[:, self._places]
-        return error, *_whitened(self.model, state.past, whole, seen)
+        effects = np.concatenate([estimates, effect], axis=1)[:, self._places]
+        return error, *_whitened(self.model, state.past, effects, seen)
 
 
 class LinearEffects(FaultEffects):
@@ -249,9 +249,9 @@ class LinearEffects(FaultEffects):
                 steps[k] = read @ z + through
                 z = transition @ z + inputs
             parts += [steps, np.cumsum(steps, axis=0)]
-        whole = np.concatenate(parts, axis=2)
-        past, white = np.zeros((1, self.model.order, *whole.shape[1:])), []
-        for row in whole:
+        responses = np.concatenate(parts, axis=2)
+        past, white = np.zeros((1, self.model.order, *responses.shape[1:])), []
+        for row in responses:
             past, added = _whitened(self.model, past, row[None], np.ones(len(places), dtype=bool))
             white.append(added[0])
         return np.array(white)
@@ -260,12 +260,12 @@ class LinearEffects(FaultEffects):
 def effects_of(design: ObserverDesign, learned: LearnedThresholds) -> FaultEffects | None:
     """Return how faults and sensors of a design act on what its thresholds watch; `None` where that is not known."""
     observer = design.observer
-    found: FaultEffects | None = None
+    effects: FaultEffects | None = None
     if isinstance(observer, DAEObserver) and observer.form == "augmented-kalman":
-        found = None if parameter_walk(observer) is None else FilterEffects(observer, learned)
+        effects = None if parameter_walk(observer) is None else FilterEffects(observer, learned)
     elif isinstance(observer, LinearObserver) and not expects_fault_courses(design):
-        found = LinearEffects(design, learned)
-    return None if found is None or found.numbers > MOST_NUMBERS else found
+        effects = LinearEffects(design, learned)
+    return None if effects is None or effects.numbers > MOST_NUMBERS else effects
 
 
 def _doublings(row: int) -> int:
@@ -275,13 +275,13 @@ def _doublings(row: int) -> int:
 
 def _gain(said: DAERow, reading: FloatArray, R: FloatArray) -> FloatArray:
     """Return the gain ``(n, ny)`` of a sample on states and parameters, by the covariance after it: ``P H' R^-1``."""
-    nx, whole = len(said.x), np.empty((reading.shape[1], reading.shape[1]))
-    whole[:nx, :nx], whole[nx:, nx:] = said.covariance, said.parameter_covariance
-    whole[:nx, nx:] = said.cross_covariance
-    whole[nx:, :nx] = whole[:nx, nx:].T
-    seen, found = said.seen, np.zeros((len(whole), len(reading)))
-    found[:, seen] = np.linalg.solve(R[seen][:, seen], reading[seen] @ whole).T
-    return found
+    nx, joint_covariance = len(said.x), np.empty((reading.shape[1], reading.shape[1]))
+    joint_covariance[:nx, :nx], joint_covariance[nx:, nx:] = said.covariance, said.parameter_covariance
+    joint_covariance[:nx, nx:] = said.cross_covariance
+    joint_covariance[nx:, :nx] = joint_covariance[:nx, nx:].T
+    measured, gain = said.seen, np.zeros((len(joint_covariance), len(reading)))
+    gain[:, measured] = np.linalg.solve(R[measured][:, measured], reading[measured] @ joint_covariance).T
+    return gain
 
 
 def _whitened(
@@ -294,11 +294,11 @@ def _whitened(
         row = predicted
     elif not seen.all():
         precision = model.whitener.T @ model.whitener
-        rest = np.linalg.solve(precision[np.ix_(~seen, ~seen)], -precision[np.ix_(~seen, seen)])
+        regression = np.linalg.solve(precision[np.ix_(~seen, ~seen)], -precision[np.ix_(~seen, seen)])
         away = (row - predicted)[:, seen]
         completed = predicted.copy()
         completed[:, seen] = row[:, seen]
-        completed[:, ~seen] += rest @ away
+        completed[:, ~seen] += regression @ away
         row = completed
     kept = np.concatenate([row[:, None], past[:, :-1]], axis=1) if model.order else past
     return kept, np.asarray(model.whitener @ (row - predicted))
@@ -309,10 +309,10 @@ def _sampled(a: FloatArray, b: FloatArray, dt: float, rows: float) -> tuple[Floa
     if dt > 0.0:
         return a, b
     n = len(a)
-    both = np.zeros((n + b.shape[1], n + b.shape[1]))
-    both[:n, :n], both[:n, n:] = a * rows, b * rows
-    found = expm(both)
-    return np.asarray(found[:n, :n]), np.asarray(found[:n, n:])
+    generator = np.zeros((n + b.shape[1], n + b.shape[1]))
+    generator[:n, :n], generator[:n, n:] = a * rows, b * rows
+    exponential = expm(generator)
+    return np.asarray(exponential[:n, :n]), np.asarray(exponential[:n, n:])
 
 
 def _explanation(
@@ -320,15 +320,15 @@ def _explanation(
 ) -> tuple[Explanation, NDArray[np.intp]]:
     """Return what hypotheses explain at their likeliest begin, and its place ``(h,)``: from scores and information
     ``(b, h)`` of each, and sums ``(b, m)`` of so many white rows ``(b,)``."""
-    known = information > 0.0
-    safe = np.where(known, information, 1.0)
-    ratios = np.where(known, score**2 / safe, 0.0)
-    best, each = ratios.argmax(axis=0), np.arange(ratios.shape[1])
+    is_informed = information > 0.0
+    safe = np.where(is_informed, information, 1.0)
+    ratios = np.where(is_informed, score**2 / safe, 0.0)
+    best, hypotheses = ratios.argmax(axis=0), np.arange(ratios.shape[1])
     shifts = np.where(counts > 0.0, np.sum(sums**2, axis=1) / np.maximum(counts, 1.0), 0.0)
-    found = Explanation(
-        ratios[best, each],
-        (score / safe)[best, each],
-        1.0 / np.sqrt(safe[best, each]),
+    explanation = Explanation(
+        ratios[best, hypotheses],
+        (score / safe)[best, hypotheses],
+        1.0 / np.sqrt(safe[best, hypotheses]),
         float(shifts.max(initial=0.0)),
     )
-    return found, best
+    return explanation, best

@@ -54,8 +54,8 @@ class GapGrowth:
         self._last = powers[-1] @ model.A
         self._impulses = np.hstack([power @ driven for power in powers]) if len(model.A) else np.zeros((0, 0))
         self._powers, self._aged = np.stack(powers), float(np.linalg.norm(self._last @ driven, axis=0).sum())
-        left = largest_singular_value(self._last)
-        self._aged /= 1.0 - left
+        contraction = largest_singular_value(self._last)
+        self._aged /= 1.0 - contraction
         self._size = np.abs(self._impulses).sum(axis=1) if self._impulses.size else np.zeros(len(model.A))
         # By age: what the outputs of the model may miss, and how they hang on the error at the last complete row.
         self._misses: list[FloatArray] = [np.abs(self._Dq).sum(axis=1)]
@@ -74,12 +74,12 @@ class GapGrowth:
         """Return ``(ny,)``: what outputs may miss ``age`` rows after a complete one; ``(ny, n)``: per error there."""
         while len(self._misses) <= age:
             self._further()
-            shown = self._H @ self._power
-            on_errors = shown @ self._S
-            reach = np.abs(on_errors @ self._impulses).sum(axis=1) if self._impulses.size else np.zeros(len(shown))
+            reading = self._H @ self._power
+            on_errors = reading @ self._S
+            reach = np.abs(on_errors @ self._impulses).sum(axis=1) if self._impulses.size else np.zeros(len(reading))
             # What is older than all powers, as in `unlimited_bound`.
             older = np.linalg.norm(np.einsum("ij,kjl->kil", on_errors, self._powers), axis=2).sum(axis=0) * self._aged
-            own = np.abs(shown @ self._Sq).sum(axis=1)
+            own = np.abs(reading @ self._Sq).sum(axis=1)
             self._misses.append(reach + older + own + self._drift + self._misses[0])
             self._maps.append(on_errors)
         return self._misses[age], self._maps[age]
@@ -134,22 +134,22 @@ def _disturbances(model: ResidualModel, errors: ErrorModel, sizes: FloatArray) -
     slope, largest = a @ sampled.plant.Bd, np.zeros((plant.nx, plant.nd))
     for _ in range(count):
         largest, slope = np.maximum(largest, wider @ np.abs(slope)), step @ slope
-    rest = np.diag((largest @ sizes) * h**2 / 3.0)
+    deviation = np.diag((largest @ sizes) * h**2 / 3.0)
     outputs = np.zeros((plant.ny, plant.nd)), plant.Dd * sizes, np.zeros((plant.ny, plant.nx))
-    return np.hstack([plant.Bd * sizes, none, rest]), np.hstack(outputs)
+    return np.hstack([plant.Bd * sizes, none, deviation]), np.hstack(outputs)
 
 
 def _stand_in(errors: ErrorModel, Bq: FloatArray, Dq: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return how far the states that the model starts from, and the faults it holds, are off: per error and input."""
     plant, observer = errors.plant, errors.observer
-    told = [plant.fault_names.index(name) for name in observer.fault_names]
+    estimated = [plant.fault_names.index(name) for name in observer.fault_names]
 
     def off(rows: slice) -> tuple[FloatArray, FloatArray]:
         added = 0.0 if errors.T0 is None else errors.T0[rows, : plant.nx] @ Bq
         return -observer.Cz[rows], observer.Dy[rows] @ Dq + added
 
     fault_e, fault_q = np.zeros((plant.nf, observer.order)), np.zeros((plant.nf, Bq.shape[1]))
-    fault_e[told], fault_q[told] = off(observer.fault_rows)
+    fault_e[estimated], fault_q[estimated] = off(observer.fault_rows)
     if len(observer.state_names) == plant.nx:
         order = [plant.state_names.index(name) for name in observer.state_names]
         state_e, state_q = np.zeros((plant.nx, observer.order)), np.zeros((plant.nx, Bq.shape[1]))
@@ -180,8 +180,8 @@ def gap_growth(model: ResidualModel, bounds: FloatArray, noise_bound: float | No
     if not observer.state_names:
         if errors.T[:, plant.nx :].any():
             return "the observer follows earlier states"
-        known = np.vstack([errors.own @ plant.E, plant.C])
-        gap = np.linalg.pinv(known) @ known - np.eye(plant.nx)
+        solved = np.vstack([errors.own @ plant.E, plant.C])
+        gap = np.linalg.pinv(solved) @ solved - np.eye(plant.nx)
         if np.abs(gap).max(initial=0.0) > SOLVED_SHARE:
             return "the states that the plant's model starts from do not follow from the observer's"
     return GapGrowth(errors, model, np.where(moving, bounds, 0.0), 0.0 if noise_bound is None else noise_bound)

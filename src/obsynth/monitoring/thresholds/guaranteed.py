@@ -64,9 +64,9 @@ def _checked(design: ObserverDesign, kind: str, given: Mapping[str, Any]) -> Gua
             "This guaranteed test is for an exact model: design it for a plant whose constants have tolerances, with a "
             "scenario, so that an observer of the state runs beside it."
         )
-    asked = [name for name in ("constants", "initial_set") if given[name] is not None]
-    if why and asked:
-        raise SpecError(why, path=asked[0])
+    refused = [name for name in ("constants", "initial_set") if given[name] is not None]
+    if why and refused:
+        raise SpecError(why, path=refused[0])
     return test
 
 
@@ -77,16 +77,18 @@ def _bounded(test: GuaranteedTest, constants: Any) -> tuple[ObserverDesign, Floa
     return with_tolerances(changed, constants)[0], window.bounds.disturbance
 
 
-def _course_of(test: GuaranteedTest) -> str:
+def _between_samples(test: GuaranteedTest) -> str:
     """Return what disturbances do between samples, as the other monitors have it."""
     return "held" if test.options["disturbance"] in HELD_BETWEEN_SAMPLES else "any"
 
 
 def _statement(test: GuaranteedTest) -> str:
-    course = test.options["course"]
-    said = "; ".join(_promise(one, group) for one, group in zip(test.tests, test.groups, strict=True))
+    profile = test.options["course"]
+    promises = "; ".join(
+        _promise(test_of_group, group) for test_of_group, group in zip(test.tests, test.groups, strict=True)
+    )
     ending = "; each row has the least interval for its own samples" if test.options.get("exact") else ""
-    return f"{said}, for a fault with the time course '{course}'{ending}; for an exact model{while_inside(test)}"
+    return f"{promises}, for a fault with the time course '{profile}'{ending}; for an exact model{while_inside(test)}"
 
 
 def _promise(test: GuaranteedTest, group: tuple[str, ...]) -> str:
@@ -117,10 +119,12 @@ def record_monitor(design: ObserverDesign, scenario: Scenario, kind: str, given:
     bench = make_bench(design, scenario)
     runs = bench.run([scenario.seed])
     observer, tests = test.linear[1], test.tests
-    known = np.concatenate([np.abs(runs.inputs), np.abs(runs.outputs)], axis=2)
-    floors = [float(np.max(known @ one.certificate.matrices["rounding"].ravel(), initial=0.0)) for one in tests]
+    signals = np.concatenate([np.abs(runs.inputs), np.abs(runs.outputs)], axis=2)
+    floors = [
+        float(np.max(signals @ row_test.certificate.matrices["rounding"].ravel(), initial=0.0)) for row_test in tests
+    ]
     # Of a bank each row is told in units of its own threshold, with what rounding adds.
-    limits = np.array([one.threshold for one in tests])
+    limits = np.array([row_test.threshold for row_test in tests])
     scales = limits + floors if is_bank(test) else np.ones(1)
     threshold = np.full(len(runs.outputs), 1.0 if is_bank(test) else limits[0])
     before = max(map(rows_before, tests))
@@ -137,7 +141,7 @@ def record_monitor(design: ObserverDesign, scenario: Scenario, kind: str, given:
     if constants is not None or initial_set is not None:
         changed, bounds = _bounded(test, constants)
         rule, statement = over_box(
-            changed, nominal, bounds, 1.0, None, initial_set, scenario=scenario, disturbance=_course_of(test)
+            changed, nominal, bounds, 1.0, None, initial_set, scenario=scenario, disturbance=_between_samples(test)
         )
     return Monitor(
         kind,
@@ -209,8 +213,10 @@ class GuaranteedRule(Rule):
         self._orders = [rows_before(test) for test in tests]
         self._programmes = [Programmes.of(test) for test in tests if self._exact or self._solve]
         self._nu, self._alone = plant.nu, [len(group) == 1 for group in design.groups]
-        told = [test.fault for test, alone in zip(tests, self._alone, strict=True) if alone]
-        self.columns = tuple(f"{end} {name}" for name in told for end in ("lowest", "highest")) if self._exact else ()
+        isolated = [test.fault for test, alone in zip(tests, self._alone, strict=True) if alone]
+        self.columns = (
+            tuple(f"{end} {name}" for name in isolated for end in ("lowest", "highest")) if self._exact else ()
+        )
         self.takes_gaps = self._solve
 
     def init(self) -> GuaranteedState:
@@ -222,19 +228,21 @@ class GuaranteedRule(Rule):
         """Return statistic and threshold; NaN while the window is not full, and nothing else is known of it."""
         said: Any = sample.said
         cells = (np.nan,) * len(self.columns)
-        known = np.full(len(state.largest), np.nan) if said is None else np.concatenate([said.inputs, said.outputs])
+        signals = np.full(len(state.largest), np.nan) if said is None else np.concatenate([said.inputs, said.outputs])
         if self._programmes:
-            state = self._kept(state, known[None])
-        complete = bool(np.isfinite(known).all())
-        state = state._replace(largest=np.fmax(state.largest, np.abs(known)), rows=state.rows + 1 if complete else 0)
+            state = self._kept(state, signals[None])
+        complete = bool(np.isfinite(signals).all())
+        state = state._replace(largest=np.fmax(state.largest, np.abs(signals)), rows=state.rows + 1 if complete else 0)
         if not complete and not self._solve:
             state = self.restart(state)
         thresholds = self._limits + self._rounding @ state.largest
         if state.rows >= self._length and (sample.deciding or self._solve):
             values = np.asarray(said.faults_and_residuals[: len(thresholds)], dtype=np.float64)
         elif self._solve and len(state.recent) == self._length:
-            found = [programme.least_test(*self._window(state, k)) for k, programme in enumerate(self._programmes)]
-            values, thresholds = (np.array(part) for part in zip(*found, strict=True))
+            least_tests = [
+                programme.least_test(*self._window(state, k)) for k, programme in enumerate(self._programmes)
+            ]
+            values, thresholds = (np.array(part) for part in zip(*least_tests, strict=True))
         else:
             return state, RuleOutput(np.nan, float(thresholds[0]), None, cells)
         if self._exact:
@@ -244,8 +252,8 @@ class GuaranteedRule(Rule):
             return state, RuleOutput(np.nan, float(thresholds[0]), None, cells)
         sizes = np.where(known_tests, np.abs(values), 0.0)
         share = np.divide(sizes, thresholds, out=np.where(sizes > 0.0, np.inf, 0.0), where=thresholds > 0.0)
-        which = int(np.argmax(np.where(known_tests, share, -1.0)))
-        return state, RuleOutput(float(sizes[which]), float(thresholds[which]), which, cells)
+        largest = int(np.argmax(np.where(known_tests, share, -1.0)))
+        return state, RuleOutput(float(sizes[largest]), float(thresholds[largest]), largest, cells)
 
     def _kept(self, state: GuaranteedState, rows: FloatArray) -> GuaranteedState:
         return state._replace(recent=np.vstack([state.recent, rows])[-self._length :])
@@ -264,8 +272,8 @@ class GuaranteedRule(Rule):
         high = np.fmin(ends[:, 1], values + widths)
         # Nothing explains a window whose ends have passed each other: neither a fault of this course nor none.
         empty = low > high
-        shown = np.where(empty[:, None], np.nan, np.stack([low, high], axis=1))
-        cells = tuple(shown[self._alone].ravel().tolist())
+        intervals = np.where(empty[:, None], np.nan, np.stack([low, high], axis=1))
+        cells = tuple(intervals[self._alone].ravel().tolist())
         middle = np.where(empty, values, 0.5 * (low + high))
         half = np.where(empty, 0.0, 0.5 * (high - low))
         outside = (low > 0.0) | (high < 0.0) | empty
@@ -312,12 +320,12 @@ class VaryingRule(Rule):
     def step(self, state: VaryingState, sample: Sample) -> tuple[VaryingState, RuleOutput]:
         """Return statistic and threshold; NaN where the row has no verdict."""
         said: Any = sample.said
-        known = np.concatenate([said.inputs, said.outputs])
-        after = VaryingState(state.k + 1, np.fmax(state.largest, np.abs(known)))
-        which = self._observer.programme_at(state.k)
-        if which < 0:
+        signals = np.concatenate([said.inputs, said.outputs])
+        after = VaryingState(state.k + 1, np.fmax(state.largest, np.abs(signals)))
+        programme = self._observer.programme_at(state.k)
+        if programme < 0:
             return after, RuleOutput(np.nan, np.nan)
-        threshold = float(self._limits[which] + self._rounding[which] @ after.largest)
+        threshold = float(self._limits[programme] + self._rounding[programme] @ after.largest)
         return after, RuleOutput(float(abs(said.faults_and_residuals[0])), threshold, 0)
 
     def restart(self, state: VaryingState, skipped: int = 0) -> VaryingState:
@@ -339,7 +347,7 @@ def data_monitor(design: ObserverDesign, kind: str, given: Mapping[str, Any]) ->
     statement = _statement(test) + ("" if own is None else "; each row has its own threshold")
     if constants is not None or initial_set is not None:
         changed, bounds = _bounded(test, constants)
-        rule, statement = over_box(changed, None, bounds, 1.0, None, initial_set, disturbance=_course_of(test))
+        rule, statement = over_box(changed, None, bounds, 1.0, None, initial_set, disturbance=_between_samples(test))
         if initial_set is None:
             statement += "; it holds once the effect of the initial error, which is not stated, has settled"
     return Monitor(

@@ -56,39 +56,41 @@ def hypotheses_of(faults: Sequence[str], outputs: Sequence[str]) -> tuple[Hypoth
     )
 
 
-def ranked(hypotheses: Sequence[Hypothesis], found: Explanation) -> Ranking | None:
+def ranked(hypotheses: Sequence[Hypothesis], explanation: Explanation) -> Ranking | None:
     """Return the ranking of what hypotheses explain; `None` where none of them, and no shift, explains anything.
 
     Where shares do not decide, the faults of the plant come first, and the others are ties.
     """
     best = dict[str, int]()
     drifts = set[str]()
-    for i, one in enumerate(hypotheses):
-        ratio, before = found.ratios[i], best.get(one.name)
+    for i, hypothesis in enumerate(hypotheses):
+        ratio, before = explanation.ratios[i], best.get(hypothesis.name)
         # A jump is what is usual: a drift is told where it explains clearly more.
-        if before is None or ratio > found.ratios[before] + DISTINGUISHED * _scale(ratio):
-            best[one.name] = i
-            (drifts.add if one.is_drift else drifts.discard)(one.name)
-    ratios = {name: float(found.ratios[i]) for name, i in best.items()}
+        if before is None or ratio > explanation.ratios[before] + DISTINGUISHED * _scale(ratio):
+            best[hypothesis.name] = i
+            (drifts.add if hypothesis.is_drift else drifts.discard)(hypothesis.name)
+    ratios = {name: float(explanation.ratios[i]) for name, i in best.items()}
     for name, value in list(ratios.items()):
         if name.startswith(SENSOR) and any(
-            abs(value - other) <= SAME_EFFECT * value for known, other in ratios.items() if not known.startswith(SENSOR)
+            abs(value - other_value) <= SAME_EFFECT * value
+            for other_name, other_value in ratios.items()
+            if not other_name.startswith(SENSOR)
         ):
             del ratios[name]
-    ratios[NONE_OF_THESE] = EXPLAINED_SHARE * found.shift
+    ratios[NONE_OF_THESE] = EXPLAINED_SHARE * explanation.shift
     most = max(ratios.values())
     if not most >= LEAST_RATIO:
         return None
     scale = _scale(most)
     weights = {name: float(np.exp(-0.5 * (most - value) / scale)) for name, value in ratios.items()}
     total = sum(weights.values())
-    shares = sorted(((name, weight / total) for name, weight in weights.items()), key=lambda one: -one[1])
+    shares = sorted(((name, weight / total) for name, weight in weights.items()), key=lambda hypothesis: -hypothesis[1])
     near = [name for name, _ in shares if most - ratios[name] <= DISTINGUISHED * scale]
     near.sort(key=lambda name: (name == NONE_OF_THESE, name.startswith(SENSOR)))
     named = near[0]
     size = deviation = np.nan
     if named.startswith(SENSOR):
-        size, deviation = float(found.sizes[best[named]]), float(found.deviations[best[named]])
+        size, deviation = float(explanation.sizes[best[named]]), float(explanation.deviations[best[named]])
     return Ranking(tuple(shares), named, tuple(near[1:]), named in drifts, size, deviation)
 
 

@@ -48,13 +48,13 @@ def likelihood_ratio(
         information = np.concatenate([information, np.zeros((1, nq, nq))])[-GLR_WINDOW:] + G.transpose(0, 2, 1) @ G
         scores = np.concatenate([scores, np.zeros((1, nq))])[-GLR_WINDOW:] + gaps[k][: G.shape[1]] @ G
         signatures = gains.gain @ right
-        found = _doubled_log_ratios(information, scores)
-        best = int(np.argmax(found))
-        values[k] = found[best]
+        ratios = _doubled_log_ratios(information, scores)
+        best = int(np.argmax(ratios))
+        values[k] = ratios[best]
         if alarm is None and values[k] > threshold:
             confidence = 1.0 - min(1.0, looks * float(tail(np.array(float(nq)), values[k])))
             name = estimates.parameter_names[alone(scores[best], np.diag(information[best]))]
-            alarm = Alarm(k, name, max(k + 1 - len(found), begin) + best, confidence, float(values[k]))
+            alarm = Alarm(k, name, max(k + 1 - len(ratios), begin) + best, confidence, float(values[k]))
     return Decision("glr", read_only(values), read_only(np.full(samples, threshold)), alarm)
 
 
@@ -80,10 +80,12 @@ def initial_parameter_response(observer: RecursiveObserver, estimates: Estimates
             path="nominal",
         )
     random_walk = adaptation is not None and adaptation.form == "random-walk"
-    left = np.concatenate([np.zeros(nx if random_walk else 0), error])
+    error_left = np.concatenate([np.zeros(nx if random_walk else 0), error])
     pulls = np.tile(error, (len(estimates.parameters), 1))
     begin = 0 if observer.early_constraints else 1
     for k, gains in enumerate(gain_steps(observer, len(pulls) - 1, received=estimates.received), begin):
-        left = gains.gain[:, : len(gains.step.A)] @ gains.step.A @ left if random_walk else gains.retain @ left
-        pulls[k] = left[-len(error) :]
+        error_left = (
+            gains.gain[:, : len(gains.step.A)] @ gains.step.A @ error_left if random_walk else gains.retain @ error_left
+        )
+        pulls[k] = error_left[-len(error) :]
     return pulls

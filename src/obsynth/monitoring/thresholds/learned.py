@@ -188,17 +188,17 @@ class LearnedThresholds:
                 "Give several normal logs, of other starts and set points"
             )
         rarest = min(self.rows, self.every)
-        other = (
+        remedy = (
             f"the lowest rate that {self.rows} rows can determine is one per {rarest:.6g} rows "
             f"({_duration(rarest * self.dt)})"
         )
         if rows_needed(model, 1.0) > self.rows:
-            other = "the residuals are too strongly correlated, or too many, for any rate from these rows"
+            remedy = "the residuals are too strongly correlated, or too many, for any rate from these rows"
         elif self.needed > rows_needed(model, self.every):
-            other = "the estimates are too strongly correlated for any rate from these rows"
+            remedy = "the estimates are too strongly correlated for any rate from these rows"
         return (
             f"{text}. Too few rows for this rate ({self.rows}; about {self.needed:,} needed, "
-            f"{_duration(self.needed * self.dt)}): {other}"
+            f"{_duration(self.needed * self.dt)}): {remedy}"
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -261,8 +261,8 @@ def _duration(seconds: float) -> str:
     return f"{count:.3g} {name}{'' if count == 1.0 else 's'}"
 
 
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 @arguments_checked
@@ -324,17 +324,19 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
     columns, m = tuple(map(str, data["columns"])), len(data["columns"])
     parts = ("offset", "A", "whitener", "signatures", "age_levels", "levels")
     offset, a, whitener, signatures, by_age, levels = (np.asarray(data[name], dtype=np.float64) for name in parts)
-    told, estimates = (tuple(map(str, data[name])) for name in ("told", "estimates"))
+    shown_by, estimates = (tuple(map(str, data[name])) for name in ("told", "estimates"))
     optional = ("bands", "fault_bands", "initial_covariance")
     arrays = {
         name: None if data[name] is None else read_only(np.asarray(data[name], dtype=np.float64)) for name in optional
     }
     bands, of_faults = arrays["bands"], arrays["fault_bands"]
-    statistics = Statistics(Autoregression(offset, a, whitener), signatures, told, estimates, by_age, bands, of_faults)
+    statistics = Statistics(
+        Autoregression(offset, a, whitener), signatures, shown_by, estimates, by_age, bands, of_faults
+    )
     shapes = (offset.shape, a.shape[1:], whitener.shape, signatures.shape[1:], levels.shape)
-    fits = shapes == ((m,), (m, m), (m, m), (m,), (len(statistics.names),)) and len(told) == len(signatures)
-    fits &= by_age.shape == (2 * len(told), len(AGES)) and bool((by_age > 0.0).all() and (levels > 0.0).all())
-    fits &= bands is None or (bands.shape == (len(told),) and bool((bands >= 0.0).all()))
+    fits = shapes == ((m,), (m, m), (m, m), (m,), (len(statistics.names),)) and len(shown_by) == len(signatures)
+    fits &= by_age.shape == (2 * len(shown_by), len(AGES)) and bool((by_age > 0.0).all() and (levels > 0.0).all())
+    fits &= bands is None or (bands.shape == (len(shown_by),) and bool((bands >= 0.0).all()))
     fits &= of_faults is None or (of_faults.shape == (len(estimates),) and bool((of_faults >= 0.0).all()))
     if not (fits and all(np.isfinite(part).all() for part in (offset, a, whitener, signatures, by_age))):
         raise ValueError("its parts do not fit together")

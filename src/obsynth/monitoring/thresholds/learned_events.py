@@ -35,11 +35,11 @@ def events_of(
 ) -> tuple[Event, ...]:  # fmt: skip
     """Return the events in watched rows ``(n, m)`` from which ``levels (k,)`` were learned, in order; none where what
     stands out is too much of the log.  ``scores``: what the rows say of faults, which are usually at the ``centre``."""
-    found = normal_statistics(x, statistics, scores, (centre, np.ones(len(centre)))) / levels[:, None]
+    statistic_shares = normal_statistics(x, statistics, scores, (centre, np.ones(len(centre)))) / levels[:, None]
     # After a blank, rows are not whitened for as long as the autoregression looks back: signals themselves show events.
     away = np.nan_to_num((x - np.nanmedian(x, axis=0)) ** 2 / np.nanvar(x, axis=0))
-    judged, seen = _in_usual(found.max(axis=0)), _in_usual(away.max(axis=1))
-    values = np.maximum(judged, seen)
+    statistic_sizes, signal_sizes = _in_usual(statistic_shares.max(axis=0)), _in_usual(away.max(axis=1))
+    values = np.maximum(statistic_sizes, signal_sizes)
     places = np.flatnonzero(values > 1.0)
     stretches = np.split(places, np.flatnonzero(np.diff(places) > HOLD) + 1)
     out = [part for part in stretches if part.size and values[part].max() > EVENT_STANDS_OUT]
@@ -51,7 +51,9 @@ def events_of(
     for part in out:
         first = int(part[values[part] > EVENT_STANDS_OUT][0])
         # Statistics look back: after the event they fade, from their largest value on.
-        last = int(part[(seen[part] > EVENT_STANDS_OUT) | (judged[part] == judged[part].max())][-1])
+        last = int(
+            part[(signal_sizes[part] > EVENT_STANDS_OUT) | (statistic_sizes[part] == statistic_sizes[part].max())][-1]
+        )
         signal = columns[int(np.argmax(np.nan_to_num(own[first : last + 1]).max(axis=0)))]
         events.append(Event(first, last, int(part[0]), int(part[-1]), signal))
     return tuple(events)
@@ -69,16 +71,16 @@ def factors(
 ) -> dict[str, float]:
     """Return how many times as large a change has to be to reach the level of each statistic as with ``others`` of the
     same names: a step that lasts `HOLD` rows, for those of all columns in the direction in which this is most."""
-    (first, whole), (other_first, other_whole) = _powers(statistics), _powers(others)
+    (first, held_power), (other_first, other_held) = _powers(statistics), _powers(others)
     gains = {
         "T2": float((other_first / first).max()),
         **dict.fromkeys(
-            (name for name in others.names if name.startswith("MEWMA")), float((other_whole / whole).max())
+            (name for name in others.names if name.startswith("MEWMA")), float((other_held / held_power).max())
         ),
     }
     names, by_age = statistics.names, (others.levels_by_age / statistics.levels_by_age)[:, AGES.index(HOLD)]
     ratios = names[len(gains) : len(gains) + len(by_age)]
-    gains |= dict(zip(ratios, (np.tile(other_whole / whole, 2) / by_age).tolist(), strict=True))
+    gains |= dict(zip(ratios, (np.tile(other_held / held_power, 2) / by_age).tolist(), strict=True))
     # What samples say of faults is in the observer's own deviations, whatever rows were learned from.
     return {
         name: float(np.sqrt(a / b * gains.get(name, 1.0)))

@@ -92,52 +92,52 @@ def thresholds_from_rows(
     names, faults = watched_names(design), len(design.observer.fault_names)
     seldom = seldom_known(rows, faults) if like is None else [names.index(name) for name in like.seldom]
     usual = [i for i in range(len(names)) if i not in seldom]
-    known = np.asarray(np.isfinite(rows[:, usual]).all(axis=1))
-    others = pairs.others(every)
-    count = int(known.sum())
+    complete = np.asarray(np.isfinite(rows[:, usual]).all(axis=1))
+    every_other = pairs.others(every)
+    count = int(complete.sum())
     if count < LEAST_NORMAL:
         raise SpecError(
             f"Only {count} rows of the log can be used, as warm-up, gaps and what a stuck sensor repeats do not count: "
             f"give {LEAST_NORMAL} and more.",
             path="normal",
         )
-    conformal = is_conformal(count, others)
-    scores = None if scores is None else _usual_scores(scores, known)
+    conformal = is_conformal(count, every_other)
+    scores = None if scores is None else _usual_scores(scores, complete)
     if like is None:
-        both = [usual[i] for i in independent(rows[known][:, usual])]
-        residuals = [usual[i] for i in varying(rows[known][:, usual], faults)]
-        choices = [part for part in ((both, residuals) if scores is None else (residuals or both,)) if part]
+        candidates = [usual[i] for i in independent(rows[complete][:, usual])]
+        residuals = [usual[i] for i in varying(rows[complete][:, usual], faults)]
+        choices = [part for part in ((candidates, residuals) if scores is None else (residuals or candidates,)) if part]
     else:
         choices = [[names.index(name) for name in like.columns]]
     if not choices:
         raise SpecError("No monitored signal changes in these rows: there is no noise to learn from.", path="normal")
-    fits = [(kept, fitted_autoregression(np.where(known[:, None], rows[:, kept], np.nan))) for kept in choices]
+    fits = [(kept, fitted_autoregression(np.where(complete[:, None], rows[:, kept], np.nan))) for kept in choices]
     enough = [fit for fit in fits if rows_needed(fit[1], 1.0) <= count and (fit is fits[-1] or fit[1].is_regular)]
     kept, model = enough[0] if enough else min(fits, key=lambda fit: rows_needed(fit[1], 1.0))
-    x = np.where(known[:, None], rows[:, kept], np.nan)
-    told = tuple(names[i] for i in kept)
-    centres, scales = rows[known, :faults].mean(axis=0), rows[known, :faults].std(axis=0)
+    x = np.where(complete[:, None], rows[:, kept], np.nan)
+    columns = tuple(names[i] for i in kept)
+    centres, scales = rows[complete, :faults].mean(axis=0), rows[complete, :faults].std(axis=0)
     if scores is not None:
         centres = scores.chosen(slice(len(rows) // 2 if conformal else None)).centre()
-    found = (
+    directions = (
         signatures(design, kept, np.sqrt(np.nanvar(x, axis=0)))
         if like is None
         else (like.statistics.signatures, like.statistics.told)
     )
-    statistics = Statistics(model, *found, estimates=() if scores is None else names[:faults])
+    statistics = Statistics(model, *directions, estimates=() if scores is None else names[:faults])
     lasting, extrapolated = 0.0, False
     if conformal:
-        statistics, levels = conformal_levels(x, others, statistics, scores, logs)
+        statistics, levels = conformal_levels(x, every_other, statistics, scores, logs)
     else:
         lasting = lasting_sizes(model.whitened(x)) if like is None else like.lasting
         rarer = RARER_WHERE_SIZES_LAST if lasting else 1.0
-        statistics, levels, extrapolated = learned_levels(x, others * rarer, statistics, seed, scores, logs)
-    left, room = held_out(x, statistics, scores, logs), room_for_other_logs(statistics, logs)
-    time = healthy_time(levels, left, others, room)
-    judged = left if validated else not_held_out(x, statistics, scores)
-    levels = room * levels_of_other_parts(levels, judged, others)
+        statistics, levels, extrapolated = learned_levels(x, every_other * rarer, statistics, seed, scores, logs)
+    held, room = held_out(x, statistics, scores, logs), room_for_other_logs(statistics, logs)
+    time = healthy_time(levels, held, every_other, room)
+    judged = held if validated else not_held_out(x, statistics, scores)
+    levels = room * levels_of_other_parts(levels, judged, every_other)
     return LearnedThresholds(
-        told,
+        columns,
         statistics,
         read_only(levels),
         every,
@@ -165,12 +165,12 @@ def thresholds_from_rows(
 def seldom_known(rows: FloatArray, faults: int) -> list[int]:
     """Return the residuals of rows ``(n, m)``, after so many estimates of ``faults``, without which at least half of
     the rows are whole: those of sensors that are slower than the rows.  One residual is left."""
-    there = np.isfinite(rows)
-    there = there[there.any(axis=1)]
-    left = list(range(rows.shape[1]))
-    while len(left) > faults + 1 and 2 * there[:, left].all(axis=1).sum() < len(there):
-        left.remove(min(left[faults:], key=lambda i: int(there[:, i].sum())))
-    return [i for i in range(rows.shape[1]) if i not in left]
+    present = np.isfinite(rows)
+    present = present[present.any(axis=1)]
+    columns = list(range(rows.shape[1]))
+    while len(columns) > faults + 1 and 2 * present[:, columns].all(axis=1).sum() < len(present):
+        columns.remove(min(columns[faults:], key=lambda i: int(present[:, i].sum())))
+    return [i for i in range(rows.shape[1]) if i not in columns]
 
 
 def divided_at_starts(observer: Any, scores: Scores | None) -> dict[str, float]:
@@ -181,8 +181,8 @@ def divided_at_starts(observer: Any, scores: Scores | None) -> dict[str, float]:
     if not any(offset_state(name) in observer.plant.state_names for name in observer.plant.output_names):
         return {}
     shares = np.nanstd(scores.theta / scores.deviations, axis=0)
-    found = zip(observer.fault_names, shares.tolist(), strict=True)
-    return {name: share for name, share in found if share < ONE_START_SHARE}
+    by_name = zip(observer.fault_names, shares.tolist(), strict=True)
+    return {name: share for name, share in by_name if share < ONE_START_SHARE}
 
 
 class Raised(NamedTuple):
@@ -195,60 +195,66 @@ class Raised(NamedTuple):
 
 
 def raised_levels(
-    design: ObserverDesign, found: LearnedThresholds, rows: FloatArray, scores: Scores | None, **given: Any
+    design: ObserverDesign, learned: LearnedThresholds, rows: FloatArray, scores: Scores | None, **given: Any
 ) -> Raised:
-    """Return what in ``rows (n, m)`` raises the levels that were ``found`` with what was ``given`` to
+    """Return what in ``rows (n, m)`` raises the levels that were ``learned`` with what was ``given`` to
     `thresholds_from_rows`: no events where none do by much."""
-    known = whole_rows(design, found, rows)
-    said = _usual_scores(scores, known) if found.statistics.estimates and scores is not None else None
-    x = watched_rows(design, found, rows)
-    events = events_of(x, found.columns, found.statistics, found.levels, said, found.centres)
-    left = rows.copy()
+    complete = whole_rows(design, learned, rows)
+    usual = _usual_scores(scores, complete) if learned.statistics.estimates and scores is not None else None
+    x = watched_rows(design, learned, rows)
+    events = events_of(x, learned.columns, learned.statistics, learned.levels, usual, learned.centres)
+    without_events = rows.copy()
     for event in events:
-        left[event.begun : event.ended + 1] = np.nan
-    count = int(whole_rows(design, found, left).sum())
-    others = found.pairs.others(found.every)
-    if not events or count < LEAST_NORMAL or is_conformal(count, others) != is_conformal(found.rows, others):
+        without_events[event.begun : event.ended + 1] = np.nan
+    count = int(whole_rows(design, learned, without_events).sum())
+    every_other = learned.pairs.others(learned.every)
+    if (
+        not events
+        or count < LEAST_NORMAL
+        or is_conformal(count, every_other) != is_conformal(learned.rows, every_other)
+    ):
         return Raised()
 
     def compared(before: LearnedThresholds, *, validated: bool) -> tuple[float, str]:
-        other = thresholds_from_rows(design, left, scores=scores, like=found, validated=validated, **given)
-        if other.statistics.names != before.statistics.names:
+        relearned = thresholds_from_rows(
+            design, without_events, scores=scores, like=learned, validated=validated, **given
+        )
+        if relearned.statistics.names != before.statistics.names:
             return 1.0, ""
-        each = factors(before.statistics, before.levels, other.statistics, other.levels)
-        most = max(each, key=lambda name: each[name])
-        return each[most], most
+        by_statistic = factors(before.statistics, before.levels, relearned.statistics, relearned.levels)
+        most = max(by_statistic, key=lambda name: by_statistic[name])
+        return by_statistic[most], most
 
     # The largest of few parts say little of rare rows: these alone tell whether events stand out.
-    inside = thresholds_from_rows(design, rows, scores=scores, like=found, validated=False, **given)
+    inside = thresholds_from_rows(design, rows, scores=scores, like=learned, validated=False, **given)
     if compared(inside, validated=False)[0] < TOLD_LEVEL_FACTOR:
         return Raised()
-    factor, most = compared(found, validated=True)
+    factor, most = compared(learned, validated=True)
     return Raised(events, most, factor) if factor >= TOLD_LEVEL_FACTOR else Raised()
 
 
-def watched_rows(design: ObserverDesign, found: LearnedThresholds, rows: FloatArray) -> FloatArray:
+def watched_rows(design: ObserverDesign, learned: LearnedThresholds, rows: FloatArray) -> FloatArray:
     """Return the columns that are watched of ``rows (n, m)``, NaN in rows of which a part is not known."""
-    places = [watched_names(design).index(name) for name in found.columns]
-    return np.where(whole_rows(design, found, rows)[:, None], rows[:, places], np.nan)
+    places = [watched_names(design).index(name) for name in learned.columns]
+    return np.where(whole_rows(design, learned, rows)[:, None], rows[:, places], np.nan)
 
 
-def whole_rows(design: ObserverDesign, found: LearnedThresholds, rows: FloatArray) -> NDArray[np.bool_]:
+def whole_rows(design: ObserverDesign, learned: LearnedThresholds, rows: FloatArray) -> NDArray[np.bool_]:
     """Return in which of ``rows (n, m)`` nothing is missing but what most of them lack ``(n,)``."""
-    usual = [name not in found.seldom for name in watched_names(design)]
+    usual = [name not in learned.seldom for name in watched_names(design)]
     return np.asarray(np.isfinite(rows[:, usual]).all(axis=1))
 
 
-def _usual_scores(scores: Scores, known: NDArray[np.bool_]) -> Scores | None:
+def _usual_scores(scores: Scores, complete: NDArray[np.bool_]) -> Scores | None:
     """Return what rows say of faults, and nothing of those that are not known; `None` where they do not determine
     them."""
-    found = replace(
+    kept = replace(
         scores,
-        score=np.where(known[:, None], scores.score, 0.0),
-        information=np.where(known[:, None, None], scores.information, 0.0),
-        theta=np.where(known[:, None], scores.theta, np.nan),
+        score=np.where(complete[:, None], scores.score, 0.0),
+        information=np.where(complete[:, None, None], scores.information, 0.0),
+        theta=np.where(complete[:, None], scores.theta, np.nan),
     )
-    return found if found.chosen(slice(len(known) // 2)).determine and found.determine else None
+    return kept if kept.chosen(slice(len(complete) // 2)).determine and kept.determine else None
 
 
 def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
@@ -256,9 +262,9 @@ def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -
     each shows: a column alone, and what a constant fault of a linear design does to all of them where this is another
     direction."""
     names = [watched_names(design)[i] for i in kept]
-    found = list(np.diag(sizes))
+    directions = list(np.diag(sizes))
     if not isinstance(design.observer, LinearObserver) or expects_fault_courses(design):
-        return np.array(found), tuple(names)
+        return np.array(directions), tuple(names)
     errors = error_model(design)
     observer, plant = errors.observer, errors.plant
     c, direct, *_ = errors.output(slice(len(observer.state_names), None))
@@ -266,14 +272,14 @@ def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -
     try:
         gains = (direct - c @ np.linalg.solve(held, errors.fault))[kept]
     except np.linalg.LinAlgError:
-        return np.array(found), tuple(names)
+        return np.array(directions), tuple(names)
     for name, gain in zip(plant.fault_names, gains.T, strict=True):
         scaled = gain / sizes
         size = float(np.linalg.norm(scaled))
         if np.isfinite(size) and size > 0.0 and float(np.abs(scaled).max()) < OWN_DIRECTION * size:
-            found.append(gain / size)
+            directions.append(gain / size)
             names.append(f"fault {name}")
-    return np.array(found), tuple(names)
+    return np.array(directions), tuple(names)
 
 
 def expects_fault_courses(design: ObserverDesign) -> bool:
@@ -292,12 +298,12 @@ def independent(rows: FloatArray) -> list[int]:
     kept: list[int] = []
     basis = np.zeros((len(rows), 0))
     for i, column in enumerate(rows.T):
-        left = column - column.mean()
-        power = float(left @ left)
+        residual = column - column.mean()
+        power = float(residual @ residual)
         # Twice, as once leaves rounding of large parts.
         for _ in range(2):
-            left = left - basis @ (basis.T @ left)
-        if power > 0.0 and float(left @ left) > LEAST_NEW * power:
+            residual = residual - basis @ (basis.T @ residual)
+        if power > 0.0 and float(residual @ residual) > LEAST_NEW * power:
             kept.append(i)
-            basis = np.column_stack([basis, left / np.linalg.norm(left)])
+            basis = np.column_stack([basis, residual / np.linalg.norm(residual)])
     return kept

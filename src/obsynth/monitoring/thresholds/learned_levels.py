@@ -84,13 +84,13 @@ def _levels_by_age(parts: Sequence[tuple[Statistics, FloatArray]], every: float)
     """Return what likelihood ratios of each age are to be divided by, ``(2 s, ages)``, of mean one over ages, from
     normal streams: statistics and white rows ``(1, n, m)`` of each."""
     rate = min(max(every * RARER[0], AGES_APART * max(AGES)), sum(e.shape[1] - SETTLING for _, e in parts) / OBSERVED)
-    found = []
+    by_age = []
     for i in range(2 * len(parts[0][0].told)):
         runs = [list(likelihood_ratios(e, *(part[i] for part in judged.responses()))) for judged, e in parts]
         own = [level_of(np.concatenate(ages), rate) for ages in zip(*runs, strict=True)]
         # Ages for which the streams are too short are as the oldest of them.
-        found.append(own + own[-1:] * (len(AGES) - len(own)))
-    levels = np.maximum(found, SMALLEST) ** OWN_LEVEL_SHARE
+        by_age.append(own + own[-1:] * (len(AGES) - len(own)))
+    levels = np.maximum(by_age, SMALLEST) ** OWN_LEVEL_SHARE
     return read_only(levels / levels.mean(axis=1, keepdims=True))
 
 
@@ -188,13 +188,13 @@ def drawn_places(n: int, runs: int, rows: int, rng: np.random.Generator) -> NDAr
 
 def drawn_rows(e: FloatArray, places: NDArray[np.int64], rng: np.random.Generator) -> FloatArray:
     """Return the white rows ``(n, m)`` at places ``(runs, rows)``, the largest drawn from their tail."""
-    found, radii = e[places], np.linalg.norm(e, axis=1)
+    rows, radii = e[places], np.linalg.norm(e, axis=1)
     tail = Tail.of(radii)
     far = radii[places] > tail.begin
     # Numbers in (0, 1]: zero would be infinitely far.
     longer = tail.drawn(1.0 - rng.random(int(far.sum())))
-    found[far] *= (longer / radii[places][far])[:, None]
-    return np.asarray(found)
+    rows[far] *= (longer / radii[places][far])[:, None]
+    return np.asarray(rows)
 
 
 def is_conformal(rows: int, every: float) -> bool:
@@ -213,13 +213,13 @@ def conformal_levels(
     """
     half = len(x) // 2
     model = fitted_autoregression(x[:half])
-    found = replace(statistics, model=model)
+    fitted = replace(statistics, model=model)
     rng, e = np.random.default_rng(0), model.whitened(x[:half])
     e = e[np.isfinite(e).all(axis=1)]
     whites = drawn_rows(e, drawn_places(len(e), AGE_STREAMS, LEAST_STREAM_ROWS, rng), rng)
-    found = replace(found, age_levels=_levels_by_age([(found, white[None]) for white in whites], every))
+    fitted = replace(fitted, age_levels=_levels_by_age([(fitted, white[None]) for white in whites], every))
     usual = None if scores is None else _usual(scores.chosen(slice(half)))
-    runs = normal_statistics(x, found, scores, usual)[:, None]
+    runs = normal_statistics(x, fitted, scores, usual)[:, None]
     first, second = (np.moveaxis(part, 1, 0) for part in (runs[..., :half], runs[..., half:]))
     own, _ = _union(first, every, half - SETTLING)
     union = (second / own[None, :, None]).max(axis=1)
@@ -227,8 +227,8 @@ def conformal_levels(
     levels = _of_deviations(own, usual) * exchangeable_level(union, rows, every)
     if len(logs) < 2:
         # Where many rows of one log lie elsewhere, they have raised these levels already.
-        return found, read_only(levels)
-    return with_bands(found, x, scores, logs), with_room_for_offsets(levels, found, x, logs)
+        return fitted, read_only(levels)
+    return with_bands(fitted, x, scores, logs), with_room_for_offsets(levels, fitted, x, logs)
 
 
 def _of_faults(scores: Scores, centre: FloatArray, sizes: FloatArray, bands: FloatArray | None = None) -> FloatArray:
@@ -260,44 +260,46 @@ def learned_levels(
     rows = int(np.clip(ROWS_PER_ALARM * every, LEAST_STREAM_ROWS, MOST_STREAM_ROWS))
     beside = None if scores is None else ScoreModel.of(scores)
     parts = [model.whitened(x), *(() if beside is None else beside.whites)]
-    known = np.asarray(np.isfinite(np.hstack(parts)).all(axis=1))
-    known[: max(model.order, *(() if beside is None else (beside.model.order, beside.followed.order)), 0)] = False
-    e, *others = [part[known] - part[known].mean(axis=0) for part in parts]
+    complete = np.asarray(np.isfinite(np.hstack(parts)).all(axis=1))
+    complete[: max(model.order, *(() if beside is None else (beside.model.order, beside.followed.order)), 0)] = False
+    e, *beside_whites = [part[complete] - part[complete].mean(axis=0) for part in parts]
     # What is drawn together happened together.
     places = drawn_places(len(e), STREAMS, BURN_IN_ROWS + n + rows, rng)
     streams = model.simulated(drawn_rows(e, places, rng))
     of_faults = None
     if beside is not None:
-        of_faults = beside.drawn([drawn_rows(part, places, rng) for part in others], np.flatnonzero(known)[places])
-    known = np.asarray(np.isfinite(x).all(axis=1))
-    normal = np.arange(BURN_IN_ROWS, BURN_IN_ROWS + n)[known]
+        of_faults = beside.drawn(
+            [drawn_rows(part, places, rng) for part in beside_whites], np.flatnonzero(complete)[places]
+        )
+    complete = np.asarray(np.isfinite(x).all(axis=1))
+    normal = np.arange(BURN_IN_ROWS, BURN_IN_ROWS + n)[complete]
     parts = []
     for stream in streams:
-        seen = np.where(known[:, None], stream[BURN_IN_ROWS : BURN_IN_ROWS + n], np.nan)
-        again = fitted_autoregression(seen, order=model.order)
+        rows_again = np.where(complete[:, None], stream[BURN_IN_ROWS : BURN_IN_ROWS + n], np.nan)
+        again = fitted_autoregression(rows_again, order=model.order)
         parts.append((replace(statistics, model=again, estimates=()), again.whitened(stream[None, -rows:])))
     by_age = _levels_by_age(parts[:AGE_STREAMS], every)
-    statistics, found = replace(statistics, age_levels=by_age), []
+    statistics, values_of_streams = replace(statistics, age_levels=by_age), []
     for i, (judged, e) in enumerate(parts):
         values = replace(judged, age_levels=by_age).of_rows(e)[:, 0]
         if of_faults is not None:
             score, information, followed = (part[i] for part in of_faults)
-            said = Scores(score, information, followed, np.ones_like(followed))
-            centre = said.chosen(normal).centre()
+            drawn = Scores(score, information, followed, np.ones_like(followed))
+            centre = drawn.chosen(normal).centre()
             # Estimates follow from what samples before them said, and have a centre of their own.
-            said = replace(said, theta=followed - followed[normal].mean(axis=0) + centre)
-            sizes = np.mean(said.chosen(normal).followed(centre) ** 2, axis=0)
-            values = np.concatenate([values, _of_faults(said.chosen(slice(-rows, None)), centre, sizes)])
-        found.append(values)
-    runs = np.array(found)
+            drawn = replace(drawn, theta=followed - followed[normal].mean(axis=0) + centre)
+            sizes = np.mean(drawn.chosen(normal).followed(centre) ** 2, axis=0)
+            values = np.concatenate([values, _of_faults(drawn.chosen(slice(-rows, None)), centre, sizes)])
+        values_of_streams.append(values)
+    runs = np.array(values_of_streams)
     total = runs[:, 0, SETTLING:].size
     seen_rate = min(every, total / OBSERVED)
     own, union = _union(runs, seen_rate, total)
     level = level_of(union, seen_rate)
     # One stream alone shows less rare alarms than all of them.
-    shown = min(seen_rate, rows / ROWS_PER_ALARM)
-    each = np.array([level_of(stream, shown) for stream in union])
-    sure = max(1.0, float(np.quantile(each, SURE_STREAMS)) / level_of(union, shown))
+    shown_rate = min(seen_rate, rows / ROWS_PER_ALARM)
+    of_streams = np.array([level_of(stream, shown_rate) for stream in union])
+    sure = max(1.0, float(np.quantile(of_streams, SURE_STREAMS)) / level_of(union, shown_rate))
     if every > seen_rate:
         # Beyond what the streams show, levels rise by the same amount for each factor between rates.
         before = level_of(union, seen_rate / OBSERVED)
@@ -317,10 +319,10 @@ def exchangeable_level(values: FloatArray, rows: int, every: float) -> float:
     share of what is between them, this leaves the mean at most as stated for tails from even to heavy ones.
     """
     allowed = max(rows / every - 1.0, 0.0)
-    whole, size = int(allowed), values[:, SETTLING:].size
+    alarms_allowed, size = int(allowed), values[:, SETTLING:].size
     # Halves, as a quotient of a quotient may be less than the whole number.
-    higher, lower = (level_of(values, size / (count + 0.5)) for count in (whole, whole + 1))
-    return higher - (allowed - whole) * (higher - lower)
+    higher, lower = (level_of(values, size / (count + 0.5)) for count in (alarms_allowed, alarms_allowed + 1))
+    return higher - (allowed - alarms_allowed) * (higher - lower)
 
 
 def normal_statistics(
@@ -329,10 +331,10 @@ def normal_statistics(
     """Return the statistics of rows ``(n, m)`` without faults as they came, ``(k, n)``, of faults in units of what is
     ``usual``."""
     # A row that is missing adds no evidence.
-    found = statistics.of_rows(np.nan_to_num(statistics.model.whitened(x[None])))[:, 0]
+    values = statistics.of_rows(np.nan_to_num(statistics.model.whitened(x[None])))[:, 0]
     if scores is None or usual is None:
-        return found
-    return np.concatenate([found, _of_faults(scores, *usual, statistics.fault_bands)])
+        return values
+    return np.concatenate([values, _of_faults(scores, *usual, statistics.fault_bands)])
 
 
 def _of_deviations(own: FloatArray, usual: tuple[FloatArray, FloatArray] | None) -> FloatArray:
@@ -362,9 +364,11 @@ def lasting_sizes(white: FloatArray) -> float:
     sizes = np.sum(white**2, axis=1)
     scores = normal_scores(sizes[np.isfinite(sizes)])
     products = [float(scores[lag:] @ scores[:-lag]) for lag in range(1, SIZE_LAGS + 1)]
-    found = float(np.mean(products)) / max(float(scores @ scores), SMALLEST)
+    autocorrelation = float(np.mean(products)) / max(float(scores @ scores), SMALLEST)
     return (
-        found if found > max(SIZE_AUTOCORRELATION, CHANCE_DEVIATIONS / float(np.sqrt(SIZE_LAGS * len(scores)))) else 0.0
+        autocorrelation
+        if autocorrelation > max(SIZE_AUTOCORRELATION, CHANCE_DEVIATIONS / float(np.sqrt(SIZE_LAGS * len(scores))))
+        else 0.0
     )
 
 
@@ -396,12 +400,12 @@ def with_bands(statistics: Statistics, x: FloatArray, scores: Scores | None, log
     """Return statistics in which no offset alarms that the logs, of rows ``(n, m)``, do not exclude."""
     logs = logs or (slice(None),)
     e = statistics.model.whitened(x)
-    known = np.asarray(np.isfinite(e).all(axis=1))
+    complete = np.asarray(np.isfinite(e).all(axis=1))
     lasting = statistics.responses()[0][: len(statistics.told), -1]
     powers = np.sum(lasting**2, axis=1)
-    values = np.where(known[:, None], np.nan_to_num(e) @ lasting.T, 0.0)
+    values = np.where(complete[:, None], np.nan_to_num(e) @ lasting.T, 0.0)
     bands = [
-        offset_bound(column, np.asarray(known * power), logs) for column, power in zip(values.T, powers, strict=True)
+        offset_bound(column, np.asarray(complete * power), logs) for column, power in zip(values.T, powers, strict=True)
     ]
     of_faults = None
     if scores is not None:
@@ -415,11 +419,11 @@ def with_room_for_offsets(
 ) -> FloatArray:
     """Return levels of T2 and MEWMA raised by what offsets add to them."""
     e = statistics.model.whitened(x)
-    known = np.asarray(np.isfinite(e).all(axis=1))
+    complete = np.asarray(np.isfinite(e).all(axis=1))
     logs = logs or (slice(None),)
-    seen = np.where(known[:, None], np.nan_to_num(e), 0.0)
-    size = float(np.linalg.norm([offset_bound(column, known.astype(np.float64), logs) for column in seen.T]))
+    white = np.where(complete[:, None], np.nan_to_num(e), 0.0)
+    size = float(np.linalg.norm([offset_bound(column, complete.astype(np.float64), logs) for column in white.T]))
     gains = np.sqrt([1.0, *((2.0 - share) / share for share in FORGETTING)])
-    found = levels.copy()
-    found[: len(gains)] = (np.sqrt(found[: len(gains)]) + gains * size) ** 2
-    return read_only(found)
+    raised = levels.copy()
+    raised[: len(gains)] = (np.sqrt(raised[: len(gains)]) + gains * size) ** 2
+    return read_only(raised)

@@ -90,10 +90,10 @@ class LearnedRule(Rule):
         model = self._model
         white, means = np.zeros((max(AGES), model.channels)), np.zeros((len(FORGETTING), model.channels))
         effects = NO_EFFECTS if self.effects is None else self.effects.init()
-        found = LearnedState(np.tile(model.mean, (model.order, 1)), white, means, effects=effects)
+        state = LearnedState(np.tile(model.mean, (model.order, 1)), white, means, effects=effects)
         if self._walk is None:
-            return found
-        return found._replace(before=before_any(len(self._walk)), scores=np.zeros((max(AGES), 2 * len(self._walk))))
+            return state
+        return state._replace(before=before_any(len(self._walk)), scores=np.zeros((max(AGES), 2 * len(self._walk))))
 
     def step(self, state: LearnedState, sample: Sample) -> tuple[LearnedState, RuleOutput]:
         """Return the largest statistic in units of its level, one as threshold, and the fault whose step it is."""
@@ -102,21 +102,29 @@ class LearnedRule(Rule):
             state = self._added(state, None)
         state = state._replace(last=sample.time, taken=state.taken + 1)
         state = self._scored(state, sample.said, max(missing, 0))
-        found = watched_values(sample.residuals, sample.said)
-        whole = found is not None and sample.deciding and bool(np.isfinite(found[self._usual]).all())
-        shown = None if found is None or not sample.deciding else self._completed(state, found, whole=whole)
-        counts = shown is not None and state.taken > self.learned.settling
+        values_of_row = watched_values(sample.residuals, sample.said)
+        complete = values_of_row is not None and sample.deciding and bool(np.isfinite(values_of_row[self._usual]).all())
+        evidence = (
+            None
+            if values_of_row is None or not sample.deciding
+            else self._completed(state, values_of_row, complete=complete)
+        )
+        counts = evidence is not None and state.taken > self.learned.settling
         most, varying = math.inf if counts else 0.0, isinstance(sample.said, Evidence)
         if counts and state.waiting and isinstance(sample.said, Evidence):
             most = float(np.linalg.norm(sample.said.whitened)) / self.learned.innovation
-        if not whole and varying:
+        if not complete and varying:
             state = state._replace(waiting=self._model.order + 1)
         state = state._replace(waiting=max(state.waiting - 1, 0))
-        if found is None or not (whole or (varying and (counts or np.isfinite(found[self._places]).all()))):
+        if values_of_row is None or not (
+            complete or (varying and (counts or np.isfinite(values_of_row[self._places]).all()))
+        ):
             return self._followed(self._added(state, None), sample.said), RuleOutput(math.nan, math.nan)
-        seen = found[self._places]
-        kept = seen if shown is None else np.where(np.isfinite(seen), seen, shown)
-        state = self._followed(self._added(state, kept, most, shown), sample.said, np.isfinite(seen), counts=counts)
+        watched = values_of_row[self._places]
+        kept = watched if evidence is None else np.where(np.isfinite(watched), watched, evidence)
+        state = self._followed(
+            self._added(state, kept, most, evidence), sample.said, np.isfinite(watched), counts=counts
+        )
         if not counts:
             return state, RuleOutput(math.nan, math.nan)
         # Products of numbers that overflow have passed any level.
@@ -131,12 +139,14 @@ class LearnedRule(Rule):
             values = np.concatenate([first, smooth, ratios, changes.max(axis=0), squares]) / self.learned.levels
         values = np.where(np.isnan(values), np.inf, values)
         # Faults are compared without what their slow offsets explain: each has its own.
-        which = self._fault(found, ratios) if self._walk is None else most_likely_change(self._changes(state, 0.0))
+        fault = (
+            self._fault(values_of_row, ratios) if self._walk is None else most_likely_change(self._changes(state, 0.0))
+        )
         ranking = None
         if self.effects is not None and values.max() > 1.0:
             effects, explained = self.effects.explained(state.effects)
             state, ranking = state._replace(effects=effects), ranked(self.effects.hypotheses, explained)
-        return state, RuleOutput(float(values.max()), 1.0, which, (), ranking)
+        return state, RuleOutput(float(values.max()), 1.0, fault, (), ranking)
 
     def _followed(
         self, state: LearnedState, said: Any, seen: NDArray[np.bool_] | None = None, *, counts: bool = False
@@ -150,8 +160,8 @@ class LearnedRule(Rule):
         """Return the state with what a sample says of the faults."""
         if self._walk is None or not isinstance(said, Evidence):
             return state
-        before, found = sample_score(state.before, said, self._walk, missing + 1)
-        row = np.concatenate([found.away(self.learned.centres), np.diag(found.information)])
+        before, scores = sample_score(state.before, said, self._walk, missing + 1)
+        row = np.concatenate([scores.away(self.learned.centres), np.diag(scores.information)])
         gone = min(missing, max(AGES))
         kept = np.vstack([state.scores, np.zeros((gone, len(row))), row])[-max(AGES) :]
         return state._replace(before=before, scores=kept)
@@ -172,15 +182,17 @@ class LearnedRule(Rule):
         away = beyond(said.theta - self.learned.centres, self._bands)
         return np.asarray(away**2 / np.diag(said.parameter_covariance))
 
-    def _fault(self, found: FloatArray, ratios: FloatArray) -> int | None:
+    def _fault(self, watched: FloatArray, ratios: FloatArray) -> int | None:
         """Return the fault whose step or ramp explains most, or whose estimate is furthest from where it was."""
         names, count = self.learned.columns, len(self.learned.scales)
-        told = self.learned.statistics.told[int(np.argmax(ratios)) % len(self.learned.statistics.told)]
-        if told.startswith("fhat["):
-            return int(self._places[names.index(told)])
-        if told in self._faults:
-            return self._faults[told]
-        return None if not count else int(np.argmax(np.abs(found[:count] - self.learned.centres) / self.learned.scales))
+        signature = self.learned.statistics.told[int(np.argmax(ratios)) % len(self.learned.statistics.told)]
+        if signature.startswith("fhat["):
+            return int(self._places[names.index(signature)])
+        if signature in self._faults:
+            return self._faults[signature]
+        return (
+            None if not count else int(np.argmax(np.abs(watched[:count] - self.learned.centres) / self.learned.scales))
+        )
 
     def _predicted(self, state: LearnedState) -> FloatArray:
         """Return what the autoregression says of the next row."""
@@ -188,29 +200,31 @@ class LearnedRule(Rule):
         rows = zip(model.A, state.past, strict=True)
         return np.asarray(model.offset + sum((a @ row for a, row in rows), np.zeros(model.channels)))
 
-    def _completed(self, state: LearnedState, found: FloatArray, *, whole: bool) -> FloatArray | None:
+    def _completed(self, state: LearnedState, values: FloatArray, *, complete: bool) -> FloatArray | None:
         """Return the watched values of a row; where some are missing, as those of sensors that are there make them most
         likely, and `None` without any."""
-        x = found[self._places]
-        seen = self._residual & np.isfinite(x)
-        if whole or not (self.by_sensor and seen.any()):
-            return x if whole else None
+        x = values[self._places]
+        measured = self._residual & np.isfinite(x)
+        if complete or not (self.by_sensor and measured.any()):
+            return x if complete else None
         predicted, precision = self._predicted(state), self._model.whitener.T @ self._model.whitener
-        away = (x - predicted)[seen]
-        rest = np.linalg.solve(precision[np.ix_(~seen, ~seen)], -precision[np.ix_(~seen, seen)] @ away)
-        completed = np.where(seen, x, predicted)
-        completed[~seen] += rest
+        away = (x - predicted)[measured]
+        expected = np.linalg.solve(
+            precision[np.ix_(~measured, ~measured)], -precision[np.ix_(~measured, measured)] @ away
+        )
+        completed = np.where(measured, x, predicted)
+        completed[~measured] += expected
         return completed
 
     def _added(
-        self, state: LearnedState, x: FloatArray | None, most: float = 0.0, shown: FloatArray | None = None
+        self, state: LearnedState, x: FloatArray | None, most: float = 0.0, evidence: FloatArray | None = None
     ) -> LearnedState:
         """Return the state after a row, or after one that is as predicted (`None`): of a norm of ``most`` at most, with
-        what is ``shown`` of it for evidence (``(m,)``, as it is by default)."""
+        its values as ``evidence`` (``(m,)``, by default the row itself)."""
         model, predicted = self._model, self._predicted(state)
-        shown = x if shown is None else shown
+        evidence = x if evidence is None else evidence
         with np.errstate(over="ignore", invalid="ignore"):
-            e = np.zeros(model.channels) if shown is None or not most else model.whitener @ (shown - predicted)
+            e = np.zeros(model.channels) if evidence is None or not most else model.whitener @ (evidence - predicted)
             size = float(np.linalg.norm(e))
             e = e * (most / size) if size > most else e
         shares = np.array(FORGETTING)[:, None]

@@ -56,8 +56,8 @@ class Statistics:
         """Return what steps, then ramps, of each signature do to e: their first p + 1 rows ``(2 s, p + 1, m)``, and
         what each row after that adds ``(2 s, m)``."""
         gone = np.concatenate([np.zeros((1, *np.eye(self.model.channels).shape)), np.cumsum(self.model.A, axis=0)])
-        left = self.signatures[:, None, :] - np.einsum("jab,sb->sja", gone, self.signatures)
-        steps = np.asarray(left @ self.model.whitener.T)
+        remaining = self.signatures[:, None, :] - np.einsum("jab,sb->sja", gone, self.signatures)
+        steps = np.asarray(remaining @ self.model.whitener.T)
         # A ramp is a sum of steps, of which one more begins in each row.
         return (
             np.concatenate([steps, np.cumsum(steps, axis=1)]),
@@ -88,29 +88,29 @@ class Statistics:
         """Return weights of the last ``max(AGES)`` rows of e, oldest first, for steps and ramps of each signature and
         age, of which the squares add up to one over the level of this age: ``(2 s, ages, rows, m)``."""
         long = self.long_responses()
-        found = np.zeros((len(long), len(AGES), max(AGES), self.model.channels))
+        weights = np.zeros((len(long), len(AGES), max(AGES), self.model.channels))
         for i, age in enumerate(AGES):
             part = long[:, :age]
             size = np.sqrt(np.maximum(np.sum(part**2, axis=(1, 2)), SMALLEST))
-            found[:, i, max(AGES) - age :] = part / size[:, None, None]
-        return np.asarray(found / np.sqrt(self.levels_by_age)[:, :, None, None])
+            weights[:, i, max(AGES) - age :] = part / size[:, None, None]
+        return np.asarray(weights / np.sqrt(self.levels_by_age)[:, :, None, None])
 
     def of_rows(self, e: FloatArray) -> FloatArray:
         """Return the statistics of white rows ``(runs, n, m)``: all but those of estimates, ``(k, runs, n)``."""
         from scipy.signal import lfilter
 
-        found = [np.sum(e**2, axis=-1)]
+        statistics = [np.sum(e**2, axis=-1)]
         for share in FORGETTING:
             smooth = lfilter([share], [1.0, share - 1.0], e, axis=1)
-            found.append((2.0 - share) / share * np.sum(smooth**2, axis=-1))
+            statistics.append((2.0 - share) / share * np.sum(smooth**2, axis=-1))
         parts = (*self.responses(), self.levels_by_age, self.offset_effects())
         for shape, slope, levels, effects in zip(*parts, strict=True):
             largest = np.zeros(e.shape[:2])
             for ratio, level, effect in zip(likelihood_ratios(e, shape, slope), levels, effects, strict=False):
                 far = ratio if effect == 0.0 else np.maximum(np.sqrt(ratio) - effect, 0.0) ** 2
                 np.maximum(largest, far / level, out=largest)
-            found.append(largest)
-        return np.array(found)
+            statistics.append(largest)
+        return np.array(statistics)
 
 
 def likelihood_ratios(e: FloatArray, shape: FloatArray, slope: FloatArray) -> Iterator[FloatArray]:

@@ -144,15 +144,18 @@ def learn_thresholds(
     starts: FloatArray | None = None
 
     def started(sizes: FloatArray | None = None) -> LogRun:
-        given = {} if sizes is None else {"outlier_sizes": sizes}
+        changes = {} if sizes is None else {"outlier_sizes": sizes}
         if starts is not None:
-            given["initial_covariance"] = starts
-        known = design if not given else design.replace(observer=changed(design.observer, **given))
-        return LogRun(known, columns, scales, gap=gap, warm_up=warm_up)
+            changes["initial_covariance"] = starts
+        own = design if not changes else design.replace(observer=changed(design.observer, **changes))
+        return LogRun(own, columns, scales, gap=gap, warm_up=warm_up)
 
     first_run = started()
-    read = [_read(one, first_run.signals, time_zone, time_unit) for one in several(data)]
-    log, borders = np.vstack([one for one, _ in read]), np.cumsum([0, *(len(one) for one, _ in read)])
+    read = [_read(log_part, first_run.signals, time_zone, time_unit) for log_part in several(data)]
+    log, borders = (
+        np.vstack([log_part for log_part, _ in read]),
+        np.cumsum([0, *(len(log_part) for log_part, _ in read)]),
+    )
     ends = list(zip(borders[:-1].tolist(), borders[1:].tolist(), strict=True))
     if len(log) < LEAST_NORMAL:
         raise SpecError(f"The log has {len(log)} rows: give {LEAST_NORMAL} and more.", path="normal")
@@ -166,47 +169,47 @@ def learn_thresholds(
     parts = [log[a:b] for a, b in ends if a < b]
     unrepeated = [Unrepeated(repeats).of_rows(part[:, before:], rising(part[:, 0].tolist()))[0] for part in parts]
     log = np.hstack([log[:, :before], np.vstack(unrepeated)])
-    said, sizes = _sized(design, started, log, ends)
-    starts = started_anywhere(design.observer, said.starts)
+    output, sizes = _output_and_outlier_sizes(design, started, log, ends)
+    starts = started_anywhere(design.observer, output.starts)
     if starts is not None:
-        said = _said(design, lambda: started(sizes), log, ends)
-    dt = design.observer.dt or float(np.median(np.diff(said.times)))
+        output = _output_of_logs(design, lambda: started(sizes), log, ends)
+    dt = design.observer.dt or float(np.median(np.diff(output.times)))
     every = rows_per_alarm(false_alarms, dt)
-    said, pairs = _without_pairs(design, lambda: started(sizes), log, ends, said, every)
+    output, pairs = _without_pairs(design, lambda: started(sizes), log, ends, output, every)
     wanted = [(a + first, a + last) for a, b in ends for first, last in [parsed_rows(rows, b - a)]]
-    chosen = np.any([(first <= said.numbers) & (said.numbers < last) for first, last in wanted], axis=0)
-    dt = design.observer.dt or float(np.median(np.diff(said.times[chosen])))
-    watched, scores = said.watched[chosen], None if said.scores is None else said.scores.chosen(chosen)
-    squares = said.squares[chosen]
+    chosen = np.any([(first <= output.numbers) & (output.numbers < last) for first, last in wanted], axis=0)
+    dt = design.observer.dt or float(np.median(np.diff(output.times[chosen])))
+    watched, scores = output.watched[chosen], None if output.scores is None else output.scores.chosen(chosen)
+    squares = output.squares[chosen]
     squares = squares[np.isfinite(squares) & (squares > 0.0)]
-    places = np.searchsorted(said.numbers[chosen], borders)
+    places = np.searchsorted(output.numbers[chosen], borders)
     logs = tuple(slice(a, b) for a, b in zip(places[:-1].tolist(), places[1:].tolist(), strict=True))
-    given: dict[str, Any] = {
+    options: dict[str, Any] = {
         "every": rows_per_alarm(false_alarms, dt), "dt": dt, "seed": seed, "pairs": pairs, "logs": logs,
         "repeats": repeats,
     }  # fmt: skip
-    found = thresholds_from_rows(
+    learned = thresholds_from_rows(
         design,
         watched,
         scores=scores,
         innovation=float(np.sqrt(squares.mean())) if squares.size else 1.0,
         outlier_sizes=sizes,
         initial_covariance=starts,
-        **given,
+        **options,
     )
-    raised = raised_levels(design, found, watched, scores, **given)
+    raised = raised_levels(design, learned, watched, scores, **options)
     outputs = first_run.signals.names[first_run.signals.inputs :]
     by_name = dict(zip(outputs, stuck, strict=True))
     notes = notes_of_normal_rows(
-        raised, said.numbers[chosen], log[:, 0], wanted, by_name, ends, [one for _, one in read]
+        raised, output.numbers[chosen], log[:, 0], wanted, by_name, ends, [log_part for _, log_part in read]
     )
-    white = found.statistics.model.whitened(watched_rows(design, found, watched))
-    inputs = log[said.numbers[chosen], 1 : 1 + first_run.signals.inputs]
-    divided = notes_of_starts(divided_at_starts(design.observer, scores if found.statistics.estimates else None))
-    return replace(found, notes=(*notes, *notes_of_sizes(white, inputs), *divided))
+    white = learned.statistics.model.whitened(watched_rows(design, learned, watched))
+    inputs = log[output.numbers[chosen], 1 : 1 + first_run.signals.inputs]
+    divided = notes_of_starts(divided_at_starts(design.observer, scores if learned.statistics.estimates else None))
+    return replace(learned, notes=(*notes, *notes_of_sizes(white, inputs), *divided))
 
 
-def _sized(
+def _output_and_outlier_sizes(
     design: ObserverDesign,
     started: Callable[[FloatArray | None], LogRun],
     log: FloatArray,
@@ -217,18 +220,18 @@ def _sized(
     run = started(None)
     if not (isinstance(run.observer, SteppingLogObserver) and run.observer.gates
             and has_innovations_by_sensor(design.observer)):  # fmt: skip
-        return _said(design, lambda: started(None), log, ends), None
+        return _output_of_logs(design, lambda: started(None), log, ends), None
     ny = len(run.observer.output_names)
     stated = run.observer.observer.outlier_sizes
-    whole = _said(design, lambda: started(np.zeros(ny)), log, ends)
+    output = _output_of_logs(design, lambda: started(np.zeros(ny)), log, ends)
     usual = checked_limit("gate", run.observer.observer.outlier_limit) * np.sqrt(
-        np.nanmean(whole.watched[:, -ny:] ** 2, axis=0)
+        np.nanmean(output.watched[:, -ny:] ** 2, axis=0)
     )
     inputs = np.asarray(np.isfinite(log[:, 1:-ny]).all(axis=1))
-    sizes = learned_sizes(wrong_samples(whole.refused, inputs), usual, np.zeros(ny) if stated is None else stated)
+    sizes = learned_sizes(wrong_samples(output.refused, inputs), usual, np.zeros(ny) if stated is None else stated)
     if not sizes.any():
-        return (whole, None) if stated is None else (whole, sizes)
-    return _said(design, lambda: started(sizes), log, ends), None if stated is not None and np.array_equal(
+        return (output, None) if stated is None else (output, sizes)
+    return _output_of_logs(design, lambda: started(sizes), log, ends), None if stated is not None and np.array_equal(
         sizes, stated
     ) else sizes
 
@@ -237,14 +240,14 @@ def wrong_samples(refused: Sequence[FloatArray], known: NDArray[np.bool_]) -> li
     """Return how far off the samples of each output were that a gate left out, and none of which it believed later, by
     its memory after each row ``(4, ny)``; ``known (n,)``: whether the inputs of the row were."""
     memory = np.array(refused)
-    found = []
-    for row, total, left, believed in np.moveaxis(memory, 2, 0).transpose(0, 2, 1):
+    distances = []
+    for row, total, residual, believed in np.moveaxis(memory, 2, 0).transpose(0, 2, 1):
         gone, count = np.diff(total, prepend=0.0) > 0.0, np.abs(row)
         # A run of samples that are far ends where the next one is near.
         run = np.cumsum((count == 0.0) | ((count == 1.0) & (np.concatenate([[0.0], count[:-1]]) != 1.0)))
         moved = np.isin(run, run[believed != 0.0])
-        found.append(np.abs(left[gone & ~moved & known & (left != 0.0)]))
-    return found
+        distances.append(np.abs(residual[gone & ~moved & known & (residual != 0.0)]))
+    return distances
 
 
 def learned_sizes(wrong: Sequence[FloatArray], usual: FloatArray, stated: FloatArray) -> FloatArray:
@@ -259,17 +262,17 @@ def learned_sizes(wrong: Sequence[FloatArray], usual: FloatArray, stated: FloatA
     """
     from scipy.special import stdtrit
 
-    found = stated.copy()
+    least_sizes = stated.copy()
     for i, sizes in enumerate(wrong):
         n = len(sizes)
         if n >= LEAST_WRONG:
             logarithms = np.log(sizes)
             reach = float(stdtrit(n - 1, 1.0 - NEARER)) * np.sqrt(1.0 + 1.0 / n) * float(logarithms.std(ddof=1))
             least = max(float(np.exp(logarithms.mean() - reach)), usual[i])
-            found[i] = min(stated[i], least) if stated[i] > 0.0 else np.sqrt(usual[i] * least)
+            least_sizes[i] = min(stated[i], least) if stated[i] > 0.0 else np.sqrt(usual[i] * least)
         elif n and sizes.min() < stated[i]:
-            found[i] = usual[i]
-    return found
+            least_sizes[i] = usual[i]
+    return least_sizes
 
 
 class _ObserverOutput(NamedTuple):
@@ -284,27 +287,27 @@ class _ObserverOutput(NamedTuple):
     refused: list[FloatArray]  # ``(4, ny)`` each: what a gate remembers after each row; empty without a gate
 
 
-def _said(
+def _output_of_logs(
     design: ObserverDesign, started: Callable[[], LogRun], log: FloatArray, ends: Sequence[tuple[int, int]]
 ) -> _ObserverOutput:
     """Return what a design says of rows ``(n, 1 + nu + ny)`` of logs that begin and end where ``ends`` says, one after
     the other with so many unknown rows between them that no statistic looks from one into another."""
     parts = []
     for first, last in ends:
-        part = _said_of(design, started(), log[first:last], first)
+        part = _output_of_log(design, started(), log[first:last], first)
         parts += [part] if last == ends[-1][1] else [part, _unknown_rows(part, last - 1)]
     if len(parts) == 1:
         return parts[0]
-    known = [part for part in parts if len(part.numbers)]
+    nonempty = [part for part in parts if len(part.numbers)]
     scores = None
-    if all(part.scores is not None for part in known):
-        columns = [[getattr(part.scores, one.name) for part in known] for one in fields(Scores)]
+    if all(part.scores is not None for part in nonempty):
+        columns = [[getattr(part.scores, field.name) for part in nonempty] for field in fields(Scores)]
         scores = Scores(*(np.concatenate(column) for column in columns))
     return _ObserverOutput(
-        np.concatenate([part.numbers for part in known]),
-        np.concatenate([part.times for part in known]),
-        np.concatenate([part.watched for part in known]),
-        np.concatenate([part.squares for part in known]),
+        np.concatenate([part.numbers for part in nonempty]),
+        np.concatenate([part.times for part in nonempty]),
+        np.concatenate([part.watched for part in nonempty]),
+        np.concatenate([part.squares for part in nonempty]),
         scores,
         np.max([part.starts for part in parts], axis=0),
         [row for part in parts for row in part.refused],
@@ -337,16 +340,16 @@ def _without_pairs(
         return said, NO_PAIRS
 
     def again(chosen: Sequence[Pair]) -> _ObserverOutput:
-        return _said(design, started, np.hstack([log[:, :before], without(y, chosen)]), ends)
+        return _output_of_logs(design, started, np.hstack([log[:, :before], without(y, chosen)]), ends)
 
     hidden = again(pairs)
     wrong = taken_back(pairs, hidden.refused, y)
-    seen = np.isfinite(y).sum(axis=0)
+    measured = np.isfinite(y).sum(axis=0)
     # All of a pair are wrong samples: those that were believed too.
     last = np.sum([hidden.refused[end - 1][1] for _, end in ends], axis=0)
-    refused = last + 2.0 * np.bincount([output for _, _, output in wrong], minlength=len(seen))
+    refused = last + 2.0 * np.bincount([output for _, _, output in wrong], minlength=len(measured))
     # A second comes with the same probability as the first, and in half of the cases on the same side.
-    chance = float(0.5 * np.sum((refused / np.maximum(seen, 1)) ** 2))
+    chance = float(0.5 * np.sum((refused / np.maximum(measured, 1)) ** 2))
     # So many pairs are what single wrong samples make at this rate, and leave most of the alarms to others.
     are_chance = chance * every <= MOST_OF_RATE and float(pdtrc(len(wrong) - 1, chance * len(y))) >= CHANCE
     if not wrong or not are_chance:
@@ -389,8 +392,13 @@ def _unknown_rows(like: _ObserverOutput, number: int) -> _ObserverOutput:
     count = max(AGES)
     scores = None
     if like.scores is not None:
-        one = like.scores
-        fills = ((one.score, 0.0), (one.information, 0.0), (one.theta, np.nan), (one.deviations, np.nan))
+        like_scores = like.scores
+        fills = (
+            (like_scores.score, 0.0),
+            (like_scores.information, 0.0),
+            (like_scores.theta, np.nan),
+            (like_scores.deviations, np.nan),
+        )
         scores = Scores(*(np.full((count, *part.shape[1:]), fill) for part, fill in fills))
     last = float(like.times[-1]) if len(like.times) else 0.0
     return _ObserverOutput(
@@ -399,11 +407,11 @@ def _unknown_rows(like: _ObserverOutput, number: int) -> _ObserverOutput:
     )  # fmt: skip
 
 
-def _said_of(design: ObserverDesign, run: LogRun, log: FloatArray, first: int) -> _ObserverOutput:
+def _output_of_log(design: ObserverDesign, run: LogRun, log: FloatArray, first: int) -> _ObserverOutput:
     """Return what a design says of rows ``(n, 1 + nu + ny)`` of one log, of which the first one has this number."""
     nothing = np.full(len(watched_names(design)), np.nan)
     residuals = [i for i, name in enumerate(run.observer.columns) if name.startswith("r[")]
-    found, refused = list[tuple[int, float, FloatArray, float, Scores]](), list[FloatArray]()
+    records, refused = list[tuple[int, float, FloatArray, float, Scores]](), list[FloatArray]()
     walk, taken = parameter_walk(design.observer), 0
     faults = len(design.observer.fault_names)
     before, nothing_of_faults = before_any(faults), np.full(faults, np.nan)
@@ -419,32 +427,32 @@ def _said_of(design: ObserverDesign, run: LogRun, log: FloatArray, first: int) -
             refused.append(gate.state.refused)
         # Rows that are missing are among those that a monitor takes.
         for row in () if last.status in STALE else (*last.missed, last):
-            said = watched_values(row.values[residuals], row.evidence)
+            watched = watched_values(row.values[residuals], row.evidence)
             taken += 1
             if row.status not in DECIDING or taken <= settling:
-                said = None
+                watched = None
             if row.status in DECIDING and starts.size:
                 starts = np.fmax(starts, np.abs(row.values[: len(starts)] - initial))
             square, score = np.nan, silent
             if walk is not None and isinstance(row.evidence, Evidence):
                 before, score = sample_score(before, row.evidence, walk, row.skipped + 1)
-            if said is not None and isinstance(row.evidence, Evidence) and np.isfinite(said).all():
+            if watched is not None and isinstance(row.evidence, Evidence) and np.isfinite(watched).all():
                 own = row.evidence.whitened
                 square = float(np.mean(own**2)) if own.size else np.nan
             # Longer gaps than the statistics look back are all the same.
             missing = min(row.skipped, max(AGES))
-            found += [(first + count, row.time, nothing, np.nan, silent)] * missing
-            found.append((first + count, row.time, nothing if said is None else said, square, score))
+            records += [(first + count, row.time, nothing, np.nan, silent)] * missing
+            records.append((first + count, row.time, nothing if watched is None else watched, square, score))
         if len(last.missed) > max(AGES):
-            del found[-1 - len(last.missed) : -1 - max(AGES)]
-    numbers, times, rows, squares, scores = zip(*found, strict=True) if found else ((),) * 5
-    both = [np.array([getattr(one, part.name) for one in scores]) for part in fields(Scores)]
+            del records[-1 - len(last.missed) : -1 - max(AGES)]
+    numbers, times, rows, squares, scores = zip(*records, strict=True) if records else ((),) * 5
+    columns = [np.array([getattr(score_of_row, part.name) for score_of_row in scores]) for part in fields(Scores)]
     return _ObserverOutput(
         np.array(numbers),
         np.array(times),
         np.array(rows),
         np.array(squares),
-        None if walk is None or not scores else Scores(*both),
+        None if walk is None or not scores else Scores(*columns),
         starts,
         refused,
     )

@@ -80,9 +80,9 @@ def statement_of(
         # Of a sampled plant disturbances may move between samples where the continuous one behind it is known.
         held = HELD if model.sampled is None else BOUNDS_AND_HELD_INPUTS
         ending = held if model.continuous is None else BOUNDS_BETWEEN_SAMPLES + ASSUMED
-    known = {name: shown(value) for name, value in numbers.items()}
+    words_of_numbers = {name: shown(value) for name, value in numbers.items()}
     kept = "" if assumed is None else assumed.bounds_phrase
-    words = (STATEMENTS[kind] + "{kept}" + ending).format(kept=f", with {kept}" if kept else "", **known)
+    words = (STATEMENTS[kind] + "{kept}" + ending).format(kept=f", with {kept}" if kept else "", **words_of_numbers)
     return (OF_ESTIMATES if estimates else "") + words
 
 
@@ -177,10 +177,10 @@ class Rule(ABC):
 
     def statistics(self, residuals: FloatArray) -> FloatArray:
         """Return the statistic ``(steps, runs)`` of records ``(steps, runs, nr)``: a scan of `fold`."""
-        state, found = self.init(), np.empty(residuals.shape[:2])
+        state, values = self.init(), np.empty(residuals.shape[:2])
         for k, row in enumerate(residuals):
-            state, found[k] = self.fold(state, row)
-        return found
+            state, values[k] = self.fold(state, row)
+        return values
 
     def passed_in(self, runs: Runs, norm: FloatArray, limits: FloatArray, onset: int | None) -> NDArray[np.bool_]:
         """Return where runs pass thresholds ``limits (steps,)``, ``(steps, runs)``; ``norm``: their statistic."""
@@ -287,25 +287,25 @@ class Monitor:
         bridged = self.rule.bridges and sample.bridged
         if not bridged and (sample.skipped or (state.decided and not sample.deciding)):
             inner = self.rule.restart(inner, sample.skipped)
-        inner, (statistic, threshold, which, more, ranking) = self.rule.step(inner, sample)
+        inner, (statistic, threshold, number, more, ranking) = self.rule.step(inner, sample)
         after = MonitorState(sample.deciding, inner)
         # A statistic that has overflowed has passed any threshold.
         if math.isnan(statistic) or not math.isfinite(threshold):
             return after, MonitorOutput(math.nan, math.nan, False, "", more)
         if statistic <= threshold + self.floor:
             return after, MonitorOutput(statistic, threshold, False, "", more)
-        if which is None and self.fault_names and np.isfinite(sample.faults).all():
-            which = int(np.argmax(np.abs(sample.faults) / self.fault_scales))
+        if number is None and self.fault_names and np.isfinite(sample.faults).all():
+            number = int(np.argmax(np.abs(sample.faults) / self.fault_scales))
         # Between faults of the plant the rule decides; sensors, and none of these, are ranked beside them.
-        of_plant = ranking is None or (which is not None and ranking.named in self.fault_names)
-        fault = self._named(which) if of_plant or ranking is None else ranking.called(self.fault_names)
+        of_plant = ranking is None or (number is not None and ranking.named in self.fault_names)
+        fault = self._named(number) if of_plant or ranking is None else ranking.called(self.fault_names)
         return after, MonitorOutput(statistic, threshold, True, fault, more, ranking)
 
-    def _named(self, which: int | None) -> str:
+    def _named(self, number: int | None) -> str:
         """Return the fault of a number, or the group of faults one of which is there for certain."""
-        if which is None or which == NOT_DISTINGUISHED:
+        if number is None or number == NOT_DISTINGUISHED:
             return ""
-        return " or ".join(self.groups[which]) if self.groups else (self.fault_names or ("",))[which]
+        return " or ".join(self.groups[number]) if self.groups else (self.fault_names or ("",))[number]
 
     def as_data(self, state: MonitorState) -> dict[str, Any]:
         """Return a state as plain data, with what it must share with the monitor that goes on from it.
@@ -409,7 +409,7 @@ class Monitor:
         values = self.statistic(watched[:, None])[:, 0]
         hits = np.flatnonzero(values > self.threshold + self.floor)
         k = int(hits[0]) if hits.size else None
-        shown = watched if self.groups else estimates.faults
-        fault = "" if k is None or not shown.shape[1] else self._named(self.isolated(shown, k))
+        compared = watched if self.groups else estimates.faults
+        fault = "" if k is None or not compared.shape[1] else self._named(self.isolated(compared, k))
         time = None if k is None else k * self.dt
         return Detection(self.kind, self.statement, read_only(values), self.threshold, k, time, fault)

@@ -40,10 +40,10 @@ def notes_of_normal_rows(
         place = next(i for i, (_, end) in enumerate(ends) if first < end)
         begin, end = (stamps[place].shown(float(times[row])) for row in (first, last))
         a, b = first - ends[place][0], last - ends[place][0]
-        which = f" of log {place + 1}" if len(ends) > 1 else ""
-        return f"row {a}{which} ({begin})" if a == b else f"rows {a} to {b}{which} ({begin} to {end})"
+        of_log = f" of log {place + 1}" if len(ends) > 1 else ""
+        return f"row {a}{of_log} ({begin})" if a == b else f"rows {a} to {b}{of_log} ({begin} to {end})"
 
-    def found() -> Iterator[str]:
+    def notes() -> Iterator[str]:
         if raised.events:
             where = ", ".join(
                 f"{event.signal} in {shown(int(numbers[event.first]), int(numbers[event.last]))}"
@@ -54,13 +54,13 @@ def notes_of_normal_rows(
                 f"smaller would pass that of {raised.statistic!r}. Look whether the plant was as usual there; if it "
                 "was not, blank its outputs in these rows, or give another log."
             )
-        told = {
+        runs_in_rows = {
             name: [(begin, end) for begin, end in runs if any(end >= a and begin < b for a, b in wanted)]
             for name, runs in stuck.items()
         }
-        yield from stuck_texts(told, shown, ": what it repeats there counts as not measured")
+        yield from stuck_texts(runs_in_rows, shown, ": what it repeats there counts as not measured")
 
-    return tuple(found())
+    return tuple(notes())
 
 
 def notes_of_sizes(white: FloatArray, inputs: FloatArray) -> tuple[str, ...]:
@@ -93,11 +93,11 @@ def _larger_at_moves(sizes: FloatArray, inputs: FloatArray) -> tuple[int, float]
     changes = np.abs(np.diff(inputs, axis=0, prepend=inputs[:1]))
     moves = np.any(changes > MOVES * np.nanmedian(changes, axis=0), axis=1)
     close = np.convolve(moves, np.ones(2 * AFTER_A_MOVE - 1), mode="same") > 0.0
-    known = np.isfinite(windows)
-    after, others = windows[known & moves[: len(windows)]], windows[known & ~close[: len(windows)]]
+    finite = np.isfinite(windows)
+    after, calm = windows[finite & moves[: len(windows)]], windows[finite & ~close[: len(windows)]]
     count = len(after)
-    if min(count, len(others)) < LEAST_MOVES:
+    if min(count, len(calm)) < LEAST_MOVES:
         return count, 0.0
-    lead = float(normal_scores(np.concatenate([after, others]))[:count].mean() * np.sqrt(count))
+    lead = float(normal_scores(np.concatenate([after, calm]))[:count].mean() * np.sqrt(count))
     large = 1.0 - LARGE_SHARE
-    return count, float(np.sqrt(np.quantile(after, large) / np.quantile(others, large))) * (lead > CHANCE_DEVIATIONS)
+    return count, float(np.sqrt(np.quantile(after, large) / np.quantile(calm, large))) * (lead > CHANCE_DEVIATIONS)

@@ -164,14 +164,14 @@ def online_monitor(
     """
     require_verified(design, unverified=unverified)
     recursive = isinstance(design.observer, (RecursiveObserver, DAEObserver))
-    given = {
+    options = {
         "scenario": scenario, "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound,
         "initial_error": initial_error, "gamma": gamma, "window": window, "false_alarms": false_alarms,
         "change": change, "sample_time": sample_time, "constants": constants, "initial_set": initial_set,
         "normal": normal, "sensor_faults": None if sensor_faults else False,
         "disturbance": None if chosen(disturbance, "disturbance", DISTURBANCES) == "any" else "held",
     }  # fmt: skip
-    window, false_alarms, change = checked_options(PARAMETER_OPTIONS if recursive else LINEAR_OPTIONS, kind, given)
+    window, false_alarms, change = checked_options(PARAMETER_OPTIONS if recursive else LINEAR_OPTIONS, kind, options)
     if kind == "learned":
         return _learned(design, normal, sensor_faults=sensor_faults)
     if isinstance(design.observer, (RecursiveObserver, DAEObserver)):
@@ -179,7 +179,7 @@ def online_monitor(
     require_no_region(design, kind)
     _require_linear_kind(kind, nominal)
     if is_guaranteed(design):
-        return data_monitor(design, kind, given)
+        return data_monitor(design, kind, options)
     design, adaptive = tolerances_of(design, constants, initial_set, initial_error)
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
@@ -208,11 +208,11 @@ def online_monitor(
         start = 0.0 if initial_error is None else float(initial_error)
         norm, limit = _norm_rule(design, kind, model, bounds, noise_bound, start, gamma, window, dt, estimates)
         if adaptive:
-            rule, told = over_box(
+            rule, promise = over_box(
                 noisy, norm, bounds, noise_bound, initial_error, initial_set, sample_time=dt, disturbance=disturbance
             )
             first = _AFTER_WARM_UP if initial_error is None else _AFTER_A_GAP
-            return made(told + (first if initial_set is None else _FROM_THE_FIRST), rule)
+            return made(promise + (first if initial_set is None else _FROM_THE_FIRST), rule)
         _require_above_rounding(kind, limit, model, bounds)
         gaps = gap_growth(model, bounds, noise_bound) if kind == "pointwise" else ""
         rule = norm.over_gaps(gaps) if isinstance(gaps, GapGrowth) else norm
@@ -257,8 +257,8 @@ def _require_above_rounding(kind: str, limit: float, model: ResidualModel, bound
     """Refuse a bound that rounding of what it is made of would pass: of disturbances that cancel."""
     plant = model.errors.plant
     # They come by the states, of which a row may show others than those that they enter.
-    entering = np.abs(model.errors.own) @ np.abs(plant.Bd) @ np.where(np.isfinite(bounds), bounds, 0.0)
-    size = float(np.linalg.norm(model.C, 2) * np.linalg.norm(entering))
+    into_error = np.abs(model.errors.own) @ np.abs(plant.Bd) @ np.where(np.isfinite(bounds), bounds, 0.0)
+    size = float(np.linalg.norm(model.C, 2) * np.linalg.norm(into_error))
     if not limit > RESIDUAL_ROUNDING_SHARE * size:
         raise SpecError(
             "As stated, no disturbance reaches the residual, and (66) bounds nothing else: use pointwise, which bounds "
@@ -329,8 +329,8 @@ def _endless_model(
     plant, observer = design.linear
     if plant.is_discrete and sample_time is not None:
         raise SpecError("sample_time is for continuous designs: this one is sampled already.", path="sample_time")
-    asked = sample_time if sample_time is not None or scenario is None else scenario.sample_time
-    dt = plant.dt if plant.is_discrete else asked
+    stated_time = sample_time if sample_time is not None or scenario is None else scenario.sample_time
+    dt = plant.dt if plant.is_discrete else stated_time
     if dt is None or not (is_finite_number(dt) and dt > 0.0):
         raise SpecError(
             "A continuous design needs the sample_time of its data, in seconds, for a threshold.", path="sample_time"

@@ -49,7 +49,7 @@ def refuse_idle(
         # The command line gives a mapping without entries where nothing is stated.
         if value is None or (isinstance(value, Mapping) and not value) or name in used:
             continue
-        kinds = [other for other, names in table.items() if name in names]
+        kinds = [other_kind for other_kind, names in table.items() if name in names]
         where = f"the monitor {' or '.join(kinds)}" if kinds else "designs of another kind"
         raise SpecError(f"{called(name)} is for {where}, not for {kind}: leave it out.", path=called(name))
 

@@ -211,46 +211,46 @@ def _chi_square(rule: ParameterRule, observer: ParameterObserver, estimates: Est
             )
         gaps = gaps - initial_parameter_response(observer, estimates, start)
     values = weighted_squares(gaps, estimates.parameter_covariances)
-    found, k = _passed("chi-square", values, np.full(len(values), rule.limit(rule.init())))
+    decision, k = _passed("chi-square", values, np.full(len(values), rule.limit(rule.init())))
     if k is None:
-        return found
+        return decision
     # The last sample at which the statistic was what it is without a change, on average or less.
     quiet = np.flatnonzero(values[:k] <= nq)
     onset = int(quiet[-1]) + 1 if quiet.size else 0
     confidence = 1.0 - min(1.0, rule.looks_of_record * float(tail(np.array(float(nq)), values[k])))
     name = estimates.parameter_names[rule.moved(gaps[k], estimates.parameter_covariances[k])]
-    return replace(found, alarm=Alarm(k, name, onset, confidence, float(values[k])))
+    return replace(decision, alarm=Alarm(k, name, onset, confidence, float(values[k])))
 
 
 def _nis(rule: ParameterRule, observer: ParameterObserver, estimates: Estimates) -> Decision:
     """Decide by the squared innovations of the latest samples."""
     states, values = _scanned(rule, observer, estimates)
-    found, k = _passed("nis", values, np.array([rule.limit(state) for state in states]))
+    decision, k = _passed("nis", values, np.array([rule.limit(state) for state in states]))
     if k is None:
-        return found
+        return decision
     state = states[k]
     confidence = 1.0 - min(1.0, rule.looks_of_record * float(tail(np.array(float(sum(state.degrees))), values[k])))
     # The split of the window after which the squares are largest against their degrees of freedom.
     excess = np.cumsum((np.array(state.squares) - state.degrees)[::-1])[::-1]
     onset = k + 1 - len(state.squares) + int(np.argmax(excess))
-    return replace(found, alarm=Alarm(k, "", onset, confidence, float(values[k])))
+    return replace(decision, alarm=Alarm(k, "", onset, confidence, float(values[k])))
 
 
 def _cusum(rule: ParameterRule, observer: ParameterObserver, estimates: Estimates) -> Decision:
     """Decide by sums of log likelihood ratios, from scores at the nominal parameters and their variances."""
     states, values = _scanned(rule, observer, estimates)
-    found, k = _passed("cusum", values, np.full(len(values), rule.limit(rule.init())))
+    decision, k = _passed("cusum", values, np.full(len(values), rule.limit(rule.init())))
     if k is None:
-        return found
+        return decision
     levels = np.stack([state.levels for state in states[: k + 1]])
-    which = int(np.argmax(levels[k]))
-    onset = int(np.max(np.flatnonzero(levels[:, which] == 0.0), initial=-1)) + 1
+    largest = int(np.argmax(levels[k]))
+    onset = int(np.max(np.flatnonzero(levels[:, largest] == 0.0), initial=-1)) + 1
     confidence = 1.0 - min(1.0, levels.shape[1] * rule.looks_of_record * float(np.exp(-values[k])))
     rows = [RecordedRow(observer, estimates, i) for i in range(onset, k + 1)]
     along = sum((row.score - row.information @ rule.nominal for row in rows), np.zeros(len(rule.nominal)))
     squares = sum((np.diag(row.information) for row in rows), np.zeros(len(rule.nominal)))
     name = estimates.parameter_names[alone(along, squares)]
-    return replace(found, alarm=Alarm(k, name, onset, confidence, float(values[k])))
+    return replace(decision, alarm=Alarm(k, name, onset, confidence, float(values[k])))
 
 
 def _scanned(
@@ -267,8 +267,8 @@ def _scanned(
 def _passed(statistic: str, values: FloatArray, thresholds: FloatArray) -> tuple[Decision, int | None]:
     """Return a decision without its alarm, and the first sample at which the threshold is passed."""
     hits = np.flatnonzero(values > thresholds)
-    found = Decision(statistic, read_only(values), read_only(thresholds), None)
-    return found, int(hits[0]) if hits.size else None
+    decision = Decision(statistic, read_only(values), read_only(thresholds), None)
+    return decision, int(hits[0]) if hits.size else None
 
 
 @dataclass(frozen=True, eq=False)

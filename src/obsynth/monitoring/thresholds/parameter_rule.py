@@ -100,8 +100,8 @@ class ParameterRule(Rule):
         if self._kind == "cusum":
             along = evidence.score - evidence.information @ self.nominal
             levels = two_sided_sums(state.levels, along, np.diag(evidence.information), self._change)
-            which = int(np.argmax(levels))
-            return state._replace(levels=levels), (float(levels[which]), which % len(self.nominal))
+            largest = int(np.argmax(levels))
+            return state._replace(levels=levels), (float(levels[largest]), largest % len(self.nominal))
         if self._kind == "chi-square":
             away, covariance = evidence.theta - self.nominal, evidence.parameter_covariance
             return state, (float(weighted_squares(away, covariance)), self.moved(away, covariance))
@@ -129,11 +129,11 @@ class ParameterRule(Rule):
         """Return the state after a sample, statistic, threshold, and the number of the parameter if it is known."""
         if not sample.deciding:
             return state, NOT_DECIDED
-        state, (value, which) = self.fold(state, cast(Any, sample.said))
+        state, (value, parameter) = self.fold(state, cast(Any, sample.said))
         if self._kind == "nis" and not sum(state.degrees):
             return state, NOT_DECIDED
         state = state._replace(looks=state.looks + 1)
-        return state, RuleOutput(value, self.limit(state), which)
+        return state, RuleOutput(value, self.limit(state), parameter)
 
     def restart(self, state: ParameterRuleState, skipped: int = 0) -> ParameterRuleState:
         """Clear the sums; the covariance of the filter accounts for missing rows."""

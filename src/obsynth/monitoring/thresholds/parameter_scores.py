@@ -58,11 +58,11 @@ class Scores:
     @property
     def determine(self) -> bool:
         """Whether all samples ``(n, nf)`` together determine every parameter, whatever its unit."""
-        whole = self.information.sum(axis=0)
-        units = np.sqrt(np.maximum(np.diag(whole), 0.0))
-        if not (np.isfinite(whole).all() and (units > 0.0).all()):
+        total = self.information.sum(axis=0)
+        units = np.sqrt(np.maximum(np.diag(total), 0.0))
+        if not (np.isfinite(total).all() and (units > 0.0).all()):
             return False
-        return rounding_rank(whole / np.outer(units, units)) == len(units)
+        return rounding_rank(total / np.outer(units, units)) == len(units)
 
     def centre(self) -> FloatArray:
         """Return the parameters that the samples make most likely ``(nf,)``, if they never change."""
@@ -100,11 +100,11 @@ def sample_score(before: FloatArray, evidence: Evidence, walk: FloatArray, rows:
         except np.linalg.LinAlgError:
             return after, nothing
         added = own - prior
-        found = replace(nothing, score=own @ theta - prior @ before[0], information=0.5 * (added + added.T))
+        score_of_sample = replace(nothing, score=own @ theta - prior @ before[0], information=0.5 * (added + added.T))
         # A covariance that has grown beside its walk has started again: what it was before says nothing of this.
         if not (np.isfinite(added).all() and (np.diag(added) >= -LEAST_ADDED * np.diag(own)).all()):
             return after, nothing
-    return after, found if (np.diag(added) > LEAST_ADDED * np.diag(own)).any() else nothing
+    return after, score_of_sample if (np.diag(added) > LEAST_ADDED * np.diag(own)).any() else nothing
 
 
 def roots(information: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -129,7 +129,7 @@ def change_ratios(
     widths = np.zeros((away.shape[1], 1)) if bands is None else bands[:, None]
     n, nf = away.shape
     sums, powers = (np.vstack([np.zeros((1, nf)), np.cumsum(part, axis=0)]) for part in (away, own))
-    found = np.zeros((nf, n))
+    ratios = np.zeros((nf, n))
     for age in ages:
         if age > n:
             break
@@ -137,17 +137,17 @@ def change_ratios(
         with np.errstate(divide="ignore", invalid="ignore"):
             far = beyond((sums[age:] - sums[:-age]).T, widths * power)
             ratio = np.where(power > 0.0, far**2 / power, 0.0)
-        np.maximum(found[:, age - 1 :], ratio, out=found[:, age - 1 :])
-    return found
+        np.maximum(ratios[:, age - 1 :], ratio, out=ratios[:, age - 1 :])
+    return ratios
 
 
 def most_likely_change(ratios: FloatArray) -> int:
     """Return the fault of which a change alone explains the most, from twice the log likelihood ratios of changes of
     each age ``(ages, nf)``, at the most likely age; or that this does not tell the faults apart."""
-    found = ratios[int(np.argmax(ratios.max(axis=1)))]
-    best = int(np.argmax(found))
-    lead = found[best] - np.delete(found, best).max(initial=0.0)
-    return best if lead > max(DISTINGUISHED, MODEL_SHARE * found[best]) else NOT_DISTINGUISHED
+    of_age = ratios[int(np.argmax(ratios.max(axis=1)))]
+    best = int(np.argmax(of_age))
+    lead = of_age[best] - np.delete(of_age, best).max(initial=0.0)
+    return best if lead > max(DISTINGUISHED, MODEL_SHARE * of_age[best]) else NOT_DISTINGUISHED
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,8 +170,8 @@ class ScoreModel:
         root, inverse = roots(scores.information)
         centre = scores.centre()
         units = (inverse @ scores.away(centre)[..., None])[..., 0]
-        said = np.asarray(np.einsum("kii->k", scores.information) > 0.0)
-        units = np.where(said[:, None], units, np.nan)
+        informed = np.asarray(np.einsum("kii->k", scores.information) > 0.0)
+        units = np.where(informed[:, None], units, np.nan)
         estimates = scores.followed(centre)
         models = fitted_autoregression(units), fitted_autoregression(estimates)
         whites = models[0].whitened(units), models[1].whitened(estimates)

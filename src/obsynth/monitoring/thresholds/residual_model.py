@@ -78,11 +78,11 @@ class ResidualModel:
         """Return ``A^k`` for every sample."""
         triangular, basis = schur_form(self.A)
         power = np.eye(len(self.A), dtype=triangular.dtype)
-        found: list[FloatArray] = []
-        while len(found) < self.steps:
-            found.append(np.asarray((basis @ power @ basis.conj().T).real))
+        powers: list[FloatArray] = []
+        while len(powers) < self.steps:
+            powers.append(np.asarray((basis @ power @ basis.conj().T).real))
             power = np.triu(power @ triangular)
-        return found
+        return powers
 
     @property
     def noisy(self) -> bool:
@@ -91,8 +91,8 @@ class ResidualModel:
 
     def fault_scales(self) -> FloatArray:
         """Return ``(nf,)``: deviations of the fault estimates, for disturbances of theirs, or of half their bound."""
-        known = np.where(np.isfinite(self.bounds), self.bounds, 0.0) / 2.0
-        sizes = np.where(self.deviations > 0.0, self.deviations, known)
+        half_bounds = np.where(np.isfinite(self.bounds), self.bounds, 0.0) / 2.0
+        sizes = np.where(self.deviations > 0.0, self.deviations, half_bounds)
         covariance = output_covariance(
             self.A,
             np.hstack([self.Bd * sizes, self.Bw]),
@@ -158,8 +158,8 @@ class ContinuousDesign:
 
     def direct(self, rows: slice) -> FloatArray:
         """Return the direct effect of w on some rows of output at a sample."""
-        shown = sample_observer(self.observer, self.dt).Dy[rows] @ self.plant.Dw[:, self.sensors]
-        return np.hstack([shown, np.zeros((len(shown), self.recursion[2].shape[1] - shown.shape[1]))])
+        of_sensors = sample_observer(self.observer, self.dt).Dy[rows] @ self.plant.Dw[:, self.sensors]
+        return np.hstack([of_sensors, np.zeros((len(of_sensors), self.recursion[2].shape[1] - of_sensors.shape[1]))])
 
     @property
     def start_noise(self) -> FloatArray:
@@ -175,8 +175,8 @@ class ContinuousDesign:
 
 def _gathered(A: FloatArray, noise: FloatArray, dt: float) -> FloatArray:
     """Return a factor of what noise ``(n, m)`` adds to states in a sample."""
-    whole = DescriptorSystem(None, A, C=np.eye(len(A)), Bw=noise)
-    return np.asarray(discretise(whole, dt).plant.Bw)
+    plant = DescriptorSystem(None, A, C=np.eye(len(A)), Bw=noise)
+    return np.asarray(discretise(plant, dt).plant.Bw)
 
 
 def watches_estimates(design: ObserverDesign) -> bool:
@@ -205,7 +205,7 @@ def residual_model(
     errors = replace(error_model(design), plant=noisy)
     start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])
     initial = errors.own @ (plant.E @ start) - observer_start(scenario, observer.order)
-    shown, _, direct_d, direct_w = errors.fault_output if estimates else errors.residual_output
+    reading, _, direct_d, direct_w = errors.fault_output if estimates else errors.residual_output
     rows = observer.fault_rows if estimates else observer.residual_rows
     faults, _, faults_d, faults_w = errors.fault_output
     bounds, means, deviations, steady = _disturbances(scenario, plant.disturbance_names, drive.steps, drive.dt)
@@ -219,7 +219,7 @@ def residual_model(
         between = IntersampleErrorSystem.of_sampled(design.source.plant, plant, observer, errors.own, rows=rows)
     return ResidualModel(
         A=a,
-        C=-shown,
+        C=-reading,
         Bd=driven,
         Dd=direct_d,
         Bw=noise,

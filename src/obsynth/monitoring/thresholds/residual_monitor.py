@@ -144,15 +144,15 @@ def monitor(
     require_verified(design, unverified=unverified)
     require_no_region(design, kind)
     chosen(kind, "kind", MONITOR_KINDS)
-    given = {
+    options = {
         "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound, "initial_error": initial_error,
         "gamma": gamma, "window": window, "false_alarms": false_alarms, "change": change, "constants": constants,
         "initial_set": initial_set,
         "disturbance": None if chosen(disturbance, "disturbance", DISTURBANCES) == "any" else "held",
     }  # fmt: skip
-    window, false_alarms, change = checked_options(LINEAR_OPTIONS, kind, given, isolation_delay)
+    window, false_alarms, change = checked_options(LINEAR_OPTIONS, kind, options, isolation_delay)
     if is_guaranteed(design):
-        return record_monitor(design, scenario, kind, given)
+        return record_monitor(design, scenario, kind, options)
     design, adaptive = tolerances_of(design, constants, initial_set, initial_error)
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model = residual_model(design, scenario, estimates=estimates)
@@ -261,10 +261,10 @@ def _norm_threshold(
     return threshold if kind == "pointwise" else window_threshold(model, inputs, start, window)
 
 
-def bounds_of(design: ObserverDesign, model: ResidualModel, given: Mapping[str, float] | None) -> FloatArray:
+def bounds_of(design: ObserverDesign, model: ResidualModel, stated: Mapping[str, float] | None) -> FloatArray:
     """Return the largest absolute value of each disturbance ``(nd,)``: the scenario's, or what is given."""
     bounds = model.bounds.copy()
-    for name, value in (given or {}).items():
+    for name, value in (stated or {}).items():
         place = index_of(name, design.linear[0].disturbance_names, what="disturbance_bounds")
         bounds[place] = real_number(
             value, f"The bound of {name!r}", "a number, 0 or more", least=0.0, path="disturbance_bounds"

@@ -84,9 +84,9 @@ class NormRule(Rule):
     def over_gaps(self, gaps: GapGrowth) -> NormRule:
         """Return the rule that knows what missing outputs add after them: it need not wait until their effect has
         settled."""
-        found = copy(self)
-        found.gaps, found.bridges, found.takes_gaps = gaps, True, True
-        return found
+        rule = copy(self)
+        rule.gaps, rule.bridges, rule.takes_gaps = gaps, True, True
+        return rule
 
     def init(self) -> NormState:
         """Return the state before the first sample."""
@@ -211,8 +211,8 @@ class WhitenedRule(Rule):
             white = _finite(np.concatenate(window, axis=-1) @ self.whitener.T)
             if self._change is None:
                 return state, np.sum(white**2, axis=-1)
-            one = np.ones_like(white)
-            levels = _finite(two_sided_sums(state.levels, white, one, self._change * one))
+            ones = np.ones_like(white)
+            levels = _finite(two_sided_sums(state.levels, white, ones, self._change * ones))
         return state._replace(levels=levels), levels.max(axis=-1)
 
     def step(self, state: WindowRuleState, sample: Sample) -> tuple[WindowRuleState, RuleOutput]:

@@ -50,22 +50,22 @@ class SampledProblem(NamedTuple):
     ramp: FloatArray
     unknown: FloatArray  # ``(nz,)``: first disturbance and noise to eps at the start, at most
 
-    def start(self, known: Start, box: tuple[FloatArray, FloatArray] | None) -> Start:
+    def start(self, stated: Start, box: tuple[FloatArray, FloatArray] | None) -> Start:
         """Return what is known of eps at the start; ``box`` of the plant's state, middle and half width."""
-        z, t = known.state, self.tracking.T
+        z, t = stated.state, self.tracking.T
         if box is None:
-            if known.stated and not self.affine.C.is_certain:
+            if stated.stated and not self.affine.C.is_certain:
                 raise PreconditionError(
                     "A constant with a tolerance is in C: the norm of the error at the start bounds too little; give "
                     "initial_set (--initial).",
                     condition="start",
                 )
-            radius = self.unknown if known.stated else np.zeros(len(z))
-            return Start(len(z), norm=known.norm, radius=radius, state=z)
+            radius = self.unknown if stated.stated else np.zeros(len(z))
+            return Start(len(z), norm=stated.norm, radius=radius, state=z)
         center, radius = self.reading @ box[0], np.abs(self.reading) @ box[1]
         moved = self.affine.C.spread + self.affine.C.radius
-        seen = np.abs(self.ramp) @ (moved @ (np.abs(center) + radius))
-        size = np.abs(t) @ radius + seen + self.unknown
+        through_outputs = np.abs(self.ramp) @ (moved @ (np.abs(center) + radius))
+        size = np.abs(t) @ radius + through_outputs + self.unknown
         followed = (t + self.ramp @ self.affine.C.center) @ center
         far = np.abs(self.ramp) @ (np.abs(self.affine.C.center) @ radius)
         return Start(len(z), center=z - followed, radius=(size + far) * SUM_SLACK, state=z)
@@ -162,8 +162,8 @@ def _noise(smooth: DescriptorSystem, back: FloatArray, dt: float) -> tuple[Float
         )
     gathered = np.zeros((smooth.nx, 0))
     if process.any():
-        whole = DescriptorSystem(None, smooth.A, C=np.eye(smooth.nx), Bw=smooth.Bw[:, process])
-        gathered = back @ discretise(whole, dt).plant.Bw
+        process_only = DescriptorSystem(None, smooth.A, C=np.eye(smooth.nx), Bw=smooth.Bw[:, process])
+        gathered = back @ discretise(process_only, dt).plant.Bw
     measurement_noise = smooth.Dw[:, sensors]
     return (
         np.hstack([gathered, np.zeros((smooth.nx, measurement_noise.shape[1]))]),

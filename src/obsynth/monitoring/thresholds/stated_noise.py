@@ -114,32 +114,32 @@ def pointwise_threshold(model: ResidualModel, inputs: ScaledInputs, initial_erro
     """Return what the norm of the residual never passes: exact initial-error term and l1 (peak) gains of each input.
     Larger by more than rounding of these sums and of the residual: noise may be at its bounds with the worst signs."""
     powers = model.powers()
-    shown = [model.C @ power for power in powers]
-    start = np.array([np.linalg.norm(c, 2) for c in shown]) * initial_error
-    start += np.array([_columns(c @ inputs.start) for c in shown])
+    responses = [model.C @ power for power in powers]
+    start = np.array([np.linalg.norm(c, 2) for c in responses]) * initial_error
+    start += np.array([_columns(c @ inputs.start) for c in responses])
     start += _left_of_powers(model, powers, np.hstack([inputs.start, initial_error * np.eye(len(model.A))]))
-    seen = np.array([_columns(c @ inputs.B) for c in shown]) + _left_of_powers(model, powers, inputs.B)
-    earlier = np.concatenate([[0.0], np.cumsum(seen)[:-1]])
+    per_sample = np.array([_columns(c @ inputs.B) for c in responses]) + _left_of_powers(model, powers, inputs.B)
+    earlier = np.concatenate([[0.0], np.cumsum(per_sample)[:-1]])
     return np.asarray((start + earlier + _columns(inputs.D) + inputs.between) * OUTWARD)
 
 
-def _left_of_powers(model: ResidualModel, powers: list[FloatArray], entering: FloatArray) -> FloatArray:
+def _left_of_powers(model: ResidualModel, powers: list[FloatArray], columns: FloatArray) -> FloatArray:
     """Return what rounding of the powers may hide of columns ``(n, m)`` at each sample, to the first order.
 
     Where entries of A cancel, powers keep half of their digits.  What ``C A^k`` misses by from one sample to the next
     is found, and moves on by A as everything does.
     """
-    if not entering.any():
+    if not columns.any():
         return np.zeros(len(powers))
     # In these units what is added up has one size.
-    units = state_units(model.A, entering, model.C)
-    a, shown = model.A * units / units[:, None], [model.C @ power * units for power in powers]
+    units = state_units(model.A, columns, model.C)
+    a, responses = model.A * units / units[:, None], [model.C @ power * units for power in powers]
     share = len(a) * np.finfo(float).eps
     missed = [
         np.linalg.norm(after - before @ a) + share * np.linalg.norm(np.abs(before) @ np.abs(a))
-        for before, after in itertools.pairwise(shown)
+        for before, after in itertools.pairwise(responses)
     ]
-    sizes = [_columns(power @ entering / units[:, None]) for power in powers[:-1]]
+    sizes = [_columns(power @ columns / units[:, None]) for power in powers[:-1]]
     return np.concatenate([[0.0], np.convolve(missed, sizes)[: len(missed)]]) if missed else np.zeros(1)
 
 
@@ -148,9 +148,9 @@ def _columns(matrix: FloatArray) -> float:
     return float(np.sum(np.linalg.norm(matrix, axis=0)))
 
 
-def _stacked_norms(shown: list[FloatArray], window: int) -> FloatArray:
+def _stacked_norms(responses: list[FloatArray], window: int) -> FloatArray:
     """Return the spectral norm of every ``window`` successive matrices ``(nr, n)``, one above the other."""
-    rows = np.array(shown)
+    rows = np.array(responses)
     squares = rows.transpose(0, 2, 1) @ rows
     count = len(squares) - window + 1
     # Added up anew for each window: late ones are far smaller than those before.
@@ -168,12 +168,12 @@ def norms_of_windows(values: FloatArray, window: int) -> FloatArray:
     return np.array([np.linalg.norm(values[max(k - window + 1, 0) : k + 1]) for k in range(len(values))])
 
 
-def _stacked_columns(shown: list[FloatArray], left: FloatArray, window: int) -> FloatArray:
+def _stacked_columns(responses: list[FloatArray], hidden: FloatArray, window: int) -> FloatArray:
     """Return the sum of the norms of the columns of every ``window`` successive matrices, one above the other; what
-    rounding hides of each, ``left``, is added."""
-    columns = np.array([np.linalg.norm(part, axis=0) for part in shown])
-    seen = np.linalg.norm(sliding_window_view(columns, window, axis=0), axis=-1)
-    return np.asarray(np.sum(seen, axis=-1) + _windowed_sums(left, window))
+    rounding hides of each, ``hidden``, is added."""
+    columns = np.array([np.linalg.norm(part, axis=0) for part in responses])
+    norms = np.linalg.norm(sliding_window_view(columns, window, axis=0), axis=-1)
+    return np.asarray(np.sum(norms, axis=-1) + _windowed_sums(hidden, window))
 
 
 def _window_gain(model: ResidualModel, inputs: ScaledInputs) -> tuple[float, int]:
@@ -190,16 +190,16 @@ def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: 
     if model.continuous is not None or model.sampled is not None:
         return summed
     powers, (gain, count) = model.powers(), _window_gain(model, inputs)
-    shown = [model.C @ power for power in powers]
+    responses = [model.C @ power for power in powers]
     # Before the window is full it begins with the record.
     before, length = [np.zeros_like(model.C)] * (window - 1), np.minimum(np.arange(model.steps) + 1, window)
     hidden = _left_of_powers(model, powers, initial_error * np.eye(len(model.A)))
-    start = _stacked_norms(before + shown, window) * initial_error
+    start = _stacked_norms(before + responses, window) * initial_error
     start += _windowed_sums(np.concatenate([np.zeros(window - 1), hidden]), window)
     earlier = np.zeros(model.steps)
     if window < model.steps:
-        left = _left_of_powers(model, powers, inputs.B)
-        gathered = np.cumsum(_stacked_columns([part @ inputs.B for part in shown], left, window))
+        hidden_inputs = _left_of_powers(model, powers, inputs.B)
+        gathered = np.cumsum(_stacked_columns([part @ inputs.B for part in responses], hidden_inputs, window))
         earlier[window:] = gathered[: model.steps - window]
     bound = (gain * np.sqrt(length * count) + start + earlier) * OUTWARD
     return np.asarray(np.minimum(bound, summed))
@@ -226,26 +226,26 @@ def unlimited_bound(
     """Return the pointwise or window bound for records of any length."""
     powers = model.powers()
     last = powers[-1] @ model.A
-    left = largest_singular_value(last)
-    shown = [largest_singular_value(model.C @ power) for power in powers]
+    contraction = largest_singular_value(last)
+    gains = [largest_singular_value(model.C @ power) for power in powers]
     # Of k = m N + j samples, m N shrink by left^m: inputs of that age, and the start, add no more than this.
-    aged = _columns(last @ inputs.B) * sum(shown) / (1.0 - left)
+    aged = _columns(last @ inputs.B) * sum(gains) / (1.0 - contraction)
     if not np.isfinite(inputs.limit):
         # What outputs do between stamps that may be anywhere has no bound.
         return np.full(model.steps, np.inf), np.inf
     bare = pointwise_threshold(model, inputs, 0.0)
-    pointwise = float(bare[-1] - inputs.between[-1]) + inputs.limit + shown[-1] * _columns(inputs.B) + aged
+    pointwise = float(bare[-1] - inputs.between[-1]) + inputs.limit + gains[-1] * _columns(inputs.B) + aged
     begins = initial_error + _columns(inputs.start)
-    start = max(shown) * left * begins
+    start = max(gains) * contraction * begins
     if kind == "pointwise":
         return _start_added(model, bare, initial_error) * OUTWARD, (pointwise + start) * OUTWARD
     table = window_threshold(model, inputs, initial_error, window)
     # No window has more energy than its samples one by one; for a sampled plant its own bound may be smaller.
     # Such a window may begin in the table, where more is left of the start.
-    start = max(max(shown[-window:]), max(shown) * left) * begins
+    start = max(max(gains[-window:]), max(gains) * contraction) * begins
     limit = float(np.sqrt(window)) * (pointwise + start) * OUTWARD
     if model.continuous is None and model.sampled is None:
-        limit = min(limit, _window_limit(model, inputs, (initial_error, left, last), window))
+        limit = min(limit, _window_limit(model, inputs, (initial_error, contraction, last), window))
     return table, limit
 
 
@@ -253,17 +253,17 @@ def _window_limit(
     model: ResidualModel, inputs: ScaledInputs, start_of: tuple[float, float, FloatArray], window: int
 ) -> float:
     """Return the l2 bound of a window that begins after the table, see `window_threshold`."""
-    (initial_error, left, last), (gain, count) = start_of, _window_gain(model, inputs)
+    (initial_error, contraction, last), (gain, count) = start_of, _window_gain(model, inputs)
     # A window that begins with the table's last sample ends after it.
     longer = replace(model, steps=model.steps + window - 1)
     powers = longer.powers()
-    shown = [model.C @ power for power in powers]
+    responses = [model.C @ power for power in powers]
     hidden = _windowed_sums(_left_of_powers(longer, powers, np.eye(len(model.A))), window)
-    sizes = _stacked_norms(shown, window) + hidden
+    sizes = _stacked_norms(responses, window) + hidden
     left_of_inputs = _left_of_powers(longer, powers, inputs.B)
-    gathered = float(np.sum(_stacked_columns([part @ inputs.B for part in shown], left_of_inputs, window)))
-    aged = _columns(last @ inputs.B) * float(np.sum(sizes)) / (1.0 - left)
-    start = float(max(np.max(sizes) * left, np.max(sizes[-window:]))) * initial_error
+    gathered = float(np.sum(_stacked_columns([part @ inputs.B for part in responses], left_of_inputs, window)))
+    aged = _columns(last @ inputs.B) * float(np.sum(sizes)) / (1.0 - contraction)
+    start = float(max(np.max(sizes) * contraction, np.max(sizes[-window:]))) * initial_error
     return (gain * float(np.sqrt(window * count)) + gathered + aged + start) * OUTWARD
 
 
@@ -283,5 +283,5 @@ def _start_added(model: ResidualModel, bare: FloatArray, initial_error: float) -
     # In the norm of a Lyapunov function a free motion never grows.
     a = model.errors.Az
     root = np.linalg.cholesky(continuous_lyapunov(a.T, -np.eye(len(a)))).T
-    seen = largest_singular_value(np.linalg.solve(root.T, model.C.T))
-    return bare + np.array([seen * np.linalg.norm(root @ power, 2) for power in model.powers()]) * initial_error
+    reading_gain = largest_singular_value(np.linalg.solve(root.T, model.C.T))
+    return bare + np.array([reading_gain * np.linalg.norm(root @ power, 2) for power in model.powers()]) * initial_error

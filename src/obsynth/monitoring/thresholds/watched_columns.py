@@ -24,9 +24,9 @@ from obsynth.results.design import ObserverDesign
 
 def as_learned(observer: Any, learned: LearnedThresholds) -> Any:
     """Return an observer as the one from which thresholds were learned judged outliers."""
-    given = {"outlier_sizes": learned.outlier_sizes, "initial_covariance": learned.initial_covariance}
-    known = {name: value for name, value in given.items() if value is not None}
-    return changed(observer, **known) if known else observer
+    options = {"outlier_sizes": learned.outlier_sizes, "initial_covariance": learned.initial_covariance}
+    stated = {name: value for name, value in options.items() if value is not None}
+    return changed(observer, **stated) if stated else observer
 
 
 def watched_names(design: ObserverDesign) -> tuple[str, ...]:

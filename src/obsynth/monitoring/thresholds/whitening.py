@@ -73,8 +73,8 @@ def innovation_whitener(covariance: FloatArray, count: int) -> FloatArray:
     past = whitener_of(covariance[:old, :old]) if old else np.zeros((0, 0))
     predict = covariance[old:, :old] @ past.T @ past
     error = np.hstack([-predict, np.eye(count)])
-    left = error @ covariance @ error.T
-    sizes, vectors = np.linalg.eigh((left + left.T) / 2.0)
+    innovation_covariance = error @ covariance @ error.T
+    sizes, vectors = np.linalg.eigh((innovation_covariance + innovation_covariance.T) / 2.0)
     kept = sizes > CANCELLATION_TOLERANCE * float(np.max(np.abs(np.diag(covariance))))
     if not kept.any():
         raise SpecError("The newest residual is determined by the older ones: it has no innovation.", path="window")
@@ -92,15 +92,15 @@ def correlation_left(model: ResidualModel, window: int, whitener: FloatArray) ->
     b, d, spread = _driving(model)
     ahead = model.A @ spread @ model.C.T + b @ d.T
     blocks = [whitener[:, i * count : (i + 1) * count] for i in range(window)]
-    shown, driven = np.zeros((len(whitener), n)), np.zeros((n, len(whitener)))
+    reading, driven = np.zeros((len(whitener), n)), np.zeros((n, len(whitener)))
     for newest, oldest in zip(reversed(blocks), blocks, strict=True):
-        shown = shown @ model.A + newest @ model.C
+        reading = reading @ model.A + newest @ model.C
         driven = model.A @ driven + ahead @ oldest.T
-    left = CORRELATION_LEFT * float(np.linalg.norm(driven))
+    negligible = CORRELATION_LEFT * float(np.linalg.norm(driven))
     for _ in range(MOST_LAGS):
-        total += largest_singular_value(shown @ driven)
+        total += largest_singular_value(reading @ driven)
         driven = model.A @ driven
-        if float(np.linalg.norm(driven)) <= left:
+        if float(np.linalg.norm(driven)) <= negligible:
             return total
     raise SpecError("The residual is correlated for too long to be whitened: use chi-square.", path="kind")
 
@@ -108,8 +108,8 @@ def correlation_left(model: ResidualModel, window: int, whitener: FloatArray) ->
 def cusum_whitener(model: ResidualModel, window: int) -> tuple[FloatArray, bool]:
     """Return what cumulative sums add up, n samples of no more variance than n, and whether it is white."""
     whitener = innovation_whitener(window_covariance(model, window), len(model.C))
-    left = correlation_left(model, window, whitener)
-    return whitener / np.sqrt(1.0 + 2.0 * left), left <= WHITE_CORRELATIONS
+    correlations = correlation_left(model, window, whitener)
+    return whitener / np.sqrt(1.0 + 2.0 * correlations), correlations <= WHITE_CORRELATIONS
 
 
 def whitened(kind: str, model: ResidualModel, window: int) -> tuple[FloatArray, bool]:

@@ -26,30 +26,30 @@ Pair: TypeAlias = tuple[int, int, int]
 def believed_pairs(refused: Sequence[FloatArray], y: FloatArray) -> list[Pair]:
     """Return the samples that a gate believed after those before them in a row, which it left out, with these: from its
     memory after each row ``(4, ny)``, and what was measured ``(n, ny)``."""
-    found, begun = [], np.full(y.shape[1], -1)
-    for k, (memory, seen) in enumerate(zip(refused, np.isfinite(y), strict=True)):
+    pairs, begun = [], np.full(y.shape[1], -1)
+    for k, (memory, measured) in enumerate(zip(refused, np.isfinite(y), strict=True)):
         before = refused[k - 1] if k else np.zeros_like(memory)
-        begun[seen & (np.abs(memory[0]) == 1.0)] = k
-        believed = seen & (np.abs(memory[0]) >= 2.0) & (memory[3] != 0.0) & (before[3] == 0.0)
-        found += [(int(begun[i]), k, int(i)) for i in np.flatnonzero(believed)]
-    return found
+        begun[measured & (np.abs(memory[0]) == 1.0)] = k
+        believed = measured & (np.abs(memory[0]) >= 2.0) & (memory[3] != 0.0) & (before[3] == 0.0)
+        pairs += [(int(begun[i]), k, int(i)) for i in np.flatnonzero(believed)]
+    return pairs
 
 
 def without(y: FloatArray, pairs: Sequence[Pair]) -> FloatArray:
     """Return what was measured ``(n, ny)`` without these pairs."""
-    left = y.copy()
+    measured = y.copy()
     for first, last, output in pairs:
-        left[first : last + 1, output] = np.nan
-    return left
+        measured[first : last + 1, output] = np.nan
+    return measured
 
 
 def taken_back(pairs: Sequence[Pair], refused: Sequence[FloatArray], y: FloatArray) -> list[Pair]:
     """Return the pairs after which the next sample is no outlier, by the memory of a gate to which none of them was
     shown."""
     far = np.array([memory[0] != 0.0 for memory in refused])
-    found = []
+    wrong = []
     for first, last, output in pairs:
         later = np.flatnonzero(np.isfinite(y[last + 1 :, output]))
         if later.size and not far[last + 1 + later[0], output]:
-            found.append((first, last, output))
-    return found
+            wrong.append((first, last, output))
+    return wrong
