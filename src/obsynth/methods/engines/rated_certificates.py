@@ -19,6 +19,9 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.rated_inequalities import prove_rated_gain
 from obsynth.verification.error_polytope import ErrorPolytope
 
+#: Gains are sought at this multiple of the least level: those of the bare optimum are large.
+ABOVE_LEAST = 1.1
+
 #: Degree of P and pieces of [0, 1]: 3 and 8 prove a few per cent less, in twenty times the time.
 DEGREE, PIECES = 2, 2
 
@@ -120,8 +123,9 @@ def rated_gains(
     if not has_numbers(problem, solver, settings, runs):
         raise SolverError("No Lyapunov matrix that moves with the parameter was found.", record=runs[-1])
     least = float(np.sqrt(max(float(problem.variables["gamma_squared"].value), 0.0)))
-    # A tenth above the least: the bare optimum has large gains.
-    problem = rated_inequalities(units.moved(1.0), rate, degree=1, pieces=PIECES, decay=decay, level=1.1 * least)
+    problem = rated_inequalities(
+        units.moved(1.0), rate, degree=1, pieces=PIECES, decay=decay, level=ABOVE_LEAST * least
+    )
     if not has_numbers(problem, solver, settings, runs):
         raise SolverError("No Lyapunov matrix that moves with the parameter was found.", record=runs[-1])
     known = problem.gains()

@@ -59,11 +59,11 @@ def bounded_real_certificate(
     best, spare = np.eye(core), None
     # Of many states, one solution without other coordinates has room enough, and takes a fifth of the time.
     for more, noise in ROOMS if core >= FEWEST_STATES and 0 < len(c) <= b.shape[1] else ():
-        found = _with_room(a, b, c, d, 1.0 + more, noise)
-        if found is None:
+        factor = _with_room(a, b, c, d, 1.0 + more, noise)
+        if factor is None:
             continue
-        if prove_bounded_real(plant, observer, tracking, found, gain).in_double_precision:
-            return found, True
+        if prove_bounded_real(plant, observer, tracking, factor, gain).in_double_precision:
+            return factor, True
     for change in islice(_changes(a, b, c, d), tries):
         inverse = np.asarray(np.linalg.inv(change))
         moved_a, moved_b, moved_c = inverse @ a @ change, inverse @ b, c @ change
@@ -151,9 +151,9 @@ def _coordinates(
     change = np.eye(a.shape[0])
     for level in path:
         inverse = np.asarray(np.linalg.inv(change))
-        shown = c @ change
-        size = max(largest_singular_value(shown) ** 2, np.finfo(np.float64).tiny)
-        p = bounded_real_matrix(inverse @ a @ change, inverse @ b, shown, d, level, slack=tail * size)
+        output_map = c @ change
+        size = max(largest_singular_value(output_map) ** 2, np.finfo(np.float64).tiny)
+        p = bounded_real_matrix(inverse @ a @ change, inverse @ b, output_map, d, level, slack=tail * size)
         if p is None:
             return None
         change = change @ normalising_change(p)

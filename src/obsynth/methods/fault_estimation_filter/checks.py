@@ -132,10 +132,10 @@ def _least_gain(design: ObserverDesign, work: DescriptorSystem | None) -> Iterat
     if "gamma_min" not in claims and not LEAST_GAIN_WITNESSES & matrices.keys():
         return
     free = design.options.get("weight") == "free"
-    kept = matrices if work is not None else {}
+    witnesses = matrices if work is not None else {}
     sought = bool(design.options.get("prove_least"))
     least = claimed(claims, "gamma_min")
-    yield least_gain_row(work, design.gains, kept, least, free_weight=free, thorough=sought)
+    yield least_gain_row(work, design.gains, witnesses, least, free_weight=free, thorough=sought)
 
 
 def _with_sensor_faults(plant: DescriptorSystem) -> DescriptorSystem | None:
@@ -179,10 +179,10 @@ def _norm_rows(
     (plant, observer), claims = design.linear, design.certificate.claims
     gamma = claimed(claims, "gamma")
     proof = prove_bounded_real(plant, observer, tracking, factor, gamma if plant.nd else 1.0)
-    what = f"stable, and l2 gain d -> fault error < {gamma:.6g}" if plant.nd else "stable (Lyapunov)"
+    claim = f"stable, and l2 gain d -> fault error < {gamma:.6g}" if plant.nd else "stable (Lyapunov)"
     yield Check(
         "LMI",
-        f"the matrix inequality is positive definite: {what}",
+        f"the matrix inequality is positive definite: {claim}",
         proof.lower_bound,
         0.0,
         proof.lower_bound,

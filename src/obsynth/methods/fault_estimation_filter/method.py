@@ -236,8 +236,8 @@ class FaultEstimationFilter(Method):
                 "gamma is needed: the plant has disturbances, and a gain set claims a bound on them.", path="gamma"
             )
         if gamma is not None:
-            for what, value in (("gamma", checked_value(gamma, "gamma", Positive)), ("1 / gamma", 1.0 / gamma)):
-                require_no_overflow(value, what, "gamma")
+            for label, value in (("gamma", checked_value(gamma, "gamma", Positive)), ("1 / gamma", 1.0 / gamma)):
+                require_no_overflow(value, label, "gamma")
         return synthesis_from_gains(plant, T=T, N=N, L=L, W=W, gamma=gamma, indexes=indexes)
 
     @classmethod

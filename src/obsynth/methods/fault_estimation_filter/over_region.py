@@ -36,10 +36,10 @@ NOT_OVER_REGION = (
 
 
 def synthesise_over_region(
-    plant: PolytopicSystem, asked: FaultEstimationFilter, *, progress: Callable[[str], None]
+    plant: PolytopicSystem, method: FaultEstimationFilter, *, progress: Callable[[str], None]
 ) -> Synthesis:
     """Return a scheduled filter with its certificate; see `obsynth.fault_estimation_filter`."""
-    _require_options(asked)
+    _require_options(method)
     progress("checking the existence conditions over the region")
     conditions, parts = examine_over_region(plant)
     require_all(conditions)
@@ -50,9 +50,9 @@ def synthesise_over_region(
     steps = plant.scheduling.step_of(plant.dt)
     steps = steps if steps is not None and steps < 1.0 else None
     progress("solving the inequalities at the vertices")
-    found = _certified(errors, asked, parts, steps)
+    certificate = _certified(errors, method, parts, steps)
     progress("building the realisation and its certificate")
-    return _synthesis(plant, asked, parts, W, found, steps)
+    return _synthesis(plant, method, parts, W, certificate, steps)
 
 
 def synthesis_of_gains(plant: PolytopicSystem, R: Sequence[FloatArray]) -> Synthesis:
@@ -63,57 +63,57 @@ def synthesis_of_gains(plant: PolytopicSystem, R: Sequence[FloatArray]) -> Synth
         raise SpecError("The plant has no filter over its region.", path="plant")
     W = np.asarray(np.linalg.pinv(parts.Upsilon))
     errors, _, _ = errors_over_region(parts, W)
-    asked = FaultEstimationFilter()
-    return _synthesis(plant, asked, parts, W, _certified(errors, asked, parts, None, gains=R, margin=0.0), None)
+    method = FaultEstimationFilter()
+    return _synthesis(plant, method, parts, W, _certified(errors, method, parts, None, gains=R, margin=0.0), None)
 
 
 def _synthesis(
     plant: PolytopicSystem,
-    asked: FaultEstimationFilter,
+    method: FaultEstimationFilter,
     parts: FilterOverRegion,
     W: FloatArray,
-    found: VertexCertificate,
+    certificate: VertexCertificate,
     steps: float | None,
 ) -> Synthesis:
     errors, L0, U2 = errors_over_region(parts, W)
     gains: dict[str, FloatArray] = {"T": parts.T, "N": parts.N, "W": W, "Psi": parts.Psi, "Upsilon": parts.Upsilon}
-    R = found.gains * (errors.count if len(found.gains) == 1 else 1)
+    R = certificate.gains * (errors.count if len(certificate.gains) == 1 else 1)
     L = [first + r @ U2.T for first, r in zip(L0, R, strict=True)]
     gains |= {f"L[{i + 1}]": matrix for i, matrix in enumerate(L)}
-    observer, tracking = _realised(plant, parts, gains, L, found.decay)
-    matrices = {"tracking": tracking, WITNESSES[0]: np.array(found.witness.P)}
-    if found.witness.G is not None:
-        matrices[WITNESSES[1]] = np.array(found.witness.G)
-    claims = {"region_decay": found.decay, "state_lag": 0.0}
+    observer, tracking = _realised(plant, parts, gains, L, certificate.decay)
+    matrices = {"tracking": tracking, WITNESSES[0]: np.array(certificate.witness.P)}
+    if certificate.witness.G is not None:
+        matrices[WITNESSES[1]] = np.array(certificate.witness.G)
+    claims = {"region_decay": certificate.decay, "state_lag": 0.0}
     if plant.nd:
-        claims |= {"gamma": _above(found.level * parts.reach), "gamma_min": found.least * parts.reach}
+        claims |= {"gamma": _above(certificate.level * parts.reach), "gamma_min": certificate.least * parts.reach}
     return Synthesis(
-        options=asked.as_plain(),
+        options=method.as_plain(),
         gains=gains,
         observer=observer,
         certificate=Certificate(matrices, claims),
-        solver={"engine": "lmi", "runs": list(found.runs)},
-        notes=_notes(plant, parts, found, steps),
+        solver={"engine": "lmi", "runs": list(certificate.runs)},
+        notes=_notes(plant, parts, certificate, steps),
     )
 
 
-def _require_options(asked: FaultEstimationFilter) -> None:
+def _require_options(method: FaultEstimationFilter) -> None:
     plain = FaultEstimationFilter()
-    given = [name for name in NOT_OVER_REGION if getattr(asked, name) is not getattr(plain, name)]
-    given += ["gamma_search"] if asked.gamma_search != plain.gamma_search else []
-    given += ["engine"] if asked.engine == "riccati" else []
-    if given:
+    unsupported = [name for name in NOT_OVER_REGION if getattr(method, name) is not getattr(plain, name)]
+    unsupported += ["gamma_search"] if method.gamma_search != plain.gamma_search else []
+    unsupported += ["engine"] if method.engine == "riccati" else []
+    if unsupported:
         raise SpecError(
-            f"A filter over a region has no {', '.join(given)}: leave it out. It takes gamma, gamma_margin, decay, "
-            "solver and solver_options.",
-            path=f"method.options.{given[0]}",
+            f"A filter over a region has no {', '.join(unsupported)}: leave it out. It takes gamma, gamma_margin, "
+            "decay, solver and solver_options.",
+            path=f"method.options.{unsupported[0]}",
         )
-    chosen_solver(asked.solver, asked.solver_options)
+    chosen_solver(method.solver, method.solver_options)
 
 
 def _certified(
     errors: ErrorPolytope,
-    asked: FaultEstimationFilter,
+    method: FaultEstimationFilter,
     parts: FilterOverRegion,
     steps: float | None,
     *,
@@ -129,17 +129,17 @@ def _certified(
             errors.A, list(errors.C), B=np.eye(n), D=np.zeros((errors.outputs, n)), Cz=np.eye(n), dt=errors.dt
         )
     lyapunov = "common" if steps is None else "vertex"
-    level = asked.gamma / parts.reach if asked.gamma is not None and count else None
+    level = method.gamma / parts.reach if method.gamma is not None and count else None
     return certified(
         work,
         level=level,
-        margin=asked.gamma_margin if margin is None else margin,
-        decay=None if asked.decay is None else float(np.exp(-asked.decay * errors.dt)),
+        margin=method.gamma_margin if margin is None else margin,
+        decay=None if method.decay is None else float(np.exp(-method.decay * errors.dt)),
         lyapunov=lyapunov,
         steps=steps,
         gains=gains,
-        solver=asked.solver,
-        settings=asked.solver_options,
+        solver=method.solver,
+        settings=method.solver_options,
     )
 
 
@@ -183,12 +183,12 @@ def _above(value: float) -> float:
 
 
 def _notes(
-    plant: PolytopicSystem, parts: FilterOverRegion, found: VertexCertificate, steps: float | None
+    plant: PolytopicSystem, parts: FilterOverRegion, certificate: VertexCertificate, steps: float | None
 ) -> tuple[str, ...]:
     notes = [
         f"One certificate at {plant.count} vertices, for the region {plant.scheduling.sentence()}. A row with a "
         "parameter outside or missing is out: the parameter is moved into its range, and nothing is claimed for "
-        f"{rows_to_forget(found.decay)} rows from the last such row on."
+        f"{rows_to_forget(certificate.decay)} rows from the last such row on."
     ]
     rated = [
         name for name, rate in zip(plant.scheduling.names, plant.scheduling.rates, strict=True) if rate is not None

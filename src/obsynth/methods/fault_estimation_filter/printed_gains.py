@@ -159,12 +159,12 @@ def paper_weight_row(gains: Mapping[str, FloatArray]) -> Check:
     """Return the row that W is the paper's, the left inverse of Upsilon of least norm."""
     upsilon = gains["Upsilon"]
     units = np.linalg.norm(upsilon, axis=0)
-    wanted = np.linalg.pinv(upsilon / units) / units[:, None]
-    size = np.max(np.abs(wanted), axis=1, initial=0.0, keepdims=True)
+    pseudoinverse = np.linalg.pinv(upsilon / units) / units[:, None]
+    size = np.max(np.abs(pseudoinverse), axis=1, initial=0.0, keepdims=True)
     return upper_bound_check(
         "gains: paper's W",
         "W is the pseudoinverse of Upsilon, for the outputs as they are: relative difference",
-        float(np.max(np.abs(gains["W"] - wanted) / size, initial=0.0)),
+        float(np.max(np.abs(gains["W"] - pseudoinverse) / size, initial=0.0)),
         PSEUDOINVERSE_SHARE,
         source="Wang 2015, eq. (47)",
         kind="equality",
@@ -189,18 +189,18 @@ def printed_allowances(
         tracking = equations.tracking(moved["T"])
         lag = tracking.shape[1] // plant.nx - 1
         errors = ErrorModel(plant, built, tracking, lag=lag)
-        found = gain_identities(work, moved, equations, scaling)
+        identities = gain_identities(work, moved, equations, scaling)
         for name, steps in fault_identities(errors, built.fault_delays).items():
-            found |= {step_key(name, step): identity for step, identity in enumerate(steps)}
-        return {**tracking_totals(errors), **{name: identity.total for name, identity in found.items()}}
+            identities |= {step_key(name, step): identity for step, identity in enumerate(steps)}
+        return {**tracking_totals(errors), **{name: identity.total for name, identity in identities.items()}}
 
     centre = totals()
-    found = {name: np.zeros_like(total) for name, total in centre.items()}
+    allowances = {name: np.zeros_like(total) for name, total in centre.items()}
     for letter in PRINTED:
         for index in np.ndindex(gains[letter].shape):
             move = np.zeros_like(gains[letter])
             move[index] = half_a_unit
             more, less = totals(letter, move), totals(letter, -move)
             for name, middle in centre.items():
-                found[name] += np.maximum(np.abs(more[name] - middle), np.abs(less[name] - middle))
-    return found
+                allowances[name] += np.maximum(np.abs(more[name] - middle), np.abs(less[name] - middle))
+    return allowances

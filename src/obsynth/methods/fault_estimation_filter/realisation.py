@@ -109,30 +109,30 @@ def notes(
     largest_zero: float = np.inf,
 ) -> tuple[str, ...]:
     """Return what a user should know; ``largest_zero`` is the largest modulus of a fault zero, where known already."""
-    found = list(sampling_zero_warnings(plant)) if largest_zero > SLOW_ZERO_RADIUS else []
+    texts = list(sampling_zero_warnings(plant)) if largest_zero > SLOW_ZERO_RADIUS else []
     if detectability.condition_number > WARN_DETECTABILITY_CONDITION:
-        found.append(
+        texts.append(
             f"Upsilon has condition number {detectability.condition_number:.3g}: some combination of faults is "
             "estimated with a much larger standard deviation than the others."
         )
     for name, row in zip(plant.fault_names, observer.Dy[observer.fault_rows], strict=True):
         amplification = float(np.linalg.norm(row))
         if amplification > WARN_AMPLIFICATION:
-            found.append(
+            texts.append(
                 f"The estimate of {name!r} amplifies errors of the newest measurement by up to {amplification:.3g}: "
                 "the outputs respond little to the fault within its delay."
             )
     radius = float(np.max(np.abs(poles_of(observer)), initial=0.0))
     if radius >= 1.0:
-        found.append(
+        texts.append(
             f"The filter's initial-condition response does not decay: its spectral radius is {radius:.6g}, not below 1."
         )
     elif radius > SLOW_FILTER:
-        found.append(
+        texts.append(
             f"The filter settles slowly: spectral radius {radius:.6g}, time constant "
             f"{-plant.dt / np.log(radius):.3g} s."
         )
-    return tuple(found)
+    return tuple(texts)
 
 
 def synthesis_from_gains(
@@ -168,8 +168,8 @@ def _checked(indexes: Sequence[int] | None, work: DescriptorSystem) -> tuple[int
     if indexes is None:
         return None
     listed: list[Any] = list(indexes) if isinstance(indexes, (list, tuple, np.ndarray)) else []
-    whole = all(is_whole(index) for index in listed)
-    if len(listed) != work.nf or not whole or not all(1 <= index <= work.nx for index in listed):
+    are_whole = all(is_whole(index) for index in listed)
+    if len(listed) != work.nf or not are_whole or not all(1 <= index <= work.nx for index in listed):
         raise SpecError(
             f"indexes is {indexes!r}: give one whole number from 1 to {work.nx} for each of "
             f"{', '.join(map(repr, work.fault_names))}.",
@@ -181,10 +181,10 @@ def _checked(indexes: Sequence[int] | None, work: DescriptorSystem) -> tuple[int
 def _detectability(work: DescriptorSystem, t: FloatArray, indexes: tuple[int, ...] | None) -> FaultDetectability:
     """Return the detectability matrices of given gains, with given indexes where there are any."""
     ta, tf = t @ work.A, t @ work.Bf
-    found = fault_detectability(ta, work.C, tf, plant=work)
+    detectability = fault_detectability(ta, work.C, tf, plant=work)
     if indexes is None:
-        return found
-    powers = replace(found, indexes=indexes).chain(ta, tf)
+        return detectability
+    powers = replace(detectability, indexes=indexes).chain(ta, tf)
     psi = np.column_stack([powers[index - 1][:, i] for i, index in enumerate(indexes)])
     upsilon = work.C @ psi
     lengths = np.linalg.norm(upsilon, axis=0)
@@ -197,18 +197,18 @@ def _detectability(work: DescriptorSystem, t: FloatArray, indexes: tuple[int, ..
     return FaultDetectability(indexes, psi, upsilon, decide_rank(unit, expected=work.nf), float(np.linalg.cond(unit)))
 
 
-def _lost_indexes(plant: DescriptorSystem, found: FaultDetectability) -> tuple[str, ...]:
+def _lost_indexes(plant: DescriptorSystem, detectability: FaultDetectability) -> tuple[str, ...]:
     """Return a note for faults that show earlier with the given T than the plant's own equations let them."""
     own = prepare(plant).detectability.indexes
     early = [
-        (name, given, index)
-        for name, given, index in zip(plant.fault_names, found.indexes, own, strict=True)
-        if index is not None and given is not None and given < index
+        (name, shipped_index, index)
+        for name, shipped_index, index in zip(plant.fault_names, detectability.indexes, own, strict=True)
+        if index is not None and shipped_index is not None and shipped_index < index
     ]
     if not early:
         return ()
-    told = ", ".join(f"{name!r} {given} instead of {index}" for name, given, index in early)
+    lower = ", ".join(f"{name!r} {shipped_index} instead of {index}" for name, shipped_index, index in early)
     return (
-        f"With this T the detectability indexes are lower than the plant's own: {told}. If T was rounded, C T f no "
+        f"With this T the detectability indexes are lower than the plant's own: {lower}. If T was rounded, C T f no "
         f"longer vanishes where it should: give indexes={list(own)}, or T with all of its digits.",
     )

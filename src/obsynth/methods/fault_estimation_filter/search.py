@@ -57,12 +57,12 @@ class FoundGains:
 
     def within(self, limit: WeightLimit) -> bool:
         """Whether the weights of both, the least gain and what is shipped, keep a limit."""
-        return all(limit.norm(found.V) <= limit.bound for found in (self.least.injection, self.chosen))
+        return all(limit.norm(injection.V) <= limit.bound for injection in (self.least.injection, self.chosen))
 
 
 def found_gains(
     problem: GainProblem,
-    asked: FaultEstimationFilter,
+    method: FaultEstimationFilter,
     engine: str,
     *,
     printed: PrintedInequality,
@@ -72,7 +72,7 @@ def found_gains(
     size = max(problem.disturbance_size, NOMINAL_GAIN)
     progress("searching for the least gain")
     noisy = printed.plant.nw > 0
-    least = _least_gain(problem, asked)
+    least = _least_gain(problem, method)
     unfelt = problem.disturbances and least.starting_gain <= ROUNDING_GAIN * problem.disturbance_size
     if unfelt and noisy and problem.weight_limit is None:
         # Against the noise, gains may take up measurements that feel the disturbance: it stays in the problem.
@@ -80,11 +80,11 @@ def found_gains(
     elif unfelt:
         # What is left of the disturbance in the estimates is rounding: nothing to minimise.
         problem = replace(problem, B=problem.B[:, :0], D=problem.D[:, :0], Zd=problem.Zd[:, :0])
-        least = replace(_least_gain(problem, asked), gain=least.starting_gain)
-    elif engine == "lmi" or (engine == "auto" and _leaves_little(asked.gamma, least.gain, problem)):
+        least = replace(_least_gain(problem, method), gain=least.starting_gain)
+    elif engine == "lmi" or (engine == "auto" and _leaves_little(method.gamma, least.gain, problem)):
         progress("refining the least gain")
         least = _polished(problem, least, printed)
-    gamma = _gain_to_ship(asked, problem, least, noisy=noisy)
+    gamma = _gain_to_ship(method, problem, least, noisy=noisy)
     progress("reducing the observer gains")
     inner = gamma - min(CERTIFICATE_SHARE * (gamma - least.gain), CERTIFICATE_MARGIN * gamma)
     chosen, records = small_gain_design(problem, least, inner, printed=printed, engine=engine)
@@ -94,19 +94,19 @@ def found_gains(
 def found_within(
     problem: GainProblem,
     limited: GainProblem | None,
-    asked: FaultEstimationFilter,
+    method: FaultEstimationFilter,
     *,
     exactly: bool,
     printed: PrintedInequality,
     progress: Callable[[str], None],
 ) -> FoundGains:
     """Search gains; of a problem with a limit on the weight by the inequality, as Riccati equations do not cover it."""
-    search = partial(found_gains, asked=asked, printed=printed, progress=progress)
+    search = partial(found_gains, method=method, printed=printed, progress=progress)
     problem = replace(problem, judged_exactly=exactly)
     if limited is None:
-        return search(problem, engine=asked.engine)
+        return search(problem, engine=method.engine)
     limited = replace(limited, judged_exactly=exactly)
-    if asked.engine == "auto" and limited.weight_limit is not None:
+    if method.engine == "auto" and limited.weight_limit is not None:
         # They do where the limit costs nothing: what is found without it keeps it.
         try:
             free = search(problem, engine="auto")
@@ -114,13 +114,13 @@ def found_within(
             free = None
         if free is not None and free.within(limited.weight_limit):
             return free
-    return search(limited, engine="lmi" if asked.engine == "auto" else asked.engine)
+    return search(limited, engine="lmi" if method.engine == "auto" else method.engine)
 
 
-def _least_gain(problem: GainProblem, asked: FaultEstimationFilter) -> LeastGain:
-    if asked.gamma_search == "direct":
+def _least_gain(problem: GainProblem, method: FaultEstimationFilter) -> LeastGain:
+    if method.gamma_search == "direct":
         return search_least_gain(problem)
-    return search_by_bisection(problem, tolerance=asked.tolerance)
+    return search_by_bisection(problem, tolerance=method.tolerance)
 
 
 def _polished(problem: GainProblem, least: LeastGain, printed: PrintedInequality) -> LeastGain:
@@ -129,8 +129,8 @@ def _polished(problem: GainProblem, least: LeastGain, printed: PrintedInequality
     if problem.measured == 0 or problem.disturbances == 0:
         return least
     if least.gain <= least_level(problem) * (1.0 + AT_THE_BOUND):
-        told = {"what": "least gain", "solver": "lower bound", "status": NOTHING_TO_POLISH, "gain": least.gain}
-        return replace(least, records=[*records, told])
+        record = {"what": "least gain", "solver": "lower bound", "status": NOTHING_TO_POLISH, "gain": least.gain}
+        return replace(least, records=[*records, record])
     injection = printed.least(problem, records)
     gain = np.inf if injection is None else replace(problem, judged_exactly=True).achieved_gain(injection)
     if injection is None or not gain < least.gain:
@@ -145,19 +145,19 @@ def _leaves_little(gamma: float | None, least: float, problem: GainProblem) -> b
     return near and problem.disturbances > 0 and problem.order <= POLISHING_UP_TO
 
 
-def _gain_to_ship(asked: FaultEstimationFilter, problem: GainProblem, least: LeastGain, *, noisy: bool) -> float:
+def _gain_to_ship(method: FaultEstimationFilter, problem: GainProblem, least: LeastGain, *, noisy: bool) -> float:
     floor = SMALLEST_USEFUL_GAIN * least.starting_gain
     if problem.disturbances == 0:
         return NOMINAL_GAIN
-    if asked.gamma is None and noisy:
+    if method.gamma is None and noisy:
         # Where noise is stated, the least gain may cost any amount of it (a decoupled disturbance).  The Kalman filter
         # that takes the disturbance as unit white noise is a fair compromise, and its gain is known to be reachable.
-        return max((1.0 + asked.gamma_margin) * least.gain, least.starting_gain)
-    if asked.gamma is None:
-        return max((1.0 + asked.gamma_margin) * least.gain, floor)
-    _require_reachable(problem, least, asked.gamma, solver=asked.solver)
+        return max((1.0 + method.gamma_margin) * least.gain, least.starting_gain)
+    if method.gamma is None:
+        return max((1.0 + method.gamma_margin) * least.gain, floor)
+    _require_reachable(problem, least, method.gamma, solver=method.solver)
     ceiling = LARGEST_USEFUL_GAIN * least.starting_gain
-    return min(asked.gamma, ceiling) if ceiling > 0.0 else asked.gamma
+    return min(method.gamma, ceiling) if ceiling > 0.0 else method.gamma
 
 
 def _require_reachable(problem: GainProblem, least: LeastGain, gain: float, *, solver: str) -> None:

@@ -133,31 +133,31 @@ class PrintedInequality:
         from obsynth.conditions.atoms import region
         from obsynth.conditions.wang import h2_terms, noise_paths
 
-        found, added = self.conditions, dict[str, Any]()
-        P, Y = found.variables["P"], found.variables["Y"]
+        inequality, added = self.conditions, dict[str, Any]()
+        P, Y = inequality.variables["P"], inequality.variables["Y"]
         if problem.disturbances:
-            added["gamma"] = found.variables["gamma_squared"] <= level**2
+            added["gamma"] = inequality.variables["gamma_squared"] <= level**2
         if decay < 1.0:
-            added["decay"] = region(found.data["A1"], P, disk(0.0, decay), Y=Y, Cy=found.data["C1"])[1]
+            added["decay"] = region(inequality.data["A1"], P, disk(0.0, decay), Y=Y, Cy=inequality.data["C1"])[1]
         if self.plant.nw:
             work = with_sensor_faults_as_states(self.plant)
-            entering, free = noise_paths(self.plant, found, work.Bw, work.Dw)
+            driving, free = noise_paths(self.plant, inequality, work.Bw, work.Dw)
         else:
             # Unit noise on what no fault reaches alone: its variance is the size of the gains.
             free = self.parts.V / self.prepared.scaling.outputs[:, None]
-            entering = np.zeros((len(found.data["T"]), free.shape[1]))
-        _, added["variance"], Z = h2_terms(self.plant, found, entering, free)
-        changed = found.changed(constraints=added, objective=cp.trace(Z))
+            driving = np.zeros((len(inequality.data["T"]), free.shape[1]))
+        _, added["variance"], Z = h2_terms(self.plant, inequality, driving, free)
+        changed = inequality.changed(constraints=added, objective=cp.trace(Z))
         return self._filter("small gains", changed, problem.weight_limit, records)
 
     def _filter(
-        self, what: str, found: Conditions, limit: WeightLimit | None, records: list[dict[str, Any]]
+        self, purpose: str, inequality: Conditions, limit: WeightLimit | None, records: list[dict[str, Any]]
     ) -> Injection | None:
-        if limit is not None and found.weight is not None:
-            found = found.changed(constraints={"weight": cp.norm(found.weight, 2) <= limit.bound})
+        if limit is not None and inequality.weight is not None:
+            inequality = inequality.changed(constraints={"weight": cp.norm(inequality.weight, 2) <= limit.bound})
         try:
-            records.append(solved(found.problem, what, self.solver))
-            gains = found.gains()
+            records.append(solved(inequality.problem, purpose, self.solver))
+            gains = inequality.gains()
         except SolverError as error:
             records.append({**error.record, "outcome": str(error)})
             return None
@@ -171,13 +171,13 @@ class PrintedInequality:
 
 def gains_by_inequality(goal: Goal, printed: PrintedInequality, records: list[dict[str, Any]]) -> list[Injection]:
     """Return what the inequality gives that meets the goal; with a decay imposed where that is too slow without."""
-    found: list[Injection] = []
+    injections: list[Injection] = []
     for decay in (1.0, goal.slowest):
         injection = printed.small_gains(goal.problem, goal.gain, records, decay=decay)
-        found += [injection] if injection is not None and goal.met(injection) else []
-        if any(map(goal.is_fast, found)):
+        injections += [injection] if injection is not None and goal.met(injection) else []
+        if any(map(goal.is_fast, injections)):
             break
-    return found
+    return injections
 
 
 def small_gain_design(
@@ -215,25 +215,25 @@ def small_gain_design(
         candidates += [_towards(goal, min(central, key=goal.cost), target)] if central else []
     records.append({"what": "small gains", "solver": "central filter", "status": f"{len(central)} filters"})
     small = problem.order <= WHOLE_INEQUALITY_UP_TO
-    wanted = {
+    takes_inequality = {
         "auto": small and not candidates,
         "riccati": False,
         "lmi": problem.order <= POLISHING_UP_TO or problem.weight_limit is not None or not candidates,
     }
-    if wanted[engine]:
+    if takes_inequality[engine]:
         candidates += gains_by_inequality(goal, printed, records)
-    if (wanted[engine] or not candidates) and goal.met(least.injection):
+    if (takes_inequality[engine] or not candidates) and goal.met(least.injection):
         candidates.append(least.injection)
     if not candidates:
         raise SolverError(f"No filter with gain {gain:.6g} was found: the result is inconclusive.", record=records[-1])
     # An inaccurate solution may be far from the least noise: the true cost decides, not the solver.
     fast = [item for item in candidates if goal.met_fast(item)]
-    found = min(fast or candidates, key=goal.cost)
-    if quick is not None and goal.cost(quick) <= PRICE_OF_SPEED * goal.cost(found):
-        found = quick
+    cheapest = min(fast or candidates, key=goal.cost)
+    if quick is not None and goal.cost(quick) <= PRICE_OF_SPEED * goal.cost(cheapest):
+        cheapest = quick
     # Among many states what was moved towards the target once is not moved again: each judgement is an equation.
     moved = problem.order > HIGHER_LEVEL_UP_TO and len(candidates) == 1
-    return (_towards(goal, found, target) if goal.noisy and quick is None and not moved else found), records
+    return (_towards(goal, cheapest, target) if goal.noisy and quick is None and not moved else cheapest), records
 
 
 def _fast_filters(goal: Goal) -> list[Injection]:
@@ -243,12 +243,14 @@ def _fast_filters(goal: Goal) -> list[Injection]:
     """
     problem = goal.problem
     size = largest_singular_value(np.vstack([problem.Bn, problem.Dn]))
-    found: list[Injection] = []
+    filters: list[Injection] = []
     for share in STATE_NOISE:
         noisier = problem.with_state_noise(share * size)
-        found += [item for item in noise_weighted_filters(noisier, goal.gain, reaches=goal.met) if goal.met_fast(item)]
-    least = min(map(goal.cost, found), default=0.0)
-    return sorted((item for item in found if goal.cost(item) <= PRICE_OF_SPEED * least), key=problem.radius)
+        filters += [
+            item for item in noise_weighted_filters(noisier, goal.gain, reaches=goal.met) if goal.met_fast(item)
+        ]
+    least = min(map(goal.cost, filters), default=0.0)
+    return sorted((item for item in filters if goal.cost(item) <= PRICE_OF_SPEED * least), key=problem.radius)
 
 
 def _towards(goal: Goal, injection: Injection, target: Injection | None, *, slowest: float | None = None) -> Injection:

@@ -65,51 +65,51 @@ FIRST_TRIES = 4
 
 
 def synthesise(
-    plant: DescriptorSystem | PolytopicSystem, asked: FaultEstimationFilter, *, progress: Callable[[str], None]
+    plant: DescriptorSystem | PolytopicSystem, method: FaultEstimationFilter, *, progress: Callable[[str], None]
 ) -> Synthesis:
     """Design the filter; see `obsynth.fault_estimation_filter` for the options, results and errors."""
     if isinstance(plant, PolytopicSystem):
-        return synthesise_over_region(plant, asked, progress=progress)
-    solver = chosen_solver(asked.solver, asked.solver_options)
-    if asked.own_inequality:
+        return synthesise_over_region(plant, method, progress=progress)
+    solver = chosen_solver(method.solver, method.solver_options)
+    if method.own_inequality:
         from obsynth.methods.engines.own_terms import filter_by_inequality
 
-        return filter_by_inequality(plant, asked, progress=progress)
-    asked = replace(asked, solver=solver)
+        return filter_by_inequality(plant, method, progress=progress)
+    method = replace(method, solver=solver)
     progress("checking the existence conditions")
-    held, prepared = examine_fault_filter(plant)
-    require_all(held)
+    conditions, prepared = examine_fault_filter(plant)
+    require_all(conditions)
     merged = merged_outputs(plant)
     dependent = merged is not None and _is_prepared_without(plant, prepared)
-    paper = asked.asks_for_free_weight is False
-    near = nearly_merged_outputs(plant) if asked.S is None and not plant.nd and not paper else None
+    paper = method.asks_for_free_weight is False
+    near = nearly_merged_outputs(plant) if method.S is None and not plant.nd and not paper else None
     if merged is None or not dependent:
-        made = _synthesised(plant, held, prepared, asked, progress)
-        return made if near is None else _less_noisy(plant, near, made, asked, progress)
-    if asked.S is not None:
+        made = _synthesised(plant, conditions, prepared, method, progress)
+        return made if near is None else _less_noisy(plant, near, made, method, progress)
+    if method.S is not None:
         raise _for_independent_outputs("S", "S", plant, merged)
-    made = _of_merged(plant, merged, _synthesised(merged.plant, held, prepared, asked, progress))
+    made = _of_merged(plant, merged, _synthesised(merged.plant, conditions, prepared, method, progress))
     if not _is_as_labelled(made):
         if paper:
             raise _for_independent_outputs("The paper's W", "weight", plant, merged)
-        free = replace(asked, weight="free")
-        made = _of_merged(plant, merged, _synthesised(merged.plant, held, prepared, free, progress))
-    return made if near is None else _less_noisy(plant, near, made, asked, progress)
+        free = replace(method, weight="free")
+        made = _of_merged(plant, merged, _synthesised(merged.plant, conditions, prepared, free, progress))
+    return made if near is None else _less_noisy(plant, near, made, method, progress)
 
 
 def _less_noisy(
     plant: DescriptorSystem,
     near: MergedOutputs,
     made: Synthesis,
-    asked: FaultEstimationFilter,
+    method: FaultEstimationFilter,
     progress: Callable[[str], None],
 ) -> Synthesis:
     """Return the filter with nearly dependent outputs merged where that exists and is less noisy, else the other."""
-    held, prepared = examine_fault_filter(near.plant)
-    if prepared is None or not all(condition.holds for condition in held):
+    conditions, prepared = examine_fault_filter(near.plant)
+    if prepared is None or not all(condition.holds for condition in conditions):
         return made
     try:
-        other = _of_merged(plant, near, _synthesised(near.plant, held, prepared, asked, progress))
+        other = _of_merged(plant, near, _synthesised(near.plant, conditions, prepared, method, progress))
     except ObsynthError:
         return made
     if not _is_as_labelled(other):
@@ -120,11 +120,11 @@ def _less_noisy(
 
 
 def _for_independent_outputs(
-    given: str, option: str, plant: DescriptorSystem, merged: MergedOutputs
+    choice: str, option: str, plant: DescriptorSystem, merged: MergedOutputs
 ) -> PreconditionError:
     """Return the refusal of what is for independent outputs alone, with the option to leave out."""
     return PreconditionError(
-        f"{given} is for independent outputs (Wang 2015, below eq. (1), assumes rank C = {plant.ny}), but "
+        f"{choice} is for independent outputs (Wang 2015, below eq. (1), assumes rank C = {plant.ny}), but "
         f"{plant.ny - merged.plant.ny} of the outputs depend on others. Leave {option} out: a filter exists, and such "
         "outputs are merged by their noise then.",
         condition="rank C",
@@ -136,13 +136,13 @@ def _is_as_labelled(made: Synthesis) -> bool:
     return made.options["weight"] == "free" or paper_weight_row(made.gains).passed
 
 
-def _of_merged(plant: DescriptorSystem, merged: MergedOutputs, found: Synthesis) -> Synthesis:
+def _of_merged(plant: DescriptorSystem, merged: MergedOutputs, synthesis: Synthesis) -> Synthesis:
     """Return the filter of a plant from that of it with merged outputs."""
-    observer, weights = found.linear_observer, merged.weights
+    observer, weights = synthesis.linear_observer, merged.weights
     return replace(
-        found,
-        gains={name: gain @ weights if name in _OF_OUTPUTS else gain for name, gain in found.gains.items()}
-        | {"Upsilon": with_sensor_faults_as_states(plant).C @ found.gains["Psi"]},
+        synthesis,
+        gains={name: gain @ weights if name in _OF_OUTPUTS else gain for name, gain in synthesis.gains.items()}
+        | {"Upsilon": with_sensor_faults_as_states(plant).C @ synthesis.gains["Psi"]},
         observer=replace(observer, By=observer.By @ weights, Dy=observer.Dy @ weights, output_names=plant.output_names),
     )
 
@@ -154,16 +154,16 @@ def _is_prepared_without(plant: DescriptorSystem, prepared: PreparedPlant | None
 
 def _synthesised(
     plant: DescriptorSystem,
-    held: Sequence[Condition],
+    conditions: Sequence[Condition],
     prepared: PreparedPlant | None,
-    asked: FaultEstimationFilter,
+    method: FaultEstimationFilter,
     progress: Callable[[str], None],
 ) -> Synthesis:
     """Return the filter of a plant with independent outputs."""
-    s = None if asked.S is None else as_matrix(asked.S, "S")
+    s = None if method.S is None else as_matrix(method.S, "S")
     prepared = prepare(plant, s) if prepared is None or s is not None else prepared
-    limit = asked.residual_weight_limit
-    free, told = weight_by_gain(plant, prepared, asked)
+    limit = method.residual_weight_limit
+    free, remarks = weight_by_gain(plant, prepared, method)
     problem, parts = gain_problem(prepared, free_weight=free)
     # Where nothing disturbs the estimates, a small share of what disturbances could do is proved.
     nominal = NOMINAL_GAIN * max(problem.disturbance_size, NOMINAL_GAIN)
@@ -173,35 +173,35 @@ def _synthesised(
     elif plant.nw == 0:
         problem = with_output_noise(problem, parts)
     limited = None if limit is None else with_weight_limit(problem, prepared, parts, limit)
-    printed = PrintedInequality(plant, prepared, parts, free, asked.solver)
-    search = partial(found_within, problem, limited, asked, printed=printed, progress=progress)
-    found = search(exactly=False)
+    printed = PrintedInequality(plant, prepared, parts, free, method.solver)
+    search = partial(found_within, problem, limited, method, printed=printed, progress=progress)
+    outcome = search(exactly=False)
     progress("building the realisation and its certificate")
-    level = found.gamma if found.problem.disturbances else nominal
-    gains, realised, factor, proved = _shipped(plant, prepared, parts, found, level, tries=FIRST_TRIES)
+    level = outcome.gamma if outcome.problem.disturbances else nominal
+    gains, realised, factor, proved = _shipped(plant, prepared, parts, outcome, level, tries=FIRST_TRIES)
     if not proved:
-        if not replace(found.problem, judged_exactly=True).reaches(found.chosen, level):
-            found = search(exactly=True)  # a peak was missed
-            level = found.gamma if found.problem.disturbances else nominal
-        gains, realised, factor, _ = _shipped(plant, prepared, parts, found, level, tries=None)
+        if not replace(outcome.problem, judged_exactly=True).reaches(outcome.chosen, level):
+            outcome = search(exactly=True)  # a peak was missed
+            level = outcome.gamma if outcome.problem.disturbances else nominal
+        gains, realised, factor, _ = _shipped(plant, prepared, parts, outcome, level, tries=None)
     observer, tracking, lag = realised
     claims, witnesses = {"state_lag": float(lag)}, {"P_factor": factor, "tracking": tracking}
     if plant.nd:
         progress("proving that no filter has a smaller gain")
-        least, proof = _least(found, prepared, asked, gains, factor, level=level, free_weight=free)
+        least, proof = _least(outcome, prepared, method, gains, factor, level=level, free_weight=free)
         claims = {"gamma": level, "gamma_min": least["gamma_min"]} | claims | least
         witnesses |= proof
-    records = [*found.least.records, *found.records]
-    resolved = asked.as_plain() | {"weight": "free" if free else "paper", "S": None if s is None else s.tolist()}
-    if asked.mean > 1:
+    records = [*outcome.least.records, *outcome.records]
+    resolved = method.as_plain() | {"weight": "free" if free else "paper", "S": None if s is None else s.tolist()}
+    if method.mean > 1:
         # Registers hold estimates, which see no state: nothing of the plant is tracked there.
-        zeros = np.zeros(((asked.mean - 1) * plant.nf, tracking.shape[1]))
+        zeros = np.zeros(((method.mean - 1) * plant.nf, tracking.shape[1]))
         witnesses["tracking"] = np.vstack([tracking, zeros])
-        observer = averaged(observer, asked.mean)
-    if plant.nd and asked.gamma is not None and level < asked.gamma:
-        told = (
-            *told,
-            f"gamma = {asked.gamma:.6g} was asked for, and {level:.6g} is proved: a larger gamma would only make the "
+        observer = averaged(observer, method.mean)
+    if plant.nd and method.gamma is not None and level < method.gamma:
+        remarks = (
+            *remarks,
+            f"gamma = {method.gamma:.6g} was asked for, and {level:.6g} is proved: a larger gamma would only make the "
             "gains worse conditioned.",
         )
     return Synthesis(
@@ -210,34 +210,34 @@ def _synthesised(
         observer,
         Certificate(witnesses, claims),
         {"engine": "lmi" if any("settings" in record for record in records) else "riccati", "runs": records},
-        (*told, *notes(plant, prepared.detectability, observer, largest_zero=held[-1].value)),
+        (*remarks, *notes(plant, prepared.detectability, observer, largest_zero=conditions[-1].value)),
     )
 
 
 def weight_by_gain(
-    plant: DescriptorSystem, prepared: PreparedPlant, asked: FaultEstimationFilter
+    plant: DescriptorSystem, prepared: PreparedPlant, method: FaultEstimationFilter
 ) -> tuple[bool, tuple[str, ...]]:
     """Return whether W is free, and what a free W and the paper's give where both were compared.
 
     By default W is free where the plant states noise, or where that lowers the least gain by `WORTH_A_FREE_WEIGHT`.
     """
-    if asked.asks_for_free_weight is not None:
-        return asked.asks_for_free_weight, ()
+    if method.asks_for_free_weight is not None:
+        return method.asks_for_free_weight, ()
     if plant.nw or not plant.nd:
         return plant.nw > 0, ()
     if not gain_problem(prepared, free_weight=True)[0].measured:
         return False, ()
     upper, lower = least_gains_by_weight(prepared)
-    taken = bool(lower < (1.0 - WORTH_A_FREE_WEIGHT) * upper)
-    taken_for = "the free W is taken" if taken else "the paper's W is taken"
-    told = f"Least gamma with these T and N: {lower:.5g} with a free W, {upper:.5g} with the paper's W; {taken_for}."
-    return taken, (told,)
+    is_free = bool(lower < (1.0 - WORTH_A_FREE_WEIGHT) * upper)
+    taken_for = "the free W is taken" if is_free else "the paper's W is taken"
+    remark = f"Least gamma with these T and N: {lower:.5g} with a free W, {upper:.5g} with the paper's W; {taken_for}."
+    return is_free, (remark,)
 
 
 def _least(
-    found: FoundGains,
+    outcome: FoundGains,
     prepared: PreparedPlant,
-    asked: FaultEstimationFilter,
+    method: FaultEstimationFilter,
     gains: Mapping[str, FloatArray],
     factor: FloatArray,
     *,
@@ -245,20 +245,20 @@ def _least(
     free_weight: bool,
 ) -> tuple[dict[str, float], dict[str, FloatArray]]:
     """Return what is claimed of the least gain of any filter, and the witnesses."""
-    least = found.least
+    least = outcome.least
     proof, proved = least_gain_certificate(
-        found.problem,
+        outcome.problem,
         prepared.plant,
         gains,
         factor,
         gain=least.gain,
         free_weight=free_weight,
-        solver=asked.solver,
-        thorough=asked.prove_least,
+        solver=method.solver,
+        thorough=method.prove_least,
     )
     # The search may end below what is proved, by its tolerance: no filter is there.
     claims = {"gamma_min": min(max(least.gain, proved), level)}
-    if asked.gamma_search == "bisection":
+    if method.gamma_search == "bisection":
         low, high = least.bracket
         claims |= {"gamma_bracket_low": low, "gamma_bracket_high": max(high, claims["gamma_min"])}
     return claims, proof
@@ -268,13 +268,13 @@ def _shipped(
     plant: DescriptorSystem,
     prepared: PreparedPlant,
     parts: GainParts,
-    found: FoundGains,
+    outcome: FoundGains,
     level: float,
     *,
     tries: int | None,
 ) -> tuple[dict[str, FloatArray], tuple[LinearObserver, FloatArray, int], FloatArray, bool]:
     """Return gains, their realisation, the certificate of the level that is claimed, and whether it proves that."""
-    gains = gains_in_given_units(prepared, parts, found.chosen)
+    gains = gains_in_given_units(prepared, parts, outcome.chosen)
     observer, tracking, lag = realise_filter(plant, prepared.plant, gains, prepared.detectability)
     proof = bounded_real_certificate(plant, observer, tracking, level, core=prepared.plant.nx, lag=lag, tries=tries)
     return gains, (observer, tracking, lag), *proof

@@ -45,13 +45,13 @@ def fault_identities(errors: ErrorModel, delays: tuple[int, ...]) -> dict[str, t
         to_fault.append((-cf @ trace, -expected))
         to_residual.append((-cr @ trace, -expected))
         to_state.append((cx @ trace,))
-    found: dict[str, list[tuple[FloatArray, ...]]] = {
+    terms_by_row: dict[str, list[tuple[FloatArray, ...]]] = {
         "fault decoupled after its delay": [(traces[-1],)],
         "fault estimate": to_fault,
         "fault in the residual": to_residual,
         "no fault in the state estimate": to_state,
     }
-    return {name: tuple(Identity(terms) for terms in steps) for name, steps in found.items()}
+    return {name: tuple(Identity(terms) for terms in steps) for name, steps in terms_by_row.items()}
 
 
 def fault_traces(errors: ErrorModel, delays: tuple[int, ...]) -> list[FloatArray]:
@@ -86,12 +86,12 @@ def fault_rows(
         "no fault in the state estimate": ((errors.state_output[0], sizes), (_in_state_units(sizes, plant.nx),)),
     }
     for name, steps in fault_identities(errors, observer.fault_delays).items():
-        found = [
+        residuals = [
             replace(identity, factors=factors[name]).residual(allowances.get(step_key(name, step)))
             for step, identity in enumerate(steps)
         ]
         source = "ours: the paper's xhat is biased by Psi" if name.startswith("no fault") else _SOURCE
-        yield equality(name, claims[name], worst(found), source)
+        yield equality(name, claims[name], worst(residuals), source)
 
 
 def step_key(name: str, step: int) -> str:
@@ -163,14 +163,14 @@ class Equations:
 
     def moved(self, t: FloatArray, age: int, *, rows: int) -> FloatArray:
         """Return what each fault known now did to the first ``rows`` states of some age, per unit ``(rows, nf)``."""
-        found = np.zeros((rows, len(self.delays)))
+        effects = np.zeros((rows, len(self.delays)))
         for i, delay in enumerate(self.delays):
             if delay > age:
                 column = t @ self.F[:, i]
                 for _ in range(delay - 1 - age):
                     column = t @ (self.A @ column)
-                found[:, i] = column[:rows]
-        return found
+                effects[:, i] = column[:rows]
+        return effects
 
     def realised(self, gains: Mapping[str, FloatArray], *, minus: float = -1.0) -> dict[str, FloatArray]:
         """Return Az, Bu, By, Cz, Du and Dy of the filter."""
@@ -181,11 +181,11 @@ class Equations:
         measured = y + minus * (self.D @ u)
         x0 = core + n @ measured
         innovation = measured + minus * (self.C @ x0)
-        shown = w @ innovation
+        residual = w @ innovation
         known = [x0[:nx], *np.split(stored, lag)] if lag else [x0[:nx]]
-        states = [state + self.moved(t, age, rows=nx) @ shown for age, state in enumerate(known)]
+        states = [state + self.moved(t, age, rows=nx) @ residual for age, state in enumerate(known)]
         following = np.vstack([t @ (self.A @ x0) + feedback @ innovation + t @ (self.B @ u), *states[:-1]])
-        outputs = np.vstack([states[-1], shown, shown])
+        outputs = np.vstack([states[-1], residual, residual])
         columns = [nz, nz + self.B.shape[1]]
         return dict(
             zip(
@@ -199,7 +199,7 @@ class Equations:
         """Return the map V ``(nz, nx (lag + 1))`` that the observer's states track."""
         lag = max(self.delays, default=1) - 1
         na, older = len(self.A), lag * self.nx
-        found = np.zeros((na + older, self.nx + older))
-        found[:na, : self.nx] = t[:, : self.nx]
-        found[na:, self.nx :] = np.eye(older)
-        return found
+        tracking_map = np.zeros((na + older, self.nx + older))
+        tracking_map[:na, : self.nx] = t[:, : self.nx]
+        tracking_map[na:, self.nx :] = np.eye(older)
+        return tracking_map
