@@ -14,7 +14,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.pencil import structure_of
 from obsynth.plants.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
 from obsynth.plants.transformations.exact_elimination import EXACT_ELIMINATION_UP_TO
-from obsynth.plants.transformations.index_reduction import improper_outputs
+from obsynth.plants.transformations.index_reduction import improper_outputs, with_input_derivatives
 from obsynth.plants.transformations.recovery import StateRecovery, Transformation
 
 if TYPE_CHECKING:
@@ -88,7 +88,23 @@ def _of_low_index(plant: DescriptorSystem, method: Method | None) -> tuple[Trans
     except PreconditionError as error:
         if error.condition != "index" or method is None or _exists(plant, method):
             return None, ()
-    return _without_improper_outputs(plant)
+    return _with_input_derivatives(plant) or _without_improper_outputs(plant)
+
+
+def _with_input_derivatives(plant: DescriptorSystem) -> tuple[Transformation, tuple[str, ...]] | None:
+    """Return the proper form of a plant in which derivatives of known inputs are inputs, and what that means."""
+    reduced = with_input_derivatives(plant)
+    if reduced is None:
+        return None
+    done, names = reduced
+    outputs, signals = improper_outputs(plant)
+    one = len(outputs) == 1
+    note = (
+        f"The output{'' if one else 's'} {', '.join(outputs)} need{'s' if one else ''} the derivative of "
+        f"{', '.join(signals)}: a run on a log forms {', '.join(map(repr, names))} by differences from row to row "
+        "where the log has no column of that name; C code and FMUs take it as an input."
+    )
+    return done, (note,)
 
 
 def _exists(plant: DescriptorSystem, method: Method) -> bool:

@@ -12,6 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_given, as_matrix, freeze
 from obsynth.plants.dae import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.input_derivatives import derivative_of, difference_quotients
 from obsynth.plants.polytopic import PolytopicSystem
 from obsynth.plants.signal_names import index_of
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -152,6 +153,7 @@ def _resolved(
                     added = _missing(profile, ends[:, actuator], acts, left[:, actuator])
                     ends[:, column] += np.where(acts, added, 0.0)
         before += len(names)
+    _form_derivatives(plant.input_names, scenario, left, right, dt)
     random.sort(key=lambda item: item[0])
     uncertain = plant.uncertainty if isinstance(plant, DescriptorSystem) else None
     if uncertain is not None and uncertain.shift and uncertain.shift not in scenario.inputs:
@@ -163,6 +165,19 @@ def _resolved(
     ]
     deviations = np.array([scenario.sensor_noise.get(name, 0.0) for name in plant.output_names])
     return ScenarioSignals(dt, left, right, tuple(random), tuple(sensors), scenario.noise, deviations)
+
+
+def _form_derivatives(
+    inputs: Sequence[str], scenario: Scenario, left: FloatArray, right: FloatArray, dt: float
+) -> None:
+    """Write derivatives of known inputs for which no profile is given, by differences from sample to sample as in runs
+    on logs."""
+    times = np.arange(len(left), dtype=np.float64) * float(dt)
+    for column, name in enumerate(inputs):
+        base = None if name in scenario.inputs else derivative_of(name, inputs)
+        if base is not None:
+            quotients, _ = difference_quotients(times, left[:, inputs.index(base[0])], base[1], None)
+            left[:, column] = right[:, column] = quotients
 
 
 def _missing(profile: Profile, commanded: FloatArray, acts: np.ndarray, before: FloatArray) -> FloatArray:

@@ -466,7 +466,10 @@ class LogRun:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""
+        # Designs without such inputs have states as they always had.
+        latest = None if self.stamps is None else [[i, *row] for i, row in self.stamps.differenced.items()] or None
         return {
+            **({"differenced": latest} if self.signals.has_derivatives else {}),
             "observer": self.observer.as_dict(),
             "clock": self.clock.as_dict(),
             "recovered": None if self.recovered is None else self.recovered.as_dict(),
@@ -490,6 +493,8 @@ class LogRun:
             self.stamps.latest = self.clock.stamp
         if self.stamps is not None:
             self.stamps.earlier, self.stamps.numeric = data["inputs"], set(data["numeric"])
+            latest = data.get("differenced") or []
+            self.stamps.differenced = {int(row[0]): np.asarray(row[1:], dtype=np.float64) for row in latest}
         if self.recovered is not None:
             self.recovered.resume(data["recovered"])
         if self.monitor is not None:

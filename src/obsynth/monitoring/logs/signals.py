@@ -17,6 +17,7 @@ from obsynth.monitoring.logs.stamps import WITH_UNIT, Stamps
 from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.measurement_units import conversion
+from obsynth.plants.input_derivatives import derivative_name, derivative_of
 
 #: A time of day without its date, as it stands beside one; hours, minutes and seconds since a log began.
 _TIME_OF_DAY = re.compile(
@@ -80,8 +81,8 @@ class LogSignals:
         shift = None if uncertain is None else uncertain.shift
         return cls(
             names,
-            tuple(renamed.get(name, name) for name in (TIME_HEADER, *names) if not shift or name != shift),
-            read_only(np.array([factors.get(name, observer.scales.get(name, 1.0)) for name in names])),
+            tuple(_column(name, names, renamed) for name in (TIME_HEADER, *names) if not shift or name != shift),
+            read_only(np.array([_factor(name, names, factors, observer.scales) for name in names])),
             read_only(np.array([observer.point.get(name, 0.0) for name in names])),
             dict(observer.point),
             names.index(shift) if shift and shift in names else None,
@@ -89,6 +90,11 @@ class LogSignals:
             observer.input_delay,
             {name: unit for name, unit in units.items() if name not in factors and name not in observer.scales},
         )
+
+    @property
+    def has_derivatives(self) -> bool:
+        """Whether a signal is the derivative of a known input, which a run may form."""
+        return any(derivative_of(name, self.names) for name in self.names)
 
     def conversions(
         self, header: Sequence[str], places: Sequence[int], stamps: Stamps, below: Sequence[str] = ()
@@ -104,6 +110,10 @@ class LogSignals:
         names = [name for i, name in enumerate(self.names) if i != self.one]
         factors, shifts = np.ones(len(names)), np.zeros(len(names))
         for i, (name, place) in enumerate(zip(names, places[1:], strict=True)):
+            base = derivative_of(name, names)
+            if base is not None and place == places[1 + names.index(base[0])]:
+                # It is formed from the samples of its input, in the unit of these.
+                name = base[0]
             behind = WITH_UNIT.fullmatch(header[place])
             found = below[i + 1].strip("[]() ") if i + 1 < len(below) else "" if behind is None else behind[2]
             if not found or name not in self.units:
@@ -133,6 +143,10 @@ class LogSignals:
     def positions(self, header: tuple[str, ...]) -> list[int]:
         """Return where in a header each column is that is read."""
         found = [column_of(header, name) for name in self.columns]
+        for i, name in enumerate(self.columns):
+            # A derivative that has no column is formed from that of its input.
+            base = derivative_of(name, self.columns) if found[i] is None else None
+            found[i] = found[i] if base is None else found[self.columns.index(base[0])]
         missing = sorted({name for name, there in zip(self.columns, found, strict=True) if there is None})
         if missing:
             raise SpecError(
@@ -155,6 +169,19 @@ class LogSignals:
         values = [self.point.get(name, 0.0) for name in observer.state_names]
         values += [0.0 if name in biases else self.point.get(name, 0.0) for name in observer.fault_names]
         return np.array(values + [0.0] * (len(observer.columns) - len(values)))
+
+
+def _column(name: str, names: Sequence[str], renamed: Mapping[str, str]) -> str:
+    """Return the column of a signal: a derivative goes by that of its input."""
+    base = derivative_of(name, names)
+    return renamed.get(name, name if base is None else derivative_name(renamed.get(base[0], base[0]), base[1]))
+
+
+def _factor(name: str, names: Sequence[str], factors: Mapping[str, float], scales: Mapping[str, float]) -> float:
+    """Return the factor of a column: that of its input for a derivative that states none."""
+    base = derivative_of(name, names)
+    default = 1.0 if base is None else factors.get(base[0], scales.get(base[0], 1.0))
+    return factors.get(name, scales.get(name, default))
 
 
 def is_bad(status: str) -> bool:

@@ -34,6 +34,7 @@ from obsynth.monitoring.logs.unpacked_logs import (
 )
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.input_derivatives import difference_quotients
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -64,7 +65,7 @@ def chunks(
 ) -> Iterator[FloatArray]:
     """Yield ``(rows, 1 + nu + ny)``: time and signals, in order; NaN where a sample is missing.  Inputs are those that
     act in a row as the design takes it.  The first rows are left out up to the time ``after``."""
-    found = _without_days(_chunks(data, signals, stamps, rows), stamps)
+    found = _differenced(_without_days(_chunks(data, signals, stamps, rows), stamps), stamps, goes_on=after is None)
     if after is not None:
         found = _later(found, after)
     if not signals.delay or not signals.inputs:
@@ -82,6 +83,17 @@ def _without_days(found: Iterator[FloatArray], stamps: Stamps) -> Iterator[Float
     for count, chunk in enumerate(found):
         if not count:
             stamps.require_no_days(chunk[:, 0])
+        yield chunk
+
+
+def _differenced(found: Iterator[FloatArray], stamps: Stamps, *, goes_on: bool) -> Iterator[FloatArray]:
+    """Yield rows with the derivatives of known inputs that no column has; ``goes_on``: after the rows of a state."""
+    before = stamps.differenced if goes_on else {}
+    for chunk in found:
+        for place, (base, order) in stamps.formed.items():
+            values = chunk[:, base].copy()
+            chunk[:, place], before[place] = difference_quotients(chunk[:, 0], values, order, before.get(place))
+        stamps.differenced = before
         yield chunk
 
 

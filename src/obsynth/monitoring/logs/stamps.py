@@ -15,6 +15,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import number_in_text
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.input_derivatives import derivative_of
 
 if TYPE_CHECKING:
     pass
@@ -202,6 +203,10 @@ class Stamps:
         self.numeric: set[str] = set()
         #: Inputs ``(delay, nu)`` of the latest rows, where inputs act later than they are written.
         self.earlier: FloatArray | None = None
+        #: Columns of derivatives that are formed, by their place in a row: the place of the input, and the order.
+        self.formed: dict[int, tuple[int, int]] = {}
+        #: Of each of them what the differences of the next rows need of the latest ones.
+        self.differenced: dict[int, FloatArray] = {}
 
     def warnings(self) -> tuple[str, ...]:
         """Return what is to be said of the file, and a text for each column with words in it."""
@@ -255,7 +260,16 @@ class Stamps:
         per_second = None if found is None else _UNITS_OF_TIME.get(found.group(2).strip().lower())
         if per_second is not None:
             self._take_unit(per_second, header[places[0]])
-        named = [repr(header[place]) for name, place in zip(wanted, places, strict=True) if header[place] != name]
+        for i, name in enumerate(wanted):
+            base = derivative_of(name, wanted) if header[places[i]] != name else None
+            if base is not None and places[i] == places[wanted.index(base[0])]:
+                self.formed[i] = (wanted.index(base[0]), base[1])
+                self.notes.append(f"{name} is formed from {base[0]} by differences from row to row.")
+        named = [
+            repr(header[place])
+            for i, (name, place) in enumerate(zip(wanted, places, strict=True))
+            if header[place] != name and i not in self.formed
+        ]
         if named:
             self.notes.append(f"Columns are found by their names without units: {', '.join(named)}.")
 

@@ -17,7 +17,7 @@ positions and speeds is lost: z has as many entries as there are free initial va
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -29,6 +29,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
+from obsynth.plants.input_derivatives import MOST_DERIVATIVES, derivative_name, derivative_of
 from obsynth.plants.pencil import in_own_units, structure_of
 from obsynth.plants.plant_units import PlantUnits
 from obsynth.plants.transformations.exact_elimination import EXACT_ELIMINATION_UP_TO
@@ -79,6 +80,58 @@ def improper_outputs(plant: DescriptorSystem) -> tuple[tuple[str, ...], tuple[st
     return ((), ()) if split is None else _improper(plant, split.differentiated_outputs)
 
 
+def with_input_derivatives(plant: DescriptorSystem) -> tuple[Transformation, tuple[str, ...]] | None:
+    """Return the minimal proper form of a continuous plant whose outputs need derivatives of known inputs, which become
+    known inputs of their own, and the names of these; ``None`` where outputs need those of other signals, derivatives
+    of an order above three, or none.
+    """
+    split = None if plant.dt or plant.delays else _split(plant)
+    if split is None or not split.count or not split.differentiated_outputs.any():
+        return None
+    if split.differentiated_outputs[:, plant.nu :].any():
+        return None
+    states: list[FloatArray] = []
+    names: list[str] = []
+    lost = (split.differentiated[:, plant.nu :] != 0.0).any(axis=1)
+    for order, by_signal in enumerate(split.orders, 1):
+        reached = _but_small(plant.C @ by_signal, np.abs(plant.C) @ np.abs(by_signal))
+        for column, name in enumerate(plant.input_names):
+            if not reached[:, column].any():
+                # A state that needs it alone is not recovered.
+                lost |= by_signal[:, column] != 0.0
+            elif order > MOST_DERIVATIVES:
+                return None
+            else:
+                states.append(by_signal[:, column])
+                names.append(derivative_name(name, order))
+    if set(names) & {*plant.input_names, *plant.output_names, *plant.state_names}:
+        return None
+    dropped = tuple(name for name, gone in zip(plant.state_names, lost.tolist(), strict=True) if gone)
+    plain = replace(_transformation(plant, split), dropped=dropped)
+    return _with_inputs(plain, names, np.column_stack(states)), tuple(names)
+
+
+def _with_inputs(plain: Transformation, names: list[str], by_input: FloatArray) -> Transformation:
+    """Return a transformation whose plant has more known inputs, by which states of its source ``(nx, inputs)`` are
+    moved at once."""
+    source, plant, recovery = plain.source, plain.plant, plain.recovery
+    count, units = len(names), dict(plant.units)
+    for name in names:
+        base, order = derivative_of(name, source.input_names) or ("", 0)
+        if unit := source.units.get(base):
+            units[name] = f"{unit}/s" if order == 1 else f"{unit}/s^{order}"
+    more = plant.replace(
+        B=np.hstack([plant.B, np.zeros((plant.nx, count))]),
+        D=np.hstack([plant.D, source.C @ by_input]),
+        input_names=[*plant.input_names, *names],
+        units=units,
+    )
+    moved = replace(recovery, from_input=np.hstack([recovery.from_input, by_input]))
+    signals = ", ".join(names)
+    text = f"{plain.description}; {signals} {'is an input of its own' if count == 1 else 'are inputs of their own'}"
+    return replace(plain, plant=more, recovery=moved, description=text)
+
+
 @dataclass(frozen=True, eq=False)
 class _Split:
     """The proper form ``z' = A z + B q, y = C z + D q, x = V z + X q + (terms in derivatives of q)``, in doubles."""
@@ -91,6 +144,7 @@ class _Split:
     X: FloatArray
     differentiated: FloatArray  # of the states, by what is differentiated once
     differentiated_outputs: FloatArray
+    orders: tuple[FloatArray, ...]  # of the states, by the first derivatives, the second ones, ...
     chosen: tuple[int, ...]  # states of which V has the rows of an identity
     exact: Mapping[str, fmpq_mat] | None  # A, B, C, D as rational numbers
 
@@ -141,10 +195,13 @@ def _split_exactly(plant: DescriptorSystem, wanted: int) -> _Split | None:
         "C": c * dynamic,
         "D": c * states + direct,
     }
+    orders, term = [], algebraic
+    while (term := fmpq(-1) * g * n * term).rank():
+        orders.append(nearest_doubles(nilpotent * term))
     others = (dynamic, states, differentiated, c * differentiated)
     chosen = tuple(int(row) for row in pivot_columns(dynamic.transpose()))
     a, b, seen, through, v, x, later, outputs = map(nearest_doubles, (*exact.values(), *others))
-    return _Split(a, b, seen, through, v, x, later, outputs, chosen, exact)
+    return _Split(a, b, seen, through, v, x, later, outputs, tuple(orders), chosen, exact)
 
 
 def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | None:
@@ -179,6 +236,13 @@ def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | No
     later = np.abs(nilpotent) @ np.abs(g @ n) @ np.abs(algebraic)
     differentiated = _but_small(nilpotent @ g @ n @ algebraic, later)
     v, factor = units.states[:, None], units.states[rows]
+    orders, term = [], algebraic
+    for order in range(1, plant.nx - count + 1):
+        # What is rounding beside the terms of one order is not carried on to the next.
+        term = _but_small(-g @ n @ term, np.abs(g @ n) @ np.abs(term))
+        if not term.any():
+            break
+        orders.append(v * _but_small(nilpotent @ term, np.abs(nilpotent) @ np.abs(term)) * units.rate**order)
     return _Split(
         own * factor[:, None] / factor / units.rate,
         b * factor[:, None] / units.rate,
@@ -188,6 +252,7 @@ def _split_in_floating_point(plant: DescriptorSystem, count: int) -> _Split | No
         v * states,
         v * differentiated,
         _but_small(c @ differentiated, np.abs(c) @ np.abs(differentiated)) / shown,
+        tuple(orders),
         tuple(rows),
         None,
     )
