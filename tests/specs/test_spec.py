@@ -359,3 +359,61 @@ class TestMethods:
         of_function = {name: p.default for name, p in parameters.items() if name not in own}
         fields = options_schema(method).model_fields
         assert {name: field.default for name, field in fields.items()} == of_function
+
+
+THERMAL = Path(__file__).parents[2] / "docs" / "examples" / "thermal" / "spec.yaml"
+
+
+def with_text(tmp_path, before, after):
+    text = THERMAL.read_text(encoding="utf-8")
+    assert before in text
+    path = tmp_path / "spec.yaml"
+    path.write_text(text.replace(before, after, 1), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("sensor_noise: {heater: 0.1,", "sensor_noise: {heater: 0.1 K,"),
+        ("operating_point: {power: 100,", "operating_point: {power: 100 W,"),
+        ("heater: 175.45,", "heater: 175.45 degC,"),
+    ],
+)
+def test_numbers_with_the_unit_that_is_stated_are_numbers(tmp_path, before, after):
+    plain, written = load_spec(THERMAL).plant, load_spec(with_text(tmp_path, before, after)).plant
+    assert written.operating_point == plain.operating_point
+    assert np.array_equal(written.Dw, plain.Dw)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("units: {power: W, ", "units: {", r"plant: operating_point\.power is in W, but units states none"),
+        ("heater: 175.45,", "heater: 448.6 K,", r"operating_point\.heater: kelvin is not degC"),
+        ("sensor_noise: {heater: 0.1,", "sensor_noise: {heater: 0.1 V,", r"sensor_noise\.heater is in V"),
+    ],
+)
+def test_numbers_in_another_unit_are_not_taken_as_they_are(tmp_path, before, after, words, monkeypatch):
+    monkeypatch.setattr("obsynth.numerics.measurement_units.find_spec", lambda name: None)
+    path = with_text(tmp_path, before, after)
+    path.write_text(path.read_text().replace("point: {power: 100,", "point: {power: 100 W,"), encoding="utf-8")
+    with pytest.raises(SpecError, match=words):
+        load_spec(path)
+
+
+def test_numbers_in_another_unit_are_converted(tmp_path):
+    pytest.importorskip("pint", reason="pint is not installed (obsynth[units])")
+    plant = load_spec(with_text(tmp_path, "point: {power: 100,", "point: {power: 0.1 kW,")).plant
+    assert np.isclose(plant.operating_point["power"], 100.0)
+
+
+def test_times_of_profiles_may_have_a_unit(tmp_path):
+    path = tmp_path / "spec.yaml"
+    scenario = "scenario:\n  horizon: 1 h\n  faults: {heater fault: {kind: step, size: 1, start: 10 min, end: 0.5 h}}\n"
+    path.write_text(THERMAL.read_text(encoding="utf-8") + scenario, encoding="utf-8")
+    (profile,) = load_spec(path).scenario.faults["heater fault"]
+    assert (profile.start, profile.end) == (600.0, 1800.0)
+    path.write_text(path.read_text().replace("10 min", "10 parsecs"), encoding="utf-8")
+    with pytest.raises(SpecError, match="a time in us, ms, s, min or h"):
+        load_spec(path)

@@ -49,6 +49,11 @@ def conversion(source: str, target: str) -> tuple[float, float] | None:
     return (factor if zero == 0.0 else round(factor, _FACTOR_DIGITS)), zero
 
 
+def is_temperature(unit: str) -> bool:
+    """Whether a text is a spelling of a temperature."""
+    return unit.strip() in _TEMPERATURES
+
+
 def _spelled(text: str, other: str) -> str:
     """Return a unit without blanks around it; C and F are temperatures beside another one."""
     text = text.strip()

@@ -9,12 +9,12 @@ from dataclasses import fields
 from functools import cache
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, Tag, create_model
+from pydantic import BeforeValidator, Discriminator, Field, Tag, create_model
 
 from obsynth.simulation.scenario import PROFILE_KINDS
 from obsynth.specs.schema_plants import PlantReference, PlantSection
 from obsynth.specs.schema_sections import CalibrateSection, DAESection, InputsSection, TimeVaryingSection
-from obsynth.specs.schema_values import LIST_TAG, ONE_TAG, PositiveTime, Section, Text
+from obsynth.specs.schema_values import LIST_TAG, ONE_TAG, PositiveTime, Section, Text, in_seconds
 
 SPEC_VERSION = 1
 
@@ -24,12 +24,16 @@ RARE_KINDS = ("time-varying", "dae")
 
 _PROFILE_KEYS = [item.name for profile in PROFILE_KINDS.values() for item in fields(profile)]
 
+#: Keys of profiles that are times; they may be negative.
+_PROFILE_TIMES = ("start", "end", "time_constant", "period")
+_ProfileTime = Annotated[float | None, BeforeValidator(in_seconds)]
+
 #: How a signal goes with time; which keys belong to which kind is checked when it is built.
 ProfileSection: Any = create_model(  # type: ignore[call-overload]
     "ProfileSection",
     __base__=Section,
     kind=(Literal[tuple(PROFILE_KINDS)], ...),
-    **dict.fromkeys(_PROFILE_KEYS, (float | None, None)),
+    **{name: (_ProfileTime if name in _PROFILE_TIMES else float | None, None) for name in _PROFILE_KEYS},
 )
 
 

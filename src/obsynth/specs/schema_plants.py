@@ -11,6 +11,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from obsynth.numerics.arguments import NonNegative, Positive
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, expressions_in
+from obsynth.specs.quantities import with_numbers
 from obsynth.specs.schema_values import (
     FILE_TAG,
     ONE_TAG,
@@ -155,8 +156,9 @@ class PlantSection(Section):
     @model_validator(mode="before")
     @classmethod
     def _expressions(cls, data: Any) -> Any:
-        """Return a raw plant section with expressions in rows moved to ``entries``; only where there are constants, or
-        scheduling parameters."""
+        """Return a raw plant section with numbers for quantities, and with expressions in rows moved to ``entries``;
+        these only where there are constants, or scheduling parameters."""
+        data = with_numbers(data)
         known = isinstance(data, dict) and any(isinstance(data.get(name), dict) for name in ("constants", "scheduling"))
         if not isinstance(data, dict) or not known:
             return data

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from obsynth.numerics.arguments import Positive
+from obsynth.specs.quantities import with_numbers
 from obsynth.specs.schema_plants import BoxSection, SensorNoises, Sizes, TransformSection
 from obsynth.specs.schema_values import (
     FILE_TAG,
@@ -71,6 +72,12 @@ class DAESection(Section):
     walks: Sizes | None = None
     process_noise: dict[Text, Positive] | None = None
     transform: TransformSection | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _quantities(cls, data: Any) -> Any:
+        """Return a raw section with numbers for quantities."""
+        return with_numbers(data)
 
 
 class CalibrateSection(Section):

@@ -6,7 +6,6 @@ This module imports pydantic, so it is imported only when a spec is read.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import cache
@@ -40,6 +39,7 @@ from obsynth.numerics.arguments import (
     is_number,
     problem_with,
 )
+from obsynth.specs.quantities import QUANTITY
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
 _ROWS, FILE_TAG, PICKED, LIST_TAG, _STACK_TAG, _NUMBER_TAG, ONE_TAG = (
@@ -57,9 +57,6 @@ Text = Annotated[str, Field(min_length=1)]
 
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 
-#: A number with the word behind it.
-_QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\d\s.].*?)\s*")
-
 #: By what a number in each unit is multiplied, then divided, for seconds: 1.1 ms are 0.0011 s to the last digit.
 _SECONDS = {
     "us": (1.0, 1e6),
@@ -71,9 +68,9 @@ _SECONDS = {
 }
 
 
-def _in_seconds(value: Any) -> Any:
+def in_seconds(value: Any) -> Any:
     """Return a text such as ``10 ms`` in seconds, anything else as it is."""
-    match = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
+    match = QUANTITY.fullmatch(value) if isinstance(value, str) else None
     if match is None:
         return value
     number, unit = match.groups()
@@ -84,9 +81,9 @@ def _in_seconds(value: Any) -> Any:
 
 
 #: Times in seconds, or as texts with their unit.
-PositiveTime = Annotated[Positive, BeforeValidator(_in_seconds)]
+PositiveTime = Annotated[Positive, BeforeValidator(in_seconds)]
 
-Time = Annotated[NonNegative, BeforeValidator(_in_seconds)]
+Time = Annotated[NonNegative, BeforeValidator(in_seconds)]
 
 
 Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER_TAG)]
