@@ -219,3 +219,43 @@ def test_in_continuous_time_one_gain_is_enough_and_it_is_small() -> None:
     assert len(made.gains) == 1
     assert np.linalg.norm(made.gains[0]) < 1e5
     assert made.level <= 1.001 * made.least
+
+
+#: The flexible joint (Raghavan, Hedrick): states in radians and radians per second.
+JOINT = np.array([[0, 1, 0, 0], [-48.6, -1.25, 48.6, 0], [0, 0, 0, 1], [19.5, 0, -19.5, 0.0]])
+
+
+@pytest.mark.parametrize(("unit", "limit"), [(0.1, 10.0), (1.0, 1.0)])
+def test_a_lipschitz_condition_depends_on_units(unit: float, limit: float) -> None:
+    """Any term with a Lipschitz constant below the distance to unobservability, and none above, by units of x4."""
+    turned = np.diag([1, 1, 1, unit]) @ JOINT @ np.diag([1, 1, 1, 1 / unit])
+
+    def proved(constant: float) -> bool:
+        errors = ErrorPolytope([turned], np.eye(2, 4), dt=0.0, ball=constant)
+        try:
+            _, witness, gains = best_decay(errors, limit=1e5)
+        except SolverError:
+            return False
+        vertices = errors.closed(gains)
+        assert not prove_decay(vertices, witness, 0.0, discrete=False, ball=1.5 * limit).proved
+        return prove_decay(vertices, witness, 0.0, discrete=False, ball=constant).proved
+
+    unseen = np.eye(4)[:, 2:]
+    distance = min(
+        np.linalg.svd((turned - 1j * w * np.eye(4)) @ unseen, compute_uv=False)[-1]
+        for w in [0.0, *np.logspace(-4, 4, 2001)]
+    )
+    assert distance == pytest.approx(limit, rel=1e-3)
+    assert proved(0.9 * limit)
+    assert not proved(1.001 * limit)
+
+
+def test_a_remainder_in_continuous_time_is_covered() -> None:
+    """``x' = -a x + r x + w`` with ``|r| <= rho``: the gain is ``1 / (a - rho)``."""
+    errors = ErrorPolytope([[[-2.0]]], np.zeros((0, 1)), B=[[1.0]], D=np.zeros((0, 1)), dt=0.0, ball=0.5)
+    made = certified(errors, gains=[np.zeros((1, 0))])
+    assert made.level == pytest.approx(1.0 / 1.5, rel=2e-3)
+    assert made.level > 1.0 / 1.5
+    vertices = errors.closed(made.gains)
+    assert prove_gain(vertices, made.witness, made.level, discrete=False, ball=0.5).proved
+    assert not prove_gain(vertices, made.witness, made.level, discrete=False, ball=0.55).proved

@@ -6,6 +6,7 @@
 ``rated_inequalities`` those where its one parameter is slow, in continuous time, ``slope_inequality`` those of
 `SlopedErrors` with a multiplier; ``nonlinear_region``, or ``region`` of a model, those of a nonlinear plant over a
 region;
+``turning_faults`` those of an exact decoupling of faults that turn with the scheduling;
 ``bounded_real``, ``h2``, ``region`` and ``admissible`` return constraints; ``disk``, ``half_plane`` and ``sector`` are
 regions for the eigenvalues.  ``Conditions.bisect`` returns a `Bisection` over a parameter.
 """
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from obsynth.conditions.rated_polytope import rated_inequalities
     from obsynth.conditions.share_pasand import sharepasand
     from obsynth.conditions.slope_multipliers import SlopedErrors, slope_inequality
+    from obsynth.conditions.turning_directions import turning_errors, turning_faults
     from obsynth.conditions.wang import wang2015
     from obsynth.numerics.regions import LMIRegion, disk, half_plane, sector
     from obsynth.verification.error_polytope import ErrorPolytope
@@ -54,6 +56,8 @@ __all__ = [
     "sector",
     "sharepasand",
     "slope_inequality",
+    "turning_errors",
+    "turning_faults",
     "vertex_inequalities",
     "wang2015",
 ]
@@ -73,6 +77,7 @@ _HOMES = {
         "conditions.slope_multipliers": "SlopedErrors slope_inequality",
         "conditions.problem": "Conditions",
         "conditions.share_pasand": "sharepasand",
+        "conditions.turning_directions": "turning_errors turning_faults",
         "conditions.wang": "wang2015",
         "numerics.regions": "LMIRegion disk half_plane sector",
         "verification.error_polytope": "ErrorPolytope",

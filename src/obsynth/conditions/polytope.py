@@ -19,7 +19,8 @@ time
     \begin{bmatrix} \mathrm{He}(P A_i - Y_i C) + C_z^T C_z & P B_i - Y_i D + C_z^T D_z \\ * & D_z^T D_z - \gamma^2 I
     \end{bmatrix} < 0 \tag{V4}
 
-with ``[[P1, 0], [P2, P3]]`` for P where the last errors are algebraic.
+with ``[[P1, 0], [P2, P3]]`` for P where the last errors are algebraic.  A remainder R beside A, ``|R| <= rho``, takes
+``rho^2 t I`` from the first place, and one more row and column with P (discrete time: G) and ``t I`` (S-procedure).
 
 References: Boyd, El Ghaoui, Feron, Balakrishnan 1994; Daafouz, Bernussou, Syst. Control Lett. 43 (2001); de Oliveira,
 Bernussou, Geromel, Syst. Control Lett. 37 (1999).
@@ -179,9 +180,9 @@ def _require_fitting(
             f"decay is {shown(decay)}: give a factor a sample in discrete time, or a rate, 0 or more.",
             path="decay",
         )
-    if (lyapunov == "vertex" or steps is not None or errors.ball) and errors.dt <= 0.0:
+    if (lyapunov == "vertex" or steps is not None) and errors.dt <= 0.0:
         raise SpecError(
-            "P at each vertex, steps and a remainder are for discrete time: take lyapunov='common' here.",
+            "P at each vertex and steps are for discrete time: take lyapunov='common' here, or rated_inequalities.",
             path="lyapunov",
         )
     if steps is not None and not steps > 0.0:
@@ -325,11 +326,12 @@ class _Forms:
         decay: float | None,
         slack: Any,
     ) -> dict[str, Any]:
-        p = Dz.shape[1]
+        n, p = P.shape[0], Dz.shape[1]
+        rest = self.errors.ball**2 * self.t * np.eye(n) if self.t is not None else 0.0
         constraints = {}
         if goal == "gain":
-            lower = [[-2.0 * GA - Z.T @ Z], [-(GB + Z.T @ Dz).T, value * np.eye(p) - Dz.T @ Dz]]
-            constraints[f"(V4){place}"] = lmi.at_least(lmi.symmetric_blocks(lower), slack)
+            lower = [[-2.0 * GA - Z.T @ Z - rest], [-(GB + Z.T @ Dz).T, value * np.eye(p) - Dz.T @ Dz]]
+            constraints[f"(V4){place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, -P, 0)), slack)
         if goal == "power":
             W = cp.Variable((p, p), symmetric=True)
             constraints[f"(V4) power{place}"] = lmi.at_least(-2.0 * GA - Z.T @ Z, slack)
@@ -337,7 +339,8 @@ class _Forms:
             k = self.errors.differential or P.shape[0]
             constraints[f"(V4) noise{place}"] = lmi.at_least(lmi.symmetric_blocks([[W], [GB[:k], P[:k, :k]]]), 0.0)
         if decay is not None:
-            constraints[f"decay{place}"] = lmi.at_least(-2.0 * GA - 2.0 * decay * P, slack)
+            lower = [[-2.0 * GA - 2.0 * decay * P - rest]]
+            constraints[f"decay{place}"] = lmi.at_least(lmi.symmetric_blocks(self._with_ball(lower, -P, 0)), slack)
         return constraints
 
     def gains(self, values: Values) -> dict[str, FloatArray]:

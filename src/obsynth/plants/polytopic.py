@@ -50,6 +50,8 @@ class PolytopicSystem:
         the first vertex is at the low end.
     constants : mapping of str to float, optional
         Values of other names in the expressions.
+    shift : str, optional
+        A known input that is one in every row, as `linearise` makes one: logs have no column of it.
 
     Raises
     ------
@@ -85,6 +87,7 @@ class PolytopicSystem:
 
     vertices: tuple[DescriptorSystem, ...]
     scheduling: Scheduling
+    shift: str | None
 
     def __init__(
         self,
@@ -93,6 +96,7 @@ class PolytopicSystem:
         plant: Mapping[str, Any] | None = None,
         scheduling: Mapping[str, Any] | None = None,
         constants: Mapping[str, float] | None = None,
+        shift: str | None = None,
     ) -> None:
         if (vertices is None) == (plant is None):
             raise SpecError("Give vertices, or plant with expressions and scheduling.", path="vertices")
@@ -106,7 +110,10 @@ class PolytopicSystem:
             numbers = _constants(constants)
             found, held = _from_expressions(plant or {}, scheduling, numbers)
             given = {"plant": _plain(plant), "scheduling": _plain(scheduling), "constants": numbers}
-        for name, value in (("vertices", found), ("scheduling", held), ("_given", given)):
+        if shift is not None and shift not in found[0].input_names:
+            raise SpecError(f"shift is {shown(shift)}, which is no input of the plant.", path="shift")
+        given |= {} if shift is None else {"shift": shift}
+        for name, value in (("vertices", found), ("scheduling", held), ("shift", shift), ("_given", given)):
             object.__setattr__(self, name, value)
 
     def __setattr__(self, name: str, value: Any) -> None:

@@ -18,6 +18,8 @@ algebraic too (``E e' = M e + B w``, ``E = diag(I, 0)``, ``G = [[P1, 0], [P2, P3
 .. math::
     \begin{bmatrix} G^T M + M^T G + C_z^T C_z & G^T B + C_z^T D_z \\ * & D_z^T D_z - g I \end{bmatrix} < 0
 
+A remainder takes ``rho^2 t I`` from the first place there, with ``t I`` and P in one more row and column.
+
 Decay: ``r^2 P_a`` or ``2 a P`` in the first place, without w and z: ``|e(k)|_P <= r^k |e(0)|_P``, or ``exp(-a t)``.
 Mean square: ``tr B'PB + |Dz|^2 < J`` beside ``M'PM - P + Cz'Cz < 0``: the mean of ``|z|^2`` for unit white w, whatever
 the weights are that do not depend on w.
@@ -229,8 +231,10 @@ def _proved(
 
 def _flow_problem(vertices: Sequence[Vertex], witness: Witness, ball: float, power: float | None) -> str:
     """Return why a certificate is none in continuous time; empty where it is one."""
-    if len(witness.P) > 1 or ball or (witness.G is not None and len(witness.G) > 1):
-        return "in continuous time one P is proved, without a remainder"
+    if len(witness.P) > 1 or (witness.G is not None and len(witness.G) > 1):
+        return "in continuous time one P is proved"
+    if ball and (witness.G is not None or power is not None):
+        return "a remainder in continuous time is for one P, and bounds no mean square"
     P, k = witness.P[0], witness.order if witness.differential is None else witness.differential
     G = P if witness.G is None else witness.G[0]
     if not 0 < k <= len(P) or P[k:].any() or (G[:k] != P[:k]).any():
@@ -334,11 +338,18 @@ class _Forms:
             gm, gb, cz, dz, _ = self._at(kind, now)
             first = -(gm + gm.T) - self._lyapunov(kind, now).scaled(2.0 * rate)
             first = first - cz.T @ cz if with_outputs else first
+            P, n, p = self._lyapunov(kind, now), self.witness.order, dz.shape[1]
+            if self.ball:
+                first = first - self._remainder(kind)
+            corner = kind.exact(np.eye(n)).scaled(self.witness.multiplier)
             if gain is None:
-                return first
+                return block([[first, -P], [-P, corner]]) if self.ball else first
             across = -(gb + cz.T @ dz)
-            level = kind.exact(np.eye(dz.shape[1])).scaled(gain).scaled(gain) - dz.T @ dz
-            return block([[first, across], [across.T, level]])
+            level = kind.exact(np.eye(p)).scaled(gain).scaled(gain) - dz.T @ dz
+            rows = [[first, across], [across.T, level]]
+            if self.ball:
+                rows = [[*rows[0], -P], [*rows[1], _zero(kind, p, n)], [-P, _zero(kind, n, p), corner]]
+            return block(rows)
 
         return formula
 

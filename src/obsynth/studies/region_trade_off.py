@@ -205,7 +205,7 @@ def _changed(plant: PolytopicSystem, by: str, value: float | None) -> PolytopicS
     middle = 1.0 / plant.count
     weights = size * np.eye(plant.count) + (1.0 - size) * middle
     vertices = [plant.mean(row) for row in weights]
-    return PolytopicSystem(vertices, scheduling=None if scheduling.gives_weights else ranges)
+    return PolytopicSystem(vertices, scheduling=None if scheduling.gives_weights else ranges, shift=plant.shift)
 
 
 def _about_middle(ends: Any, size: float) -> list[float]:

@@ -42,7 +42,7 @@ class ErrorPolytope:
     differential : int, optional
         How many of the errors, the first ones, are differential; all by default.
     ball : float, optional
-        Largest spectral norm of a remainder beside A (discrete time).
+        Largest spectral norm of a remainder beside A, that may change as it likes.
 
     Raises
     ------
@@ -88,8 +88,10 @@ class ErrorPolytope:
             raise SpecError(
                 f"differential is {self.differential}: give 1 to {n}, in continuous time.", path="differential"
             )
-        if not (np.isfinite(self.ball) and self.ball >= 0.0) or (self.ball and self.dt <= 0.0):
-            raise SpecError("ball must be a finite number, 0 or more, in discrete time.", path="ball")
+        if not (np.isfinite(self.ball) and self.ball >= 0.0):
+            raise SpecError("ball must be a finite number, 0 or more.", path="ball")
+        if self.ball and self.differential not in (None, n):
+            raise SpecError("A remainder beside A is for errors that are all differential.", path="ball")
         for name, matrices in given.items():
             object.__setattr__(self, name, tuple(read_only(matrix) for matrix in matrices))
 

@@ -183,7 +183,8 @@ def _direction_condition(plant: PolytopicSystem, directions: object) -> Conditio
         _SOURCE,
         ""
         if directions is not None
-        else "a fault turns with the scheduling; a filter with exact decoupling for that is not known here",
+        else "a fault turns with the scheduling, and no filter with exact decoupling for that is shipped (for two "
+        "vertices: obsynth.conditions.turning_faults). Take ui-pi-observer, for which faults may turn",
         signals=() if directions is not None else plant.fault_names,
         of_the_method=True,
     )

@@ -20,6 +20,8 @@ class ScheduledLogObserver(ClaimedLogObserver):
         plant, observer = design.scheduled
         super().__init__(observer, warm_up, design.input_delay)
         self.point, self.scales = plant.operating_point, plant.scales
+        #: An input that is one in every row, and has no column.
+        self.shift = plant.shift
 
     @property
     def _needed(self) -> NDArray[np.bool_]:

@@ -78,7 +78,7 @@ class LogSignals:
             if not is_finite_number(factor) or factor == 0.0:
                 raise SpecError(f"The scale of {name!r} is {factor!r}: give a finite number, not zero.", path="scales")
         uncertain = getattr(getattr(observer, "plant", None), "uncertainty", None)
-        shift = None if uncertain is None else uncertain.shift
+        shift = getattr(observer, "shift", None) if uncertain is None else uncertain.shift
         return cls(
             names,
             tuple(_column(name, names, renamed) for name in (TIME_HEADER, *names) if not shift or name != shift),

@@ -169,7 +169,8 @@ def _plans(
     columns = [str(name) for name in table.columns]
     estimated = {name[5:-1] for name in columns if name.startswith("xhat[")}
     # The input of a linearised plant that is one in every row is in no log.
-    shift = getattr(getattr(getattr(design, "plant", None), "uncertainty", None), "shift", None)
+    plant = getattr(design, "plant", None)
+    shift = getattr(getattr(plant, "uncertainty", None), "shift", None) or getattr(plant, "shift", None)
     outputs = [str(name) for name in measured.columns if name not in ("time", shift)]
     # Known inputs come first and are no outputs; of these the estimated ones say more.
     outputs.sort(key=lambda name: name not in estimated)

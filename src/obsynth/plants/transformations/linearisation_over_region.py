@@ -104,6 +104,7 @@ def over_scheduling(
     }
     at = dict(zip((*model.parameter_names, *model.input_names), (*point.theta, *point.u), strict=True))
     entries, moved, shown = entries_in(model, point, {name: float(at[name]) for name in asked}, columns, moving=False)
+    shift = None
     if moved or shown:
         shift, place = shift_name(linear), linear.nu
         linear = with_shift(linear, shift)
@@ -118,7 +119,7 @@ def over_scheduling(
     scheduling = {
         name: {**({"unit": model.units[name]} if name in model.units else {}), **entry} for name, entry in asked.items()
     }
-    return PolytopicSystem(plant=arguments, scheduling=scheduling)
+    return PolytopicSystem(plant=arguments, scheduling=scheduling, shift=shift)
 
 
 def shift_name(linear: DescriptorSystem) -> str:

@@ -1,0 +1,206 @@
+r"""Faults that turn with the scheduling, decoupled exactly by a correction that turns with them; two vertices.
+
+With constant ``T E + N C = I`` and ``xhat = z + N y``, corrected at once by ``K(mu) (y - C xhat)`` where z was formed
+with the same mu, the corrected error obeys
+
+.. math::
+    \epsilon^+ = (I - K(\mu) C) (T A(\mu) \epsilon + T B_d(\mu) d), \qquad K(\mu) C T B_f(\mu) = T B_f(\mu),
+
+so that no fault has an effect on it, whatever its direction does.  Every matrix belongs to one sample.  With
+``Y = P K`` linear in the weights both are linear in (P, Y):
+
+.. math::
+    Y_i C T B_{f,j} + Y_j C T B_{f,i} = P T (B_{f,i} + B_{f,j}), \qquad
+    \begin{bmatrix} r^2 P & M_{ij}^T P \\ * & P \end{bmatrix} > 0, \quad
+    P M_{ij} = \tfrac12 ((P - Y_i C) T A_j + (P - Y_j C) T A_i)
+
+for i <= j: weights ``mu_i mu_j`` make every point of these pairs.  The equations leave freedom only where there are
+more outputs than faults and their turns need; otherwise `obsynth.ui_pi_observer` takes such a plant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.existence.restricted_equivalent import prepare
+from obsynth.conditions import lazy_cvxpy as cp
+from obsynth.conditions import lmi
+from obsynth.conditions.polytope import MOST_ROOM, TRACE
+from obsynth.conditions.problem import Conditions, Values
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics.arguments import arguments_checked, require_kind, shown
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.polytopic import PolytopicSystem
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_polytope import ErrorPolytope
+
+#: Pairs of two vertices: more of them are not tried, and not proved.
+VERTICES = 2
+
+
+@arguments_checked
+def turning_faults(plant: PolytopicSystem, *, decay: float = 1.0) -> Conditions:
+    """Return the inequalities of a correction that turns with the faults, in P and Y.
+
+    Parameters
+    ----------
+    plant : PolytopicSystem
+        Two vertices, discrete in time, with the same C and without Df, D of any kind.
+    decay : float, optional
+        Factor a sample by which corrected errors shrink at least, in the norm of P.
+
+    Returns
+    -------
+    Conditions
+        Variables ``P``, ``Y[1]``, ``Y[2]`` and ``room``, which is positive where there is such a correction; gains
+        ``T``, ``N``, ``K[1]``, ``K[2]`` and ``P``.  `turning_errors` has the error system of these, for a proof.
+
+    Raises
+    ------
+    SpecError
+        Another number of vertices, or a decay that is none.
+    PreconditionError
+        The plant is continuous, its outputs change or see faults at once, or ``C T Bf`` loses rank at a vertex.
+
+    Examples
+    --------
+    >>> plant = PolytopicSystem(
+    ...     plant={
+    ...         "A": [[0.9, 0, "0.1 * v"], [0, 0.7, 0], [0.1, 0, 0.8]], "C": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    ...         "Bf": [["1 - v"], ["v"], [0.3]], "dt": 1.0,
+    ...     },
+    ...     scheduling={"v": [0.0, 1.0]},
+    ... )
+    >>> found = turning_faults(plant)
+    >>> found.solve("CLARABEL", {})
+    >>> bool(found.variables["room"].value > 1e-6)
+    True
+    """
+    require_kind(plant, PolytopicSystem, "plant", "a PolytopicSystem")
+    if not 0.0 < decay <= 1.0:
+        raise SpecError(f"decay is {shown(decay)}: give a factor a sample, above 0, to 1.", path="decay")
+    T, N = _constant_parts(plant)
+    n, m, C = plant.nx, plant.ny, plant.vertices[0].C
+    TA, TB = ([T @ getattr(vertex, name) for vertex in plant.vertices] for name in ("A", "Bf"))
+    P, room = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable(name="room")
+    Y = [cp.Variable((n, m), name=f"Y[{i + 1}]") for i in range(VERTICES)]
+    constraints: dict[str, Any] = {"P": lmi.at_least(P, room), "trace": cp.trace(P) <= TRACE * n}
+    constraints["room"] = room <= MOST_ROOM
+    for i in range(VERTICES):
+        for j in range(i, VERTICES):
+            name = f"[{i + 1},{j + 1}]"
+            constraints[f"decoupled{name}"] = Y[i] @ (C @ TB[j]) + Y[j] @ (C @ TB[i]) == P @ (TB[i] + TB[j])
+            moved = 0.5 * ((P - Y[i] @ C) @ TA[j] + (P - Y[j] @ C) @ TA[i])
+            constraints[f"stable{name}"] = lmi.at_least(lmi.symmetric_blocks([[decay**2 * P], [moved, P]]), room)
+
+    def gains(_: Values) -> dict[str, FloatArray]:
+        found = np.asarray(P.value)
+        found = 0.5 * (found + found.T)
+        K = _exactly_decoupled([np.linalg.solve(found, np.asarray(y.value)) for y in Y], C, TB)
+        return {"T": T, "N": N, "P": found} | {f"K[{i + 1}]": each for i, each in enumerate(K)}
+
+    def unsupported(_: dict[str, FloatArray], name: str) -> ObserverDesign:
+        raise SpecError(
+            f"{name!r}: no observer of this form is shipped; obsynth.ui_pi_observer takes faults that turn.",
+            path="plant",
+        )
+
+    return Conditions(
+        "exact decoupling of faults that turn, two vertices",
+        lmi.semidefinite_problem(cp.Maximize(room), list(constraints.values())),
+        {"P": P, "Y[1]": Y[0], "Y[2]": Y[1], "room": room},
+        {},
+        {"T": T, "N": N} | {f"TA[{i + 1}]": each for i, each in enumerate(TA)},
+        constraints,
+        tuple,
+        gains,
+        unsupported,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class TurningErrors:
+    """The corrected errors of gains that turn.
+
+    Parameters
+    ----------
+    errors : ErrorPolytope
+        Three vertices, of weights ``mu_1^2``, ``2 mu_1 mu_2``, ``mu_2^2``: closed already, with no gain to add.
+    leak : float
+        Largest entry of ``(I - K C) T Bf`` over the pairs, beside the largest of ``T Bf``.
+    """
+
+    errors: ErrorPolytope
+    leak: float
+
+
+def turning_errors(plant: PolytopicSystem, gains: dict[str, FloatArray]) -> TurningErrors:
+    """Return the error system of gains of `turning_faults`, recomputed from the plant.
+
+    Parameters
+    ----------
+    plant : PolytopicSystem
+        Two vertices.
+    gains : dict
+        With ``T``, ``K[1]`` and ``K[2]``.
+    """
+    C, T, eye = plant.vertices[0].C, gains["T"], np.eye(plant.nx)
+    K, A, leaks = [gains["K[1]"], gains["K[2]"]], [], []
+    largest = max(float(np.abs(T @ vertex.Bf).max(initial=0.0)) for vertex in plant.vertices)
+    for i in range(VERTICES):
+        for j in range(i, VERTICES):
+            one, other = plant.vertices[i], plant.vertices[j]
+            A.append(0.5 * ((eye - K[i] @ C) @ T @ other.A + (eye - K[j] @ C) @ T @ one.A))
+            left = 0.5 * ((eye - K[i] @ C) @ T @ other.Bf + (eye - K[j] @ C) @ T @ one.Bf)
+            leaks.append(float(np.abs(left).max(initial=0.0)))
+    errors = ErrorPolytope(A, np.zeros((0, plant.nx)), dt=plant.dt)
+    return TurningErrors(errors, max(leaks) / largest if largest else 0.0)
+
+
+def _constant_parts(plant: PolytopicSystem) -> tuple[FloatArray, FloatArray]:
+    """Return T and N, after what the plant must be."""
+    if plant.count != VERTICES:
+        raise SpecError(
+            f"Exact decoupling of faults that turn is proved for two vertices, there are {plant.count}: take "
+            "obsynth.ui_pi_observer, which estimates faults that follow a model.",
+            path="plant",
+        )
+    first = plant.vertices[0]
+    changing = not plant.is_constant("C") or any(np.any(getattr(v, k)) for v in plant.vertices for k in ("Df", "Dd"))
+    if not plant.is_discrete or changing:
+        raise PreconditionError(
+            "Exact decoupling of faults that turn is for discrete time, with the same C at both vertices and without "
+            "Df and Dd.",
+            condition="faults that turn",
+        )
+    prepared = prepare(plant.center, exactly=False)
+    states = prepared.scaling.states[:, None]
+    T = states * prepared.T * prepared.scaling.equations
+    for vertex in plant.vertices:
+        if np.linalg.matrix_rank(first.C @ T @ vertex.Bf) < plant.nf:
+            raise PreconditionError(
+                "C T Bf loses rank at a vertex: a fault reaches the outputs later than after one sample there.",
+                condition="one sample to the outputs",
+            )
+    return T, states * prepared.N * prepared.scaling.outputs
+
+
+def _exactly_decoupled(K: list[FloatArray], C: FloatArray, TB: list[FloatArray]) -> list[FloatArray]:
+    """Return the nearest gains that satisfy the equations to rounding: a solver satisfies them to its tolerances."""
+    m = K[0].shape[1]
+    rows, right = [], []
+    for i in range(VERTICES):
+        for j in range(i, VERTICES):
+            # Acts on the rows of [K1 K2]: (K_i CTB_j + K_j CTB_i) = TB_i + TB_j.
+            row = np.zeros((2 * m, TB[0].shape[1]))
+            row[i * m : (i + 1) * m] += C @ TB[j]
+            row[j * m : (j + 1) * m] += C @ TB[i]
+            rows.append(row)
+            right.append(TB[i] + TB[j])
+    W, target, whole = np.hstack(rows), np.hstack(right), np.hstack(K)
+    whole = whole - (whole @ W - target) @ np.linalg.pinv(W)
+    whole = whole - (whole @ W - target) @ np.linalg.pinv(W)
+    return [whole[:, :m], whole[:, m:]]
