@@ -101,7 +101,7 @@ def test_a_design_for_the_region_estimates_a_fault_of_the_nonlinear_plant() -> N
             "wall": "der(W) = T - W",
         },
         {"T1": "T", "W1": "W"},
-        states={"T": 20.0, "W": 20.0}, inputs={"flow": 0.5, "inlet": 20.0, "power": 0.0}, parameters={"loss": 0.0},
+        states={"T": 23.0, "W": 23.0}, inputs={"flow": 0.5, "inlet": 20.0, "power": 0.5}, parameters={"loss": 0.0},
     )  # fmt: skip
     with pytest.raises(PreconditionError, match=r"'tank' is not linear .* depend on 'T', 'flow'"):
         obsynth.linearise(model, region={"inlet": [10.0, 30.0]})

@@ -346,10 +346,10 @@ class _Forms:
                 return block([[first, -P], [-P, corner]]) if self.ball else first
             across = -(gb + cz.T @ dz)
             level = kind.exact(np.eye(p)).scaled(gain).scaled(gain) - dz.T @ dz
-            rows = [[first, across], [across.T, level]]
-            if self.ball:
-                rows = [[*rows[0], -P], [*rows[1], _zero(kind, p, n)], [-P, _zero(kind, n, p), corner]]
-            return block(rows)
+            if not self.ball:
+                return block([[first, across], [across.T, level]])
+            nothing = _zero(kind, p, n)
+            return block([[first, across, -P], [across.T, level, nothing], [-P, nothing.T, corner]])
 
         return formula
 
