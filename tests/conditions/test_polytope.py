@@ -208,6 +208,8 @@ def test_what_cannot_be_asked_is_refused() -> None:
         vertex_inequalities(_spring(2.0), steps=0.1)
     with pytest.raises(SpecError, match="needs the rate"):
         vertex_inequalities(errors, goal="decay")
+    with pytest.raises(SpecError, match="all differential"):
+        ErrorPolytope([-np.eye(2)], np.zeros((0, 2)), dt=0.0, differential=1, ball=0.1)
 
 
 def test_in_continuous_time_one_gain_is_enough_and_it_is_small() -> None:

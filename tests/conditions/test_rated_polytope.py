@@ -154,3 +154,29 @@ def test_what_does_not_fit_is_refused(errors: ErrorPolytope, options: dict[str, 
     rate = arguments.pop("rate")
     with pytest.raises(SpecError, match=told):
         rated_inequalities(errors, rate, **arguments)  # type: ignore[arg-type]
+
+
+def lag(rate: float = 1.0, gain: float = 0.5) -> ErrorPolytope:
+    """Return e' = -rate e + w, z = gain e, at both vertices."""
+    return ErrorPolytope([[[-rate]]] * 2, np.zeros((0, 1)), B=[[1.0]], D=np.zeros((0, 1)), Cz=[[gain]], dt=0.0)
+
+
+def test_each_number_of_a_scalar_certificate_counts() -> None:
+    vertices, none = lag().closed([np.zeros((1, 0))]), [np.zeros((1, 0))]
+    one = [np.array([[1.0]])]
+    # The gain of the lag is a half; P = 1/4 proves it.
+    quarter = [np.array([[0.25]])] * 2
+    assert prove_rated_gain(vertices, quarter, 0.0, 0.51).proved
+    assert not prove_rated_gain(vertices, quarter, 0.0, 0.49).proved
+    assert not prove_rated_gain(vertices, quarter, 0.0, 0.3).proved
+    # Its decay is one.
+    assert prove_rated_decay(vertices, one, 0.0, 0.99).proved
+    assert not prove_rated_decay(vertices, one, 0.0, 1.01).proved
+    # A P that grows with t proves nothing where t falls fast enough, and the other way round.
+    growing = [np.array([[1.0]]), np.array([[4.0]])]
+    assert prove_rated_decay(vertices, growing, 0.5, 0.0).proved
+    assert not prove_rated_decay(vertices, growing, 2.0, 0.0).proved
+    assert not prove_rated_decay(vertices, growing[::-1], 2.0, 0.0).proved
+    # A negative P beside an unstable error satisfies the other inequality.
+    unstable = lag(-1.0).closed(none)
+    assert not prove_rated_decay(unstable, [np.array([[-1.0]])], 0.0, 0.0).proved

@@ -124,3 +124,13 @@ def test_a_point_inside_at_which_nothing_shows_a_growing_mode_is_named() -> None
     plant = PolytopicSystem(plant=hidden, scheduling={"a": [-1.0, 1.0]})
     with pytest.raises(PreconditionError, match=r"at the middle of the region \(a = 0\)"):
         obsynth.ui_pi_observer(plant)
+
+
+def test_an_input_that_is_one_in_every_row_is_kept_and_must_be_an_input() -> None:
+    given = {"A": [["-k"]], "B": [[1.0]], "C": [[1.0]], "input_names": ["offset"]}
+    plant = PolytopicSystem(plant=given, scheduling={"k": {"range": [1, 6], "rate": 0.5}}, shift="offset")
+    assert PolytopicSystem.from_dict(plant.as_dict()).shift == "offset"
+    assert plant.scheduling.rate_of_weight == pytest.approx(0.1, rel=1e-5)
+    assert plant.scheduling.rate_of_weight > 0.1
+    with pytest.raises(SpecError, match="no input"):
+        PolytopicSystem(plant=given, scheduling={"k": [1, 6]}, shift="other")

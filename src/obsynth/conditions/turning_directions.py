@@ -20,6 +20,7 @@ more outputs than faults and their turns need; otherwise `obsynth.ui_pi_observer
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -137,16 +138,37 @@ class TurningErrors:
     leak: float
 
 
-def turning_errors(plant: PolytopicSystem, gains: dict[str, FloatArray]) -> TurningErrors:
+@arguments_checked
+def turning_errors(plant: PolytopicSystem, gains: Mapping[str, FloatArray]) -> TurningErrors:
     """Return the error system of gains of `turning_faults`, recomputed from the plant.
 
     Parameters
     ----------
     plant : PolytopicSystem
         Two vertices.
-    gains : dict
+    gains : mapping
         With ``T``, ``K[1]`` and ``K[2]``.
+
+    Raises
+    ------
+    SpecError
+        Another kind of plant or gains, or another number of vertices.
+
+    Examples
+    --------
+    >>> plant = PolytopicSystem(
+    ...     plant={"A": [[0.9, 0], [0, "0.5 * v"]], "C": [[1, 0], [0, 1]], "Bf": [["1 - v"], ["v"]], "dt": 1.0},
+    ...     scheduling={"v": [0.0, 1.0]},
+    ... )
+    >>> all_measured = {"T": 0.5 * np.eye(2), "K[1]": np.eye(2), "K[2]": np.eye(2)}
+    >>> made = turning_errors(plant, all_measured)
+    >>> made.errors.count, made.leak
+    (3, 0.0)
     """
+    require_kind(plant, PolytopicSystem, "plant", "a PolytopicSystem")
+    require_kind(gains, Mapping, "gains", "what gains() of turning_faults returns")
+    if plant.count != VERTICES or not {"T", "K[1]", "K[2]"} <= set(gains):
+        raise SpecError("Give a plant of two vertices, and T, K[1] and K[2].", path="gains")
     C, T, eye = plant.vertices[0].C, gains["T"], np.eye(plant.nx)
     K, A, leaks = [gains["K[1]"], gains["K[2]"]], [], []
     largest = max(float(np.abs(T @ vertex.Bf).max(initial=0.0)) for vertex in plant.vertices)
