@@ -190,9 +190,9 @@ def test_correlations_are_sought_between_a_third_of_a_sample_and_the_length_of_t
 def test_a_state_for_coloured_noise_pays_for_two_numbers(monkeypatch, nats: float, taken: bool) -> None:
     """Log(400) = 5.99 for both numbers together, and three nats that no explanation is below."""
     known = SimpleNamespace(best=lambda problem: (100.0 - nats, known))
-    monkeypatch.setattr(calibrating, "_asking", lambda problem, fit: {("coloured", "y")})
+    monkeypatch.setattr(calibrating, "_proposals", lambda problem, fit: {("coloured", "y")})
     monkeypatch.setattr(calibrating, "like_problem", lambda problem, new: new)
-    monkeypatch.setattr(calibrating, "_Known", SimpleNamespace(of=lambda problem, fit: known))
+    monkeypatch.setattr(calibrating, "_SearchStart", SimpleNamespace(of=lambda problem, fit: known))
     problem = SimpleNamespace(
         output_names=("y",), plant=SimpleNamespace(unknown_inputs=()), log=SimpleNamespace(samples=400)
     )

@@ -213,7 +213,7 @@ def calibrate(
     note = progress or (lambda text: None)
     model = _loads_as_parameters(require_plant(model), walks)
     factors = dict(getattr(model, "scales", {})) | dict(scales or {})
-    whole = read_log(
+    record = read_log(
         log,
         model.input_names,
         model.output_names,
@@ -222,12 +222,12 @@ def calibrate(
         scales=factors,
         dt=_sample_time(model, dt, substeps),
     )
-    digest = whole.digest
-    whole = whole.unstuck()
-    whole = whole.without(wrong_samples(whole.y))
-    whole = whole.shifted(input_delay) if isinstance(input_delay, int) else whole
-    plant = NonlinearPlant(model) if isinstance(model, DAEModel) else LinearPlant(model, whole)
-    asked = asked_states(sensor_noise, offset, walks, model.output_names)
+    digest = record.digest
+    record = record.unstuck()
+    record = record.without(wrong_samples(record.y))
+    record = record.shifted(input_delay) if isinstance(input_delay, int) else record
+    plant = NonlinearPlant(model) if isinstance(model, DAEModel) else LinearPlant(model, record)
+    noise_model = asked_states(sensor_noise, offset, walks, model.output_names)
 
     def problem_with(states: NoiseStates, log: RecordedLog) -> CalibrationProblem:
         extended = PlantWithNoise(plant, states, log) if states else plant
@@ -248,22 +248,24 @@ def calibrate(
             integration=plant.integration(integration),
         )
 
-    require_variation(problem_with(asked, whole))
+    require_variation(problem_with(noise_model, record))
     innovations = method == "innovations"
     fitting = _Fitting(
         plant, problem_with, starts, seed, level, note, integration == "auto", initial_covariance is None, innovations
     )
     search = innovations and input_delay == "auto" and bool(model.input_names)
-    found, asked, told = fitting.first_fit(asked, whole, search=search, may_take_offsets=offset is None)
-    found = fitting.without_outliers(found)
+    fitted, noise_model, sentences = fitting.first_fit(
+        noise_model, record, search=search, may_take_offsets=offset is None
+    )
+    fitted = fitting.without_outliers(fitted)
     kinds = (("coloured", sensor_noise), ("offset", offset), ("walk", walks))
-    open_kinds = tuple(kind for kind, given in kinds if given is None)
-    if found.fit is not None and open_kinds:
-        found = fitting.with_proposals(found, found.fit, asked, open_kinds, told)
+    open_kinds = tuple(kind for kind, stated in kinds if stated is None)
+    if fitted.fit is not None and open_kinds:
+        fitted = fitting.with_proposals(fitted, fitted.fit, noise_model, open_kinds, sentences)
     if offset is None:
-        found = fitting.with_unseen_offsets(found)
+        fitted = fitting.with_unseen_offsets(fitted)
     return reported(
-        found.problem, found.fits[0], found.fit, level=level, losses=found.losses, error=found.error, digest=digest
+        fitted.problem, fitted.fits[0], fitted.fit, level=level, losses=fitted.losses, error=fitted.error, digest=digest
     )
 
 
@@ -289,7 +291,7 @@ def _by_name(value: Any, names: Sequence[str]) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class _FittedProblem:
     """A problem as it was fitted at last, with its fits, what backward Euler errs, and what each delay of the inputs
     loses in nats, where it was searched for."""
 
@@ -314,11 +316,11 @@ class _Fitting:
     widen_start: bool
     innovations: bool
 
-    def fitted(self, problem: CalibrationProblem, *, search: bool) -> _Found:
+    def fitted(self, problem: CalibrationProblem, *, search: bool) -> _FittedProblem:
         """Return the fit of a problem; the delay of the inputs is searched for where asked."""
         fits = simulation_fits(problem, self.starts, self.seed, self.note)
-        if self.widen_start and (seen := with_seen_start(problem, fits[0])) is not problem:
-            problem, fits = seen, simulation_fits(seen, 1, self.seed, self.note, start=fits[0].t)
+        if self.widen_start and (widened := with_seen_start(problem, fits[0])) is not problem:
+            problem, fits = widened, simulation_fits(widened, 1, self.seed, self.note, start=fits[0].t)
         error = None
         if self.choose_steps and isinstance(self.plant, NonlinearPlant):
             names, start = problem.names, fits[0]
@@ -339,55 +341,60 @@ class _Fitting:
             before = problem, error
             problem, fit, error = _innovations(problem, fits, self.level, self.note, error)
             if self.widen_start and fit is not None:
-                seen = with_seen_start(before[0], fits[0], first=fit.whitened[:FIRST_ROWS])
-                if seen is not before[0]:
-                    fits = simulation_fits(seen, 1, self.seed, self.note, start=fits[0].t)
-                    problem, fit, error = _innovations(seen, fits, self.level, self.note, before[1])
-        return _Found(problem, fits, fit, error, losses)
+                widened = with_seen_start(before[0], fits[0], first=fit.whitened[:FIRST_ROWS])
+                if widened is not before[0]:
+                    fits = simulation_fits(widened, 1, self.seed, self.note, start=fits[0].t)
+                    problem, fit, error = _innovations(widened, fits, self.level, self.note, before[1])
+        return _FittedProblem(problem, fits, fit, error, losses)
 
     def first_fit(
-        self, asked: NoiseStates, log: RecordedLog, *, search: bool, may_take_offsets: bool
-    ) -> tuple[_Found, NoiseStates, list[str]]:
+        self, states: NoiseStates, log: RecordedLog, *, search: bool, may_take_offsets: bool
+    ) -> tuple[_FittedProblem, NoiseStates, list[str]]:
         """Return the fit with the states that were asked for; and with those, and a sentence for each, the offsets of
         sensors that it takes where without them the model explains nothing."""
         try:
-            return self.fitted(self.problem_with(asked, log), search=search), asked, []
+            return self.fitted(self.problem_with(states, log), search=search), states, []
         except PreconditionError as error:
             # An offset as large as what a sensor does looks like a model that explains nothing.
             if not may_take_offsets or not self.innovations or error.condition != "explains-nothing":
                 raise
-            asked = replace(asked, offsets=log.output_names)
+            states = replace(states, offsets=log.output_names)
             try:
-                found = self.fitted(self.problem_with(asked, log), search=search)
+                fitted = self.fitted(self.problem_with(states, log), search=search)
             except PreconditionError:
                 raise error from None
-        told = [OFFSET_TAKEN.format(name) for name in log.output_names]
-        return replace(found, problem=found.problem.with_notes(*told)), asked, told
+        sentences = [OFFSET_TAKEN.format(name) for name in log.output_names]
+        return replace(fitted, problem=fitted.problem.with_notes(*sentences)), states, sentences
 
     def with_proposals(
-        self, found: _Found, fit: InnovationsFit, asked: NoiseStates, kinds: tuple[str, ...], before: list[str]
-    ) -> _Found:
+        self,
+        fitted: _FittedProblem,
+        fit: InnovationsFit,
+        stated: NoiseStates,
+        kinds: tuple[str, ...],
+        before: list[str],
+    ) -> _FittedProblem:
         """Return the fit with states of some kinds where its innovations ask for them; ``before``: what is told of
         those that it has."""
-        log = found.problem.log
-        states, told = proposed_states(
-            found.problem, fit, asked, kinds, lambda states: self.problem_with(states, log), self.note
+        log = fitted.problem.log
+        states, sentences = proposed_states(
+            fitted.problem, fit, stated, kinds, lambda states: self.problem_with(states, log), self.note
         )
-        if not told:
-            return found
+        if not sentences:
+            return fitted
         again = self.fitted(self.problem_with(states, log), search=False)
         # What is white beside coloured noise is less than both: more samples stand out.
-        problem = again.problem.with_notes(*before, *told)
-        return self.without_outliers(replace(again, problem=problem, losses=found.losses))
+        problem = again.problem.with_notes(*before, *sentences)
+        return self.without_outliers(replace(again, problem=problem, losses=fitted.losses))
 
-    def with_unseen_offsets(self, found: _Found) -> _Found:
+    def with_unseen_offsets(self, fitted: _FittedProblem) -> _FittedProblem:
         """Return the fit with boxes that hold beside offsets of sensors which are too small to be seen: the wider of
         those without and with offsets of `UNSEEN_OFFSET` deviations."""
-        problem, fit = found.problem, found.fit
+        problem, fit = fitted.problem, fitted.fit
         states = problem.plant.states if isinstance(problem.plant, PlantWithNoise) else NoiseStates()
         unseen = [name for name in problem.output_names if name not in states.offsets]
         if fit is None or not unseen or not problem.names:
-            return found
+            return fitted
         self.note("boxes beside offsets")
         wide = like_problem(
             problem, self.problem_with(replace(states, offsets=(*states.offsets, *unseen)), problem.log)
@@ -404,30 +411,30 @@ class _Fitting:
         except (PreconditionError, SolverError):
             again = None
         if again is None:
-            told = problem.with_notes(OFFSETS_UNTRIED)
-            return replace(found, problem=told)
+            noted = problem.with_notes(OFFSETS_UNTRIED)
+            return replace(fitted, problem=noted)
         sides = [
             (min(low, other_low, key=lambda side: side.value), max(high, other_high, key=lambda side: side.value))
             for (low, high), (other_low, other_high) in zip(fit.sides, again.sides, strict=True)
         ]
-        told = problem.with_notes(OFFSETS_ALLOWED.format(", ".join(unseen), UNSEEN_OFFSET))
-        return replace(found, problem=told, fit=replace(fit, sides=sides))
+        noted = problem.with_notes(OFFSETS_ALLOWED.format(", ".join(unseen), UNSEEN_OFFSET))
+        return replace(fitted, problem=noted, fit=replace(fit, sides=sides))
 
-    def without_outliers(self, found: _Found) -> _Found:
+    def without_outliers(self, fitted: _FittedProblem) -> _FittedProblem:
         """Return the fit again without samples that stand out alone or a few in a row: they would make R a multiple of
         what it is."""
         for _ in range(OUTLIER_ROUNDS):
-            if found.fit is None:
+            if fitted.fit is None:
                 break
-            problem = found.problem
-            alone = standing_out(found.fit.whitened)
-            wrong = alone | wrong_runs(problem, found.fit)
-            off = np.abs(found.fit.innovations).T
+            problem = fitted.problem
+            alone = standing_out(fitted.fit.whitened)
+            wrong = alone | wrong_runs(problem, fitted.fit)
+            off = np.abs(fitted.fit.innovations).T
             if not wrong.any():
                 break
             self.note("without samples that stand out")
             names, log = problem.output_names, problem.log
-            told = [
+            sentences = [
                 f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations (row "
                 f"{told_rows(log.rows[0] + np.flatnonzero(wrong[:, i]))}): they count as not measured."
                 for i, name in enumerate(names)
@@ -436,16 +443,16 @@ class _Fitting:
             kept = replace(
                 log,
                 y=read_only(np.where(wrong, np.nan, problem.y)),
-                notes=(*log.notes, *told),
+                notes=(*log.notes, *sentences),
                 outliers=tuple(
                     np.concatenate([before, off[i, alone[:, i]]])
                     for i, before in enumerate(log.outliers or [np.zeros(0)] * len(names))
                 ),
             )
-            fits = simulation_fits(problem.with_log(kept), 1, self.seed, self.note, start=found.fit.t)
-            again = _innovations(problem.with_log(kept), fits, self.level, self.note, found.error)
-            found = _Found(again[0], fits, *again[1:], found.losses)
-        return found
+            fits = simulation_fits(problem.with_log(kept), 1, self.seed, self.note, start=fitted.fit.t)
+            again = _innovations(problem.with_log(kept), fits, self.level, self.note, fitted.error)
+            fitted = _FittedProblem(again[0], fits, *again[1:], fitted.losses)
+        return fitted
 
 
 def _innovations(

@@ -140,20 +140,20 @@ def mean_off(column: FloatArray) -> float:
 
 def wrong_samples(y: FloatArray) -> BoolArray:
     """Return which single values of outputs ``(n, ny)`` are far from all others of their sensor, as truth values."""
-    found = np.zeros(y.shape, dtype=bool)
+    wrong = np.zeros(y.shape, dtype=bool)
     for i, column in enumerate(y.T):
-        seen = np.isfinite(column)
-        if seen.sum() < LEAST_DIAGNOSED_ROWS:
+        measured = np.isfinite(column)
+        if measured.sum() < LEAST_DIAGNOSED_ROWS:
             continue
-        middle = float(np.median(column[seen]))
+        middle = float(np.median(column[measured]))
         away = np.abs(column - middle)
-        spread = max(float(np.quantile(away[seen], OTHERS)), LEAST_SPREAD * abs(middle))
-        far = seen & (away > FAR_OFF * spread)
+        spread = max(float(np.quantile(away[measured], OTHERS)), LEAST_SPREAD * abs(middle))
+        far = measured & (away > FAR_OFF * spread)
         edges = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]]).astype(np.int64)))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
             if spread > 0.0 and begin > 0 and end < len(column) and end - begin <= LONGEST_SPIKE:
-                found[begin:end, i] = True
-    return found
+                wrong[begin:end, i] = True
+    return wrong
 
 
 def usual_size(column: FloatArray) -> float:
@@ -167,17 +167,17 @@ def standing_out(whitened: FloatArray) -> BoolArray:
     Those whose neighbours stand out too are no wrong samples, but something that happened; unless there are two, and
     the second is what a filter of coloured noise makes of the sample after a wrong one: less, to the other side.
     """
-    found = np.zeros(whitened.shape, dtype=bool)
+    outliers = np.zeros(whitened.shape, dtype=bool)
     for i, column in enumerate(whitened.T):
-        seen = np.isfinite(column)
-        if seen.sum() < LEAST_DIAGNOSED_ROWS:
+        measured = np.isfinite(column)
+        if measured.sum() < LEAST_DIAGNOSED_ROWS:
             continue
-        far = seen & (np.abs(column) > STANDS_OUT * usual_size(column))
+        far = measured & (np.abs(column) > STANDS_OUT * usual_size(column))
         beside = np.concatenate([[False], far[:-1]]) | np.concatenate([far[1:], [False]])
         alone = far & (~beside | _answered(column, far))
-        if alone.sum() <= MOST_OUTLIERS * seen.sum():
-            found[alone, i] = True
-    return found
+        if alone.sum() <= MOST_OUTLIERS * measured.sum():
+            outliers[alone, i] = True
+    return outliers
 
 
 def _answered(column: FloatArray, far: BoolArray) -> BoolArray:
@@ -247,10 +247,11 @@ class Validation:
         lines.append(f"  NIS per degree of freedom {nis.value:.3g} (95 %: {nis.low:.2f} to {nis.high:.2f})")
         width = max(len(name) for name in self.sensors)
         lines.append(f"  {'':<{width}}  mean square  mean (deviations)  white (p)")
-        for name, found in self.sensors.items():
+        for name, sensor in self.sensors.items():
             lines.append(
-                f"  {name:<{width}}  {found.nis.value:<11.3g}  {found.mean:<+17.2g}  {found.whiteness.probability:.2g}"
-                if found.nis.samples
+                f"  {name:<{width}}  {sensor.nis.value:<11.3g}  {sensor.mean:<+17.2g}  "
+                f"{sensor.whiteness.probability:.2g}"
+                if sensor.nis.samples
                 else f"  {name:<{width}}  not predicted in any row"
             )
         return "\n".join([*lines, *(f"  - {sentence}" for sentence in self.verdict)])
@@ -263,11 +264,11 @@ class Validation:
             "nis": vars(self.nis) | {"holds": self.nis.holds},
             "sensors": {
                 name: {
-                    "nis": vars(found.nis) | {"holds": found.nis.holds},
-                    "mean": found.mean,
-                    "whiteness": vars(found.whiteness),
+                    "nis": vars(sensor.nis) | {"holds": sensor.nis.holds},
+                    "mean": sensor.mean,
+                    "whiteness": vars(sensor.whiteness),
                 }
-                for name, found in self.sensors.items()
+                for name, sensor in self.sensors.items()
             },
             "ratios": dict(self.ratios),
             "change": self.change,
@@ -283,26 +284,26 @@ class Validation:
         return figure
 
 
-def draw_validation(found: Validation, panels: Sequence[Axes]) -> None:
+def draw_validation(validation: Validation, panels: Sequence[Axes]) -> None:
     """Draw signal and innovation of each sensor, then each estimate, on a panel each."""
-    names, time = list(found.sensors), found.log["rows"][0] + np.arange(len(found.innovations))
+    names, time = list(validation.sensors), validation.log["rows"][0] + np.arange(len(validation.innovations))
     for i, name in enumerate(names):
-        signals, said = panels[2 * i], panels[2 * i + 1]
-        signals.plot(time, found.measured[:, i], label="measured", **TRUE_STYLE)
-        signals.plot(time, found.predicted[:, i], label="predicted", **ESTIMATE_STYLE)
+        signals, errors = panels[2 * i], panels[2 * i + 1]
+        signals.plot(time, validation.measured[:, i], label="measured", **TRUE_STYLE)
+        signals.plot(time, validation.predicted[:, i], label="predicted", **ESTIMATE_STYLE)
         signals.set_ylabel(name)
         legend_above(signals)
-        band = BAND_WIDTH * found.deviations[:, i]
-        said.fill_between(time, -band, band, **BAND_STYLE)
-        said.plot(time, found.innovations[:, i], color="black", linewidth=0.8, marker=".", markersize=3)
-        if found.sensors[name].nis.samples:
+        band = BAND_WIDTH * validation.deviations[:, i]
+        errors.fill_between(time, -band, band, **BAND_STYLE)
+        errors.plot(time, validation.innovations[:, i], color="black", linewidth=0.8, marker=".", markersize=3)
+        if validation.sensors[name].nis.samples:
             # The band of an unknown start would leave the innovations a line.
-            reach = 1.1 * max(np.nanmax(np.abs(found.innovations[:, i]), initial=0.0), np.nanmedian(band))
-            said.set_ylim(-reach, reach)
+            reach = 1.1 * max(np.nanmax(np.abs(validation.innovations[:, i]), initial=0.0), np.nanmedian(band))
+            errors.set_ylim(-reach, reach)
         else:
-            said.text(0.5, 0.5, "not predicted in any row", transform=said.transAxes, ha="center", va="center")
-        said.set_ylabel(f"innovation\nof {name}")
-    for panel, (name, columns) in zip(panels[2 * len(names) :], found.estimates.items(), strict=True):
+            errors.text(0.5, 0.5, "not predicted in any row", transform=errors.transAxes, ha="center", va="center")
+        errors.set_ylabel(f"innovation\nof {name}")
+    for panel, (name, columns) in zip(panels[2 * len(names) :], validation.estimates.items(), strict=True):
         value, band = columns[:, 0], BAND_WIDTH * columns[:, 1]
         panel.fill_between(time, value - band, value + band, **BAND_STYLE)
         panel.plot(time, value, **RESIDUAL_STYLE)

@@ -43,21 +43,21 @@ def explanations(
     ``with_constant(name, value)``: the innovations, in the same deviations, with another value of a constant; NaN where
     the plant has no solution with it.  The constants that are told have been run with the value that is told.
     """
-    found, values = [*_of_sensors(innovations, output_names, dt)], dict[str, tuple[str, float]]()
+    candidates, values = [*_of_sensors(innovations, output_names, dt)], dict[str, tuple[str, float]]()
     for i, name in enumerate(input_names):
         moves = np.diff(inputs[:, i])
         for move, word in ((np.append(np.nan, moves), "later"), (np.append(moves, np.nan), "earlier")):
-            gain, _ = _together(innovations, move[:, None, None] * np.eye(innovations.shape[1]))
-            found.append((f"an input {name} that acts {word} than the design takes it", gain))
+            gain, _ = _regression(innovations, move[:, None, None] * np.eye(innovations.shape[1]))
+            candidates.append((f"an input {name} that acts {word} than the design takes it", gain))
     for name, value in list(constants.items())[:MOST_CONSTANTS]:
         step = CONSTANT_CHANGE * (abs(value) or 1.0)
         effect = (with_constant(name, value + step) - innovations) / step
-        gain, coefficient = _together(innovations, effect[:, :, None])
+        gain, coefficient = _regression(innovations, effect[:, :, None])
         nearer = value - float(coefficient[0]) if len(coefficient) else value
         text = f"a constant {name} near {nearer:.3g} instead of {value:.3g}"
         values[text] = (name, nearer)
-        found.append((text, gain))
-    kept = sorted((item for item in found if item[1] >= LEAST_EXPLANATION), key=lambda item: -item[1])
+        candidates.append((text, gain))
+    kept = sorted((item for item in candidates if item[1] >= LEAST_EXPLANATION), key=lambda item: -item[1])
     tried = [
         (text, _of_run(innovations, with_constant(*values[text])) if text in values else gain)
         for text, gain in kept[:MOST_TOLD]
@@ -67,61 +67,67 @@ def explanations(
 
 def _of_run(before: FloatArray, after: FloatArray) -> float:
     """Return the gain in nats that a run with another constant has: what its effect foretells holds near by only."""
-    seen = np.isfinite(before) & np.isfinite(after)
-    count, whole, left = int(seen.sum()), float((before[seen] ** 2).sum()), float((after[seen] ** 2).sum())
-    if not left > 0.0 or not whole > 0.0:
+    measured = np.isfinite(before) & np.isfinite(after)
+    count, before_squares, after_squares = (
+        int(measured.sum()),
+        float((before[measured] ** 2).sum()),
+        float((after[measured] ** 2).sum()),
+    )
+    if not after_squares > 0.0 or not before_squares > 0.0:
         return -np.inf
-    return 0.5 * count * float(np.log(whole / left)) - 0.5 * float(np.log(count))
+    return 0.5 * count * float(np.log(before_squares / after_squares)) - 0.5 * float(np.log(count))
 
 
 def _of_sensors(innovations: FloatArray, names: Sequence[str], dt: float) -> list[Explanation]:
-    found = []
+    candidates = []
     for j, name in enumerate(names):
         column = innovations[:, j : j + 1]
-        gain, _ = _together(column, np.ones((len(column), 1, 1)))
-        found.append((f"an offset of the sensor {name}", gain))
-        gain, first, _ = _on_its_past(column)
+        gain, _ = _regression(column, np.ones((len(column), 1, 1)))
+        candidates.append((f"an offset of the sensor {name}", gain))
+        gain, first, _ = _regression_on_previous(column)
         if first > 0.0:
             lasting = f" over about {-dt / np.log(min(first, 1.0 - 1.0 / len(column))):.2g} s"
-            found.append((f"noise of {name} that is correlated{lasting}", gain))
-    return found
+            candidates.append((f"noise of {name} that is correlated{lasting}", gain))
+    return candidates
 
 
-def _together(innovations: FloatArray, regressors: FloatArray) -> tuple[float, FloatArray]:
+def _regression(innovations: FloatArray, regressors: FloatArray) -> tuple[float, FloatArray]:
     """Return the gain in nats of regressors ``(n, ny, p)``, and their coefficients; none where they do not move."""
     count = regressors.shape[2]
     y, x = innovations.ravel(), regressors.reshape(-1, count)
-    seen = np.isfinite(y) & np.isfinite(x).all(axis=1)
-    y, x = y[seen], x[seen]
+    complete = np.isfinite(y) & np.isfinite(x).all(axis=1)
+    y, x = y[complete], x[complete]
     if len(y) <= count + 1 or not np.any(x):
         return -np.inf, np.zeros(0)
     coefficients: FloatArray = np.asarray(np.linalg.lstsq(x, y, rcond=None)[0], dtype=np.float64)
-    left, whole = float(np.sum((y - x @ coefficients) ** 2)), float(y @ y)
-    if not left > 0.0:
+    residual_squares, squares = float(np.sum((y - x @ coefficients) ** 2)), float(y @ y)
+    if not residual_squares > 0.0:
         return np.inf, coefficients
-    return 0.5 * len(y) * float(np.log(whole / left)) - 0.5 * count * float(np.log(len(y))), coefficients
+    return 0.5 * len(y) * float(np.log(squares / residual_squares)) - 0.5 * count * float(np.log(len(y))), coefficients
 
 
 def regression_gain(column: FloatArray, others: Sequence[FloatArray], regressor: FloatArray) -> float:
     """Return what a regressor ``(n,)`` of innovations ``(n,)`` gains beside others, in nats."""
     x = np.column_stack([*others, regressor])
-    seen = np.isfinite(column) & np.isfinite(x).all(axis=1)
-    y, x = column[seen], x[seen]
-    left = [float(np.sum((y - part @ np.linalg.lstsq(part, y, rcond=None)[0]) ** 2)) for part in (x[:, :-1], x)]
-    return 0.5 * len(y) * float(np.log(left[0] / left[1])) if left[1] > 0.0 else 0.0
+    complete = np.isfinite(column) & np.isfinite(x).all(axis=1)
+    y, x = column[complete], x[complete]
+    residual_squares = [
+        float(np.sum((y - part @ np.linalg.lstsq(part, y, rcond=None)[0]) ** 2)) for part in (x[:, :-1], x)
+    ]
+    return 0.5 * len(y) * float(np.log(residual_squares[0] / residual_squares[1])) if residual_squares[1] > 0.0 else 0.0
 
 
 def whitened(innovations: FloatArray) -> FloatArray:
     """Return innovations ``(n, ny)`` less what each column keeps of its sample before: a change of mean stays one."""
-    found = np.array(innovations)
+    white = np.array(innovations)
     for j in range(innovations.shape[1]):
-        _, first, before = _on_its_past(innovations[:, j : j + 1])
-        found[:, j] -= np.where(np.isfinite(before), first * before, 0.0)
-    return found
+        _, first, before = _regression_on_previous(innovations[:, j : j + 1])
+        white[:, j] -= np.where(np.isfinite(before), first * before, 0.0)
+    return white
 
 
-def _on_its_past(column: FloatArray) -> tuple[float, float, FloatArray]:
+def _regression_on_previous(column: FloatArray) -> tuple[float, float, FloatArray]:
     """Return the gain in nats of a column's ``(n, 1)`` own sample before, its coefficient, and that sample ``(n,)``."""
     before = np.append(np.nan, column[:-1, 0])
-    gain, coefficient = _together(column, before[:, None, None])
+    gain, coefficient = _regression(column, before[:, None, None])
     return gain, float(coefficient[0]) if len(coefficient) else 0.0, before

@@ -85,33 +85,33 @@ def chosen_timing(
             break
         note(f"inputs {delay:+d} row{'s' if abs(delay) > 1 else ''}")
         moved = Objective(compared.with_log(problem.log.shifted(delay)), fits[0])
-        found, at = moved.descent(z if abs(delay) == 1 else start)
-        if found < min(values.values()):
+        loss, at = moved.descent(z if abs(delay) == 1 else start)
+        if loss < min(values.values()):
             # What a timing that is far off makes of the constants is a bad start for the next one.
             start = at
             waiting += [delay + 1] if not waiting and delay < MOST_DELAY else []
-        values[delay] = found
+        values[delay] = loss
     best = min(values.values())
     # The least delay that none beats clearly; a log whose inputs would act before they are sent is only told.
     nats = {rows: FURTHER_NATS if rows else TIMING_NATS for rows in values if rows >= 0}
     delay = min((rows for rows, clear in nats.items() if values[rows] - best <= clear), default=0)
     if values[delay] > values.get(-1, np.inf):
         delay = 0
-    losses = {rows: found - best for rows, found in sorted(values.items())}
+    losses = {rows: loss - best for rows, loss in sorted(values.items())}
     if delay:
         problem = problem.with_log(problem.log.shifted(delay))
         fits = simulation_fits(problem, 1, seed, note, start=fits[0].t)
     return problem, fits, losses
 
 
-def _said(objective: Objective, maximum: Maximum) -> Information:
+def _information_of_constants(objective: Objective, maximum: Maximum) -> Information:
     """Return what the log says of the constants; a variance with hardly a curvature leaves none of them open."""
-    found = information(maximum.hessian, objective, maximum.z)
+    knowledge = information(maximum.hessian, objective, maximum.z)
     weak = (objective.is_q | objective.is_r) & (np.diag(maximum.hessian) < WEAK_CURVATURE)
-    if found.undetermined and weak.any():
-        others = information(maximum.hessian, objective, maximum.z, apart=weak)
-        return others if len(others.undetermined) < len(found.undetermined) else found
-    return found
+    if knowledge.undetermined and weak.any():
+        without_weak = information(maximum.hessian, objective, maximum.z, apart=weak)
+        return without_weak if len(without_weak.undetermined) < len(knowledge.undetermined) else knowledge
+    return knowledge
 
 
 def guarded_maximum(
@@ -119,15 +119,17 @@ def guarded_maximum(
 ) -> tuple[Maximum, Information]:
     """Return the greatest likelihood, with variances that the log cannot distinguish from zero kept away from it."""
     maximum = greatest_likelihood(objective, fits, note)
-    found = _said(objective, maximum)
-    if not found.undetermined:
+    knowledge = _information_of_constants(objective, maximum)
+    if not knowledge.undetermined:
         # Along a direction that the log leaves open the weight of a variance would only lead the constants away.
         maximum = without_collapse(objective, maximum, note)
-        found = _said(objective, maximum)
-    return maximum, found
+        knowledge = _information_of_constants(objective, maximum)
+    return maximum, knowledge
 
 
-def moved_by(exact: CalibrationProblem, start: Fit, maximum: Maximum, avoided: FloatArray, said: Information) -> float:
+def moved_by(
+    exact: CalibrationProblem, start: Fit, maximum: Maximum, avoided: FloatArray, knowledge: Information
+) -> float:
     """Return by how much constants move with exact steps: the most, in their deviations."""
     objective = Objective(exact, start)
     objective.avoided[:] = avoided
@@ -135,7 +137,7 @@ def moved_by(exact: CalibrationProblem, start: Fit, maximum: Maximum, avoided: F
     if value >= IMPOSSIBLE:
         return 0.0
     moves = np.abs(objective.constants(z) - objective.constants(maximum.z))[: len(exact.names)]
-    return float(np.max(moves / np.sqrt(np.diag(said.covariance)), initial=0.0))
+    return float(np.max(moves / np.sqrt(np.diag(knowledge.covariance)), initial=0.0))
 
 
 def innovations_fit(
@@ -149,14 +151,14 @@ def innovations_fit(
     """Return the fit of the innovations, from fits of the simulation. With an ``exact`` problem also by how much its
     constants would move; there is no fit where that matters."""
     objective = Objective(problem, fits[0])
-    maximum, found = guarded_maximum(objective, fits, note)
-    moved = 0.0 if exact is None else moved_by(exact, fits[0], maximum, objective.avoided, found)
+    maximum, knowledge = guarded_maximum(objective, fits, note)
+    moved = 0.0 if exact is None else moved_by(exact, fits[0], maximum, objective.avoided, knowledge)
     if moved > TOLERATED_MOVE:
         return None, moved
     variances = int((objective.is_q | objective.is_r).sum())
     root = quantile(level, len(problem.names), problem.log.samples, variances)
     note("boxes by profile likelihood")
-    sides = profile_box(objective, maximum, root, found)
+    sides = profile_box(objective, maximum, root, knowledge)
     # Variances are kept from zero for the sake of the boxes; where the log tells them from it, it says them itself.
     Q, R = objective.noise(maximum.likeliest)
     limited, limits = _limits(objective, maximum)
@@ -169,7 +171,7 @@ def innovations_fit(
     return InnovationsFit(
         t=objective.constants(maximum.z),
         value=objective.likelihood(objective.full(maximum.z))[0],
-        information=found,
+        information=knowledge,
         sides=sides,
         Q=Q,
         R=R,
@@ -179,22 +181,22 @@ def innovations_fit(
         whitened=whitened,
         innovations=e,
         variances=spread,
-        at_end=_at_end(objective, maximum, found) if has_offsets else None,
+        at_end=_at_end(objective, maximum, knowledge) if has_offsets else None,
     ), moved
 
 
-def _at_end(objective: Objective, maximum: Maximum, said: Information) -> tuple[FloatArray, FloatArray]:
+def _at_end(objective: Objective, maximum: Maximum, knowledge: Information) -> tuple[FloatArray, FloatArray]:
     """Return the state after the last row, and its deviations: of the filter, and by those of the constants."""
-    v, deviations = objective.full(maximum.z), np.sqrt(np.diag(said.covariance))
+    v, deviations = objective.full(maximum.z), np.sqrt(np.diag(knowledge.covariance))
     x, P = objective.likelihood.at_end(v)
     moved = np.zeros((len(x), len(deviations)))
     for i, deviation in enumerate(deviations.tolist()):
         near = v.copy()
         near[i] += deviation
-        found = objective.likelihood.at_end(near)[0] - x
+        change = objective.likelihood.at_end(near)[0] - x
         # Where the plant has no solution a constant is not so far off.
-        moved[:, i] = found / deviation if np.isfinite(found).all() else 0.0
-    return x, np.sqrt(np.diag(P) + np.einsum("ij,jk,ik->i", moved, said.covariance, moved))
+        moved[:, i] = change / deviation if np.isfinite(change).all() else 0.0
+    return x, np.sqrt(np.diag(P) + np.einsum("ij,jk,ik->i", moved, knowledge.covariance, moved))
 
 
 def _beside(problem: CalibrationProblem) -> list[int]:

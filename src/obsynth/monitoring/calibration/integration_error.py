@@ -59,13 +59,13 @@ def integration_error(
     for k in _compared(u[: len(states)]):
         after = min(k + 1, len(u) - 1)
         try:
-            seen = [
+            outputs = [
                 step.functions.outputs(step.solve(states[k], u[after], theta, before=u[k], k=int(k)).x, theta)[0]
                 for step in steps
             ]
         except SolverError:
             return None
-        errors = np.abs(seen[0] - seen[1]) / deviations
+        errors = np.abs(outputs[0] - outputs[1]) / deviations
         i = int(np.argmax(errors))
         if not errors[i] <= worst.largest:
             worst = IntegrationError(float(errors[i]), model.output_names[i], int(after))

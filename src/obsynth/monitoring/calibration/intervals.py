@@ -74,18 +74,18 @@ def information(
     held = at_bounds(z, objective.low, objective.high)
     held = held if apart is None else held | apart
     nuisance = [i for i in range(nt, len(z)) if not held[i]]
-    found = hessian[:nt, :nt]
+    matrix = hessian[:nt, :nt]
     if nuisance:
         values, vectors = np.linalg.eigh(hessian[np.ix_(nuisance, nuisance)])
         kept = values > LEAST_INFORMATION * max(float(values.max()), SMALLEST)
         across = hessian[:nt, nuisance] @ vectors[:, kept]
-        found = found - (across / values[kept]) @ across.T
-    return covariance_of(found, widths, names)
+        matrix = matrix - (across / values[kept]) @ across.T
+    return covariance_of(matrix, widths, names)
 
 
-def covariance_of(found: FloatArray, widths: FloatArray, names: tuple[str, ...]) -> Information:
+def covariance_of(matrix: FloatArray, widths: FloatArray, names: tuple[str, ...]) -> Information:
     """Return covariance and undetermined directions of information in widths of the bounds."""
-    values, vectors = np.linalg.eigh(0.5 * (found + found.T))
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     # What is not determined counts as the whole width: rounding times more would spoil every other constant.
     deviations = 1.0 / np.sqrt(np.maximum(values, 1.0))
     directions = []
@@ -108,10 +108,10 @@ def quantile(level: float, constants: int, samples: int, variances: int) -> floa
     of the level each; Student's distribution for variances that are found; widened for short logs."""
     from scipy.stats import norm, t
 
-    each = 1.0 - (1.0 - level) / (2.0 * max(constants, 1))
+    probability = 1.0 - (1.0 - level) / (2.0 * max(constants, 1))
     if not variances:
-        return float(norm.ppf(each))
-    return float(t.ppf(each, max(samples - constants - 2, 3))) * (
+        return float(norm.ppf(probability))
+    return float(t.ppf(probability, max(samples - constants - 2, 3))) * (
         1.0 + (SHORT_WIDENING - 1.0) * min(1.0, SHORT_LOG / samples)
     )
 
@@ -124,21 +124,21 @@ class Side:
     is_open: bool
 
 
-def profile_box(objective: Objective, maximum: Maximum, root: float, said: Information) -> list[tuple[Side, Side]]:
+def profile_box(objective: Objective, maximum: Maximum, root: float, knowledge: Information) -> list[tuple[Side, Side]]:
     """Return both ends of each constant's box, in its own units."""
-    found, problem = [], objective.problem
+    box, problem = [], objective.problem
     for i, (name, width) in enumerate(zip(problem.names, problem.widths, strict=False)):
-        weak = objective.bent or any(name in direction for direction in said.undetermined)
+        weak = objective.bent or any(name in direction for direction in knowledge.undetermined)
         side = _side_along_valley if weak else _side
         sides = [side(objective, maximum, i, sign, root) for sign in (-1.0, 1.0)]
         # An open side is the bound that was given, not what a division and a product leave of it.
-        given = (float(problem.low[i]), float(problem.high[i]))
+        bounds = (float(problem.low[i]), float(problem.high[i]))
         low, high = (
             Side(bound if item.is_open else item.value * width, item.is_open)
-            for item, bound in zip(sides, given, strict=True)
+            for item, bound in zip(sides, bounds, strict=True)
         )
-        found.append((low, high))
-    return found
+        box.append((low, high))
+    return box
 
 
 def upper_limit(objective: Objective, maximum: Maximum, i: int) -> float:
@@ -167,24 +167,24 @@ def profile_root(objective: Objective, maximum: Maximum, i: int) -> tuple[Callab
     # Variables that the log does not determine move by no more than their search does.
     scale = np.minimum(spread, np.where(np.arange(len(maximum.z))[others] < objective.nt, 1.0, 3.0))
     low, high = objective.low[others], objective.high[others]
-    place, rest = float(maximum.z[i]), maximum.z[others].copy()
+    place, others_at = float(maximum.z[i]), maximum.z[others].copy()
 
     def root(value: float) -> float:
-        nonlocal place, rest
+        nonlocal place, others_at
 
         def both(w: FloatArray) -> tuple[float, FloatArray]:
             z = np.empty(len(others) + 1)
             z[others], z[i] = w, value
-            found, gradient = objective(z)
-            return found, gradient[others]
+            value_at, gradient = objective(z)
+            return value_at, gradient[others]
 
         if others:
-            guess = np.clip(rest + slope * (value - place), low, high)
-            least, rest = descent(
+            guess = np.clip(others_at + slope * (value - place), low, high)
+            least, others_at = descent(
                 both, guess, low, high, scale, tolerance=PROFILE_SEARCH_TOLERANCE, most=MOST_PROFILE_SEARCHES
             )
         else:
-            least = both(rest)[0]
+            least = both(others_at)[0]
         place = value
         return math.sqrt(max(2.0 * (least - maximum.value), 0.0))
 
@@ -215,11 +215,11 @@ def _side(objective: Objective, maximum: Maximum, i: int, sign: float, target: f
             break
         share = min(max((target - reached_inner) / (reached - reached_inner), LEAST_CUT), 1.0 - LEAST_CUT)
         middle = inner + share * (outer - inner)
-        found = root(middle)
-        if found >= target:
-            outer, reached = middle, found
+        middle_root = root(middle)
+        if middle_root >= target:
+            outer, reached = middle, middle_root
         else:
-            inner, reached_inner = middle, found
+            inner, reached_inner = middle, middle_root
         if target - reached_inner < PROFILE_TOLERANCE * target:
             # The outer end would do as well; between them the interpolation is better than either.
             share = (target - reached_inner) / max(reached - reached_inner, SAME_ROOT)
@@ -231,7 +231,7 @@ def _side_along_valley(objective: Objective, maximum: Maximum, i: int, sign: flo
     """Return the end of a constant that the log hardly determines: along a valley that bends, in short steps. The
     others are led on from the last two places, and set right by Newton's steps at each."""
     others = [j for j in range(len(maximum.z)) if j != i]
-    place, rest = float(maximum.z[i]), maximum.z[others].copy()
+    place, others_at = float(maximum.z[i]), maximum.z[others].copy()
     end = float(objective.low[i] if sign < 0 else objective.high[i])
     inner = maximum.hessian[np.ix_(others, others)]
     slope = -np.linalg.lstsq(inner, maximum.hessian[others, i], rcond=LEAST_INFORMATION)[0]
@@ -239,18 +239,18 @@ def _side_along_valley(objective: Objective, maximum: Maximum, i: int, sign: flo
     while abs(end - place) > AT_BOUND:
         new = place + sign * min(step, abs(end - place))
         z = np.empty(len(maximum.z))
-        z[others], z[i] = rest + slope * (new - place), new
+        z[others], z[i] = others_at + slope * (new - place), new
         z = np.clip(z, objective.low, objective.high)
         least, z, after = polished(
             objective, z, fixed=i, most=VALLEY_NEWTON_STEPS, tolerance=VALLEY_TOLERANCE, near=curvature
         )
-        found = math.sqrt(max(2.0 * (least - maximum.value), 0.0))
-        if found >= target:
+        new_root = math.sqrt(max(2.0 * (least - maximum.value), 0.0))
+        if new_root >= target:
             if step <= LEAST_VALLEY_STEP * VALLEY_STEP:
-                share = (target - reached) / max(found - reached, SAME_ROOT)
+                share = (target - reached) / max(new_root - reached, SAME_ROOT)
                 return Side(place + share * (new - place), False)
             step *= 0.25
             continue
-        slope, place, rest, reached = (z[others] - rest) / (new - place), new, z[others].copy(), found
+        slope, place, others_at, reached = (z[others] - others_at) / (new - place), new, z[others].copy(), new_root
         curvature = after
     return Side(end, True)

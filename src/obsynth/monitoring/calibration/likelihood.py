@@ -33,13 +33,20 @@ class Likelihood:
         graphs, noisy = problem.graphs, problem.noisy_equations
         self.ny, self.size = graphs.ny, graphs.nt + len(noisy) + graphs.ny
         y, self._nx = problem.y if y is None else y, graphs.nx
-        self._both, self._missing = Compiled(_whole(graphs, problem.u, y, noisy, problem.x0, problem.P0)), np.isnan(y)
+        self._both, self._missing = (
+            Compiled(_likelihood_function(graphs, problem.u, y, noisy, problem.x0, problem.P0)),
+            np.isnan(y),
+        )
 
     def __call__(self, v: FloatArray) -> tuple[float, FloatArray]:
         """Return the value and its gradient ``(nt + len(noisy) + ny,)``."""
         total, gradient, rows, _ = self._both(v)
-        left = rows[-1]
-        good = np.isfinite(total).all() and np.isfinite(gradient).all() and np.abs(left).max() <= LARGEST_STEP_RESIDUAL
+        step_residuals = rows[-1]
+        good = (
+            np.isfinite(total).all()
+            and np.isfinite(gradient).all()
+            and np.abs(step_residuals).max() <= LARGEST_STEP_RESIDUAL
+        )
         return (float(total[0, 0]), gradient[:, 0]) if good else (IMPOSSIBLE, np.zeros(self.size))
 
     def at_end(self, v: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -54,14 +61,14 @@ class Likelihood:
         return np.where(self._missing, np.nan, whitened), np.where(self._missing, np.nan, e), variances
 
 
-def _whole(
+def _likelihood_function(
     graphs: SampleGraphs, u: FloatArray, y: FloatArray, noisy: Sequence[int], x0: FloatArray, P0: FloatArray
 ) -> Any:
     """Return the function from v to value, gradient, rows, and the state and covariance after them, packed."""
     nx, nt, n = graphs.nx, graphs.nt, len(y)
     first = _first(graphs, noisy)
-    seen = np.isfinite(y)
-    data = np.hstack([u, np.where(seen, y, 0.0), seen]).T
+    measured = np.isfinite(y)
+    data = np.hstack([u, np.where(measured, y, 0.0), measured]).T
     v = ca.MX.sym("v", nt + len(noisy) + graphs.ny)
     begin = ca.DM(np.concatenate([x0, P0.ravel()]))
     state, row = first(begin, data[:, 0], v)
@@ -71,9 +78,9 @@ def _whole(
     back_first = first.reverse(1)
     if n > 1:
         forward, backward = _accumulated(graphs, noisy, size)
-        states, said, numbers = forward.mapaccum(n - 1)(state, data[:, 1:], ca.repmat(v, 1, n - 1))
+        states, later_rows, numbers = forward.mapaccum(n - 1)(state, data[:, 1:], ca.repmat(v, 1, n - 1))
         before = ca.horzcat(state, states[:, :-1])
-        rows, total = ca.horzcat(row, said), row[0] + ca.sum2(said[0, :])
+        rows, total = ca.horzcat(row, later_rows), row[0] + ca.sum2(later_rows[0, :])
         flip = list(range(n - 2, -1, -1))
         costates = backward.mapaccum(n - 1)(
             ca.MX.zeros(size + v.shape[0]),
@@ -92,17 +99,17 @@ def _whole(
     return ca.Function("likelihood", [v], [total, ca.densify(gradient), ca.densify(rows), ca.densify(last)])
 
 
-def _update(graphs: SampleGraphs, x: Any, P: Any, u: Any, t: Any, log_r: Any, y: Any, seen: Any) -> tuple[Any, Any]:
+def _update(graphs: SampleGraphs, x: Any, P: Any, u: Any, t: Any, log_r: Any, y: Any, measured: Any) -> tuple[Any, Any]:
     """Return the state and covariance after a measurement, packed; and its row: value, whitened, e, variances."""
     predicted, H, _ = graphs.outputs(x, u, t)
-    H = ca.densify(H) * ca.repmat(seen, 1, graphs.nx)
-    e = seen * (y - predicted)
-    S = H @ P @ H.T + ca.diag(seen * ca.exp(log_r) + (1.0 - seen))
+    H = ca.densify(H) * ca.repmat(measured, 1, graphs.nx)
+    e = measured * (y - predicted)
+    S = H @ P @ H.T + ca.diag(measured * ca.exp(log_r) + (1.0 - measured))
     root = ca.chol(ca.densify(S)).T
     whitened = ca.solve(root, ca.horzcat(e, H @ P))
     w, V = whitened[:, 0], whitened[:, 1:]
     after = P - V.T @ V
-    value = 0.5 * ca.sumsqr(w) + ca.sum1(ca.log(ca.diag(root))) + 0.5 * math.log(2.0 * math.pi) * ca.sum1(seen)
+    value = 0.5 * ca.sumsqr(w) + ca.sum1(ca.log(ca.diag(root))) + 0.5 * math.log(2.0 * math.pi) * ca.sum1(measured)
     return ca.vertcat(x + V.T @ w, ca.vec(0.5 * (after + after.T))), ca.vertcat(value, w, e, ca.diag(S))
 
 
@@ -111,29 +118,29 @@ def _symbols(graphs: SampleGraphs, noisy: Sequence[int]) -> tuple[Any, ...]:
     packed = ca.SX.sym("packed", nx + nx * nx)
     data = ca.SX.sym("data", graphs.nu + 2 * ny)
     v = ca.SX.sym("v", graphs.nt + len(noisy) + ny)
-    u, y, seen = ca.vertsplit(data, [0, graphs.nu, graphs.nu + ny, graphs.nu + 2 * ny])
+    u, y, measured = ca.vertsplit(data, [0, graphs.nu, graphs.nu + ny, graphs.nu + 2 * ny])
     t, log_q, log_r = ca.vertsplit(v, [0, graphs.nt, graphs.nt + len(noisy), v.numel()])
-    return packed, data, v, u, y, seen, t, log_q, log_r
+    return packed, data, v, u, y, measured, t, log_q, log_r
 
 
 def _first(graphs: SampleGraphs, noisy: Sequence[int]) -> Any:
-    packed, data, v, u, y, seen, t, _, log_r = _symbols(graphs, noisy)
+    packed, data, v, u, y, measured, t, _, log_r = _symbols(graphs, noisy)
     nx = graphs.nx
     x, P = packed[:nx], ca.reshape(packed[nx:], nx, nx)
-    after, row = _update(graphs, x, P, u, t, log_r, y, seen)
+    after, row = _update(graphs, x, P, u, t, log_r, y, measured)
     return ca.Function("first", [packed, data, v], [ca.densify(after), ca.densify(ca.vertcat(row, 0.0))])
 
 
 def _later(graphs: SampleGraphs, noisy: Sequence[int]) -> Any:
     """Return one sample, with what was solved as numbers: from packed, data, v, tc, numbers to packed and row."""
-    packed, data, v, u, y, seen, t, log_q, log_r = _symbols(graphs, noisy)
+    packed, data, v, u, y, measured, t, log_q, log_r = _symbols(graphs, noisy)
     nx = graphs.nx
     tc, numbers = ca.SX.sym("tc", graphs.nt), ca.SX.sym("numbers", graphs.numbers)
     P = ca.reshape(packed[nx:], nx, nx)
     x, F, _, way = graphs.local(packed[:nx], u, t, tc, numbers)
     added = way[:, list(noisy)]
     P = F @ P @ F.T + added @ ca.diag(ca.exp(log_q)) @ added.T if noisy else F @ P @ F.T
-    after, row = _update(graphs, x, P, u, t, log_r, y, seen)
+    after, row = _update(graphs, x, P, u, t, log_r, y, measured)
     return ca.Function("later", [packed, data, v, tc, numbers], [ca.densify(after), ca.densify(row)])
 
 
@@ -146,17 +153,17 @@ def _accumulated(graphs: SampleGraphs, noisy: Sequence[int], size: int) -> list[
         if graphs.in_c:
             later, backward = compiled([later, backward])
         graphs.made[key] = [_forward(graphs, later), backward]
-    found: list[Any] = graphs.made[key]
-    return found
+    functions: list[Any] = graphs.made[key]
+    return functions
 
 
 def _forward(graphs: SampleGraphs, later: Any) -> Any:
     packed, data, v = (ca.MX.sym(name, later.size1_in(i)) for i, name in enumerate(("packed", "data", "v")))
     x, u, t = packed[: graphs.nx], data[: graphs.nu], v[: graphs.nt]
-    stages, left = graphs.solve(x, u, t)
+    stages, step_residual = graphs.solve(x, u, t)
     numbers = graphs.sensitivities(x, u, t, stages)
     after, row = later(packed, data, v, t, numbers)
-    return ca.Function("forward", [packed, data, v], [after, ca.vertcat(row, left), numbers])
+    return ca.Function("forward", [packed, data, v], [after, ca.vertcat(row, step_residual), numbers])
 
 
 def _backward(graphs: SampleGraphs, later: Any, size: int) -> Any:
@@ -171,6 +178,6 @@ def _backward(graphs: SampleGraphs, later: Any, size: int) -> Any:
     # The derivative of scalar operations takes its function's results as arguments without using them.
     unused = all(reverse.nnz_in(i) == 0 for i in (5, 6))
     outputs = nothing if unused else list(later(packed, data, v, v[: graphs.nt], numbers))
-    found = reverse(packed, data, v, v[: graphs.nt], numbers, *outputs, costate[:size], seed)
-    after = ca.vertcat(found[0], costate[size:] + found[2])
+    derivatives = reverse(packed, data, v, v[: graphs.nt], numbers, *outputs, costate[:size], seed)
+    after = ca.vertcat(derivatives[0], costate[size:] + derivatives[2])
     return ca.Function("backward", [costate, packed, numbers, data, v], [after])

@@ -38,7 +38,7 @@ MATRIX_LETTERS = {"E": "E", "A": "A", "B": "B", "C": "C", "Phi": "G", "Psi": "L"
 #: Constant effects of an invariant plant are its faults, then its unknown inputs.
 INVARIANT = {**{name: (name,) for name in "EABCD"}, "G": ("Bf", "Bd"), "L": ("Df", "Dd")}
 
-Known = Mapping[str, Any]
+Symbols = Mapping[str, Any]
 
 
 #: Where the search for a correlation begins, and its bounds: in samples, the last as a share of the log.
@@ -50,7 +50,7 @@ class _Matrix:
     """A matrix ``(rows, columns)``: from values by name and its signals to symbols; from k to its signals, if any."""
 
     shape: tuple[int, int]
-    symbolic: Callable[[Known, Any], Any]
+    symbolic: Callable[[Symbols, Any], Any]
     recorded: Callable[[int], FloatArray] | None = None
 
     @property
@@ -142,8 +142,8 @@ class LinearPlant(CalibrationPlant):
                 [matrix.recorded(log.rows[0] + i).reshape(self.nx, self.nx, order="F") for i in range(1, log.samples)]
             )
             return np.flatnonzero(~stack.any(axis=(0, 2))).tolist()
-        known = {name: ca.SX.sym(name) for name in (*self.values, INDEX_NAME)}
-        E = ca.SX(matrix.symbolic(known, None))
+        symbols = {name: ca.SX.sym(name) for name in (*self.values, INDEX_NAME)}
+        E = ca.SX(matrix.symbolic(symbols, None))
         return [i for i in range(self.nx) if all(E[i, j].is_zero() for j in range(self.nx))]
 
     def signals(self, log: RecordedLog) -> FloatArray:
@@ -161,17 +161,17 @@ class LinearPlant(CalibrationPlant):
 
     def _recorded(self) -> list[tuple[str, bool]]:
         """Return matrices that are signals, with whether at the row itself or at the one before."""
-        found = []
+        matrices = []
         for name, matrix in self.matrices.items():
             if matrix.recorded is None:
                 continue
             if name in ("E", "C"):
-                found.append((name, True))
+                matrices.append((name, True))
                 continue
-            found.append((name, False))
+            matrices.append((name, False))
             if self.late and name in ("A", "B", "G"):
-                found.append((name, True))
-        return found
+                matrices.append((name, True))
+        return matrices
 
     def _at(self, s: Any, t: Any, unknown: Sequence[str]) -> Callable[[str, bool], Any]:
         """Return the function from a matrix's name, and whether at the row itself, to its symbols."""
@@ -181,7 +181,7 @@ class LinearPlant(CalibrationPlant):
             width = self.matrices[name].width
             flats[name, later] = s[place : place + width]
             place += width
-        known = {
+        values = {
             **{name: ca.SX(value) for name, value in self.values.items()},
             **{name: t[i] for i, name in enumerate(unknown)},
         }
@@ -189,8 +189,8 @@ class LinearPlant(CalibrationPlant):
 
         def matrix(name: str, later: bool) -> Any:
             # A constant of an invariant plant may have the name of the index.
-            here = {INDEX_NAME: k if later else k - 1.0} | known
-            return self.matrices[name].symbolic(here, flats.get((name, later)))
+            at_row = {INDEX_NAME: k if later else k - 1.0} | values
+            return self.matrices[name].symbolic(at_row, flats.get((name, later)))
 
         return matrix
 
@@ -218,14 +218,14 @@ class LinearPlant(CalibrationPlant):
                     / dt
                 )
                 rows.append(E @ rate - A @ parts[:, i] - driven)
-            found = ca.vertcat(*rows)
+            equations = ca.vertcat(*rows)
         else:
-            found = at("E", True) @ X - at("A", False) @ x - driven
+            equations = at("E", True) @ X - at("A", False) @ x - driven
             if self.late:
                 held = -(at("A", True) @ X + self._product(at("B", True), now) + self._product(at("G", True), f))
                 for i in self.late:
-                    found[i] = held[i]
-        return stages, ca.Function("equations", [X, x, s, t, dt], [found])
+                    equations[i] = held[i]
+        return stages, ca.Function("equations", [X, x, s, t, dt], [equations])
 
     def _product(self, matrix: Any, column: Any) -> Any:
         """Return a product that is zero where there are no signals."""
@@ -244,8 +244,10 @@ class LinearPlant(CalibrationPlant):
         """Return how large each initial state can be ``(nx,)``: so that alone it makes outputs as large as they are."""
         stages, equations = self.step((), next(iter(BUTCHER)) if self.continuous else EXACT_STEP)
         X, x, s = ca.SX.sym("X", self.nx * stages), ca.SX.sym("x", self.nx), ca.SX.sym("s", signals.shape[1])
-        found = equations(X, x, s, ca.SX(0, 1), log.dt)
-        both = ca.Function("both", [s], [ca.densify(ca.jacobian(found, X)), ca.densify(ca.jacobian(found, x))])
+        residual = equations(X, x, s, ca.SX(0, 1), log.dt)
+        jacobians = ca.Function(
+            "both", [s], [ca.densify(ca.jacobian(residual, X)), ca.densify(ca.jacobian(residual, x))]
+        )
         outputs = self.outputs(())
         y = log.y - self.output_point
         large = np.sqrt(np.nanmean(y**2, axis=0))
@@ -253,7 +255,7 @@ class LinearPlant(CalibrationPlant):
         reach, effects = np.eye(self.nx), np.zeros(self.nx)
         for i, row in enumerate(signals[:SIZED_SAMPLES]):
             if i:
-                J, before = (np.array(part) for part in both(row))
+                J, before = (np.array(part) for part in jacobians(row))
                 if not np.isfinite(J).all() or rounding_rank(J / np.maximum(np.abs(J).max(), SMALLEST)) < self.nx:
                     raise refused(
                         "undetermined-step",
@@ -274,13 +276,15 @@ class LinearPlant(CalibrationPlant):
 def _with_entries(beside: Sequence[tuple[FloatArray, Sequence[tuple[int, int, str]]]], uncertainty: Any) -> _Matrix:
     """Return matrices side by side, of which some entries are expressions."""
 
-    def symbolic(known: Known, _: Any) -> Any:
+    def symbolic(values: Symbols, _: Any) -> Any:
         parts = []
         for matrix, entries in beside:
-            found = ca.SX(ca.DM(np.asarray(matrix, dtype=np.float64)))
+            symbols = ca.SX(ca.DM(np.asarray(matrix, dtype=np.float64)))
             for row, column, text in entries:
-                found[row, column] = known[text] if text in known else symbolic_value(uncertainty.parsed(text), known)
-            parts.append(found)
+                symbols[row, column] = (
+                    values[text] if text in values else symbolic_value(uncertainty.parsed(text), values)
+                )
+            parts.append(symbols)
         return ca.horzcat(*parts)
 
     return _Matrix((len(beside[0][0]), sum(matrix.shape[1] for matrix, _ in beside)), symbolic)

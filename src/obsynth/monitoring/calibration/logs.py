@@ -95,9 +95,9 @@ class RecordedLog:
     @property
     def digest(self) -> str:
         """SHA-256 of stamps, inputs and outputs: the same numbers have the same digest, however they were stored."""
-        seen = np.ascontiguousarray(np.column_stack([self.time, self.u, self.y]), dtype="<f8")
+        values = np.ascontiguousarray(np.column_stack([self.time, self.u, self.y]), dtype="<f8")
         names = "\n".join((*self.input_names, "", *self.output_names)).encode()
-        return hashlib.sha256(names + b"\0" + np.where(np.isnan(seen), np.nan, seen).tobytes()).hexdigest()
+        return hashlib.sha256(names + b"\0" + np.where(np.isnan(values), np.nan, values).tobytes()).hexdigest()
 
     @property
     def described(self) -> dict[str, Any]:
@@ -126,9 +126,9 @@ class RecordedLog:
         for i, name in enumerate(self.output_names):
             rows = np.flatnonzero(wrong[:, i])
             if len(rows):
-                told = told_rows([f"row {self.rows[0] + row}: {self.y[row, i]:.4g}" for row in rows])
+                listed = told_rows([f"row {self.rows[0] + row}: {self.y[row, i]:.4g}" for row in rows])
                 notes.append(
-                    f"{len(rows)} value(s) of {name} are far from all others and count as not measured ({told})."
+                    f"{len(rows)} value(s) of {name} are far from all others and count as not measured ({listed})."
                 )
         return replace(self, y=read_only(np.where(wrong, np.nan, self.y)), notes=tuple(notes))
 
@@ -171,14 +171,14 @@ def read_log(
             rows=(log.rows[0] + first, log.rows[0] + last),
         )
     signals = ("time", *input_names, *output_names)
-    for what, given in (("columns", columns or {}), ("scales", scales or {})):
-        wrong = [name for name in given if name not in signals]
+    for option, mapping in (("columns", columns or {}), ("scales", scales or {})):
+        wrong = [name for name in mapping if name not in signals]
         if wrong:
             raise SpecError(
-                f"{what} names {wrong[0]!r}, which is no signal: there are {', '.join(signals)}.",
-                path=f"{what}.{wrong[0]}",
+                f"{option} names {wrong[0]!r}, which is no signal: there are {', '.join(signals)}.",
+                path=f"{option}.{wrong[0]}",
             )
-    table, names, source, said = _table(log, [(columns or {}).get(name, name) for name in signals])
+    table, names, source, notes = _table(log, [(columns or {}).get(name, name) for name in signals])
     length = max((len(values) for values in table.values()), default=0)
     first, last = parsed_rows(rows, length)
 
@@ -197,12 +197,12 @@ def read_log(
     time = column("time") if in_table else np.asarray(np.arange(first, last) * float(dt or 0.0))
     u = np.column_stack([column(name) for name in input_names]) if input_names else np.zeros((last - first, 0))
     y = np.column_stack([column(name) for name in output_names])
-    found = _on_grid(time, u, y, dt, tuple(input_names), tuple(output_names), (first, last), source)
+    record = _on_grid(time, u, y, dt, tuple(input_names), tuple(output_names), (first, last), source)
     stuck = {
         name: [(first + begins, first + ends) for begins, ends in stuck_rows(values)]
-        for name, values in zip(found.output_names, found.y.T, strict=True)
+        for name, values in zip(record.output_names, record.y.T, strict=True)
     }
-    return replace(found, notes=(*said, *found.notes, *stuck_texts(stuck)))
+    return replace(record, notes=(*notes, *record.notes, *stuck_texts(stuck)))
 
 
 def _table(log: Any, wanted: Sequence[str]) -> tuple[dict[str, Any], list[str], str, tuple[str, ...]]:
@@ -210,18 +210,21 @@ def _table(log: Any, wanted: Sequence[str]) -> tuple[dict[str, Any], list[str], 
     said of their cells."""
     log = log if isinstance(log, str | Path | Mapping) else as_frame(log)
     if isinstance(log, str | Path) or (hasattr(log, "columns") and hasattr(log, "index")):
-        found, names, said = log_table(log, wanted[1:], wanted[0])
-        return found, names, Path(log).name if isinstance(log, str | Path) else "", said
+        columns, names, notes = log_table(log, wanted[1:], wanted[0])
+        return columns, names, Path(log).name if isinstance(log, str | Path) else "", notes
     if isinstance(log, Mapping):
-        found = {str(name): np.atleast_1d(np.asarray(log[name])) for name in log}
-        there = {name: found[name] for name in wanted if name in found}
-        if any(values.dtype.kind in "OU" for values in there.values()) and len(set(map(len, there.values()))) == 1:
+        columns = {str(name): np.atleast_1d(np.asarray(log[name])) for name in log}
+        wanted_columns = {name: columns[name] for name in wanted if name in columns}
+        if (
+            any(values.dtype.kind in "OU" for values in wanted_columns.values())
+            and len(set(map(len, wanted_columns.values()))) == 1
+        ):
             import pandas as pd
 
             # Cells with words are read as those of a frame.
-            read, _, said = log_table(pd.DataFrame(there), wanted[1:], wanted[0])
-            return {**found, **read}, list(map(str, log)), "", said
-        return found, list(map(str, log)), "", ()
+            read, _, notes = log_table(pd.DataFrame(wanted_columns), wanted[1:], wanted[0])
+            return {**columns, **read}, list(map(str, log)), "", notes
+        return columns, list(map(str, log)), "", ()
     raise SpecError(
         "log must be the name of a file, a pandas.DataFrame, or a mapping from names to columns.", path="log"
     )
@@ -258,12 +261,12 @@ def _on_grid(
         notes.append(f"The stamps jitter by {jitter.max():.1%} of a step.")
     missing = ~np.isfinite(u)
     for name, column in zip(inputs, u.T, strict=True):
-        known = np.isfinite(column)
-        if not known.any():
+        finite = np.isfinite(column)
+        if not finite.any():
             raise bad_log("nan", f"The input {name!r} is nowhere finite in these rows.", path=f"log.{name}")
-        if not known.all():
-            notes.append(f"{int((~known).sum())} value(s) of {name} are missing: the ones before are held.")
-            places = np.maximum.accumulate(np.where(known, np.arange(len(column)), np.argmax(known)))
+        if not finite.all():
+            notes.append(f"{int((~finite).sum())} value(s) of {name} are missing: the ones before are held.")
+            places = np.maximum.accumulate(np.where(finite, np.arange(len(column)), np.argmax(finite)))
             u = u.copy()
             u[:, inputs.index(name)] = column[places]
     for name, column in zip(outputs, y.T, strict=True):
@@ -276,12 +279,12 @@ def _on_grid(
     if (counts > 1).any():
         held = " and the inputs before them are held" if inputs else ""
         notes.append(f"{int((counts - 1).sum())} rows are missing: their outputs count as not measured{held}.")
-        whole = np.arange(places[-1] + 1)
-        before = np.searchsorted(places, whole, side="right") - 1
-        u, missing = u[before], missing[before] | ~np.isin(whole, places)[:, None]
-        wide = np.full((len(whole), y.shape[1]), np.nan)
+        grid = np.arange(places[-1] + 1)
+        before = np.searchsorted(places, grid, side="right") - 1
+        u, missing = u[before], missing[before] | ~np.isin(grid, places)[:, None]
+        wide = np.full((len(grid), y.shape[1]), np.nan)
         wide[places] = y
-        y, time = wide, time[0] + step * whole
+        y, time = wide, time[0] + step * grid
     return RecordedLog(
         read_only(time), read_only(u), read_only(y), step, inputs, outputs, rows, source, tuple(notes), held=missing
     )
@@ -333,8 +336,8 @@ def _mean_step(time: FloatArray, counts: NDArray[np.int64]) -> float:
     places = np.concatenate([[0], np.cumsum(counts)]) - np.sum(counts) / 2.0
     away = places - places.mean()
     step = float(away @ time / (away @ away))
-    left = time - time.mean() - step * away
-    error = float(np.sqrt(left @ left / max(len(time) - 2, 1) / (away @ away)))
+    deviation = time - time.mean() - step * away
+    error = float(np.sqrt(deviation @ deviation / max(len(time) - 2, 1) / (away @ away)))
     return next(
         (short for short in (float(f"{step:.{digits}g}") for digits in range(1, 17)) if abs(short - step) <= error),
         step,
@@ -350,15 +353,15 @@ def _longest(true: NDArray[np.bool_]) -> int:
 def roughness(y: FloatArray) -> FloatArray:
     """Return the deviation of white noise that differences of successive samples of sensors ``(n, ny)`` would show
     ``(ny,)``: those of neighbouring rows, or of a sensor that is slower than the rows, of its samples."""
-    found = np.zeros(y.shape[1])
+    deviations = np.zeros(y.shape[1])
     for j, column in enumerate(y.T):
         changes = np.diff(column)
         changes = changes[np.isfinite(changes)]
         if changes.size < 2:
             changes = np.diff(column[np.isfinite(column)])
         if changes.size:
-            found[j] = float(np.std(changes)) / np.sqrt(2.0)
-    return found
+            deviations[j] = float(np.std(changes)) / np.sqrt(2.0)
+    return deviations
 
 
 def quantum(column: FloatArray) -> float:

@@ -77,9 +77,9 @@ class Objective:
         self.nt, nq = g.nt, len(p.noisy)
         first_q = _process_noise(problem, fit)
         first_r = np.log(np.maximum(fit.deviations**2, 2.0 * p.floors))
-        known = np.concatenate([p.known_Q, p.known_R])
-        self.variances = np.where(np.isnan(known), np.concatenate([first_q, first_r]), np.log(known))
-        self.free = np.concatenate([np.ones(g.nt, dtype=bool), np.isnan(known)])
+        stated = np.concatenate([p.known_Q, p.known_R])
+        self.variances = np.where(np.isnan(stated), np.concatenate([first_q, first_r]), np.log(stated))
+        self.free = np.concatenate([np.ones(g.nt, dtype=bool), np.isnan(stated)])
         guess = np.concatenate([first_q + LOWEST_VARIANCE, np.log(p.floors)])
         self.low = np.concatenate([p.low / p.widths, guess])[self.free]
         high = self.variances + HIGHEST_VARIANCE
@@ -99,15 +99,15 @@ class Objective:
 
     def start(self, t: FloatArray) -> FloatArray:
         """Return free variables from constants, variances at their first guess."""
-        whole = np.concatenate([t / self.problem.widths, self.variances])
-        return np.asarray(np.clip(whole[self.free], self.low, self.high))
+        variables = np.concatenate([t / self.problem.widths, self.variances])
+        return np.asarray(np.clip(variables[self.free], self.low, self.high))
 
     def full(self, z: FloatArray) -> FloatArray:
         """Return ``[t, log q, log r]``."""
-        whole = np.concatenate([np.zeros(self.nt), self.variances])
-        whole[self.free] = z
-        whole[: self.nt] *= self.problem.widths
-        return whole
+        variables = np.concatenate([np.zeros(self.nt), self.variances])
+        variables[self.free] = z
+        variables[: self.nt] *= self.problem.widths
+        return variables
 
     def __call__(self, z: FloatArray) -> tuple[float, FloatArray]:
         """Return value and gradient."""
@@ -168,7 +168,7 @@ def _process_noise(problem: CalibrationProblem, fit: Fit) -> FloatArray:
 
 
 def descent(
-    both: Callable[[FloatArray], tuple[float, FloatArray]],
+    objective: Callable[[FloatArray], tuple[float, FloatArray]],
     start: FloatArray,
     low: FloatArray,
     high: FloatArray,
@@ -184,11 +184,11 @@ def descent(
         return np.asarray(np.clip(start + w * scale, low, high))
 
     def scaled(w: FloatArray) -> tuple[float, FloatArray]:
-        value, gradient = both(at(w))
+        value, gradient = objective(at(w))
         return value, gradient * scale
 
     with np.errstate(all="ignore"):
-        found = minimize(
+        result = minimize(
             scaled,
             np.zeros(len(start)),
             jac=True,
@@ -196,7 +196,7 @@ def descent(
             options={"maxiter": most, "ftol": tolerance},
             bounds=np.column_stack([(low - start) / scale, (high - start) / scale]),
         )
-    return float(found.fun), at(found.x)
+    return float(result.fun), at(result.x)
 
 
 def greatest_likelihood(objective: Objective, fits: Sequence[Fit], note: Callable[[str], object]) -> Maximum:
@@ -254,9 +254,9 @@ def polished(
         before = value
         for damping in NEWTON_DAMPINGS:
             trial = _newton_step(objective, z, gradient, curvature, damping, fixed)
-            found, slope = objective(trial)
-            if found < value:
-                z, value, gradient = trial, found, slope
+            trial_value, slope = objective(trial)
+            if trial_value < value:
+                z, value, gradient = trial, trial_value, slope
                 break
         if before - value < tolerance:
             break
@@ -264,24 +264,24 @@ def polished(
     # What is left across steep walls tilts the bottom of a bent valley, and with it what the valley leaves open.
     for _ in range(ACROSS_STEPS):
         trial = _newton_step(objective, z, gradient, curvature, 0.0, fixed, least=STEEP)
-        found, slope = objective(trial)
-        if not found < value + VALUE_ROUNDING * abs(value):
+        trial_value, slope = objective(trial)
+        if not trial_value < value + VALUE_ROUNDING * abs(value):
             break
-        z, value, gradient = trial, found, slope
+        z, value, gradient = trial, trial_value, slope
     return value, z, _hessian_of_minimum(objective, z, curvature) if fixed is None else curvature
 
 
 def _hessian_of_minimum(objective: Objective, z: FloatArray, near: FloatArray) -> FloatArray:
     """Return the Hessian, in longer steps where short ones see a kink of the model and no minimum."""
     free = np.flatnonzero(~at_bounds(z, objective.low, objective.high))
-    found = hessian(objective, z, near)
+    second = hessian(objective, z, near)
     for step in LONGER_DIFFERENCES:
-        values = np.linalg.eigvalsh(found[np.ix_(free, free)]) if free.size else np.zeros(1)
+        values = np.linalg.eigvalsh(second[np.ix_(free, free)]) if free.size else np.zeros(1)
         if values[0] >= -max(DOWNWARDS, DOWNWARDS_SHARE * values[-1]):
             break
         objective.bent = True
-        found = hessian(objective, z, steps=np.where(objective.is_q | objective.is_r, 1.0, CONSTANT_STEP) * step)
-    return found
+        second = hessian(objective, z, steps=np.where(objective.is_q | objective.is_r, 1.0, CONSTANT_STEP) * step)
+    return second
 
 
 def _newton_step(
@@ -313,12 +313,12 @@ def _newton_step(
 
 def collapsed(objective: Objective, maximum: Maximum) -> BoolArray:
     """Return which variances the log cannot distinguish from zero where they are, as truth values."""
-    found = np.zeros(objective.size, dtype=bool)
+    is_collapsed = np.zeros(objective.size, dtype=bool)
     for i in np.flatnonzero(objective.is_q | objective.is_r):
         z = maximum.z.copy()
         z[i] = max(z[i] - COLLAPSE, objective.low[i])
-        found[i] = objective(z)[0] - maximum.value < COLLAPSE_NATS
-    return found
+        is_collapsed[i] = objective(z)[0] - maximum.value < COLLAPSE_NATS
+    return is_collapsed
 
 
 def without_collapse(objective: Objective, maximum: Maximum, note: Callable[[str], object]) -> Maximum:
@@ -344,7 +344,7 @@ def without_collapse(objective: Objective, maximum: Maximum, note: Callable[[str
 
 
 def hessian(
-    both: Objective, z: FloatArray, near: FloatArray | None = None, *, steps: FloatArray | None = None
+    objective: Objective, z: FloatArray, near: FloatArray | None = None, *, steps: FloatArray | None = None
 ) -> FloatArray:
     """Return second derivatives by central differences of the exact gradient, in steps that suit those nearby."""
     if steps is None:
@@ -352,13 +352,13 @@ def hessian(
     if near is not None:
         steeper = np.sqrt(np.maximum(np.diag(near), 1.0))
         steps = np.clip(DIFFERENCE_SHARE / steeper, LEAST_DIFFERENCE, GRADIENT_DIFFERENCE)
-    found = np.array(
+    second = np.array(
         [
-            (both(z + step)[1] - both(z - step)[1]) / (2.0 * size)
+            (objective(z + step)[1] - objective(z - step)[1]) / (2.0 * size)
             for size, step in zip(steps, np.diag(steps), strict=True)
         ]
     )
-    return np.asarray(0.5 * (found + found.T))
+    return np.asarray(0.5 * (second + second.T))
 
 
 def at_bounds(z: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:

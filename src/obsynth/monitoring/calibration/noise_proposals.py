@@ -38,7 +38,7 @@ LEAST_NATS = {"coloured": LEAST_EXPLANATION, "offset": 1.0, "walk": LEAST_EXPLAN
 
 #: Nats that an offset explains beside constants, variances as they are, before it is tried; and by how much constants
 #: are moved to see what they explain, in widths of their bounds.
-ASKING, SMALL_MOVE = 2.0, 1e-4
+LEAST_OFFSET_GAIN, SMALL_MOVE = 2.0, 1e-4
 
 
 _STATE_SENTENCES = {
@@ -61,39 +61,39 @@ LONGEST_RUN, RETURNED = 5, 3
 def proposed_states(
     problem: CalibrationProblem,
     fit: InnovationsFit,
-    asked: NoiseStates,
+    stated: NoiseStates,
     kinds: Sequence[str],
     problem_with: Callable[[NoiseStates], CalibrationProblem],
     note: Callable[[str], object],
 ) -> tuple[NoiseStates, list[str]]:
     """Return the states asked for with those that the innovations ask for, and a sentence for each of these."""
-    states, told = asked, list[str]()
-    asking = _asking(problem, fit)
-    value, known = fit.value, _Known.of(problem, fit)
+    states, sentences = stated, list[str]()
+    asking = _proposals(problem, fit)
+    value, start = fit.value, _SearchStart.of(problem, fit)
     while True:
-        found = []
+        candidates = []
         for kind, name, tried in _candidates(states, kinds, problem.output_names, problem.plant.unknown_inputs):
             if (kind, name) not in asking:
                 continue
             note(f"{kind} of {name}")
-            reached, place = known.best(like_problem(problem, problem_with(tried)))
+            reached, place = start.best(like_problem(problem, problem_with(tried)))
             gain = value - reached - 0.5 * ADDED_NUMBERS[kind] * np.log(problem.log.samples)
             least = LEAST_NATS[kind]
             if kind == "offset" and least < gain < LEAST_EXPLANATION and hidden_faults(problem, fit, tried):
                 least = LEAST_EXPLANATION
-            found.append((gain - least, kind, name, tried, reached, place))
-        if not found:
+            candidates.append((gain - least, kind, name, tried, reached, place))
+        if not candidates:
             break
-        gain, kind, name, tried, reached, place = max(found, key=lambda item: item[0])
+        gain, kind, name, tried, reached, place = max(candidates, key=lambda item: item[0])
         if not gain > 0.0:
             break
         hidden = hidden_faults(problem, fit, tried) if kind == "offset" else ()
         least = LEAST_EXPLANATION if hidden else LEAST_NATS[kind]
-        told.append(_STATE_SENTENCES[kind].format(name=name, gain=gain + least))
+        sentences.append(_STATE_SENTENCES[kind].format(name=name, gain=gain + least))
         if hidden:
-            told.append(_OFFSET_HIDES.format(name=name, faults=" and ".join(hidden)))
-        states, value, known = tried, reached, place
-    return states, told
+            sentences.append(_OFFSET_HIDES.format(name=name, faults=" and ".join(hidden)))
+        states, value, start = tried, reached, place
+    return states, sentences
 
 
 def hidden_faults(problem: CalibrationProblem, fit: InnovationsFit, states: NoiseStates) -> tuple[str, ...]:
@@ -102,28 +102,28 @@ def hidden_faults(problem: CalibrationProblem, fit: InnovationsFit, states: Nois
     inner = problem.plant.inner if isinstance(problem.plant, PlantWithNoise) else problem.plant
     if not isinstance(inner, NonlinearPlant) or not inner.model.nq:
         return ()
-    model, found = inner.model, []
+    model, unidentifiable = inner.model, []
     u = np.tile(model.nominal_input, (NOMINAL_SAMPLES, 1))
     for plant in (model, cast(DAEModel, with_noise(model, offset=states.offsets)[0])):
         try:
-            told = identifiability(plant, u, dt=problem.log.dt, R=np.diag(fit.R), method=problem.integration)
+            result = identifiability(plant, u, dt=problem.log.dt, R=np.diag(fit.R), method=problem.integration)
         except SolverError:
             return ()
-        found.append(told.unidentifiable)
-    return tuple(name for name in model.parameter_names if name in found[1] and name not in found[0])
+        unidentifiable.append(result.unidentifiable)
+    return tuple(name for name in model.parameter_names if name in unidentifiable[1] and name not in unidentifiable[0])
 
 
-def _asking(problem: CalibrationProblem, fit: InnovationsFit) -> set[tuple[str, str]]:
+def _proposals(problem: CalibrationProblem, fit: InnovationsFit) -> set[tuple[str, str]]:
     """Return kinds and names that innovations ask for: coloured noise of a sensor where those of one are not white or
     an equation has process noise, which may stand for it; offsets that explain more of them than constants can; unknown
     inputs."""
-    found = {("walk", name) for name in problem.plant.unknown_inputs}
+    proposed = {("walk", name) for name in problem.plant.unknown_inputs}
     names, ny = problem.output_names, len(problem.output_names)
     coloured = [whiteness(column).probability < SIGNIFICANT for column in fit.whitened.T]
     # Process noise that stands for coloured noise whitens that sensor: the next one pays for it, or none does.
     # A mean is no colour, but a bias.
     hidden = any(coloured) or not np.all(fit.limited_Q)
-    found |= {
+    proposed |= {
         ("coloured", name)
         for name, own, column in zip(names, coloured, fit.whitened.T, strict=True)
         if own or (hidden and not mean_off(column))
@@ -138,9 +138,9 @@ def _asking(problem: CalibrationProblem, fit: InnovationsFit) -> set[tuple[str, 
     for j, name in enumerate(names):
         offset = deviations[j] * (np.arange(ny) == j)
         effect = whitened_run(problem, v, problem.y - offset) - before
-        if regression_gain(before.ravel(), [move.ravel() for move in moves], effect.ravel()) > ASKING:
-            found.add(("offset", name))
-    return found
+        if regression_gain(before.ravel(), [move.ravel() for move in moves], effect.ravel()) > LEAST_OFFSET_GAIN:
+            proposed.add(("offset", name))
+    return proposed
 
 
 def whitened_run(problem: CalibrationProblem, v: FloatArray, y: FloatArray) -> FloatArray:
@@ -177,7 +177,7 @@ def _letters(problem: CalibrationProblem) -> list[tuple[str, str]]:
     return [*(("Q", name) for name in problem.noisy), *(("R", name) for name in problem.output_names)]
 
 
-class _Known:
+class _SearchStart:
     """What a fit found, by name, from which a search with one more state begins."""
 
     def __init__(
@@ -186,7 +186,7 @@ class _Known:
         self.t, self.variances, self.kept, self.R = t, variances, kept, R
 
     @classmethod
-    def of(cls, problem: CalibrationProblem, fit: InnovationsFit) -> _Known:
+    def of(cls, problem: CalibrationProblem, fit: InnovationsFit) -> _SearchStart:
         """Return what a fit found; ``kept``: how much of an innovation of each sensor its next one keeps."""
         columns = zip(problem.output_names, fit.whitened.T, strict=True)
         kept = {name: whiteness(column).first for name, column in columns}
@@ -194,7 +194,7 @@ class _Known:
         spread = np.nanmean(fit.innovations**2, axis=0)
         return cls(dict(zip(problem.unknown, fit.t.tolist(), strict=True)), variances, kept, spread)
 
-    def best(self, problem: CalibrationProblem) -> tuple[float, _Known]:
+    def best(self, problem: CalibrationProblem) -> tuple[float, _SearchStart]:
         """Return the least negative log likelihood with another model, and what it found."""
         plant = problem.plant
         nominal = {name: float(value) for name, value in zip(problem.unknown, problem.nominal, strict=True)}
@@ -228,7 +228,7 @@ class _Known:
             return np.inf, self
         objective, z = best
         Q, R = objective.noise(z)
-        found = dict(zip(_letters(problem), (*Q.tolist(), *R.tolist()), strict=True))
-        return value, _Known(
-            dict(zip(problem.unknown, objective.constants(z).tolist(), strict=True)), found, self.kept, self.R
+        variances_at = dict(zip(_letters(problem), (*Q.tolist(), *R.tolist()), strict=True))
+        return value, _SearchStart(
+            dict(zip(problem.unknown, objective.constants(z).tolist(), strict=True)), variances_at, self.kept, self.R
         )

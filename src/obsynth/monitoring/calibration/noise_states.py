@@ -115,11 +115,11 @@ class PlantWithNoise(CalibrationPlant):
         moved = np.maximum(np.where(moved > 0.0, moved, 1.0), rough)
         large = dict(zip(log.output_names, moved, strict=True))
         offsets = dict(zip(log.output_names, np.maximum(moved, LARGEST_SENSOR_OFFSET * rough), strict=True))
-        found = [large[name] for name in self.coloured] + [offsets[name] for name in self.states.offsets]
-        return np.array([*found, *self._load_sizes(log, moved)])
+        sizes = [large[name] for name in self.coloured] + [offsets[name] for name in self.states.offsets]
+        return np.array([*sizes, *self._load_sizes(log, moved)])
 
     def _load_sizes(self, log: RecordedLog, moved: FloatArray) -> list[float]:
-        found = []
+        sizes = []
         for name in self.states.loads:
             graphs = sample_graphs(self.inner, (name,), log.dt, integration=self.inner.integration("auto"), substeps=1)
             x, t = self.inner.nominal_state, np.array([float(self.inner.values[name])])
@@ -132,8 +132,8 @@ class PlantWithNoise(CalibrationPlant):
                 _, H, L = graphs.outputs(x, row, t)
                 effect = max(effect, float(np.nanmax(np.abs(np.array(H) @ reach + np.array(L))[:, 0] / moved)))
             nominal = abs(t[0]) or 1.0
-            found.append(1.0 / effect if effect > SMALLEST else nominal)
-        return found
+            sizes.append(1.0 / effect if effect > SMALLEST else nominal)
+        return sizes
 
     def _correlation(self, name: str, t: Any, unknown: Sequence[str]) -> Any:
         value = self.states.correlations[name]
@@ -149,17 +149,17 @@ class PlantWithNoise(CalibrationPlant):
 
     def step(self, unknown: Sequence[str], integration: str) -> tuple[int, Any]:
         """Return stages, and the function from stages, state before, signals, constants and dt to equations."""
-        n, whole = self.own, len(self.state_names)
-        names, _ = self._inner_constants(ca.SX.sym("x", whole), ca.SX.sym("t", len(unknown)), unknown)
+        n, count = self.own, len(self.state_names)
+        names, _ = self._inner_constants(ca.SX.sym("x", count), ca.SX.sym("t", len(unknown)), unknown)
         stages, inner = self.inner.step(names, integration)
-        X, x, dt = ca.SX.sym("X", whole * stages), ca.SX.sym("x", whole), ca.SX.sym("dt")
+        X, x, dt = ca.SX.sym("X", count * stages), ca.SX.sym("x", count), ca.SX.sym("dt")
         s, t = ca.SX.sym("s", len(self.nominal_signals)), ca.SX.sym("t", len(unknown))
-        parts = ca.reshape(X, whole, stages)
+        parts = ca.reshape(X, count, stages)
         # Loads act as inputs do: during the step that ends with them, of a discrete plant that begins with them.
         _, values = self._inner_constants(parts[:, stages - 1] if integration in BUTCHER else x, t, unknown)
-        found = ca.reshape(inner(ca.vec(parts[:n, :]), x[:n], s, values, dt), n, stages)
+        inner_equations = ca.reshape(inner(ca.vec(parts[:n, :]), x[:n], s, values, dt), n, stages)
         added = self._added(parts[n:, :], x[n:], t, unknown, dt, integration)
-        return stages, ca.Function("equations", [X, x, s, t, dt], [ca.vec(ca.vertcat(found, added))])
+        return stages, ca.Function("equations", [X, x, s, t, dt], [ca.vec(ca.vertcat(inner_equations, added))])
 
     def _added(self, parts: Any, before: Any, t: Any, unknown: Sequence[str], dt: Any, integration: str) -> Any:
         """Return the equations of the further states at each stage, in units of their change over a second."""
@@ -182,12 +182,16 @@ class PlantWithNoise(CalibrationPlant):
 
     def outputs(self, unknown: Sequence[str]) -> Any:
         """Return the function from state, signals and constants to y, H and L."""
-        whole = len(self.state_names)
-        x, s, t = ca.SX.sym("x", whole), ca.SX.sym("s", len(self.nominal_signals)), ca.SX.sym("t", len(unknown))
+        count = len(self.state_names)
+        x, s, t = ca.SX.sym("x", count), ca.SX.sym("s", len(self.nominal_signals)), ca.SX.sym("t", len(unknown))
         names, values = self._inner_constants(x, t, unknown)
         y = self.inner.outputs(names)(x[: self.own], s, values)[0]
-        shown = np.zeros((y.numel(), len(self.coloured) + len(self.states.offsets)))
+        selection = np.zeros((y.numel(), len(self.coloured) + len(self.states.offsets)))
         for column, name in enumerate((*self.coloured, *self.states.offsets)):
-            shown[self._outputs.index(name), column] = 1.0
-        y = ca.densify(y) + ca.mtimes(ca.DM(shown), x[self.own : self.own + shown.shape[1]]) if shown.size else y
+            selection[self._outputs.index(name), column] = 1.0
+        y = (
+            ca.densify(y) + ca.mtimes(ca.DM(selection), x[self.own : self.own + selection.shape[1]])
+            if selection.size
+            else y
+        )
         return outputs_function(x, s, t, y)

@@ -106,8 +106,8 @@ class NonlinearPlant(CalibrationPlant):
         X, x = ca.SX.sym("X", functions.stages * len(self.nominal_state)), ca.SX.sym("x", len(self.nominal_state))
         u, t, dt = ca.SX.sym("u", len(self.nominal_signals)), ca.SX.sym("t", len(unknown)), ca.SX.sym("dt")
         theta = casadi_column(self.theta(unknown, t))
-        found = functions.residual_function(X, x, u, theta, dt)[0]
-        return functions.stages, ca.Function("equations", [X, x, u, t, dt], [found])
+        residual = functions.residual_function(X, x, u, theta, dt)[0]
+        return functions.stages, ca.Function("equations", [X, x, u, t, dt], [residual])
 
     def outputs(self, unknown: Sequence[str]) -> Any:
         """Return the function from state, signals and constants to y, H and L."""

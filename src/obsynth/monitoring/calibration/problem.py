@@ -170,11 +170,11 @@ def _require_enough(log: RecordedLog, constants: int, variances: int) -> None:
             "bounds, or leave variances out.",
             path="unknown",
         )
-    needed, seen = VALUES_PER_UNKNOWN * (constants + variances), int(np.isfinite(log.y).sum())
-    if seen < needed:
+    needed, measured = VALUES_PER_UNKNOWN * (constants + variances), int(np.isfinite(log.y).sum())
+    if measured < needed:
         raise bad_log(
             "too-short",
-            f"The log is too short: {seen} measured values for {constants} constants and "
+            f"The log is too short: {measured} measured values for {constants} constants and "
             f"{variances} variances; at least {needed} are needed. Take more rows, fewer unknowns, or state "
             "Q and R.",
         )
@@ -225,18 +225,18 @@ def _priors(
     return means, weights
 
 
-def _variances(given: Mapping[str, float | None] | None, names: Sequence[str], what: str) -> FloatArray:
+def _variances(stated: Mapping[str, float | None] | None, names: Sequence[str], letter: str) -> FloatArray:
     """Return known variances, NaN for those that are to be found."""
-    require_mapping(given, what)
-    found = np.full(len(names), np.nan)
-    for name, value in (given or {}).items():
-        i = index_of(name, names, what=what)
+    require_mapping(stated, letter)
+    variances = np.full(len(names), np.nan)
+    for name, value in (stated or {}).items():
+        i = index_of(name, names, what=letter)
         if value is None:
             continue
-        found[i] = real_number(
-            value, f"{what}.{name}", "a positive variance, or leave it out to have it found", above=0.0
+        variances[i] = real_number(
+            value, f"{letter}.{name}", "a positive variance, or leave it out to have it found", above=0.0
         )
-    return found
+    return variances
 
 
 def _covariance(plant: CalibrationPlant, value: Any) -> FloatArray:

@@ -65,39 +65,39 @@ def reported(
     digest: str,
 ) -> Calibration:
     """Return the calibration of a fit of innovations, or of a simulation where there is none."""
-    found = fit if fit is not None else _of_simulation(problem, start, level)
-    names, whitened = problem.names, found.whitened
-    covariance = found.information.covariance
+    result = fit if fit is not None else _of_simulation(problem, start, level)
+    names, whitened = problem.names, result.whitened
+    covariance = result.information.covariance
     deviations = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(deviations, deviations)
     colours = {name: whiteness(column) for name, column in zip(problem.output_names, whitened.T, strict=True)}
     change = change_of_mean(whitened)
     nis = consistency(float(np.nansum(whitened**2)), int(np.isfinite(problem.y).sum()))
     box = _box(
-        names, found, level, digest, stands=all(colour.probability >= SIGNIFICANT for colour in colours.values())
+        names, result, level, digest, stands=all(colour.probability >= SIGNIFICANT for colour in colours.values())
     )
-    Q = {name: float(value) for name, value in zip(problem.noisy, found.Q, strict=True)} if fit is not None else {}
-    R = {name: float(value) for name, value in zip(problem.output_names, found.R, strict=True)}
+    Q = {name: float(value) for name, value in zip(problem.noisy, result.Q, strict=True)} if fit is not None else {}
+    R = {name: float(value) for name, value in zip(problem.output_names, result.R, strict=True)}
     q, r = variance_names(problem.noisy, problem.output_names)
-    limits = zip((*q, *r), (*found.limited_Q, *found.limited_R), strict=True)
+    limits = zip((*q, *r), (*result.limited_Q, *result.limited_R), strict=True)
     limited = [name for name, weak in limits if weak]
     row = None if change is None else problem.log.rows[0] + change
-    at_end = tuple(name for name, there in zip(problem.unknown, found.at_bounds, strict=True) if there)
+    at_end = tuple(name for name, is_at_end in zip(problem.unknown, result.at_bounds, strict=True) if is_at_end)
     verdict = [
         *problem.log.notes,
         *problem.plant.notes,
         *problem.notes,
-        *_fitted(problem, box, found, at_end, correlation, limited, Q, R),
+        *_fitted(problem, box, result, at_end, correlation, limited, Q, R),
         *_misfits(problem, start, whitened, R),
         *_checked(nis, colours, row, fit is None),
-        *_told(problem, R, losses, error),
+        *_sentences_on_log(problem, R, losses, error),
     ]
     return Calibration(
         box.nominal,
         read_only(covariance),
         read_only(correlation),
         box,
-        found.information.undetermined,
+        result.information.undetermined,
         Q,
         R,
         tuple(limited),
@@ -111,26 +111,26 @@ def reported(
         problem.integration,
         problem.substeps,
         "innovations" if fit is not None else "simulation",
-        -found.value,
+        -result.value,
         tuple(verdict),
         read_only(whitened),
-        read_only(problem.y - found.innovations),
-        read_only(np.sqrt(found.variances)),
+        read_only(problem.y - result.innovations),
+        read_only(np.sqrt(result.variances)),
         problem.log.described | {"digest": digest},
         {name: problem.plant.units.get(name, "1") for name in names},
         problem.output_names,
-        *_noise_model(problem, found, Q, R),
+        *_noise_model(problem, result, Q, R),
         dict(zip(problem.plant.state_names, np.diag(problem.P0).tolist(), strict=True)),
         getattr(problem.plant, "inner", problem.plant).equation_names,
-        _outlier_sizes(problem.log, np.sqrt(np.median(found.variances, axis=0))),
-        _found_offsets(problem, found),
+        _outlier_sizes(problem.log, np.sqrt(np.median(result.variances, axis=0))),
+        _found_offsets(problem, result),
     )
 
 
-def _box(names: Sequence[str], found: InnovationsFit, level: float, digest: str, *, stands: bool) -> CalibratedBox:
+def _box(names: Sequence[str], fit: InnovationsFit, level: float, digest: str, *, stands: bool) -> CalibratedBox:
     """Return the box of the constants of a fit."""
-    nominal = {name: float(value) for name, value in zip(names, found.t[: len(names)], strict=True)}
-    sides = dict(zip(names, found.sides[: len(names)], strict=True))
+    nominal = {name: float(value) for name, value in zip(names, fit.t[: len(names)], strict=True)}
+    sides = dict(zip(names, fit.sides[: len(names)], strict=True))
     return CalibratedBox(
         nominal,
         {name: min(pair[0].value, nominal[name]) for name, pair in sides.items()},
@@ -148,13 +148,13 @@ def _box(names: Sequence[str], found: InnovationsFit, level: float, digest: str,
 
 
 def _noise_model(
-    problem: CalibrationProblem, found: InnovationsFit, Q: dict[str, float], R: dict[str, float]
+    problem: CalibrationProblem, fit: InnovationsFit, Q: dict[str, float], R: dict[str, float]
 ) -> tuple[dict[str, dict[str, float]], dict[str, float], dict[str, float]]:
     """Return coloured noise, deviations of offsets, and walks, in the terms of `with_noise`."""
     if not isinstance(problem.plant, PlantWithNoise) or not Q:
         return {}, {}, {}
     states, dt = problem.plant.states, problem.log.dt
-    t = dict(zip(problem.unknown, found.t.tolist(), strict=True))
+    t = dict(zip(problem.unknown, fit.t.tolist(), strict=True))
     sensors = {}
     for name, value in states.correlations.items():
         time = float(np.exp(t[correlation_name(name)])) if value is None else value
@@ -167,11 +167,11 @@ def _noise_model(
     return sensors, offsets, {name: step * Q[name] ** 0.5 for name in states.loads}
 
 
-def _found_offsets(problem: CalibrationProblem, found: InnovationsFit) -> dict[str, tuple[float, float]]:
+def _found_offsets(problem: CalibrationProblem, fit: InnovationsFit) -> dict[str, tuple[float, float]]:
     """Return the offset of each sensor after the last row, and its deviation."""
-    if not isinstance(problem.plant, PlantWithNoise) or found.at_end is None:
+    if not isinstance(problem.plant, PlantWithNoise) or fit.at_end is None:
         return {}
-    end = dict(zip(problem.plant.state_names, np.transpose(found.at_end).tolist(), strict=True))
+    end = dict(zip(problem.plant.state_names, np.transpose(fit.at_end).tolist(), strict=True))
     pairs = {name: end[offset_state(name)] for name in problem.plant.states.offsets}
     return {name: (value, deviation) for name, (value, deviation) in pairs.items()}
 
@@ -181,10 +181,10 @@ def _of_simulation(problem: CalibrationProblem, start: Fit, level: float) -> Inn
     error = SimulationError(problem)
     nt, scale = error.nt, error.scale
     inner = start.information
-    found = inner[:nt, :nt] - inner[:nt, nt:] @ np.linalg.solve(inner[nt:, nt:], inner[nt:, :nt])
+    marginal = inner[:nt, :nt] - inner[:nt, nt:] @ np.linalg.solve(inner[nt:, nt:], inner[nt:, :nt])
     kept = slice(None, len(problem.names))
-    found = np.linalg.inv(np.linalg.inv(found)[kept, kept]) if problem.plant.bounds else found
-    information = covariance_of(found, problem.widths[kept], problem.names)
+    marginal = np.linalg.inv(np.linalg.inv(marginal)[kept, kept]) if problem.plant.bounds else marginal
+    information = covariance_of(marginal, problem.widths[kept], problem.names)
     y = error.simulated(np.concatenate([start.t, start.x0]) / scale)[0]
     e = problem.y - y
     root = quantile(level, len(problem.names), problem.log.samples, len(problem.output_names))
@@ -222,24 +222,24 @@ def _fitted(
     Q: dict[str, float],
     R: dict[str, float],
 ) -> list[str]:
-    found = []
+    sentences = []
     for direction in fit.information.undetermined:
-        told = ", ".join(f"{name} {share:+.2g}" for name, share in direction.items())
-        found.append(
-            f"This log does not determine the direction ({told}), in widths of the bounds: excite it, state a prior, "
+        listed = ", ".join(f"{name} {share:+.2g}" for name, share in direction.items())
+        sentences.append(
+            f"This log does not determine the direction ({listed}), in widths of the bounds: excite it, state a prior, "
             "or fix one of them."
         )
-    found += [
+    sentences += [
         f"The box of {name} is open on its {side} side: the bound limits it there, the log does not."
         for name, side in box.open_sides
     ]
-    found += [f"{name} is at a bound: widen it if the constant may lie beyond." for name in at_end]
+    sentences += [f"{name} is at a bound: widen it if the constant may lie beyond." for name in at_end]
     free = [
         i
         for i, name in enumerate(problem.names)
         if not any(name in direction for direction in fit.information.undetermined)
     ]
-    found += [
+    sentences += [
         f"{problem.unknown[i]} and {problem.unknown[j]} are correlated by {correlation[i, j]:+.2f}: their "
         "combination is known better than either."
         for i, j in itertools.combinations(free, 2)
@@ -248,10 +248,10 @@ def _fitted(
     q, r = variance_names(tuple(Q), tuple(R))
     values = dict(zip((*q, *r), (*Q.values(), *R.values()), strict=True))
     if not box.stands:
-        found.append(
+        sentences.append(
             f"The box does not stand: its {100 * box.level:g} % are those of white innovations, which these are not."
         )
-    return found + [
+    return sentences + [
         f"The variance of {name} cannot be distinguished from zero: its upper limit {values[name]:.3g} is used."
         for name in limited
     ]
@@ -263,20 +263,20 @@ def _outlier_sizes(log: RecordedLog, deviations: FloatArray) -> dict[str, float]
     One more outlier is nearer than all of n with the probability 1 / (n + 1): the size stands that share of the way, on
     a logarithmic scale, from the least of them to what no sample of the model reaches.
     """
-    found = {}
+    by_output = {}
     for name, sizes, deviation in zip(log.output_names, log.outliers, deviations, strict=False):
         if len(sizes):
             usual, least, share = STANDS_OUT * float(deviation), float(sizes.min()), 1.0 / (len(sizes) + 1)
-            found[name] = usual**share * least ** (1.0 - share)
-    return found
+            by_output[name] = usual**share * least ** (1.0 - share)
+    return by_output
 
 
 def _misfits(problem: CalibrationProblem, start: Fit, whitened: FloatArray, R: dict[str, float]) -> list[str]:
     """Return sentences about sensors that the model does not follow, their mean, and single samples that stand out."""
-    found = []
+    sentences = []
     for name in unexplained(problem, start.deviations):
         signal = float(np.nanvar(problem.y[:, problem.output_names.index(name)]))
-        found.append(
+        sentences.append(
             f"The best simulation explains almost nothing of {name}: "
             + (
                 "its sign, its unit or its equation is wrong, and its R is the variance of the signal itself."
@@ -287,61 +287,66 @@ def _misfits(problem: CalibrationProblem, start: Fit, whitened: FloatArray, R: d
     for name, column in zip(problem.output_names, whitened.T, strict=True):
         mean = mean_off(column)
         if mean:
-            found.append(
+            sentences.append(
                 f"The innovations of {name} have the mean {mean:+.2f} deviations: a bias of the sensor, or an "
                 "offset that the model lacks."
             )
         rows = problem.log.rows[0] + np.flatnonzero(np.abs(np.nan_to_num(column)) > STANDS_OUT)
         if len(rows):
-            found.append(
+            sentences.append(
                 f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations (row {told_rows(rows)}): "
                 "if they are outliers, mark them as missing."
             )
-    return found
+    return sentences
 
 
 def _checked(nis: Consistency, colours: dict[str, Whiteness], row: int | None, simulated: bool) -> list[str]:
-    found = [
+    sentences = [
         f"The innovations of {name} are not white (p = {test.probability:.2g}, first autocorrelation "
         f"{test.first:+.2f}): a signal that acts on {name} is not in the model."
         for name, test in colours.items()
         if test.probability < SIGNIFICANT
     ]
-    if simulated and found:
-        found.append("The residuals of a simulation that are not white make boxes too small: use method='innovations'.")
+    if simulated and sentences:
+        sentences.append(
+            "The residuals of a simulation that are not white make boxes too small: use method='innovations'."
+        )
     if not simulated and not nis.holds:
-        found.append(f"NIS per degree of freedom is {nis.value:.2f}, outside {nis.low:.2f} to {nis.high:.2f}.")
+        sentences.append(f"NIS per degree of freedom is {nis.value:.2f}, outside {nis.low:.2f} to {nis.high:.2f}.")
     if row is not None:
-        found.append(
+        sentences.append(
             f"These rows are not homogeneous: the mean of the innovations changes at row {row}. If a fault "
             "begins there, end the rows before it."
         )
-    return found
+    return sentences
 
 
-def _told(
+def _sentences_on_log(
     problem: CalibrationProblem, R: dict[str, float], losses: Mapping[int, float], error: IntegrationError | None
 ) -> list[str]:
-    found, delay = list[str](), problem.log.input_delay
+    sentences, delay = list[str](), problem.log.input_delay
     for name, step in zip(problem.output_names, problem.quanta, strict=True):
         if step > 0.0 and R[name] < AT_QUANTISATION * step**2 / EVEN:
-            found.append(
+            sentences.append(
                 f"The noise of {name} is at its quantisation ({step:.3g} / sqrt 12): its R is at least that of the "
                 "quantisation."
             )
     if delay and losses:
         rows = "1 row" if delay == 1 else f"{delay} rows"
         gained = losses[0] - losses[delay]
-        found.append(f"The inputs act {rows} later than the log states: better by {gained:.1f} nats.")
+        sentences.append(f"The inputs act {rows} later than the log states: better by {gained:.1f} nats.")
     lost = losses.get(delay, 0.0)
     if lost > NOTED_NATS:
         least = min(losses, key=lambda rows: losses[rows])
-        found.append(f"Inputs that act {least:+d} row(s) later would be better by {lost:.1f} nats: see input_delay.")
+        sentences.append(
+            f"Inputs that act {least:+d} row(s) later would be better by {lost:.1f} nats: see input_delay."
+        )
     if error is not None:
         used = "Radau" if problem.integration == "radau" else "backward Euler"
-        told = f" and moves a constant by {error.moved:.2g} of its own" if error.moved else ""
-        found.append(
-            f"A step of backward Euler has an error of at most {error.largest:.2g} deviations of {error.sensor}{told}: "
+        movement = f" and moves a constant by {error.moved:.2g} of its own" if error.moved else ""
+        sentences.append(
+            f"A step of backward Euler has an error of at most {error.largest:.2g} deviations of "
+            f"{error.sensor}{movement}: "
             f"{used} is used."
         )
-    return found
+    return sentences

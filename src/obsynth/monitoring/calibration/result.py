@@ -139,9 +139,9 @@ class Calibration:
 
     def __repr__(self) -> str:
         rows = f"rows {self.log['rows'][0]}:{self.log['rows'][1]}"
-        what = "1 constant" if len(self.nominal) == 1 else f"{len(self.nominal)} constants"
+        noun = "1 constant" if len(self.nominal) == 1 else f"{len(self.nominal)} constants"
         lines = [
-            f"Calibration of {what} from {self.log['source'] or 'a log'}, {rows} ("
+            f"Calibration of {noun} from {self.log['source'] or 'a log'}, {rows} ("
             f"{100 * self.box.level:g} % box, all at once{'' if self.box.stands else '; it DOES NOT STAND'})"
         ]
         if not self.nominal:
@@ -155,8 +155,11 @@ class Calibration:
             ]
             unit = "" if self.units.get(name, "1") == "1" else f" {self.units[name]}"
             lines.append(f"  {name:<{width}}  {value:.5g}  [{ends[0]}, {ends[1]}]{unit}")
-        for heading, letter, variances, others in (("Q per step", "Q", self.Q, self.R), ("R", "R", self.R, self.Q)):
-            limited = limited_names(self.upper_limits, letter, variances, others)
+        for heading, letter, variances, other_variances in (
+            ("Q per step", "Q", self.Q, self.R),
+            ("R", "R", self.R, self.Q),
+        ):
+            limited = limited_names(self.upper_limits, letter, variances, other_variances)
             sizes = [f"{name} {'<= ' if name in limited else ''}{value:.3g}" for name, value in variances.items()]
             if sizes:
                 lines.append(f"  {heading}: " + ", ".join(sizes))
@@ -167,8 +170,8 @@ class Calibration:
             )
         for name in self.offset:
             value, deviation = self.found_offsets.get(name, (0.0, np.inf))
-            known = f"{value:.3g}, deviation {deviation:.3g}" if np.isfinite(deviation) else "unknown"
-            lines.append(f"  offset of {name}: {known}")
+            offset_text = f"{value:.3g}, deviation {deviation:.3g}" if np.isfinite(deviation) else "unknown"
+            lines.append(f"  offset of {name}: {offset_text}")
         lines += [f"  walk of {name}: {step:.3g} per root of a second" for name, step in self.walks.items()]
         lines.append(
             f"  NIS per degree of freedom {self.nis.value:.2f} (95 %: {self.nis.low:.2f} to {self.nis.high:.2f})"
@@ -182,7 +185,7 @@ class Calibration:
                 name: {
                     "nominal": value,
                     "range": [self.box.low[name], self.box.high[name]],
-                    "open": [side for other, side in self.box.open_sides if other == name],
+                    "open": [side for constant, side in self.box.open_sides if constant == name],
                     "unit": self.units.get(name, "1"),
                 }
                 for name, value in self.nominal.items()
@@ -191,7 +194,7 @@ class Calibration:
             "stands": self.box.stands,
             "sensor_noise": {name: dict(item) for name, item in self.sensor_noise.items()},
             "offset": dict(self.offset),
-            "found_offsets": {name: list(found) for name, found in self.found_offsets.items()},
+            "found_offsets": {name: list(entry) for name, entry in self.found_offsets.items()},
             "walks": dict(self.walks),
             "initial_covariance": dict(self.initial_covariance),
             "outlier_sizes": dict(self.outlier_sizes),
@@ -202,7 +205,7 @@ class Calibration:
             "R": dict(self.R),
             "upper_limits": list(self.upper_limits),
             "nis": vars(self.nis) | {"holds": self.nis.holds},
-            "whiteness": {name: vars(found) for name, found in self.whiteness.items()},
+            "whiteness": {name: vars(entry) for name, entry in self.whiteness.items()},
             "change": self.change,
             "input_delay": self.input_delay,
             "timing": {str(rows): loss for rows, loss in self.timing.items()},
@@ -234,21 +237,26 @@ class Calibration:
         return figure
 
 
-def _boxes(panel: Axes, found: Calibration) -> None:
+def _boxes(panel: Axes, calibration: Calibration) -> None:
     """Draw boxes relative to their nominal values, so that constants of all sizes stand side by side."""
-    opened = set(found.box.open_sides)
-    for i, (name, value) in enumerate(found.nominal.items()):
-        size = abs(value) or max(abs(found.box.low[name]), abs(found.box.high[name]), SMALLEST)
-        low, high = (found.box.low[name] - value) / size * 100.0, (found.box.high[name] - value) / size * 100.0
+    opened = set(calibration.box.open_sides)
+    for i, (name, value) in enumerate(calibration.nominal.items()):
+        size = abs(value) or max(abs(calibration.box.low[name]), abs(calibration.box.high[name]), SMALLEST)
+        low, high = (
+            (calibration.box.low[name] - value) / size * 100.0,
+            (calibration.box.high[name] - value) / size * 100.0,
+        )
         panel.plot([low, high], [i, i], color="0.5", linewidth=3.0, solid_capstyle="butt")
         for side, end in (("low", low), ("high", high)):
             marker = ("<" if side == "low" else ">") if (name, side) in opened else "|"
             panel.plot([end], [i], color="black", marker=marker, markersize=9, linestyle="none")
         panel.plot([0.0], [i], color="black", marker="o", markersize=4)
     panel.set_yticks(
-        range(len(found.nominal)), [f"{name} = {value:.4g}" for name, value in found.nominal.items()], parse_math=False
+        range(len(calibration.nominal)),
+        [f"{name} = {value:.4g}" for name, value in calibration.nominal.items()],
+        parse_math=False,
     )
-    panel.set_ylim(len(found.nominal) - 0.5, -0.5)
+    panel.set_ylim(len(calibration.nominal) - 0.5, -0.5)
     panel.set_xlabel("per cent of the value")
-    panel.set_title(f"{100 * found.box.level:g} % box, all at once (arrows: open)", fontsize=10, loc="left")
+    panel.set_title(f"{100 * calibration.box.level:g} % box, all at once (arrows: open)", fontsize=10, loc="left")
     tidy(panel)

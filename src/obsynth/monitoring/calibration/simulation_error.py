@@ -94,11 +94,11 @@ class SimulationError:
     def states(self, fit: Fit) -> FloatArray:
         """Return the states of a fit ``(n, nx)``."""
         p, g = self.problem, self.problem.graphs
-        x, found = fit.x0, [fit.x0]
+        x, states = fit.x0, [fit.x0]
         for u in p.u[1:]:
             x = np.array(g.solve(x, u, fit.t)[0])[-g.nx :, 0]
-            found.append(x)
-        return np.array(found)
+            states.append(x)
+        return np.array(states)
 
     def residuals(self, v: FloatArray, weights: FloatArray) -> FloatArray:
         """Return differences in units of the sensors' deviations, then those from the priors."""
@@ -129,7 +129,7 @@ class SimulationError:
         v = np.concatenate([inside, p.x0 / self.spread])
         weights = FIRST_NOISE * np.nanstd(p.y, axis=0) + np.sqrt(p.floors)
         for i in range(WEIGHT_ROUNDS):
-            found = least_squares(
+            solution = least_squares(
                 self.residuals,
                 v,
                 jac=self.jacobian,
@@ -139,13 +139,13 @@ class SimulationError:
                 loss="soft_l1" if i == 0 else "linear",
                 max_nfev=MOST_FIT_EVALUATIONS,
             )
-            v = np.asarray(found.x)
-            left = self.simulated(v)[0] - p.y
-            if not np.isfinite(left[np.isfinite(p.y)]).all():
+            v = np.asarray(solution.x)
+            errors = self.simulated(v)[0] - p.y
+            if not np.isfinite(errors[np.isfinite(p.y)]).all():
                 return None
-            weights = np.sqrt(np.maximum(np.nanmean(left**2, axis=0), p.floors))
+            weights = np.sqrt(np.maximum(np.nanmean(errors**2, axis=0), p.floors))
         J = self.jacobian(v, weights)
-        cost = float(0.5 * found.fun @ found.fun + np.log(weights).sum() * len(p.y))
+        cost = float(0.5 * solution.fun @ solution.fun + np.log(weights).sum() * len(p.y))
         return Fit(v[: self.nt] * p.widths, v[self.nt :] * self.spread, weights, cost, J.T @ J)
 
 
@@ -163,9 +163,9 @@ def simulation_fits(
     for i in range(starts):
         note(f"simulation error, start {i + 1} of {starts}")
         drawn = problem.low + problem.widths * rng.uniform(DRAWN, 1.0 - DRAWN, len(problem.low))
-        found = error.fit(drawn if i else problem.nominal if start is None else start)
-        if found is not None:
-            fits.append(found)
+        fit_of_start = error.fit(drawn if i else problem.nominal if start is None else start)
+        if fit_of_start is not None:
+            fits.append(fit_of_start)
     if not fits:
         raise refused(
             "cannot-simulate",
@@ -175,7 +175,7 @@ def simulation_fits(
         )
     fits.sort(key=lambda fit: fit.cost)
     simulated = error.simulated(np.concatenate([fits[0].t, fits[0].x0]) / error.scale)[0]
-    judged = _judged(problem, simulated)
+    judged = _required_sensors(problem, simulated)
     _require_explained(problem, fits[0].deviations, judged)
     _require_levels(problem, fits[0], simulated, judged)
     return fits
@@ -189,33 +189,33 @@ def with_seen_start(problem: CalibrationProblem, fit: Fit, *, first: FloatArray 
     if first is not None:
         if not np.abs(np.nan_to_num(first)).max() > FIRST_LIMIT:
             return problem
-        found = SimulationError(problem.with_start(UNKNOWN_START**2 * problem.P0)).fit(fit.t)
-        fit, limit = fit if found is None else found, 1.0
+        refit = SimulationError(problem.with_start(UNKNOWN_START**2 * problem.P0)).fit(fit.t)
+        fit, limit = fit if refit is None else refit, 1.0
     away = np.abs(fit.x0 - problem.x0)
     far = away > limit * deviations
     if not far.any():
         return problem
-    told = ", ".join(
+    listed = ", ".join(
         f"{name} {fit.x0[i]:.4g} for {problem.x0[i]:.4g}" for i, name in enumerate(problem.plant.state_names) if far[i]
     )
-    note = f"The log does not begin at the nominal state ({told}): what is known of the start is widened."
+    note = f"The log does not begin at the nominal state ({listed}): what is known of the start is widened."
     return problem.with_start(np.diag(np.where(far, away, deviations) ** 2), note)
 
 
-def unexplained(problem: CalibrationProblem, left: FloatArray) -> list[str]:
+def unexplained(problem: CalibrationProblem, residual: FloatArray) -> list[str]:
     """Return sensors that move, and of whose motion the best fit leaves nearly all ``left (ny,)``."""
-    share, moves = _shares(problem, left)
+    share, moves = _shares(problem, residual)
     return [name for name, bad in zip(problem.output_names, moves & (share > UNEXPLAINED), strict=True) if bad]
 
 
-def _shares(problem: CalibrationProblem, left: FloatArray) -> tuple[FloatArray, BoolArray]:
+def _shares(problem: CalibrationProblem, residual: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return what a fit leaves of each sensor, as a share of its deviation, and whether it moves."""
     deviations = np.nanstd(problem.y, axis=0)
     moves = deviations > MOVING_SIGNAL * np.maximum(roughness(problem.y), np.sqrt(problem.floors))
-    return left / np.maximum(deviations, SMALLEST), moves
+    return residual / np.maximum(deviations, SMALLEST), moves
 
 
-def _judged(problem: CalibrationProblem, simulated: FloatArray) -> BoolArray:
+def _required_sensors(problem: CalibrationProblem, simulated: FloatArray) -> BoolArray:
     """Return of which sensors a simulation without noise must say something ``(ny,)``: those that inputs move, and only
     where no input is unknown."""
     if problem.plant.unknown_inputs:
@@ -224,19 +224,21 @@ def _judged(problem: CalibrationProblem, simulated: FloatArray) -> BoolArray:
     return np.asarray(moved | problem.plant.has_levels)
 
 
-def _require_explained(problem: CalibrationProblem, left: FloatArray, judged: BoolArray) -> None:
+def _require_explained(problem: CalibrationProblem, residual: FloatArray, judged: BoolArray) -> None:
     """Refuse a model whose best fit leaves as much as there was: its units, scales or sample time are wrong."""
     deviations = np.nanstd(problem.y, axis=0)
-    share, moves = _shares(problem, left)
+    share, moves = _shares(problem, residual)
     bad = judged & np.where(moves, share > UNEXPLAINED, share > UNEXPLAINED_AT_REST)
     moves = moves & judged
     if bad.any() and (bad[moves].all() if moves.any() else True) and not _moved_by_noise(problem, deviations):
         names = [name for name, wrong in zip(problem.output_names, bad, strict=True) if wrong]
-        told = ", ".join(f"{name}: {100 * part:.3g} %" for name, part in zip(problem.output_names, share, strict=True))
+        listed = ", ".join(
+            f"{name}: {100 * part:.3g} %" for name, part in zip(problem.output_names, share, strict=True)
+        )
         raise refused(
             "explains-nothing",
             f"The model cannot follow the log: the residual of the best fit is as large as the signals "
-            f"({told} of their deviations). Check units and scales (a factor of 1000?), the sample time, and the "
+            f"({listed} of their deviations). Check units and scales (a factor of 1000?), the sample time, and the "
             "bounds.",
             signals=names,
         )
@@ -254,10 +256,10 @@ def _require_levels(problem: CalibrationProblem, fit: Fit, simulated: FloatArray
     far &= fit.deviations > UNEXPLAINED * np.nanstd(y, axis=0)
     far &= judged & (level | _shares(problem, fit.deviations)[1])
     if far.any():
-        told = ", ".join(f"{names[i]}: {1.0 / levels[i]:.3g} times that of the model" for i in np.flatnonzero(far))
+        listed = ", ".join(f"{names[i]}: {1.0 / levels[i]:.3g} times that of the model" for i in np.flatnonzero(far))
         raise refused(
             "explains-nothing",
-            f"The model cannot follow the log: {told}. Check units and scales (a factor of 1000?).",
+            f"The model cannot follow the log: {listed}. Check units and scales (a factor of 1000?).",
             signals=[names[i] for i in np.flatnonzero(far)],
         )
 
@@ -277,20 +279,20 @@ def _simulated(problem: CalibrationProblem) -> Any:
     nx, ny, nt, size = g.nx, g.ny, g.nt, g.nt + g.nx
     packed, u, t = ca.MX.sym("packed", nx + nx * size), ca.MX.sym("u", g.nu), ca.MX.sym("t", nt)
 
-    def row(x: Any, S: Any, u: Any, t: Any, left: Any) -> Any:
+    def row(x: Any, S: Any, u: Any, t: Any, residual: Any) -> Any:
         y, H, L = g.outputs(x, u, t)
-        return ca.vertcat(y, ca.vec(H @ S + ca.horzcat(L, ca.MX.zeros(ny, nx))), left)
+        return ca.vertcat(y, ca.vec(H @ S + ca.horzcat(L, ca.MX.zeros(ny, nx))), residual)
 
     x, S = packed[:nx], ca.reshape(packed[nx:], nx, size)
-    stages, left = g.solve(x, u, t)
+    stages, residual = g.solve(x, u, t)
     after, F, G, _ = g.fast(x, u, t, t, g.sensitivities(x, u, t, stages))
     S = F @ S + ca.horzcat(G, ca.MX.zeros(nx, nx))
-    one = ca.Function("one", [packed, u, t], [ca.vertcat(after, ca.vec(S)), row(after, S, u, t, left)])
+    sample = ca.Function("one", [packed, u, t], [ca.vertcat(after, ca.vec(S)), row(after, S, u, t, residual)])
     v = ca.MX.sym("v", size)
     first = ca.DM(np.hstack([np.zeros((nx, nt)), np.eye(nx)]))
     rows = row(v[nt:], ca.MX(first), ca.DM(problem.u[0]), v[:nt], ca.MX(0.0))
     if n > 1:
         begin = ca.vertcat(v[nt:], ca.vec(first))
-        _, later = one.mapaccum(n - 1)(begin, ca.DM(problem.u[1:].T), ca.repmat(v[:nt], 1, n - 1))
+        _, later = sample.mapaccum(n - 1)(begin, ca.DM(problem.u[1:].T), ca.repmat(v[:nt], 1, n - 1))
         rows = ca.horzcat(rows, later)
     return ca.Function("simulated", [v], [ca.densify(rows)])

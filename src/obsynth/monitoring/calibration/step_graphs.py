@@ -88,11 +88,11 @@ def sample_graphs(
     nx, nu, nt, n = len(plant.state_scales), len(plant.nominal_signals), len(unknown), base.size
     x, u, t = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("t", nt)
     stages: list[Any] = []
-    state, left = x, ca.MX(0.0)
+    state, residual = x, ca.MX(0.0)
     for _ in range(substeps):
-        X, rest = base.solve(ca.repmat(state, base.stages, 1), state, u, t)
-        stages, state, left = [*stages, X], X[n - nx :], ca.fmax(left, rest)
-    solve = ca.Function("solve", [x, u, t], [ca.vertcat(*stages), left])
+        X, of_substep = base.solve(ca.repmat(state, base.stages, 1), state, u, t)
+        stages, state, residual = [*stages, X], X[n - nx :], ca.fmax(residual, of_substep)
+    solve = ca.Function("solve", [x, u, t], [ca.vertcat(*stages), residual])
 
     Z, numbers, state = ca.MX.sym("Z", n * substeps), [x], x
     for i in range(substeps):
@@ -158,29 +158,29 @@ class _Substep:
         self.order = _pivots(ca.Function("J", [X, x, u, t], [ca.densify(J)]), plant, self.stages, values)
         step = eliminated(J, -equations, self.order)
         weights = 1.0 / ca.fmax(largest_entries(ca.densify(J) @ ca.diag(sizes)), SMALLEST)
-        left = ca.mmax(ca.fabs(weights * equations)) if self.size > 1 else ca.fabs(weights * equations)
+        residual = ca.mmax(ca.fabs(weights * equations)) if self.size > 1 else ca.fabs(weights * equations)
         # The residual is that before the iteration, so that the last one is better than it says.
-        self.newton = ca.Function("newton", [X, x, u, t], [X + step, left])
+        self.newton = ca.Function("newton", [X, x, u, t], [X + step, residual])
         self.solve = self._solve()
-        found = [ca.densify(part) for part in self.symbolic(X, x, u, t)[:2]]
-        self.derivatives = ca.Function("derivatives", [X, x, u, t], found)
+        derivatives = [ca.densify(part) for part in self.symbolic(X, x, u, t)[:2]]
+        self.derivatives = ca.Function("derivatives", [X, x, u, t], derivatives)
 
     def _solve(self) -> Any:
         """Return the solution of the stages from a start, in as many iterations as it takes."""
         start = [ca.MX.sym(name, self.newton.size1_in(i)) for i, name in enumerate(("X", "x", "u", "t"))]
         X, before = start[0], start[1:]
         for _ in range(ITERATIONS):
-            X, left = self.newton(X, *before)
-        X, left = self.newton(X, *before)
-        more, rest = start[0], ca.MX(0.0)
+            X, residual = self.newton(X, *before)
+        X, residual = self.newton(X, *before)
+        more, later_residual = start[0], ca.MX(0.0)
         for _ in range(FURTHER_ITERATIONS):
-            more, rest = self.newton(more, *before)
-        further = ca.Function("iterate", start, [more, rest])
+            more, later_residual = self.newton(more, *before)
+        further = ca.Function("iterate", start, [more, later_residual])
         done = ca.Function("done", start, [start[0], ca.MX(0.0)])
         choice = ca.Function.if_else("choice", further, done)
-        unsolved = ca.logic_not(left <= SOLVED_STEP)
-        after, rest = choice(unsolved, X, *before)
-        return ca.Function("solution", start, [after, ca.if_else(unsolved, rest, left)])
+        unsolved = ca.logic_not(residual <= SOLVED_STEP)
+        after, later_residual = choice(unsolved, X, *before)
+        return ca.Function("solution", start, [after, ca.if_else(unsolved, later_residual, residual)])
 
     def symbolic(self, X: Any, x: Any, u: Any, t: Any) -> tuple[Any, Any, Any]:
         """Return the derivatives of the stages by x and by t, and of the state after by what is added."""
@@ -189,9 +189,9 @@ class _Substep:
         right = ca.horzcat(
             -ca.jacobian(equations, xs), -ca.jacobian(equations, ts), ca.repmat(ca.SX.eye(nx), self.stages, 1)
         )
-        found = eliminated(ca.jacobian(equations, Xs), right, self.order)
-        found = ca.Function("found", [Xs, xs, us, ts], [found])(X, x, u, t)
-        return found[:, :nx], found[:, nx : nx + nt], found[self.size - nx :, nx + nt :]
+        derivatives = eliminated(ca.jacobian(equations, Xs), right, self.order)
+        derivatives = ca.Function("found", [Xs, xs, us, ts], [derivatives])(X, x, u, t)
+        return derivatives[:, :nx], derivatives[:, nx : nx + nt], derivatives[self.size - nx :, nx + nt :]
 
 
 def _pivots(jacobian: Any, plant: CalibrationPlant, stages: int, values: FloatArray) -> list[int]:
@@ -221,14 +221,14 @@ def eliminated(matrix: Any, right: Any, order: Sequence[int]) -> Any:
             for c in range(j + 1, n + m):
                 if not rows[j][c].is_zero():
                     rows[i][c] = rows[i][c] - factor * rows[j][c]
-    found: list[list[Any]] = [[]] * n
+    solved: list[list[Any]] = [[]] * n
     for j in reversed(range(n)):
         solution = []
         for c in range(m):
-            rest = rows[j][n + c]
+            remainder = rows[j][n + c]
             for i in range(j + 1, n):
-                if not (rows[j][i].is_zero() or found[i][c].is_zero()):
-                    rest = rest - rows[j][i] * found[i][c]
-            solution.append(rest if rest.is_zero() else rest / rows[j][j])
-        found[j] = solution
-    return ca.vertcat(*(ca.horzcat(*row) for row in found))
+                if not (rows[j][i].is_zero() or solved[i][c].is_zero()):
+                    remainder = remainder - rows[j][i] * solved[i][c]
+            solution.append(remainder if remainder.is_zero() else remainder / rows[j][j])
+        solved[j] = solution
+    return ca.vertcat(*(ca.horzcat(*row) for row in solved))

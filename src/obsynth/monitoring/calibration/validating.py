@@ -86,8 +86,8 @@ class RecordedInnovations:
     @property
     def loss(self) -> float:
         """Negative log likelihood of each sensor's innovations, in nats, up to a constant."""
-        whole = 0.5 * self.standardised**2 + np.log(self.deviations)
-        return float(whole[np.isfinite(whole)].sum())
+        losses = 0.5 * self.standardised**2 + np.log(self.deviations)
+        return float(losses[np.isfinite(losses)].sum())
 
 
 def recorded_innovations(design: ObserverDesign, log: RecordedLog) -> RecordedInnovations:
@@ -97,8 +97,10 @@ def recorded_innovations(design: ObserverDesign, log: RecordedLog) -> RecordedIn
         # Afterwards every value is known at its own time.
         log = replace(log, y=observer.timing.in_order(log.y))
     if isinstance(observer, DAEObserver):
-        found = _over(changed(observer, sensors=None), log)
-        return _recorded(found, found.innovations, np.sqrt(np.einsum("kii->ki", found.innovation_covariances)))
+        estimates = _over(changed(observer, sensors=None), log)
+        return _recorded(
+            estimates, estimates.innovations, np.sqrt(np.einsum("kii->ki", estimates.innovation_covariances))
+        )
     if isinstance(observer, RecursiveObserver):
         return _recursive(changed(observer, sensors=None), log, dict(getattr(design.plant, "operating_point", {})))
     raise TypeError(f"{type(observer).__name__} has no innovations with a covariance")
@@ -148,11 +150,11 @@ def _recursive(observer: RecursiveObserver, log: RecordedLog, point: Mapping[str
     return _recorded(recursive_estimates(observer, rows), e, deviations)
 
 
-def _recorded(found: Estimates, innovations: FloatArray, deviations: FloatArray) -> RecordedInnovations:
-    columns = np.stack([found.parameters, found.parameter_deviations], axis=2)
-    estimates = {name: read_only(columns[:, i]) for i, name in enumerate(found.parameter_names)}
+def _recorded(run: Estimates, innovations: FloatArray, deviations: FloatArray) -> RecordedInnovations:
+    columns = np.stack([run.parameters, run.parameter_deviations], axis=2)
+    estimates = {name: read_only(columns[:, i]) for i, name in enumerate(run.parameter_names)}
     return RecordedInnovations(
-        innovations, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()), estimates, found.states
+        innovations, deviations, float(run.nis.sum()), int(run.nis_degrees.sum()), estimates, run.states
     )
 
 
@@ -214,7 +216,7 @@ def noise_ratios(observer: DAEObserver, log: RecordedLog) -> tuple[Mapping[str, 
     except PreconditionError:
         # Without a likelihood nothing can be told of its variances.
         return {}, 0.0, walk
-    found = {}
+    ratios = {}
     for i, (name, variance) in enumerate(zip(names, designed, strict=True)):
         ratio = float(np.exp(best.z[i]) / variance)
         z = best.z.copy()
@@ -224,11 +226,11 @@ def noise_ratios(observer: DAEObserver, log: RecordedLog) -> tuple[Mapping[str, 
             and max(ratio, 1.0 / ratio) > TOLD_FACTOR
             and objective(z)[0] - best.value > CLEAR_NATS
         ):
-            found[name] = ratio
+            ratios[name] = ratio
     shares = np.ones(model.nq)
     likeliest = np.exp(best.z[len(noisy) : len(noisy) + len(walks)] - np.log(designed[len(noisy) :][: len(walks)]))
     shares[walking] = np.minimum(likeliest, 1.0)
-    return found, objective(np.log(designed))[0] - best.value, shared_walk(walk, shares)
+    return ratios, objective(np.log(designed))[0] - best.value, shared_walk(walk, shares)
 
 
 @arguments_checked
@@ -291,30 +293,30 @@ def validate(
     True
     """
     note = progress or (lambda text: None)
-    found = _usable_log(design, log, rows=rows, columns=columns, scales=scales)
-    note(f"innovations of {found.samples} rows")
-    whole_walk = recorded_innovations(design, found)
-    design, record, told = _as_far_as_it_walks(design, found, whole_walk, note)
-    far_off, near = _far(whole_walk.estimates, design, found.samples)
+    record_log = _usable_log(design, log, rows=rows, columns=columns, scales=scales)
+    note(f"innovations of {record_log.samples} rows")
+    whole_walk = recorded_innovations(design, record_log)
+    design, record, walk_notes = _as_far_as_it_walks(design, record_log, whole_walk, note)
+    far_off, near = _far(whole_walk.estimates, design, record_log.samples)
     sensors = _sensors(record, design.plant.output_names)
-    whole, white = consistency(record.squares, record.degrees), _white(sensors)
+    total, white = consistency(record.squares, record.degrees), _white(sensors)
     place = change_of_mean(record.standardised if white else whitened(record.standardised))
-    change = None if place is None else found.rows[0] + place
-    ratios, others = _contradicted(design, found, record, sensors, whole, note)
-    sentences = _sentences(sensors, ratios, change, far_off, coloured=others is not None)
-    if others is not None:
-        sentences.append(_explained(others))
-    passed = whole.holds and not sentences
-    if not (passed or whole.holds or ratios) and others is None:
-        far = "small" if whole.value > whole.high else "large"
+    change = None if place is None else record_log.rows[0] + place
+    ratios, explained = _contradicted(design, record_log, record, sensors, total, note)
+    sentences = _sentences(sensors, ratios, change, far_off, coloured=explained is not None)
+    if explained is not None:
+        sentences.append(_explained(explained))
+    passed = total.holds and not sentences
+    if not (passed or total.holds or ratios) and explained is None:
+        far = "small" if total.value > total.high else "large"
         sentences.append(
-            f"Q and R are too {far} together: the innovations are {np.sqrt(whole.value):.2g} times what is expected."
+            f"Q and R are too {far} together: the innovations are {np.sqrt(total.value):.2g} times what is expected."
         )
-    error = _integration_error(design.observer, found, record)
+    error = _integration_error(design.observer, record_log, record)
     if error is not None and error.matters:
         sentences.append(
             f"A step of backward Euler has an error of up to {error.largest:.2g} deviations of "
-            f"{error.sensor} (row {found.rows[0] + error.row}), which moves estimates of "
+            f"{error.sensor} (row {record_log.rows[0] + error.row}), which moves estimates of "
             "parameters: integration: radau has no such error."
         )
     if passed:
@@ -322,17 +324,17 @@ def validate(
     return Validation(
         passed,
         design.name,
-        whole,
+        total,
         sensors,
         ratios,
         change,
-        (*found.notes, *told, *near, *sentences),
+        (*record_log.notes, *walk_notes, *near, *sentences),
         read_only(record.innovations),
         read_only(record.deviations),
-        read_only(np.array(found.y)),
-        read_only(found.y - record.innovations),
+        read_only(np.array(record_log.y)),
+        read_only(record_log.y - record.innovations),
         whole_walk.estimates,
-        found.described,
+        record_log.described,
     )
 
 
@@ -353,16 +355,16 @@ def _usable_log(
         )
     plant = design.plant
     factors = dict(getattr(plant, "scales", {})) | dict(scales or {})
-    found = read_log(
+    record = read_log(
         log, plant.input_names, plant.output_names, rows=rows, columns=columns, scales=factors, dt=design.observer.dt
     )
-    if found.samples < LEAST_VALIDATED_ROWS:
+    if record.samples < LEAST_VALIDATED_ROWS:
         raise SpecError(
-            f"The log has {found.samples} rows here: at least {LEAST_VALIDATED_ROWS} are needed.",
+            f"The log has {record.samples} rows here: at least {LEAST_VALIDATED_ROWS} are needed.",
             path="rows",
             code="too-short",
         )
-    return found.shifted(design.input_delay).without(wrong_samples(found.y))
+    return record.shifted(design.input_delay).without(wrong_samples(record.y))
 
 
 def _contradicted(
@@ -370,33 +372,33 @@ def _contradicted(
     log: RecordedLog,
     record: RecordedInnovations,
     sensors: Mapping[str, SensorValidation],
-    whole: Consistency,
+    total: Consistency,
     note: Callable[[str], object],
 ) -> tuple[Mapping[str, float], tuple[Explanation, ...] | None]:
     """Return the variances that a log contradicts, and what explains innovations that these leave coloured; ``None``
     where they are white, as the design states its variances or with the likeliest ones."""
     white, observer = _white(sensors), design.observer
     # A variance that moves no innovation out of what is expected is no reason to change a design.
-    if whole.holds and white and all(item.nis.holds for item in sensors.values()):
+    if total.holds and white and all(item.nis.holds for item in sensors.values()):
         return {}, None
-    said = None
+    likeliest_noise = None
     if isinstance(observer, DAEObserver):
         note("variances that the log makes likeliest")
         # What a gate leaves out is no sample of the stated noise.
         passed_by_gate = replace(log, y=read_only(np.where(np.isfinite(record.innovations), log.y, np.nan)))
-        said = noise_ratios(observer, passed_by_gate)
-    ratios: Mapping[str, float] = {} if said is None else said[0]
+        likeliest_noise = noise_ratios(observer, passed_by_gate)
+    ratios: Mapping[str, float] = {} if likeliest_noise is None else likeliest_noise[0]
     if white:
         return ratios, None
-    others = _explanations(design, log, record, note)
-    if said is None or not ratios or not isinstance(observer, DAEObserver):
-        return ratios, others
+    other_causes = _explanations(design, log, record, note)
+    if likeliest_noise is None or not ratios or not isinstance(observer, DAEObserver):
+        return ratios, other_causes
     # Wrong variances colour the innovations too: with the likeliest ones they are white, and nothing explains more.
-    _, gain, walk = said
+    _, gain, walk = likeliest_noise
     likeliest = recorded_innovations(design.replace(observer=_with_variances(observer, ratios, walk)), log)
-    rival = CLEARLY_MORE * others[0][1] if others else 0.0
+    rival = CLEARLY_MORE * other_causes[0][1] if other_causes else 0.0
     if not _white(_sensors(likeliest, design.plant.output_names)) or rival > gain:
-        return {}, others
+        return {}, other_causes
     return ratios, None
 
 
@@ -428,13 +430,15 @@ def states_innovations(design: ObserverDesign) -> bool:
 
 
 def _sensors(record: RecordedInnovations, names: Sequence[str]) -> dict[str, SensorValidation]:
-    found = {}
+    by_sensor = {}
     for name, column in zip(names, record.standardised.T, strict=True):
-        seen = np.isfinite(column)
-        count = int(seen.sum())
-        mean = float(column[seen].mean() * np.sqrt(count)) if count else 0.0
-        found[name] = SensorValidation(consistency(float((column[seen] ** 2).sum()), count), mean, whiteness(column))
-    return found
+        measured = np.isfinite(column)
+        count = int(measured.sum())
+        mean = float(column[measured].mean() * np.sqrt(count)) if count else 0.0
+        by_sensor[name] = SensorValidation(
+            consistency(float((column[measured] ** 2).sum()), count), mean, whiteness(column)
+        )
+    return by_sensor
 
 
 def _sentences(
@@ -445,33 +449,33 @@ def _sentences(
     *,
     coloured: bool,
 ) -> list[str]:
-    found = []
+    sentences = []
     for name, ratio in ratios.items():
-        what, factor = "small" if ratio > 1.0 else "large", max(ratio, 1.0 / ratio)
-        found.append(f"{with_letter(name, sensors)} is {_times(factor)} too {what}.")
+        size, factor = "small" if ratio > 1.0 else "large", max(ratio, 1.0 / ratio)
+        sentences.append(f"{with_letter(name, sensors)} is {_times(factor)} too {size}.")
     for name, sensor in sensors.items():
         if abs(sensor.mean) > OFFSET:
-            found.append(
+            sentences.append(
                 f"The innovations of {name} have an offset of {sensor.mean:+.1f} deviations of their mean: a "
                 "constant or an offset of the sensor is wrong."
             )
         if sensor.whiteness.probability < SIGNIFICANT:
-            found.append(
+            sentences.append(
                 f"The innovations of {name} are not white (p = {sensor.whiteness.probability:.2g}, first "
                 f"autocorrelation {sensor.whiteness.first:+.2f}): "
                 + ("coloured noise or a model error." if coloured else "Q against R is wrong.")
             )
     if change is not None:
-        found.append(
+        sentences.append(
             f"The mean of the innovations changes at row {change}: these rows are not free of faults"
             + (", or something that is not in the model changes there." if coloured else ".")
         )
     for name, deviation in far.items():
-        found.append(
+        sentences.append(
             f"The estimate of {name} ends {deviation:.1f} deviations from its nominal value: a constant is "
             f"wrong, {'coloured noise acts on it, ' if coloured else ''}or the rows are not free of faults."
         )
-    return found
+    return sentences
 
 
 def _white(sensors: Mapping[str, SensorValidation]) -> bool:
@@ -499,10 +503,10 @@ def _explanations(
         nonlinear: Any = observer  # no other observer has constants
         model = nonlinear.model.replace(constants={**nonlinear.model.constants, name: value})
         try:
-            found = recorded_innovations(design.replace(observer=replace(nonlinear, model=model)), log)
+            rerun = recorded_innovations(design.replace(observer=replace(nonlinear, model=model)), log)
         except SolverError:
             return np.full(record.innovations.shape, np.nan)
-        return np.asarray(found.innovations / record.deviations)
+        return np.asarray(rerun.innovations / record.deviations)
 
     return explanations(
         record.standardised,
@@ -515,10 +519,10 @@ def _explanations(
     )
 
 
-def _explained(told: Sequence[Explanation]) -> str:
-    if not told:
+def _explained(causes: Sequence[Explanation]) -> str:
+    if not causes:
         return "No single offset, correlated noise, delay of an input or constant explains that: plot the residuals."
-    listed = "; ".join(f"{text} ({gain:.3g} nats)" for text, gain in told)
+    listed = "; ".join(f"{text} ({gain:.3g} nats)" for text, gain in causes)
     return (
         f"What explains it best, by likelihood: {listed}. The factors of Q and R have no meaning until that is "
         "corrected."
@@ -534,20 +538,20 @@ def _far(
     start = dict(zip(observer.fault_names, getattr(observer, "initial_parameters", ()), strict=False))
     variances = np.diag(walk) if walk.size else np.zeros(len(start))
     walked = dict(zip(start, np.sqrt(samples * variances), strict=True))
-    found, told = {}, []
+    off_start, notes = {}, []
     for name, columns in estimates.items():
         value, deviation = columns[-1]
         if name not in start or not deviation > 0.0 or not abs(value - start[name]) > OFFSET * deviation:
             continue
         off = float(abs(value - start[name]) / deviation)
         if abs(value - start[name]) > OFFSET * np.hypot(deviation, walked[name]):
-            found[name] = off
+            off_start[name] = off
         else:
-            told.append(
+            notes.append(
                 f"The estimate of {name} ends {off:.1f} deviations from its nominal value, no further than it may "
                 "walk: if it is a fault, these rows are not free of it."
             )
-    return found, told
+    return off_start, notes
 
 
 def _times(factor: float) -> str:

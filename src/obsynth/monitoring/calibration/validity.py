@@ -66,8 +66,8 @@ class Validity:
     time: FloatArray
 
     def __repr__(self) -> str:
-        told = ", ".join(f"{name} {value:.3g}" for name, value in self.by_sensor.items())
-        return f"Nonlinear against linear: at most {self.largest:.3g} deviations of a sensor ({told})."
+        listed = ", ".join(f"{name} {value:.3g}" for name, value in self.by_sensor.items())
+        return f"Nonlinear against linear: at most {self.largest:.3g} deviations of a sensor ({listed})."
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything but the records as plain data."""
@@ -169,7 +169,7 @@ def validity(
         raise SpecError(
             "The linear model is of another plant, or sampled: give what obsynth.linearise returns.", path="linear"
         )
-    found = read_log(log, model.input_names, model.output_names, rows=rows, columns=columns, scales=scales, dt=dt)
+    record = read_log(log, model.input_names, model.output_names, rows=rows, columns=columns, scales=scales, dt=dt)
     point = linear.operating_point
     center = np.array([point[name] for name in linear.state_names])
     start = (
@@ -178,10 +178,12 @@ def validity(
         else named_vector(initial_state, model.state_names, np.array(model.nominal_state), "initial_state")
     )
     theta = [point.get(name, value) for name, value in model.parameters.items()]
-    true = simulate_dae(model, found.u, dt=found.dt, parameters=theta, initial_state=start).outputs
-    seen = _linear_outputs(linear, found, start - center) + np.array([point[name] for name in linear.output_names])
-    spread = {name: _deviation(found.y[:, i], name, deviations) for i, name in enumerate(model.output_names)}
-    differences = np.abs(true - seen) / np.array(list(spread.values()))
+    true = simulate_dae(model, record.u, dt=record.dt, parameters=theta, initial_state=start).outputs
+    approximate = _linear_outputs(linear, record, start - center) + np.array(
+        [point[name] for name in linear.output_names]
+    )
+    spread = {name: _deviation(record.y[:, i], name, deviations) for i, name in enumerate(model.output_names)}
+    differences = np.abs(true - approximate) / np.array(list(spread.values()))
     y0 = np.array([point[name] for name in linear.output_names])
     by_name = dict(zip(model.output_names, differences.max(axis=0).tolist(), strict=True))
     return Validity(
@@ -190,25 +192,27 @@ def validity(
         dict(zip(model.output_names, np.sqrt((differences**2).mean(axis=0)).tolist(), strict=True)),
         dict(zip(model.output_names, np.abs(true - y0).max(axis=0).tolist(), strict=True)),
         read_only(true),
-        read_only(seen),
+        read_only(approximate),
         spread,
-        found.time,
+        record.time,
     )
 
 
-def _deviation(column: FloatArray, name: str, given: Mapping[str, float] | None) -> float:
+def _deviation(column: FloatArray, name: str, stated: Mapping[str, float] | None) -> float:
     """Return a sensor's standard deviation, as given, or from the roughness of its record and its resolution."""
-    if given is not None and name in given:
-        if not given[name] > 0.0:
-            raise SpecError(f"deviations.{name} is {given[name]!r}: give a positive number.", path=f"deviations.{name}")
-        return float(given[name])
+    if stated is not None and name in stated:
+        if not stated[name] > 0.0:
+            raise SpecError(
+                f"deviations.{name} is {stated[name]!r}: give a positive number.", path=f"deviations.{name}"
+            )
+        return float(stated[name])
     rough = float(np.nanstd(np.diff(column, n=2)) / np.sqrt(6.0))
-    found = max(rough, quantum(column) / math.sqrt(EVEN))
-    if not found > 0.0:
+    deviation = max(rough, quantum(column) / math.sqrt(EVEN))
+    if not deviation > 0.0:
         raise SpecError(
             f"The record of {name!r} shows no noise: state its deviation by deviations.", path=f"deviations.{name}"
         )
-    return found
+    return deviation
 
 
 def _linear_outputs(linear: DescriptorSystem, log: RecordedLog, start: FloatArray) -> FloatArray:
@@ -221,11 +225,11 @@ def _linear_outputs(linear: DescriptorSystem, log: RecordedLog, start: FloatArra
         for name, column in zip(names, matrix.T, strict=True):
             forced += np.outer(inputs[name] - point[name], column)
     stages = len(a)
-    whole = np.kron(np.eye(stages), E) - log.dt * np.kron(a, A)
+    step_matrix = np.kron(np.eye(stages), E) - log.dt * np.kron(a, A)
     ending = np.kron(a, np.eye(n))[-n:]
-    z, found = start, [linear.C @ start]
+    z, outputs = start, [linear.C @ start]
     for k in range(1, log.samples):
-        slopes = np.linalg.solve(whole, np.tile(A @ z + forced[k], stages))
+        slopes = np.linalg.solve(step_matrix, np.tile(A @ z + forced[k], stages))
         z = z + log.dt * (ending @ slopes)
-        found.append(linear.C @ z)
-    return np.array(found)
+        outputs.append(linear.C @ z)
+    return np.array(outputs)

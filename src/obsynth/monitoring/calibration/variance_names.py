@@ -15,10 +15,10 @@ def variance_names(equations: Sequence[str], sensors: Sequence[str]) -> tuple[li
     return q, r
 
 
-def limited_names(limits: Iterable[str], letter: str, names: Iterable[str], others: Iterable[str]) -> set[str]:
+def limited_names(limits: Iterable[str], letter: str, names: Iterable[str], other_names: Iterable[str]) -> set[str]:
     """Return the equations or sensors (``names``, of this ``letter``) whose variances are among ``limits``."""
-    there, shared = set(limits), set(others)
-    return {name for name in names if (f"{letter} of {name}" if name in shared else name) in there}
+    limited, shared = set(limits), set(other_names)
+    return {name for name in names if (f"{letter} of {name}" if name in shared else name) in limited}
 
 
 def with_letter(name: str, sensors: Iterable[str]) -> str:

@@ -59,12 +59,12 @@ def likeliest_shares(walk: FloatArray, loss: Callable[[FloatArray], float]) -> F
 
 def sentences_on_shares(names: Sequence[str], walk: FloatArray, shares: FloatArray) -> list[str]:
     """Return a sentence for each parameter whose walk is not all used."""
-    found = []
+    sentences = []
     for name, share, variance in zip(names, shares.tolist(), np.diag(walk).tolist(), strict=False):
         if variance > 0.0 and share == 0.0:
-            found.append(f"These rows show no random walk of {name}: they are compared without it.")
+            sentences.append(f"These rows show no random walk of {name}: they are compared without it.")
         elif variance > 0.0 and share < 1.0:
-            found.append(
+            sentences.append(
                 f"These rows show {share:.2g} of the variance by which {name} may walk: they are compared with that."
             )
-    return found
+    return sentences

@@ -24,31 +24,31 @@ from obsynth.monitoring.calibration.problem import CalibrationProblem
 def wrong_runs(problem: CalibrationProblem, fit: InnovationsFit) -> BoolArray:
     """Return which measurements ``(n, ny)`` stand out with others of the same sensor beside them, are not seen by
     another sensor, and leave the next samples where these are predicted without them."""
-    found = np.zeros(problem.y.shape, dtype=bool)
-    seen = np.isfinite(problem.y)
-    enough = seen.sum(axis=0) >= LEAST_DIAGNOSED_ROWS
+    wrong = np.zeros(problem.y.shape, dtype=bool)
+    measured = np.isfinite(problem.y)
+    enough = measured.sum(axis=0) >= LEAST_DIAGNOSED_ROWS
     usual = np.array([usual_size(e) if many else np.inf for e, many in zip(fit.whitened.T, enough, strict=True)])
-    far = seen & (np.abs(fit.whitened) > STANDS_OUT * usual)
+    far = measured & (np.abs(fit.whitened) > STANDS_OUT * usual)
     for i in range(far.shape[1]):
         for first, last in _groups(far[:, i]):
             if np.delete(far[first : last + 1], i, axis=1).any():
                 continue
             end = _end(problem, fit, usual[i], i, first, last)
             if end is not None:
-                found[first : end + 1, i] = seen[first : end + 1, i]
-    return np.asarray(found & (found.sum(axis=0) <= MOST_OUTLIERS * seen.sum(axis=0)))
+                wrong[first : end + 1, i] = measured[first : end + 1, i]
+    return np.asarray(wrong & (wrong.sum(axis=0) <= MOST_OUTLIERS * measured.sum(axis=0)))
 
 
 def _groups(far: BoolArray) -> list[tuple[int, int]]:
     """Return first and last row of what stands out together, of no more than a run and the sample after it; single ones
     are none."""
-    found: list[tuple[int, int]] = []
+    groups: list[tuple[int, int]] = []
     for row in np.flatnonzero(far).tolist():
-        if found and row - found[-1][1] <= LONGEST_RUN:
-            found[-1] = (found[-1][0], row)
+        if groups and row - groups[-1][1] <= LONGEST_RUN:
+            groups[-1] = (groups[-1][0], row)
         else:
-            found.append((row, row))
-    return [(first, last) for first, last in found if 0 < last - first <= LONGEST_RUN]
+            groups.append((row, row))
+    return [(first, last) for first, last in groups if 0 < last - first <= LONGEST_RUN]
 
 
 def _end(
