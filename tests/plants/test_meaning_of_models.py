@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
@@ -315,3 +316,75 @@ def test_a_pencil_of_andes_with_an_unknown_key_is_refused(tmp_path):
     (tmp_path / "names.json").write_text(json.dumps({**names, "time_unit": "ms"}))
     with pytest.raises(obsynth.SpecError, match="time_unit"):
         obsynth.from_andes(tmp_path, outputs=["omega GENCLS 1"])
+
+
+def hdf5_written(path, fields, *, more=()):
+    """Write a struct ``sys`` as MATLAB 7.3 does: columns first, classes as attributes, cells as references."""
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed (obsynth[hdf5])")
+    with h5py.File(path, "w", userblock_size=512) as file:
+        group = file.create_group("sys")
+        group.attrs["MATLAB_class"] = np.bytes_("struct")
+        for number, (name, value) in enumerate(fields.items()):
+            if isinstance(value, str):
+                item = group.create_dataset(name, data=np.array([[ord(letter)] for letter in value], dtype=np.uint16))
+                item.attrs["MATLAB_class"] = np.bytes_("char")
+            elif isinstance(value, list) and value and isinstance(value[0], str):
+                names = []
+                for i, text in enumerate(value):
+                    letters = np.array([[ord(letter)] for letter in text], dtype=np.uint16)
+                    cell = file.create_dataset(f"#refs#/{number}{i}", data=letters)
+                    cell.attrs["MATLAB_class"] = np.bytes_("char")
+                    names.append([cell.ref])
+                item = group.create_dataset(name, data=np.array(names, dtype=h5py.ref_dtype).T, dtype=h5py.ref_dtype)
+                item.attrs["MATLAB_class"] = np.bytes_("cell")
+            elif np.size(value) == 0:
+                item = group.create_dataset(name, data=np.zeros(2, dtype=np.uint64))
+                item.attrs["MATLAB_class"], item.attrs["MATLAB_empty"] = np.bytes_("double"), 1
+            else:
+                item = group.create_dataset(name, data=np.atleast_2d(np.asarray(value, dtype=float)).T)
+                item.attrs["MATLAB_class"] = np.bytes_("double")
+        for name, kind in more:
+            item = group.create_dataset(name, data=np.zeros((1, 1)))
+            item.attrs["MATLAB_class"] = np.bytes_(kind)
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM")
+    return path
+
+
+def test_a_struct_of_matlab_7_3_is_read_as_one_of_an_older_version(tmp_path):
+    fields = {
+        "A": [[-1.0, 2.0], [0.0, -3.0]], "B": [[1.0], [0.5]], "C": [[1.0, 0.0]], "D": [[0.0]], "E": [], "Ts": 0.0,
+        "TimeUnit": "minutes", "StateName": ["level", "flow"], "InputName": ["pump"], "OutputName": ["gauge"],
+        "InputDelay": [[0.5]],
+    }  # fmt: skip
+    plant = obsynth.from_matlab(hdf5_written(tmp_path / "plant.mat", fields))
+    old = {
+        name: np.array(value, dtype=object)[:, None] if value and isinstance(value[0], str) else value
+        for name, value in fields.items()
+        if not isinstance(value, (str, float))
+    }
+    scipy.io.savemat(tmp_path / "old.mat", {"sys": {**old, "Ts": 0.0, "TimeUnit": "minutes"}})
+    other = obsynth.from_matlab(tmp_path / "old.mat")
+    for name in ("E", "A", "B", "C", "D"):
+        assert np.array_equal(getattr(plant, name), getattr(other, name)), name
+    assert plant.state_names == other.state_names == ("level", "flow")
+    assert dict(plant.delays) == dict(other.delays) == {"pump": 30.0}
+
+
+def test_what_no_model_has_and_damaged_files_of_7_3_are_refused(tmp_path):
+    path = hdf5_written(tmp_path / "odd.mat", {"A": [[-1.0]], "C": [[1.0]], "Ts": 0.0}, more=[("f", "function_handle")])
+    with pytest.raises(obsynth.SpecError, match="function_handle"):
+        obsynth.from_matlab(path)
+    whole = path.read_bytes()
+    for count in (600, len(whole) // 2, len(whole) - 200):
+        path.write_bytes(whole[:count])
+        with pytest.raises(obsynth.SpecError, match=r"odd\.mat"):
+            obsynth.from_matlab(path)
+
+
+def test_without_h5py_a_file_of_7_3_says_what_to_install(tmp_path, monkeypatch):
+    path = tmp_path / "new.mat"
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM" + bytes(400))
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(obsynth.SpecError, match=r"pip install 'obsynth\[hdf5\]'"):
+        obsynth.from_matlab(path)

@@ -18,6 +18,7 @@ from obsynth.files.inputs import READING_ERRORS, path_of, read_text
 from obsynth.numerics.arguments import arguments_checked, number_in_text
 from obsynth.numerics.arrays import FloatArray, require_readable
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.importing.hdf5_models import hdf5_arrays
 from obsynth.plants.importing.roles import plant_of
 
 _MODEL_MATRICES = ("E", "A", "B", "C", "D")
@@ -118,7 +119,7 @@ def from_matlab(
     dt: float | None = None,
     **plant: Any,
 ) -> DescriptorSystem:
-    """Return the plant in a ``.mat`` file (up to version 7.2).
+    """Return the plant in a ``.mat`` file (of version 7.3 with ``obsynth[hdf5]``).
 
     Parameters
     ----------
@@ -187,13 +188,13 @@ def from_matlab(
 
 
 def mat_arrays(source: Path) -> dict[str, Any]:
-    """Return what a ``.mat`` file holds by name; raise `ValueError` for other versions, damaged and too large files."""
+    """Return what a ``.mat`` file holds by name; raise `ValueError` for damaged and too large files."""
     try:
         # A small file may unpack to more than the memory holds.
         require_readable(sum(math.prod(shape) for _, shape, kind in scipy.io.whosmat(source) if kind != "sparse"))
         content = scipy.io.loadmat(source)
-    except NotImplementedError as error:
-        raise ValueError("MATLAB 7.3 files are not supported, save it with '-v7'") from error
+    except NotImplementedError:
+        return hdf5_arrays(source)
     except scipy.io.matlab.MatReadError as error:
         raise ValueError(str(error)) from error
     return {name: value for name, value in content.items() if not name.startswith("__")}

@@ -1,0 +1,70 @@
+"""Variables of MATLAB 7.3 files, which are HDF5 with MATLAB's classes as attributes (h5py, ``obsynth[hdf5]``)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+from obsynth.numerics.arrays import require_readable
+from obsynth.numerics.libraries import imported
+
+
+def hdf5_arrays(source: Path) -> dict[str, Any]:
+    """Return variables by name, as ``scipy.io.loadmat`` has those of older files.
+
+    Raises
+    ------
+    SpecError
+        h5py is not installed.
+    ValueError
+        A variable is of a class that no model has, or too large.
+    """
+    h5py = imported("h5py", extra="hdf5", what="A .mat file of version 7.3")
+    with h5py.File(source, "r") as file:
+        return {name: _value(file[name], file, h5py) for name in file if not name.startswith("#")}
+
+
+def _value(item: Any, file: Any, h5py: Any) -> Any:
+    kind = item.attrs.get("MATLAB_class", b"double")
+    kind = kind.decode() if isinstance(kind, bytes) else str(kind)
+    if isinstance(item, h5py.Group):
+        if "MATLAB_sparse" in item.attrs:
+            return _sparse(item)
+        if kind != "struct":
+            raise ValueError(f"{item.name} is a {kind}, which is not read: save struct(sys) or the matrices")
+        return _struct({name: _value(item[name], file, h5py) for name in item})
+    require_readable(math.prod(item.shape))
+    if item.attrs.get("MATLAB_empty", 0):
+        return np.zeros(tuple(int(size) for size in np.ravel(item[()])), dtype=object if kind == "cell" else float)
+    # Columns come first there.
+    raw = np.asarray(item[()]).T
+    if kind == "char":
+        return np.array(["".join(map(chr, row)) for row in np.atleast_2d(raw).tolist()])
+    if kind == "cell":
+        cells = np.empty(raw.shape, dtype=object)
+        for place in np.ndindex(*raw.shape):
+            cells[place] = _value(file[raw[place]], file, h5py)
+        return cells
+    if raw.dtype.names == ("real", "imag"):
+        return raw["real"] + 1j * raw["imag"]
+    if kind not in ("double", "single", "logical") and not kind.startswith(("int", "uint")):
+        raise ValueError(f"{item.name} is a {kind}, which is not read: save struct(sys) or the matrices")
+    return raw.astype(np.float64)
+
+
+def _struct(fields: dict[str, Any]) -> Any:
+    record = np.empty((1, 1), dtype=[(name, object) for name in fields])
+    for name, value in fields.items():
+        record[name][0, 0] = value
+    return record
+
+
+def _sparse(group: Any) -> Any:
+    starts = np.asarray(group["jc"][()], dtype=np.int64)
+    rows = np.asarray(group["ir"][()], dtype=np.int64) if "ir" in group else np.zeros(0, dtype=np.int64)
+    data = np.asarray(group["data"][()], dtype=np.float64) if "data" in group else np.zeros(0)
+    return scipy.sparse.csc_array((data, rows, starts), shape=(int(group.attrs["MATLAB_sparse"]), len(starts) - 1))
