@@ -25,11 +25,10 @@ from scipy.linalg import block_diag
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import WINDOW_RANK_TOLERANCE, decide_rank
+from obsynth.numerics.ranks import WINDOW_RANK_TOLERANCE
 from obsynth.numerics.standard_form import cayley_point, reachable_basis, standard_form
+from obsynth.numerics.unseen_inputs import seen_part
 
-#: Where the normal rank of a transfer matrix is taken, beyond all poles.
-GENERIC_POINT = 1.3717
 #: Most windows that suffice are this short: longer ones are looked for by doubling.
 LENGTHS_ONE_BY_ONE = 8
 #: An identity of the windows holds to this.
@@ -127,19 +126,43 @@ def estimation_problem(
     bh, dh = (np.hstack([bf, bd]), np.hstack([df, dd])) if exact else (bd, dd)
     if not exact:
         bw, dw = np.hstack([bf, bw]), np.hstack([df, dw])
-    lags = np.broadcast_to(np.asarray(0 if delay is None else delay, dtype=np.int64), (nf,))
+    # Of what no output shows nothing is told, and nothing need be told.
+    seen = seen_part(form.A, bh, form.C, dh)
+    wanted, reference = _told_from_outputs(seen.unseen[:nf], nf, reference) if exact else (np.zeros((0, nf)), reference)
+    a, c, bw = seen.states @ form.A @ seen.states.T, form.C @ seen.states.T, seen.states @ bw
+    hidden = seen.states @ bh @ seen.inputs, dh @ seen.inputs
+    selection = wanted @ seen.inputs[:nf] if exact else np.zeros((0, seen.inputs.shape[1]))
+    lags = np.broadcast_to(np.asarray(0 if delay is None else delay, dtype=np.int64), (len(wanted),))
     if reference is not None and exact and plant.dt > 0.0:
-        dead, reference = _without_dead_samples(reference, longest=len(form.A) + 1)
+        dead, reference = _without_dead_samples(reference, longest=len(form.A) + len(reference[0]) + 1)
         lags = lags + dead
     lags = lags + form.shift
-    window = _decoupling_window(form.A, form.C, (bh, dh), (bw, dw), nf if exact else 0, lags, plant.dt, nf, form.shift)
-    core = _core(form.A, (bw, dw), window, len(form.C))
+    window = _decoupling_window(a, c, hidden, (bw, dw), selection, lags, plant.dt, form.shift)
+    core = _core(a, (bw, dw), window, len(c))
     if reference is not None:
         newest = np.hstack([np.zeros((nf, bw.shape[1] * window.length)), np.eye(nf, bw.shape[1])])
         core = _with_reference(core, reference, form.alpha if plant.dt == 0.0 else None, None if exact else newest)
     core = _without_unseen(core, modelled=plant.dt == 0.0 or reference is not None)
     chained = _with_chain(core, bw.shape[1], window.length)
     return EstimationProblem(*chained, window.length, form.alpha, form.shift)
+
+
+def _told_from_outputs(unseen: FloatArray, nf: int, reference: Model | None) -> tuple[FloatArray, Model | None]:
+    """Return combinations of the faults that are told from the outputs and that the reference model is driven by."""
+    wanted = np.eye(nf)
+    if np.linalg.norm(unseen) > WINDOW_IDENTITY and reference is not None:
+        a, b, c, d = reference
+        _, values, rows = np.linalg.svd(np.vstack([b, d]))
+        wanted = rows[: int(np.sum(values > WINDOW_RANK_TOLERANCE * values[0]))]
+        reference = a, b @ wanted.T, c, d @ wanted.T
+    if np.linalg.norm(wanted @ unseen) > WINDOW_IDENTITY:
+        raise PreconditionError(
+            "The faults cannot be told from each other and from the decoupled disturbances, with whatever delay: the "
+            "transfer matrix from both to the outputs has too low a rank. Let a disturbance count as noise (leave it "
+            "out of decoupled), or measure more.",
+            condition="decoupling",
+        )
+    return wanted, reference
 
 
 def _without_dead_samples(model: Model, *, longest: int) -> tuple[NDArray[np.int64], Model]:
@@ -177,25 +200,16 @@ def _decoupling_window(
     c: FloatArray,
     hidden: tuple[FloatArray, FloatArray],
     noise: tuple[FloatArray, FloatArray],
-    estimated: int,
+    selection: FloatArray,
     lags: NDArray[np.int64],
     dt: float,
-    nf: int,
     shift: int,
 ) -> _Window:
     """Return the shortest window in which faults and unknown inputs can be told; raise where there is none."""
-    n, (bh, dh) = len(a), hidden
-    nh, lag = bh.shape[1], int(np.max(lags, initial=0))
-    if nh and _normal_rank(a, bh, c, dh) < nh:
-        raise PreconditionError(
-            "The unknown inputs and faults cannot be reconstructed together from the outputs, with whatever delay: the "
-            "transfer matrix from them to the outputs has a lower rank than there are of them. Let a disturbance count "
-            "as noise (leave it out of decoupled), or measure more.",
-            condition="decoupling",
-        )
-    shortest, longest = lag if estimated else 0, n + lag + 1
+    n, lag = len(a), int(np.max(lags, initial=0))
+    shortest, longest = lag, n + lag + 1
     window = _first_window(
-        lambda length: _tried_window(a, c, hidden, estimated, lags, length, nf),
+        lambda length: _tried_window(a, c, hidden, selection, lags, length),
         shortest,
         shortest if dt == 0.0 else longest,
     )
@@ -206,7 +220,7 @@ def _decoupling_window(
             condition="decoupling",
         )
     if not window.estimates_faults:
-        first = _first_lags(window.Th, nh, nf)
+        first = _first_lags(window.Th, selection)
         raise PreconditionError(
             f"No causal filter has the exact fault map with a delay of {_listed(lags - shift)} samples: the faults' "
             f"shortest delays are {_listed(first - shift)} samples.",
@@ -217,10 +231,12 @@ def _decoupling_window(
     )
 
 
-def _first_lags(th: FloatArray, nh: int, nf: int) -> NDArray[np.int64]:
+def _first_lags(th: FloatArray, selection: FloatArray) -> NDArray[np.int64]:
     """Return the fewest samples after which a long window shows each fault: rows that the outputs' rows span."""
-    spanned = np.linalg.pinv(th, rcond=WINDOW_RANK_TOLERANCE) @ th
-    missed = np.linalg.norm(spanned - np.eye(len(spanned)), axis=1).reshape(-1, nh)[::-1, :nf]
+    count = selection.shape[1]
+    left = np.linalg.pinv(th, rcond=WINDOW_RANK_TOLERANCE) @ th - np.eye(th.shape[1])
+    newest_first = [selection @ left[i : i + count] for i in reversed(range(0, len(left), count))]
+    missed = np.array([np.linalg.norm(part, axis=1) for part in newest_first])
     return np.asarray(np.argmax(missed <= WINDOW_IDENTITY, axis=0))
 
 
@@ -273,10 +289,9 @@ def _tried_window(
     a: FloatArray,
     c: FloatArray,
     hidden: tuple[FloatArray, FloatArray],
-    estimated: int,
+    selection: FloatArray,
     lags: NDArray[np.int64],
     length: int,
-    nf: int,
 ) -> _TriedWindow:
     n, (bh, dh) = len(a), hidden
     nh, rows = bh.shape[1], [c]
@@ -285,21 +300,13 @@ def _tried_window(
     th = _stacked(a, c, bh, dh, length)
     inverse = np.linalg.pinv(th, rcond=WINDOW_RANK_TOLERANCE) if nh else np.zeros((0, len(th)))
     first = np.hstack([bh, np.zeros((n, nh * length))])
-    chosen = np.zeros((nf, nh * (length + 1)))
-    if estimated:
-        faults = np.arange(nf)
-        chosen[faults, (length - lags) * nh + faults] = 1.0
-    G, Mf = (first @ inverse, chosen @ inverse) if nh else (np.zeros((n, len(th))), np.zeros((nf, len(th))))
+    chosen = np.zeros((len(selection), nh * (length + 1)))
+    for row, late, entries in zip(chosen, lags, selection, strict=True):
+        row[(length - late) * nh : (length - late + 1) * nh] = entries
+    G, Mf = first @ inverse, chosen @ inverse
     decouples = not nh or bool(np.linalg.norm(G @ th - first) <= WINDOW_IDENTITY * (1.0 + np.linalg.norm(bh)))
-    estimates_faults = not estimated or bool(np.linalg.norm(Mf @ th - chosen) <= WINDOW_IDENTITY)
+    estimates_faults = bool(np.linalg.norm(Mf @ th - chosen) <= WINDOW_IDENTITY)
     return _TriedWindow(np.vstack(rows), th, np.asarray(G), np.asarray(Mf), length, decouples, estimates_faults)
-
-
-def _normal_rank(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> int:
-    """Return the rank of a transfer matrix at a point that is a pole or a zero only by accident."""
-    n = len(a)
-    point = GENERIC_POINT * (1.0 + float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)))
-    return decide_rank(np.block([[point * np.eye(n) - a, -b], [c, d]])).rank - n
 
 
 def _core(a: FloatArray, noise: tuple[FloatArray, FloatArray], window: _Window, ny: int) -> _Core:

@@ -41,6 +41,8 @@ LEVEL_ABOVE, REGULAR_SHARE = 1e-9, 1e-40
 NEWTON_STEPS, BOX_BITS = 8, 0.6
 #: A bound for all delays is lowered by this share: that covers so many samples of delay.
 LIMIT_SHARE, LONGEST_DELAY = 1e-5, 1000
+#: Columns of signals that are smaller beside the others, in double precision, are left out.
+DEPENDENT_SHARE = 1e-12
 #: Dependent equations of last samples with more unknowns than this are not solved in rational numbers.
 MOST_UNKNOWNS = 120
 
@@ -227,7 +229,11 @@ class _Trajectories:
         pivots, others = _pivots(still + point * moved)
         exact = _complex(still + 0j) + _complex(moved + 0j) * flint.acb(point)
         solved = _columns(exact, pivots).solve(-_columns(exact, others))
-        return [_Member(flint.acb(point), _placed(solved, pivots, others, j)) for j in range(free)]
+        found = [_placed(solved, pivots, others, j) for j in range(free)]
+        # Unknown inputs alone may be invisible too, of which neither error nor noise is anything.
+        nh, nw = self.Bh.shape[1], self.Bw.shape[1]
+        counted = [*range(nx, nx + (plant.nf if self.setting.exact else 0)), *range(nx + nh, nx + nh + nw)]
+        return [_Member(flint.acb(point), found[j]) for j in _independent(_rows(_beside(found), counted))]
 
     def _part(self, which: str) -> Any:
         """Return a part of the members' vectors, one member a column."""
@@ -256,7 +262,8 @@ class _Trajectories:
         energies = [_weighted(part, weights) for part in (shown, noise)]
         if not self.samples:
             return energies[0], energies[1]
-        rest = _from_rest(self.plant, (self.Bh, self.Dh), (self.Bw, self.Dw), self.samples)
+        estimated = self.plant.nf if self.setting.exact else 0
+        rest = _from_rest(self.plant, (self.Bh, self.Dh), (self.Bw, self.Dw), self.samples, estimated)
         # The members go on, and what starts from rest is added to them.
         own = 0 if self.setting.exact else self.Bh.shape[1]
         tails, powers = [], [flint.acb(1) for _ in points]
@@ -348,9 +355,16 @@ def _largest_ratio(error: Any, noise: Any) -> tuple[float, Any]:
 
 
 def _from_rest(
-    plant: DescriptorSystem, hidden: tuple[FloatArray, FloatArray], noise: tuple[FloatArray, FloatArray], samples: int
+    plant: DescriptorSystem,
+    hidden: tuple[FloatArray, FloatArray],
+    noise: tuple[FloatArray, FloatArray],
+    samples: int,
+    estimated: int,
 ) -> list[Any]:
-    """Return the inputs ``(h, w)`` of each sample, all solutions from rest with y = 0 as columns."""
+    """Return the inputs ``(h, w)`` of each sample, solutions from rest with y = 0 as columns.
+
+    Of these, what is independent in w and the first ``estimated`` of h, the faults.
+    """
     nx, ny = plant.nx, plant.ny
     (bh, dh), (bw, dw) = hidden, noise
     inputs, through = np.hstack([bh, bw]), np.hstack([dh, dw])
@@ -376,7 +390,26 @@ def _from_rest(
         kernel = _beside(columns) if columns else _zeros(system.shape[1], 0)
     except ZeroDivisionError:
         kernel = exact_kernel(system)
-    return [_rows(kernel, range(len(loose) + j * block, len(loose) + j * block + count)) for j in range(samples)]
+    parts = [_rows(kernel, range(len(loose) + j * block, len(loose) + j * block + count)) for j in range(samples)]
+    counted = [*range(estimated), *range(bh.shape[1], count)]
+    kept = _independent(_stacked([_rows(part, counted) for part in parts]))
+    return [_columns(part, kept) for part in parts]
+
+
+def _independent(matrix: Any) -> list[int]:
+    """Return columns that span all of them, in double precision: whatever is left out, the rest is as valid."""
+    table = np.array([[complex(entry) for entry in row] for row in matrix.tolist()]).reshape(matrix.nrows(), -1)
+    sizes = np.linalg.norm(table, axis=0)
+    if not sizes.any():
+        return []
+    _, upper, order = scipy.linalg.qr(table / np.where(sizes > 0.0, sizes, 1.0), mode="economic", pivoting=True)
+    diagonal = np.abs(np.diag(upper))
+    return sorted(int(i) for i in order[: len(diagonal)][diagonal > DEPENDENT_SHARE * diagonal[0]])
+
+
+def _stacked(parts: Sequence[Any]) -> Any:
+    rows = [row for part in parts for row in part.tolist()]
+    return flint.acb_mat(len(rows), parts[0].ncols(), [entry for row in rows for entry in row])
 
 
 def exact_kernel(system: FloatArray) -> Any:

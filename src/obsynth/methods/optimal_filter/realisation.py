@@ -23,8 +23,8 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.verification.error_system import LEAST_ROW, with_past
 
-#: The identities of T and T0 hold to this, of the numbers in them.
-IDENTITY_LEFT = 1e-9
+#: The identities of T and T0 hold to this, of the numbers in them: to the second where no realisation keeps the first.
+IDENTITIES_LEFT = (1e-9, 1e-8)
 #: Entries of T and T0 that are smaller, of the largest, are rounding.
 CLEANED_SHARE = 1e-13
 #: Entries of the filter that are smaller, of the largest of their matrix, are rounding.
@@ -71,12 +71,21 @@ def realisations(filter_: Model, *, discrete: bool) -> list[Model]:
 
     Of a long window the first keeps no digits of coefficients that are as small as rounding; the second does.
     """
+    filter_ = _without_rounding(filter_)
     found = [minimal(filter_, discrete=discrete)]
     if discrete:
         a, b, c, d = filter_
         kept = _linked(a != 0.0, np.any(b != 0.0, axis=1)) & _linked(a.T != 0.0, np.any(c != 0.0, axis=0))
         found.append(_balanced((a[np.ix_(kept, kept)], b[kept], c[:, kept], d)))
     return found
+
+
+def _without_rounding(filter_: Model) -> Model:
+    """Return a filter without entries of B and C that are nothing beside what passes at once."""
+    a, b, c, d = filter_
+    size = ROUNDING_SHARE * float(np.linalg.norm(d))
+    entering, shown = float(np.linalg.norm(b)), float(np.linalg.norm(c))
+    return a, np.where(np.abs(b) * shown > size, b, 0.0), np.where(np.abs(c) * entering > size, c, 0.0), d
 
 
 def _balanced(filter_: Model) -> Model:
@@ -117,13 +126,15 @@ def followed(plant: DescriptorSystem, filters: Sequence[Model], longest: int) ->
     """
     none = np.zeros((0, plant.nx)), np.zeros((0, 0))
     copies = _dying_modes(plant)
-    for lag, (rows, moved) in ((0, none), (0, copies), *((lag, none) for lag in range(1, longest + 1))):
-        if lag == 0 and rows is copies[0] and not len(rows):
-            continue
-        for filter_ in filters:
-            found = _followed(plant, filter_, rows, moved, lag)
-            if found is not None:
-                return found
+    lags = ((0, none), (0, copies), *((lag, none) for lag in range(1, longest + 1)))
+    for share in IDENTITIES_LEFT:
+        for lag, (rows, moved) in lags:
+            if lag == 0 and rows is copies[0] and not len(rows):
+                continue
+            for filter_ in filters:
+                found = _followed(plant, filter_, rows, moved, lag, share)
+                if found is not None:
+                    return found
     raise SolverError(
         "The filter of least gain reads the plant's state by rounding: the result is inconclusive. Measure with noise "
         "(sensor_noise), or give a longer delay."
@@ -177,9 +188,9 @@ def _dying_modes(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
 
 
 def _followed(
-    plant: DescriptorSystem, filter_: Model, copied: FloatArray, moved: FloatArray, lag: int
+    plant: DescriptorSystem, filter_: Model, copied: FloatArray, moved: FloatArray, lag: int, share: float
 ) -> Followed | None:
-    """Return a filter beside copies ``copied`` of modes, with T and T0; ``None`` where the equations do not hold."""
+    """Return a filter beside copies ``copied`` of modes, with T and T0; ``None`` where an equation misses a share."""
     a, b, c, d = filter_
     e, own, _, seen = with_past(plant, lag)
     nz, rows, na, count = len(a), len(c), len(e), len(copied)
@@ -204,11 +215,13 @@ def _followed(
             equations(None, None, np.kron(outputs, (left @ bd).T), None),
         ]
     )
-    wanted = np.concatenate([part.ravel() for part in (-(b @ seen), b @ plant.Dd, -(d @ seen), d @ plant.Dd)])
+    products = ((-b, seen), (b, plant.Dd), (-d, seen), (d, plant.Dd))
+    wanted = np.concatenate([(one @ other).ravel() for one, other in products])
+    terms_wanted = np.concatenate([(np.abs(one) @ np.abs(other)).ravel() for one, other in products])
     found = _solved(system, wanted)
     size = float(np.max(np.abs(found), initial=0.0))
     found = np.where(np.abs(found) > CLEANED_SHARE * size, found, 0.0)
-    if not _holds(system, found, wanted, (nz * na, nz * plant.nd, rows * na), na):
+    if not _holds(system, found, (wanted, terms_wanted), (nz * na, nz * plant.nd, rows * na), na, share):
         return None
     t, into, s, shown = (
         part.reshape(shape)
@@ -246,17 +259,27 @@ def _solved(system: FloatArray, wanted: FloatArray) -> FloatArray:
     return found
 
 
-def _holds(system: FloatArray, found: FloatArray, wanted: FloatArray, heights: tuple[int, ...], width: int) -> bool:
-    """Whether equations hold, each to a share of the largest term of its row of the filter, as they are verified."""
-    missed, terms = np.abs(system @ found - wanted), np.abs(system) @ np.abs(found) + np.abs(wanted)
+def _holds(
+    system: FloatArray,
+    found: FloatArray,
+    wanted: tuple[FloatArray, FloatArray],
+    heights: tuple[int, ...],
+    width: int,
+    share: float,
+) -> bool:
+    """Whether equations hold, each to a share of the largest term of its row of the filter, as they are verified.
+
+    ``wanted``: the right sides, and the sizes of what cancels in them.
+    """
+    missed, terms = np.abs(system @ found - wanted[0]), np.abs(system) @ np.abs(found) + wanted[1]
     ends = np.cumsum(heights)
     for part, height in ((slice(0, ends[0]), heights[0]), (slice(ends[1], ends[2]), heights[2])):
         if height:
             largest = np.max(terms[part].reshape(-1, width), axis=1)
             largest = np.maximum(largest, LEAST_ROW * np.max(largest))
-            if np.any(np.max(missed[part].reshape(-1, width), axis=1) > IDENTITY_LEFT * largest):
+            if np.any(np.max(missed[part].reshape(-1, width), axis=1) > share * largest):
                 return False
-    return bool(np.max(missed, initial=0.0) <= IDENTITY_LEFT * (1.0 + np.max(terms, initial=0.0)))
+    return bool(np.max(missed, initial=0.0) <= share * (1.0 + np.max(terms, initial=0.0)))
 
 
 def _left_kernel(e: FloatArray) -> FloatArray:
