@@ -320,7 +320,7 @@ def test_more_disturbances_on_what_is_already_lost_change_nothing(seed: int, dt:
     turned = seed % 2 == 1
     change = np.linalg.qr(rng.normal(size=(n + k, n + k)))[0] if turned else np.eye(n + k)[rng.permutation(n + k)]
     more = {
-        "A": change @ np.block([[a, one["Bd"] @ rng.normal(size=(1, k))], [into, inner]]) @ change.T,
+        "A": change @ np.block([[a, one["Bd"] @ np.ones((1, k))], [into, inner]]) @ change.T,
         "C": np.hstack([one["C"], np.zeros((3, k))]) @ change.T,
         "Bf": change @ np.vstack([one["Bf"], rng.normal(size=(k, 1))]),
         "Bd": change @ np.block([[one["Bd"], np.zeros((n, k))], [rng.normal(size=(k, 1)), np.eye(k)]]),

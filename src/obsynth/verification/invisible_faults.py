@@ -229,11 +229,11 @@ class _Trajectories:
         pivots, others = _pivots(still + point * moved)
         exact = _complex(still + 0j) + _complex(moved + 0j) * flint.acb(point)
         solved = _columns(exact, pivots).solve(-_columns(exact, others))
-        found = [_placed(solved, pivots, others, j) for j in range(free)]
+        vectors = [_placed(solved, pivots, others, j) for j in range(free)]
         # Unknown inputs alone may be invisible too, of which neither error nor noise is anything.
         nh, nw = self.Bh.shape[1], self.Bw.shape[1]
         counted = [*range(nx, nx + (plant.nf if self.setting.exact else 0)), *range(nx + nh, nx + nh + nw)]
-        return [_Member(flint.acb(point), found[j]) for j in _independent(_rows(_beside(found), counted))]
+        return [_Member(flint.acb(point), vectors[j]) for j in _independent(_rows(_beside(vectors), counted))]
 
     def _part(self, which: str) -> Any:
         """Return a part of the members' vectors, one member a column."""

@@ -25,8 +25,11 @@ from obsynth.verification.error_system import LEAST_ROW, with_past
 
 #: The identities of T and T0 hold to this, of the numbers in them: to the second where no realisation keeps the first.
 IDENTITIES_LEFT = (1e-9, 1e-8)
-#: Entries of T and T0 that are smaller, of the largest, are rounding.
-CLEANED_SHARE = 1e-13
+#: Entries of T and T0 that are smaller, of the largest, are rounding: by the second share where a decoupled disturbance
+#: drives nothing but states that no output shows, of which T must have nothing.
+CLEANED_SHARES = (1e-13, 1e-8)
+#: Of what a decoupled disturbance does to the filter, by each of its ways, no more than this is left of them together.
+DISTURBANCE_LEFT = 1e-8
 #: Entries of the filter that are smaller, of the largest of their matrix, are rounding.
 ROUNDING_SHARE = 1e-14
 #: Entries of a sampled filter's A below this are rounding: its states are of the size of the outputs.
@@ -219,10 +222,14 @@ def _followed(
     wanted = np.concatenate([(one @ other).ravel() for one, other in products])
     terms_wanted = np.concatenate([(np.abs(one) @ np.abs(other)).ravel() for one, other in products])
     found = _solved(system, wanted)
-    size = float(np.max(np.abs(found), initial=0.0))
-    found = np.where(np.abs(found) > CLEANED_SHARE * size, found, 0.0)
-    if not _holds(system, found, (wanted, terms_wanted), (nz * na, nz * plant.nd, rows * na), na, share):
-        return None
+    size, heights = float(np.max(np.abs(found), initial=0.0)), (nz * na, nz * plant.nd, rows * na)
+    exact = found
+    for cleaned in CLEANED_SHARES:
+        found = np.where(np.abs(exact) > cleaned * size, exact, 0.0)
+        if not _holds(system, found, (wanted, terms_wanted), heights, na, share):
+            return None
+        if not _shows_a_disturbance(system, found, (wanted, terms_wanted), heights, plant.nd):
+            break
     t, into, s, shown = (
         part.reshape(shape)
         for part, shape in zip(
@@ -280,6 +287,23 @@ def _holds(
             if np.any(np.max(missed[part].reshape(-1, width), axis=1) > share * largest):
                 return False
     return bool(np.max(missed, initial=0.0) <= share * (1.0 + np.max(terms, initial=0.0)))
+
+
+def _shows_a_disturbance(
+    system: FloatArray,
+    found: FloatArray,
+    wanted: tuple[FloatArray, FloatArray],
+    heights: tuple[int, ...],
+    disturbances: int,
+) -> bool:
+    """Whether more is left of some decoupled disturbance than a share of what cancels."""
+    missed, terms = np.abs(system @ found - wanted[0]), np.abs(system) @ np.abs(found) + wanted[1]
+    ends = np.cumsum(heights)
+    own = np.r_[ends[0] : ends[1], ends[2] : len(missed)]
+    if not disturbances or not len(own):
+        return False
+    left, size = (np.max(part[own].reshape(-1, disturbances), axis=0) for part in (missed, terms))
+    return bool(np.any(left > DISTURBANCE_LEFT * size))
 
 
 def _left_kernel(e: FloatArray) -> FloatArray:
