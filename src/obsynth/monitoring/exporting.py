@@ -98,10 +98,10 @@ class LearnedMonitorInC:
 
     def source(self, prefix: str) -> str:
         """Return the tables and functions of the monitor."""
-        found, model = self.learned, self.learned.statistics.model
-        bands = found.statistics.fault_bands
-        shapes, slopes = found.statistics.responses()
-        order, shares, faults_watched = model.order, np.array(FORGETTING), len(found.statistics.estimates)
+        learned, model = self.learned, self.learned.statistics.model
+        bands = learned.statistics.fault_bands
+        shapes, slopes = learned.statistics.responses()
+        order, shares, faults_watched = model.order, np.array(FORGETTING), len(learned.statistics.estimates)
         straight = shapes[:, -1:] + (np.arange(order + 1) - order)[:, None] * slopes[:, None, :]
         rows = np.concatenate([shapes, shapes[:, -1:] + np.arange(1, max(AGES))[:, None] * slopes[:, None, :]], axis=1)
         powers = np.cumsum(np.sum(rows**2, axis=2), axis=1)[:, np.array(AGES) - 1]
@@ -112,10 +112,10 @@ class LearnedMonitorInC:
             "AGES": len(AGES),
             "MEANS": len(shares),
             "SHAPES": len(shapes),
-            "MONITOR_FAULTS": len(found.scales),
+            "MONITOR_FAULTS": len(learned.scales),
             "MONITOR_ESTIMATES": faults_watched,
             "MONITOR_WIDTH": max(faults_watched, 1),
-            "MONITOR_SETTLING": found.settling,
+            "MONITOR_SETTLING": learned.settling,
             "MONITOR_OUTPUTS": self.outputs,
             "MONITOR_HOLD": HOLD,
             "MONITOR_WATCHED": sum(name.startswith(("fhat[", "r[")) for name in self.columns),
@@ -128,17 +128,17 @@ class LearnedMonitorInC:
             "monitor_precision": model.whitener.T @ model.whitener,
             "monitor_shares": shares[None],
             "monitor_sizes": ((2.0 - shares) / shares)[None],
-            "monitor_levels": found.levels[None],
+            "monitor_levels": learned.levels[None],
             "monitor_flat": straight[:, 0],
             "monitor_slopes": slopes,
             "monitor_early": (shapes - straight).reshape(-1, model.channels),
-            "monitor_roots": np.sqrt(1.0 / (np.maximum(powers, SMALLEST) * found.statistics.levels_by_age)),
-            "monitor_effects": found.statistics.offset_effects() / np.sqrt(found.statistics.levels_by_age),
+            "monitor_roots": np.sqrt(1.0 / (np.maximum(powers, SMALLEST) * learned.statistics.levels_by_age)),
+            "monitor_effects": learned.statistics.offset_effects() / np.sqrt(learned.statistics.levels_by_age),
             "monitor_bands": (np.zeros(faults_watched) if bands is None else bands)[None],
-            "monitor_centres": found.centres[None],
-            "monitor_scales": found.scales[None],
+            "monitor_centres": learned.centres[None],
+            "monitor_scales": learned.scales[None],
             "monitor_walk": np.zeros((0, 0)) if self.walk is None else self.walk,
-            "monitor_innovation": np.array([[found.innovation]]),
+            "monitor_innovation": np.array([[learned.innovation]]),
         }
         faults = {f"fhat[{name}]": i for i, name in enumerate(self.fault_names)}
         faults |= {f"fault {name}": i for i, name in enumerate(self.fault_names)}
@@ -151,9 +151,9 @@ class LearnedMonitorInC:
             *(line for name, table in tables.items() for line in table_lines(name, filled_table(table))),
             *integer_table("monitor_longest", self.longest()),
             *integer_table("monitor_ages", AGES),
-            *integer_table("monitor_places", [self.columns.index(name) for name in found.columns]),
-            *integer_table("monitor_seldom", [int(name in found.seldom) for name in self.columns]),
-            *integer_table("monitor_told", [faults.get(name, -1) for name in found.statistics.told]),
+            *integer_table("monitor_places", [self.columns.index(name) for name in learned.columns]),
+            *integer_table("monitor_seldom", [int(name in learned.seldom) for name in self.columns]),
+            *integer_table("monitor_told", [faults.get(name, -1) for name in learned.statistics.told]),
         ]
         return "\n".join(lines) + filled_template("learned.c", prefix, {}, "obsynth.monitoring")
 

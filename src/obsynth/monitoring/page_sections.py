@@ -52,44 +52,44 @@ def agreement_section(design: ObserverDesign, run: DataRun, rows: str | None) ->
         return
     try:
         # What was read is in the signals' units already.
-        found = validate(design, run.measured, rows=rows, scales=dict.fromkeys(run.measured.columns, 1.0))
+        validation = validate(design, run.measured, rows=rows, scales=dict.fromkeys(run.measured.columns, 1.0))
     except ObsynthError as error:
         if rows is not None:
             raise
         yield f"<p>This log was not compared with the design: {escape(str(error))}</p>"
         return
     if rows is None:
-        said = "The log agrees" if found.passed else "The log, taken as free of faults, does not agree"
+        verdict = "The log agrees" if validation.passed else "The log, taken as free of faults, does not agree"
     else:
-        said = f"Rows {rows} of the log {'agree' if found.passed else 'do not agree'}"
-    yield f'<p class="verdict {"holds" if found.passed else "fails"}">{said} with the design.</p>'
-    yield from listed(found.verdict)
-    yield from fact_rows(_facts(found, rows))
-    yield from copied_table(_sensors(design, found))
-    panels = 2 * len(found.sensors) + len(found.estimates)
-    yield stacked("", _TEXT, panels, lambda axes: draw_validation(found, axes)).html()
+        verdict = f"Rows {rows} of the log {'agree' if validation.passed else 'do not agree'}"
+    yield f'<p class="verdict {"holds" if validation.passed else "fails"}">{verdict} with the design.</p>'
+    yield from listed(validation.verdict)
+    yield from fact_rows(_facts(validation, rows))
+    yield from copied_table(_sensors(design, validation))
+    panels = 2 * len(validation.sensors) + len(validation.estimates)
+    yield stacked("", _TEXT, panels, lambda axes: draw_validation(validation, axes)).html()
 
 
-def _facts(found: Validation, rows: str | None) -> Iterator[tuple[str, str]]:
-    first, last = found.log["rows"]
-    every = (
+def _facts(validation: Validation, rows: str | None) -> Iterator[tuple[str, str]]:
+    first, last = validation.log["rows"]
+    assumption = (
         "" if rows is not None else (", all of them: they are assumed to be free of faults; select others by --rows")
     )
-    yield "rows", f"{first} to {last - 1}{every}"
-    nis = found.nis
+    yield "rows", f"{first} to {last - 1}{assumption}"
+    nis = validation.nis
     yield (
         "NIS",
         (f"{nis.value:.3g} per degree of freedom; {nis.low:.2f} to {nis.high:.2f} in 95 % of logs of this length"),
     )
-    if found.change is not None:
-        yield "change", f"the mean of the innovations changes at row {found.change}"
+    if validation.change is not None:
+        yield "change", f"the mean of the innovations changes at row {validation.change}"
 
 
-def _sensors(design: ObserverDesign, found: Validation) -> Table:
+def _sensors(design: ObserverDesign, validation: Validation) -> Table:
     table = headed_table("sensor", "unit", "mean square", "expected", "mean (deviations)", "white (p)", "variance")
-    for name, sensor in found.sensors.items():
-        ratio = found.ratios.get(f"R of {name}", found.ratios.get(name))
-        told = (
+    for name, sensor in validation.sensors.items():
+        ratio = validation.ratios.get(f"R of {name}", validation.ratios.get(name))
+        cells = (
             number(sensor.nis.value),
             f"{sensor.nis.low:.2f} to {sensor.nis.high:.2f}",
             f"{sensor.mean:+.2g}",
@@ -98,7 +98,7 @@ def _sensors(design: ObserverDesign, found: Validation) -> Table:
         table.add_row(
             Text(name),
             design.plant.units.get(name, ""),
-            *(told if sensor.nis.samples else ("not predicted", "", "", "")),
+            *(cells if sensor.nis.samples else ("not predicted", "", "", "")),
             "as designed" if ratio is None else f"{ratio:.2g} times R",
         )
     return table
@@ -107,14 +107,14 @@ def _sensors(design: ObserverDesign, found: Validation) -> Table:
 def data_section(design: ObserverDesign, run: DataRun, statement: str) -> Iterator[str]:
     """Yield a picture of a run, what was counted, and statistics of estimates and residuals in decided rows."""
     # The page itself tells what the threshold means.
-    shown, count = replace(run, statement=""), panel_count(run, design=design)
+    without_statement, count = replace(run, statement=""), panel_count(run, design=design)
     if count:
         watched = bool(run.statement or run.thresholds)
         text = (
             f"Measured outputs and their estimates, fault estimates, residuals{' and what is monitored' * watched}. "
             f"Grey: settling or gap, no decision.{' Red: alarm.' * bool(run.events)}"
         )
-        yield stacked("", text, count, lambda axes: plot_data(shown, design=design, axes=axes)).html()
+        yield stacked("", text, count, lambda axes: plot_data(without_statement, design=design, axes=axes)).html()
     yield from fact_rows(_counts(run, statement))
     rows, more = alarm_rows(run.events, run.stamps.shown)
     if rows:
@@ -148,8 +148,8 @@ def _statistics(design: ObserverDesign, run: DataRun) -> Iterator[str]:
         values = values[np.isfinite(values)]
         if values.size:
             unit = design.plant.units.get(name[name.index("[") + 1 : -1], "")
-            found = (number(float(f(values))) for f in (np.min, np.mean, np.max, np.std))
-            table.add_row(Text(name), unit, *found)
+            cells = (number(float(f(values))) for f in (np.min, np.mean, np.max, np.std))
+            table.add_row(Text(name), unit, *cells)
     yield "<h3>Statistics</h3>"
     yield from copied_table(table)
 

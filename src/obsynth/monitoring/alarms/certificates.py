@@ -110,9 +110,9 @@ def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
     equal, below = np.asarray(data["equal"]), np.asarray(data["below"])
     fits = equal.shape == (len(programme.equal.right),) and below.shape == (len(programme.below.right),)
     margin = float(programme.proved_least(equal, below)) if fits else float("nan")
-    said = statement(assumed, data["window"], len(y), origin, log, body["gain_set"]["sha256"])
+    conclusion = statement(assumed, data["window"], len(y), origin, log, body["gain_set"]["sha256"])
     rows = len(y) == data["row"] and len(u) == len(y)
-    told = said == data["statement"] and origin == data["origin"]
+    is_stated = conclusion == data["statement"] and origin == data["origin"]
     proof = _row(
         "proof",
         "least excess over all bounds, from the multipliers, in exact arithmetic",
@@ -121,7 +121,7 @@ def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
         margin > 0.0,
         kind="proved",
     )
-    yield from _conclusions(proof, said, float(data["margin"]), rows=rows, told=told)
+    yield from _conclusions(proof, conclusion, float(data["margin"]), rows=rows, is_stated=is_stated)
 
 
 def gain_set_row(design: ObserverDesign, digest: str, name: str = "gain set") -> Check:
@@ -186,7 +186,7 @@ def _checked_by_test(
     """Yield the rows on a certificate of a guaranteed test."""
     row = data["row"]
     ((test, group, margin),) = checked(design, data, u, y)
-    said = statement_of(test, group, row, log, body["gain_set"]["sha256"])
+    conclusion = statement_of(test, group, row, log, body["gain_set"]["sha256"])
     rows = is_whole(row) and row >= len(y) > 0
     proof = Check(
         "proof",
@@ -198,15 +198,17 @@ def _checked_by_test(
         "duality of linear programmes",
         "proved",
     )
-    yield from _conclusions(proof, said, float(data["margin"]), rows=rows, told=said == data["statement"])
+    yield from _conclusions(
+        proof, conclusion, float(data["margin"]), rows=rows, is_stated=conclusion == data["statement"]
+    )
 
 
-def _conclusions(proof: Check, said: str, stated: float, *, rows: bool, told: bool) -> list[Check]:
+def _conclusions(proof: Check, conclusion: str, stated: float, *, rows: bool, is_stated: bool) -> list[Check]:
     """Return the rows on what a certificate says, with that on its proof."""
     margin = proof.value
     return [
         _row("rows", "the record ends at the stated row", float(rows), 1.0, rows),
-        _row("statement", said, float(told), 1.0, told),
+        _row("statement", conclusion, float(is_stated), 1.0, is_stated),
         proof,
         _row("margin", "the stated margin is not above what is proved", stated, margin, 0.0 < stated <= margin),
     ]

@@ -167,14 +167,14 @@ class AlarmLog:
             self._unexplained.pop(by, None)
         self._places_of[by] = self._place
         largest = before is None or evidence > before.evidence or math.isnan(before.evidence)
-        known = (math.nan,) * 3 if before is None else (before.size, before.low, before.high)
+        earlier = (math.nan,) * 3 if before is None else (before.size, before.low, before.high)
         named = "" if before is None else before.fault
         tells = before is None or (distinguished and not evidence <= self._named_by[by])
         shelved = self._shelved(by, fault, time)
         # What explains an alarm that was shelved is told, whatever it was called at larger evidence.
         if before is not None and not math.isnan(before.shelved) and math.isnan(shelved):
             tells = True
-        size, low, high = self._size(fault, cells, ranking) if tells else known
+        size, low, high = self._size(fault, cells, ranking) if tells else earlier
         if tells:
             named = fault
             self._named_by[by] = evidence if distinguished else -math.inf
@@ -233,7 +233,7 @@ class AlarmLog:
         return tuple(sorted([*self._closed, *self._open.values()], key=lambda event: (event.first_row, event.by)))
 
 
-def alarm_rows(events: Sequence[AlarmEvent], shown: Callable[[float], str]) -> tuple[list[tuple[str, ...]], int]:
+def alarm_rows(events: Sequence[AlarmEvent], date_of: Callable[[float], str]) -> tuple[list[tuple[str, ...]], int]:
     """Return a table of alarms, heading first and without empty columns, and how many more there are."""
     if not events:
         return [], 0
@@ -245,18 +245,18 @@ def alarm_rows(events: Sequence[AlarmEvent], shown: Callable[[float], str]) -> t
     for event in events[:MOST_LISTED_ALARMS]:
         interval = "" if math.isnan(event.low) else f"{number(event.low)} to {number(event.high)}"
         interval += " (not valid)" if interval and not event.valid else ""
-        ends = shown(event.start), shown(event.end)
-        fault = fault_text(event, shown)
+        ends = date_of(event.start), date_of(event.end)
+        fault = fault_text(event, date_of)
         rows.append((event.by, *ends, str(event.rows), fault, number(event.size), interval, f"{event.evidence:.3g}"))
     kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows[1:])]
     return [tuple(row[i] for i in kept) for row in rows], len(events) - len(rows) + 1
 
 
-def fault_text(event: AlarmEvent, shown: Callable[[float], str]) -> str:
+def fault_text(event: AlarmEvent, date_of: Callable[[float], str]) -> str:
     """Return what an alarm is said to be: with all that is as likely, whether it drifts, and since when it is
     shelved."""
     if not math.isnan(event.shelved):
-        return f"{event.fault} ({SHELVED.format(shown(event.shelved))})"
+        return f"{event.fault} ({SHELVED.format(date_of(event.shelved))})"
     if not event.distinguished:
         return NOT_DISTINGUISHED_YET
     if not event.fault:
@@ -269,22 +269,22 @@ def fault_text(event: AlarmEvent, shown: Callable[[float], str]) -> str:
 
 def rows_in_alarm(events: Sequence[AlarmEvent]) -> dict[str, int]:
     """Return how many rows were above the threshold of each column and monitor that alarmed."""
-    found = Counter[str]()
+    counts = Counter[str]()
     for event in events:
-        found[event.by] += event.rows
-    return dict(found)
+        counts[event.by] += event.rows
+    return dict(counts)
 
 
 def time_in_alarm(events: Sequence[AlarmEvent], rows: int) -> list[str]:
     """Return what share of so many ``rows`` was in alarm: an alarm that stands for hours is one event."""
-    found = []
+    sentences = []
     for by, count in rows_in_alarm(events).items():
         own = [event for event in events if event.by == by]
         longest = max(event.last_row - event.first_row + 1 for event in own)
-        alarms, lasting = (f"{n} {what}{'s' if n != 1 else ''}" for n, what in ((len(own), "alarm"), (longest, "row")))
-        told = f"{alarms}, the longest over {lasting}"
-        found.append(f"In alarm by {by}: {count} of {rows} rows ({100.0 * count / rows:.3g} %), {told}.")
-    return found
+        alarms, lasting = (f"{n} {noun}{'s' if n != 1 else ''}" for n, noun in ((len(own), "alarm"), (longest, "row")))
+        alarms_text = f"{alarms}, the longest over {lasting}"
+        sentences.append(f"In alarm by {by}: {count} of {rows} rows ({100.0 * count / rows:.3g} %), {alarms_text}.")
+    return sentences
 
 
 def alarm_notes(events: Sequence[AlarmEvent]) -> list[str]:
@@ -294,10 +294,10 @@ def alarm_notes(events: Sequence[AlarmEvent]) -> list[str]:
 
 def silence(run: Any, by: str) -> list[str]:
     """Return what a run without alarms says, and how many rows were without a decision; ``by`` names what watched."""
-    silent, found = sum(run.silent.values()), list[str]()
+    silent, sentences = sum(run.silent.values()), list[str]()
     if not run.alarms and silent < run.rows:
-        told = f" in the {run.rows - silent} rows that could alarm" if silent else ""
-        found.append(f"{NO_ALARM} by {by}{told}.")
+        where = f" in the {run.rows - silent} rows that could alarm" if silent else ""
+        sentences.append(f"{NO_ALARM} by {by}{where}.")
     if silent:
         causes = {status: count for status, count in run.silent.items() if status != PARTIAL}
         why = [
@@ -305,5 +305,5 @@ def silence(run: Any, by: str) -> list[str]:
             for status, count in causes.items()
         ]
         first = "the first " if set(causes) == {WARM_UP} else ""
-        found.append(f"No decision in {first}{silent} of {run.rows} rows: {'; '.join(why)}.")
-    return found
+        sentences.append(f"No decision in {first}{silent} of {run.rows} rows: {'; '.join(why)}.")
+    return sentences

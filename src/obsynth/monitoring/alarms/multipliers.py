@@ -52,8 +52,8 @@ def refuted(design: ObserverDesign, u: FloatArray, y: FloatArray) -> tuple[int, 
             values = exact_multipliers(programmes.window.outer, guess)
             margin = np.nan if values is None else margin_of(programmes.window.outer, values, y[-rows:], u[-rows:])
             if values is not None and margin > largest:
-                largest, told = margin, [str(value) for value in values]
-                best = place, rows, {"test": test.fault, "multipliers": told, "margin": margin}
+                largest, numbers = margin, [str(value) for value in values]
+                best = place, rows, {"test": test.fault, "multipliers": numbers, "margin": margin}
     return best
 
 
@@ -62,13 +62,13 @@ def margin_of(window: Window, values: list[Fraction], y: FloatArray, u: FloatArr
 
     All sums are exact, and the share is rounded down.
     """
-    seen = columns_of_exact(window, values)
-    if any(seen[j] for j in np.flatnonzero(window.free).tolist()):
+    combined = columns_of_exact(window, values)
+    if any(combined[j] for j in np.flatnonzero(window.free).tolist()):
         return np.nan
     right = exact_right_sides(window, y, u)
     total = abs(sum((value * side for value, side in zip(values, right, strict=True)), start=Fraction(0)))
     bounded = np.flatnonzero(window.bounded).tolist()
-    parts = [Fraction(float(window.bar[j])) * abs(seen[j]) for j in bounded]
+    parts = [Fraction(float(window.bar[j])) * abs(combined[j]) for j in bounded]
     allowed = sum(parts, start=Fraction(0))
     if window.question.ellipsoid:
         allowed = Fraction(sum_in_ellipsoids(window, parts))
@@ -85,9 +85,9 @@ def statement_of(
     window = Programmes.of(test).window
     plant, question = window.plant, window.question
     source = "a record" if log is None else f"{log.name} (sha256 {log.sha256[:SHOWN_DIGITS]})"
-    others = [plant.fault_names[k] for k in question.free]
-    besides = f", whatever {' and '.join(others)} does" if others else ""
-    one, bounds = " or ".join(group), window.bounds
+    free_faults = [plant.fault_names[k] for k in question.free]
+    besides = f", whatever {' and '.join(free_faults)} does" if free_faults else ""
+    fault, bounds = " or ".join(group), window.bounds
     noise = np.abs(bounds.noise_output) @ bounds.noise
     d_middle = bounds.disturbance_middle
     v_middle = None if bounds.noise_middle is None else bounds.noise_output @ bounds.noise_middle
@@ -102,7 +102,7 @@ def statement_of(
     assumed = ", ".join(part for part in parts if part) or "any disturbances and noise"
     return (
         f"Proved: rows {row - rows_of_test(test) + 1} to {row} of {source} cannot occur without "
-        f"{one}{besides}{while_inside(test)}, with {assumed}: {one} is present, or the model is not exact. "
+        f"{fault}{besides}{while_inside(test)}, with {assumed}: {fault} is present, or the model is not exact. "
         f"Gain set {gain_set[:SHOWN_DIGITS]}."
     )
 
@@ -116,17 +116,17 @@ def _listed(
     middles: FloatArray | None = None,
 ) -> str:
     about = np.zeros(len(sizes)) if middles is None else middles
-    known = [
+    bounded = [
         (name, size, middle)
         for name, size, middle in zip(names, sizes.tolist(), about.tolist(), strict=True)
         if np.isfinite(size) and (size > 0.0 or middle)
     ]
-    if len(known) > MOST_LISTED:
-        return f"{len(known)} {kind} {word} their bounds"
-    return ", ".join(_told(name, size, middle, units.get(name, ""), word) for name, size, middle in known)
+    if len(bounded) > MOST_LISTED:
+        return f"{len(bounded)} {kind} {word} their bounds"
+    return ", ".join(_bound_text(name, size, middle, units.get(name, ""), word) for name, size, middle in bounded)
 
 
-def _told(name: str, size: float, middle: float, unit: str, word: str) -> str:
+def _bound_text(name: str, size: float, middle: float, unit: str, word: str) -> str:
     noise = word == "noise of"
     if middle:
         # Ends are told as they were given, which half width and middle are to some digits.
@@ -139,10 +139,10 @@ def _told(name: str, size: float, middle: float, unit: str, word: str) -> str:
 
 def checked(design: ObserverDesign, body: Mapping[str, Any], u: FloatArray, y: FloatArray) -> Iterator[Any]:
     """Yield the test of a certificate, the group of faults, and the margin that is proved again."""
-    whole = GuaranteedTest.of(design)
-    place = [test.fault for test in whole.tests].index(body["test"])
-    test = whole.tests[place]
+    bank = GuaranteedTest.of(design)
+    place = [test.fault for test in bank.tests].index(body["test"])
+    test = bank.tests[place]
     window = Programmes.of(test).window.outer
     values = [Fraction(text) for text in body["multipliers"]]
     fits = len(values) == window.rows and len(y) == len(u) == rows_of_test(test)
-    yield test, whole.groups[place], margin_of(window, values, y, u) if fits else np.nan
+    yield test, bank.groups[place], margin_of(window, values, y, u) if fits else np.nan

@@ -110,11 +110,11 @@ def proved_alarm(
     A design that fails its own verification proves nothing: `VerificationError`, unless ``unverified``, and then no
     alarm is proved."""
     if is_guaranteed(design):
-        given = {
+        stated = {
             "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound, "initial_set": initial_set,
             "state_bounds": state_bounds, "disturbance": None if disturbance == "any" else disturbance,
         }  # fmt: skip
-        refuse_bounds(given)
+        refuse_bounds(stated)
         return _proved_by_test(design, u, y, log, unverified=unverified)
     assumed = assumptions_of(design, disturbance_bounds, noise_bound, initial_set, state_bounds, window, disturbance)
     row, length = len(y), min(window, len(y))
@@ -124,11 +124,11 @@ def proved_alarm(
         programme, origin = programme_of(design, assumed, window, u, y)
     except PreconditionError as error:
         return AlarmProof(False, row, length, 0.0, f"Cannot be proved: {error}", "", {})
-    found = solved(programme)
-    if found is None:
+    multipliers = solved(programme)
+    if multipliers is None:
         text = "Cannot be proved: the linear-programming solver returned no multipliers."
         return AlarmProof(False, row, length, 0.0, text, origin, {})
-    equal, below = found
+    equal, below = multipliers
     margin = float(programme.proved_least(equal, below))
     if not margin > 0.0:
         text = (
@@ -177,17 +177,17 @@ def _proved_by_test(
     design: ObserverDesign, u: FloatArray, y: FloatArray, log: LogReference | None, *, unverified: bool
 ) -> AlarmProof:
     """Return the proof of a guaranteed test: a fraction for each equation of its window."""
-    whole, row = GuaranteedTest.of(design), len(y)
-    most = max(map(rows_of_test, whole.tests))
+    bank, row = GuaranteedTest.of(design), len(y)
+    most = max(map(rows_of_test, bank.tests))
     if (failing := _failing(design, unverified=unverified)) is not None:
         return AlarmProof(False, row, most, 0.0, failing, "", {})
-    found = refuted(design, u, y)
-    if found is None:
+    refutation = refuted(design, u, y)
+    if refutation is None:
         text = f"Cannot be proved: within the bounds of the design, the last {most} samples may be without a fault."
         return AlarmProof(False, row, most, 0.0, text, "", {})
-    place, rows, numbers = found
+    place, rows, numbers = refutation
     gain_set = design_as_dict(design)
-    text = statement_of(whole.tests[place], whole.groups[place], row, log, gain_set["sha256"])
+    text = statement_of(bank.tests[place], bank.groups[place], row, log, gain_set["sha256"])
     certificate = {
         **numbers, "u": u[-rows:], "y": y[-rows:], "row": row, "statement": text,
         "log": None if log is None else log.as_dict(),
@@ -261,8 +261,8 @@ def programme_of(
     return window_programme(affine, bounds, data), origin
 
 
-def _as_lists(given: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: list(value) if isinstance(value, (list, tuple)) else value for name, value in given.items()}
+def _as_lists(bounds: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: list(value) if isinstance(value, (list, tuple)) else value for name, value in bounds.items()}
 
 
 def solved(programme: Programme) -> tuple[FloatArray, FloatArray] | None:
@@ -272,18 +272,21 @@ def solved(programme: Programme) -> tuple[FloatArray, FloatArray] | None:
     equal, below = programme.matrices()
     cost = np.zeros(len(programme.lower))
     cost[-1] = 1.0
-    given = {"A_eq": equal, "b_eq": programme.equal.right} if programme.equal.right else {}
-    found = linprog(
+    equations = {"A_eq": equal, "b_eq": programme.equal.right} if programme.equal.right else {}
+    solution = linprog(
         cost,
         A_ub=below,
         b_ub=programme.below.right,
         bounds=np.stack([programme.lower, programme.upper], axis=1),
         method="highs",
         options={"time_limit": SOLVER_SECONDS},
-        **given,
+        **equations,
     )
-    if found.status != 0:
+    if solution.status != 0:
         return None
-    multipliers = (found.eqlin.marginals if programme.equal.right else (), np.minimum(found.ineqlin.marginals, 0.0))
+    multipliers = (
+        solution.eqlin.marginals if programme.equal.right else (),
+        np.minimum(solution.ineqlin.marginals, 0.0),
+    )
     equal, below = (np.array([float(f"{value:.{MULTIPLIER_DIGITS}g}") for value in part]) for part in multipliers)
     return equal, below

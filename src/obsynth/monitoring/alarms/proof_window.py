@@ -76,13 +76,13 @@ class Programme:
         """Return both sets of rows as sparse matrices."""
         from scipy.sparse import csr_array
 
-        found = []
+        matrices = []
         for rows in (self.equal, self.below):
             starts = np.cumsum([0, *(len(item) for item in rows.columns)])
             columns = np.array([j for item in rows.columns for j in item], dtype=np.int64)
             values = np.array([value for item in rows.values for value in item])
-            found.append(csr_array((values, columns, starts), shape=(len(rows.right), len(self.lower))))
-        return found[0], found[1]
+            matrices.append(csr_array((values, columns, starts), shape=(len(rows.right), len(self.lower))))
+        return matrices[0], matrices[1]
 
     def proved_least(self, equal: FloatArray, below: FloatArray) -> Fraction:
         """Return a lower bound of the least t from any multipliers (of inequalities: 0 or less), in exact arithmetic.
@@ -167,11 +167,11 @@ class _Builder:
         steps, largest = len(self.size), self.size.max(axis=0, initial=0.0)
         least = float(min(largest[largest > 0.0], default=1.0))
         own = np.array([_power_of_two(value if value > 0.0 else least) for value in largest])
-        found = np.ones(self.t + 1)
-        found[: self.d] = np.tile(own, steps)
-        found[self.d : self.q] = np.tile([_power_of_two(value if value > 0.0 else 1.0) for value in bounds], steps)
-        found[self.products : self.t] = np.tile(own[[j for _, j in self.pairs]], steps)
-        return found
+        scales = np.ones(self.t + 1)
+        scales[: self.d] = np.tile(own, steps)
+        scales[self.d : self.q] = np.tile([_power_of_two(value if value > 0.0 else 1.0) for value in bounds], steps)
+        scales[self.products : self.t] = np.tile(own[[j for _, j in self.pairs]], steps)
+        return scales
 
     def state(self, k: int, i: int) -> int:
         return k * self.n + i
@@ -264,23 +264,23 @@ def window_data(
     estimates = observer.run(y, u if u.shape[1] else None)
     rows = np.hstack([estimates.states, estimates.faults, estimates.residuals])
     read = rows @ structure.reading.T
-    found = thresholds_of_records(bound, read[None], u[None], y[None])
-    middle = read - found.shift[0]
-    width = (found.total - np.abs(found.shift))[0] + WINDOW_OUTWARD * (np.abs(read) + found.total[0])
+    thresholds = thresholds_of_records(bound, read[None], u[None], y[None])
+    middle = read - thresholds.shift[0]
+    width = (thresholds.total - np.abs(thresholds.shift))[0] + WINDOW_OUTWARD * (np.abs(read) + thresholds.total[0])
     low, high = (middle - width)[first:], (middle + width)[first:]
     return affine, WindowData(u[first:], y[first:], low, high), REPLAY
 
 
-def _stated(affine: AffinePlant, given: Mapping[str, Any], steps: int) -> tuple[FloatArray, FloatArray]:
+def _stated(affine: AffinePlant, bounds: Mapping[str, Any], steps: int) -> tuple[FloatArray, FloatArray]:
     names = affine.plant.state_names
-    missing = [name for name in names if name not in given]
+    missing = [name for name in names if name not in bounds]
     if missing:
         raise SpecError(
             f"Nothing bounds the state {missing[0]!r}: give initial_set (--initial), or its bound.", path="initial_set"
         )
     sizes = np.array(
         [
-            real_number(given[name], f"The bound of {name!r}", "a number, 0 or more", least=0.0, path="state_bounds")
+            real_number(bounds[name], f"The bound of {name!r}", "a number, 0 or more", least=0.0, path="state_bounds")
             for name in names
         ]
     )

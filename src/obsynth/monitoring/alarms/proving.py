@@ -146,15 +146,15 @@ def rows_of(
     ``complete``: so many of the last rows have to be without gaps; all by default.
     """
     run = LogRun(design, columns, scales)
-    found, flawed, count, status = list[FloatArray](), list[tuple[bool, bool, int]](), 0, ""
+    rows, flawed, count, status = list[FloatArray](), list[tuple[bool, bool, int]](), 0, ""
     for count, (time, values) in enumerate(itertools.islice(samples(data, run.signals), row), 1):
         status = run.clock.stale(time)
         if status:
             # The same rows are left out as in a run.
             continue
         _, missing = run.clock.advance(time, count)
-        flawed.append((bool(missing and found), not np.isfinite(values).all(), count))
-        found.append(values)
+        flawed.append((bool(missing and rows), not np.isfinite(values).all(), count))
+        rows.append(values)
     if count < row:
         raise SpecError(f"The data have {count} rows: row {row} is not among them.", path="row")
     if status:
@@ -163,4 +163,4 @@ def rows_of(
         # Of what is before the first row of a window nothing is asked.
         if blank or (gap and (place or complete is None)):
             raise SpecError(f"Row {number} has a gap before it or misses a sample: give complete rows.", path="data")
-    return np.array(found)
+    return np.array(rows)

@@ -86,9 +86,9 @@ def read_by_package(path: Path) -> Iterator[None]:
 
 
 def _unreadable(path: Path, package: str, error: Exception) -> SpecError:
-    told = " ".join(reason(error).split()) or type(error).__name__
+    cause = " ".join(reason(error).split()) or type(error).__name__
     return SpecError(
-        f"{path} cannot be read: {package} says {told!r}. If the file is damaged, or its end is missing, copy it or "
+        f"{path} cannot be read: {package} says {cause!r}. If the file is damaged, or its end is missing, copy it or "
         "export it again.",
         path=str(path),
     )
@@ -144,16 +144,16 @@ def _parquet_header(schema: Any, time: str) -> tuple[list[str], str, tuple[float
 def _only(path: Path, name: str, channels: Sequence[tuple[str, str, Any]]) -> Any:
     """Return the channel that is called so, or as its group and it, such as ``rig/level``; `None` where there is none.
     ``channels`` are groups, names and channels."""
-    found = [(group, channel) for group, own, channel in channels if name in (own, f"{group}/{own}")]
-    found = found or [(group, channel) for group, own, channel in channels if column_of([own], name)]
-    if len(found) > 1:
-        groups = ", ".join(repr(group) for group, _ in found)
+    matches = [(group, channel) for group, own, channel in channels if name in (own, f"{group}/{own}")]
+    matches = matches or [(group, channel) for group, own, channel in channels if column_of([own], name)]
+    if len(matches) > 1:
+        groups = ", ".join(repr(group) for group, _ in matches)
         raise SpecError(
             f"{path} has more than one channel {name!r}, in the groups {groups}: name the group too, such as "
-            f"'{found[0][0]}/{name}' (--map, or columns={{...}}).",
+            f"'{matches[0][0]}/{name}' (--map, or columns={{...}}).",
             path=str(path),
         )
-    return found[0][1] if found else None
+    return matches[0][1] if matches else None
 
 
 def _tdms(path: Path, signals: LogSignals, stamps: Stamps, rows: int) -> Iterator[pd.DataFrame]:
@@ -164,20 +164,20 @@ def _tdms(path: Path, signals: LogSignals, stamps: Stamps, rows: int) -> Iterato
         if file.file_status.incomplete_final_segment:
             stamps.notes.append(f"{path} ends within its last segment: what follows was lost, or not written yet.")
         channels = _tdms_channels(file)
-        found = {name: _only(path, name, channels) for name in signals.columns}
-        wanted = {name: channel for name, channel in found.items() if channel is not None}
+        by_name = {name: _only(path, name, channels) for name in signals.columns}
+        wanted = {name: channel for name, channel in by_name.items() if channel is not None}
         frame: dict[str, Any] = {name: channel[:] for name, channel in wanted.items()}
         time = signals.columns[0]
         lengths = {name: len(values) for name, values in frame.items()}
         if len(set(lengths.values())) > 1:
-            told = ", ".join(f"{name!r} {count}" for name, count in lengths.items())
-            raise SpecError(f"{path}: the channels have different numbers of samples: {told}.", path=str(path))
+            listed = ", ".join(f"{name!r} {count}" for name, count in lengths.items())
+            raise SpecError(f"{path}: the channels have different numbers of samples: {listed}.", path=str(path))
         if time not in frame and wanted:
             waves = {name: channel for name, channel in wanted.items() if "wf_increment" in channel.properties}
             if waves:
                 frame = {time: _wave_times(path, waves), **frame}
-        others = {name: np.zeros(0) for _, name, _ in channels if name not in frame}
-        yield from _frames(frame, others, signals, rows)
+        unread = {name: np.zeros(0) for _, name, _ in channels if name not in frame}
+        yield from _frames(frame, unread, signals, rows)
 
 
 def _tdms_channels(file: Any) -> list[tuple[str, str, Any]]:
@@ -224,22 +224,22 @@ def _wave_times(path: Path, waves: dict[str, Any]) -> FloatArray:
 def _mdf(path: Path, signals: LogSignals, stamps: Stamps, rows: int) -> Iterator[pd.DataFrame]:
     """Yield the channels of an MDF file on the raster of the first signal, with the stamps of the time channel."""
     with _mdf_file(path) as file:
-        known = _mdf_channels(file)
+        channels = _mdf_channels(file)
         masters = set(file.masters_db.items())
         time = signals.columns[0]
-        found = {name: _only(path, name, known) for name in signals.columns[1:]}
-        wanted = {name: place for name, place in found.items() if place is not None}
+        by_name = {name: _only(path, name, channels) for name in signals.columns[1:]}
+        wanted = {name: place for name, place in by_name.items() if place is not None}
         frame: dict[str, Any] = {}
         if wanted:
             raster = np.asarray(file.get_master(next(iter(wanted.values()))[0]), dtype=np.float64)
-            of_time = _only(path, time, [entry for entry in known if entry[2] not in masters])
-            names = {name for _, name, place in known if place in masters}
+            of_time = _only(path, time, [entry for entry in channels if entry[2] not in masters])
+            names = {name for _, name, place in channels if place in masters}
             if of_time is not None:
                 frame[time] = _on_raster(file, time, of_time, raster)
             elif time == TIME_HEADER or time in names:
                 frame[time] = raster
             frame.update({name: _on_raster(file, name, place, raster) for name, place in wanted.items()})
-        yield from _frames(frame, dict.fromkeys(name for _, name, _ in known), signals, rows)
+        yield from _frames(frame, dict.fromkeys(name for _, name, _ in channels), signals, rows)
 
 
 def _mdf_channels(file: Any) -> list[tuple[str, str, tuple[int, int]]]:
@@ -330,23 +330,23 @@ _Channels: TypeAlias = "Callable[[Path], list[tuple[str, str, Any]]]"
 def _arrays(channels_of: _Channels, path: Path, signals: LogSignals, _: Stamps, rows: int) -> Iterator[pd.DataFrame]:
     """Yield the arrays of a file that are read."""
     channels = channels_of(path)
-    found = {name: _only(path, name, channels) for name in signals.columns}
-    frame = channel_frame({name: values for name, values in found.items() if values is not None}, path)
-    others = dict.fromkeys(name for _, name, _ in channels if name not in frame)
-    yield from _frames({str(name): frame[name] for name in frame}, others, signals, rows)
+    by_name = {name: _only(path, name, channels) for name in signals.columns}
+    frame = channel_frame({name: values for name, values in by_name.items() if values is not None}, path)
+    unread = dict.fromkeys(name for _, name, _ in channels if name not in frame)
+    yield from _frames({str(name): frame[name] for name in frame}, unread, signals, rows)
 
 
 def _array_names(channels_of: _Channels, path: Path, wanted: Sequence[str]) -> list[str]:
     return _called(channels_of(path), wanted, have_times=False)
 
 
-def _frames(found: dict[str, Any], others: dict[str, Any], signals: LogSignals, rows: int) -> Iterator[pd.DataFrame]:
+def _frames(columns: dict[str, Any], unread: dict[str, Any], signals: LogSignals, rows: int) -> Iterator[pd.DataFrame]:
     """Yield columns in chunks; names that are not there are told with all that are."""
     import pandas as pd
 
-    if not set(signals.columns) <= set(found):
-        signals.positions(tuple(dict.fromkeys((*found, *others))))
-    frame = pd.DataFrame(found)
+    if not set(signals.columns) <= set(columns):
+        signals.positions(tuple(dict.fromkeys((*columns, *unread))))
+    frame = pd.DataFrame(columns)
     for start in range(0, max(len(frame), 1), rows):
         yield frame.iloc[start : start + rows]
 

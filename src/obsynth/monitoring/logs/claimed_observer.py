@@ -46,23 +46,23 @@ class ClaimedLogObserver(LogObserver):
 
     def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
         """Take one row."""
-        whole = bool(np.isfinite(values[self._needed]).all())
-        if not self.begun and not whole:
+        complete = bool(np.isfinite(values[self._needed]).all())
+        if not self.begun and not complete:
             return Row(GAP, np.full(len(self.columns), np.nan), missing)
         if missing or not self.begun:
             self.state, self.begun, seconds = self.observer.init(), True, 0.0
             self.settled_at, self.phase = self._after(time, self.warm_up), WARM_UP
         row = self._advance(values, seconds)
-        if not whole:
+        if not complete:
             # Warm-up goes on where it had not ended: nothing was known before.
             self.phase = self.phase if self.phase == WARM_UP else RECOVERING
             self.settled_at = max(self.settled_at, self._after(time, self._forgetting))
-        status, nu = self._status(time, whole=whole), len(self.input_names)
+        status, nu = self._status(time, complete=complete), len(self.input_names)
         sample = LinearSample(row, values[:nu], values[nu:], len(self.state_names))
-        return Row(status, row if whole else np.full(len(row), np.nan), missing, sample if status == OK else None)
+        return Row(status, row if complete else np.full(len(row), np.nan), missing, sample if status == OK else None)
 
-    def _status(self, time: float, *, whole: bool) -> str:
-        if not whole:
+    def _status(self, time: float, *, complete: bool) -> str:
+        if not complete:
             return GAP
         if self.state.unclaimed:
             return OUT

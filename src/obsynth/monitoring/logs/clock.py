@@ -52,9 +52,9 @@ class StampError(SpecError):
         super().__init__(message, path=f"row {row}")
         self.row, self.last, self.time = row, last, time
 
-    def dated(self, shown: Callable[[float], str]) -> str:
+    def dated(self, date_of: Callable[[float], str]) -> str:
         """Return the message with dates as the log writes them."""
-        return f"Row {self.row}: the time falls from {shown(self.last)} to {shown(self.time)}."
+        return f"Row {self.row}: the time falls from {date_of(self.last)} to {date_of(self.time)}."
 
 
 class Clock:
@@ -75,8 +75,8 @@ class Clock:
 
     def as_dict(self) -> dict[str, Any]:
         """Return what goes from row to row, as data."""
-        found = {name: getattr(self, name) for name in ("last", "longest", "stamp", "away", "left_out", "count")}
-        return found | ({"longer": self.longer, "is_uneven": self.is_uneven} if self.irregular else {})
+        state = {name: getattr(self, name) for name in ("last", "longest", "stamp", "away", "left_out", "count")}
+        return state | ({"longer": self.longer, "is_uneven": self.is_uneven} if self.irregular else {})
 
     def resume(self, data: Mapping[str, Any]) -> None:
         """Go on from what `as_dict` returned."""
@@ -133,9 +133,9 @@ class Clock:
     def regular(self, times: Sequence[float]) -> list[float]:
         """Return the intervals to the first of these stamps that certainly follow each other without a gap; nothing is
         taken."""
-        found: list[float] = []
+        steps: list[float] = []
         if self.last is None or not self.longest > 0.0:
-            return found
+            return steps
         before, longest = self.last, GAP_FACTOR * self.longest if self.gap is None else self.gap
         lowest, highest = 0.0, longest
         if self.dt > 0.0:
@@ -145,9 +145,9 @@ class Clock:
             step = interval(before, time) if time > before and time < math.inf else 0.0
             if not lowest <= step <= highest or step <= 0.0:
                 break
-            found.append(step)
+            steps.append(step)
             before = time
-        return found
+        return steps
 
     def take(self, times: Sequence[float], steps: Sequence[float]) -> None:
         """Take stamps that `regular` found to follow each other, with their intervals."""

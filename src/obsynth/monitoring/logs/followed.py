@@ -85,17 +85,17 @@ class FollowedLog:
     def _turned(self) -> bool:
         """Go on with the file that has taken this one's place, if there is one."""
         try:
-            there = os.stat(self._path)
+            file_by_name = os.stat(self._path)
         except OSError:
             return False  # between the old file and the new one
-        here = os.fstat(self._file.fileno())
-        is_same = (there.st_dev, there.st_ino) == (here.st_dev, here.st_ino)
-        if is_same and there.st_size >= self._file.tell():
+        open_file = os.fstat(self._file.fileno())
+        is_same = (file_by_name.st_dev, file_by_name.st_ino) == (open_file.st_dev, open_file.st_ino)
+        if is_same and file_by_name.st_size >= self._file.tell():
             return False
-        rest = self._part if is_same else self._part + self._file.read()
+        unread = self._part if is_same else self._part + self._file.read()
         self._file.close()
         # A last line that was never ended is a line.
-        self._lines.extend(line if line.endswith(b"\n") else line + b"\n" for line in rest.splitlines(keepends=True))
+        self._lines.extend(line if line.endswith(b"\n") else line + b"\n" for line in unread.splitlines(keepends=True))
         self._lines.append(NEW_FILE)
         self._file, self._part = self._opened(), b""
         return True

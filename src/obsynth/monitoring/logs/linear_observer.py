@@ -106,10 +106,10 @@ class LinearLogObserver(LogObserver):
 
     def _usual(self) -> FloatArray | None:
         """Return what a gap may have left in fault estimates and residuals; nothing where that is not known yet."""
-        shown = self.counted >= LEAST_SHOWN
-        if not shown and not self.noise.all():
+        enough = self.counted >= LEAST_SHOWN
+        if not enough and not self.noise.all():
             return None
-        changes = self.changes / self.counted if shown else np.zeros_like(self.changes)
+        changes = self.changes / self.counted if enough else np.zeros_like(self.changes)
         return np.asarray(np.sqrt(np.maximum(GAP_LEFT_SHARE**2 * changes, self.noise)))
 
     def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
@@ -145,7 +145,7 @@ class LinearLogObserver(LogObserver):
                 if self.model is None:
                     self._advance_excess(seconds)
                 self.moves = taken_inputs(self.moves, self.v[: self.nu], u, is_first=first).history
-                found = self._measured(seconds, values)
+                estimates = self._measured(seconds, values)
                 if self.model is not None:
                     self.model, self.left, self.reach = None, np.zeros_like(self.left), np.zeros(self.nu)
                     # The initial-condition response settles in as many measured rows as without a gap: what the gap
@@ -156,38 +156,47 @@ class LinearLogObserver(LogObserver):
                     self.clear_at = self._after(time, max(self.warm_up, self.transient, unsure))
                 status = OK if time >= self.settled_at else self.phase
             else:
-                found, status = self._unmeasured(seconds, u, values), GAP
+                estimates, status = self._unmeasured(seconds, u, values), GAP
         if status == GAP:
             self.settled_at += since if self.phase == WARM_UP else 0.0
-            return Row(GAP, found, missing, bridged=self.bridged)
-        if self.z is None or not (np.isfinite(self.z).all() and np.isfinite(found).all()):
+            return Row(GAP, estimates, missing, bridged=self.bridged)
+        if self.z is None or not (np.isfinite(self.z).all() and np.isfinite(estimates).all()):
             self._restart()
             return Row(GAP, self._held(), missing)
-        self.fault = self._faults_in(found)
+        self.fault = self._faults_in(estimates)
         # Until enough is known of what is usual, rows after a gap tell it, too: others may never come.
         counts = status == OK or (status == RECOVERING and self.counted < LEAST_SHOWN)
         if previous is not None and counts and not missing:
-            self._count((found - previous)[None])
-        sample = LinearSample(found, values[: self.nu], values[self.nu :], len(self.state_names))
-        return self._complete_row(status, found, missing, sample, time)
+            self._count((estimates - previous)[None])
+        sample = LinearSample(estimates, values[: self.nu], values[self.nu :], len(self.state_names))
+        return self._complete_row(status, estimates, missing, sample, time)
 
     def _complete_row(
-        self, status: str, found: FloatArray, missing: int, sample: LinearSample, time: float, *, clear: bool = False
+        self,
+        status: str,
+        estimates: FloatArray,
+        missing: int,
+        sample: LinearSample,
+        time: float,
+        *,
+        clear: bool = False,
     ) -> Row:
         """Return a complete row; ``clear`` where it is known that gaps have left nothing."""
         settled = time >= self.clear_at
         self.bridged |= settled and time >= self.known_from
-        return Row(status, found, missing, sample, settled, None if clear else self._excess_in(status), self.bridged)
+        return Row(
+            status, estimates, missing, sample, settled, None if clear else self._excess_in(status), self.bridged
+        )
 
     def _excess_in(self, status: str) -> FloatArray | None:
         """Return what gaps can have left in the columns of a complete row, of one that is recovering."""
         if status != RECOVERING:
             self.excess, self.carried = np.zeros_like(self.excess), np.zeros_like(self.carried)
             return None
-        found = self._shown_excess()
+        excess = self._shown_excess()
         if self.observer.dt > 0.0:
             self.excess = self.observer.Az @ self.excess
-        return found
+        return excess
 
     def _shown_excess(self) -> FloatArray:
         return np.asarray(self.carried + np.abs(self.observer.Cz @ self.excess).sum(axis=1))
@@ -219,9 +228,9 @@ class LinearLogObserver(LogObserver):
                 if sampled:
                     z = observer.Az @ z + self.b @ v
         after = np.vstack([states[1:], z]) if sampled else states
-        known = np.isfinite(after).all(axis=1) & np.isfinite(rows).all(axis=1)
-        if not known.all():
-            count = int(np.argmin(known))
+        finite = np.isfinite(after).all(axis=1) & np.isfinite(rows).all(axis=1)
+        if not finite.all():
+            count = int(np.argmin(finite))
             if not count:
                 return []
         last = count - 1
@@ -235,14 +244,14 @@ class LinearLogObserver(LogObserver):
         self.seen = self._states(states[last], values[last], rows[last], self.fault)
         self.inputs = np.vstack([self.inputs, values[:count, : self.nu]])[-self.kept_inputs :]
         settled, phase = self.settled_at, self.phase
-        nu, nx, found, clear = self.nu, len(self.state_names), list[Row](), False
+        nu, nx, taken, clear = self.nu, len(self.state_names), list[Row](), False
         for time, seconds, row, v in zip(times[:count], intervals[:count], rows[:count], values[:count], strict=True):
             if not clear:
                 self._advance_excess(seconds)
-            status, said = OK if time >= settled else phase, LinearSample(row, v[:nu], v[nu:], nx)
-            found.append(self._complete_row(status, row, 0, said, time, clear=clear))
+            status, sample = OK if time >= settled else phase, LinearSample(row, v[:nu], v[nu:], nx)
+            taken.append(self._complete_row(status, row, 0, sample, time, clear=clear))
             clear = status != RECOVERING
-        return found
+        return taken
 
     def _measured(self, seconds: float, v: FloatArray) -> FloatArray:
         if self.observer.dt == 0.0:
@@ -290,20 +299,20 @@ class LinearLogObserver(LogObserver):
         if not (np.isfinite(self.left).all() and step > 0.0):
             self.carried = np.full_like(self.carried, np.inf)
             return self.warm_up, self.warm_up
-        a, left = self.observer.Az, self.left
+        a, remaining = self.observer.Az, self.left
         if self.observer.dt == 0.0:
             transition, constant, _ = self._hold(seconds or step)
-            told = left.any(axis=0) & np.repeat([False, True], [nu, len(self.output_names)])
-            a, left = self._hold(step)[0], transition @ left + constant * told
-        self.excess = left * missed
+            from_model = remaining.any(axis=0) & np.repeat([False, True], [nu, len(self.output_names)])
+            a, remaining = self._hold(step)[0], transition @ remaining + constant * from_model
+        self.excess = remaining * missed
         if usual is None:
             return self.warm_up, self.warm_up
         rows, waited, recovered = self.observer.Cz[self.shown], 0.0, self.warm_up
         longest_wait = MOST_TRANSIENTS * self.transient
         # The first row after a gap always counts as recovering.
         while waited < max(self.warm_up, longest_wait if np.isfinite(longest_wait) else 0.0):
-            left, waited = a @ left, waited + step
-            kept = np.abs(rows @ left) @ missed
+            remaining, waited = a @ remaining, waited + step
+            kept = np.abs(rows @ remaining) @ missed
             if np.all(kept <= usual):
                 recovered = min(recovered, waited)
             if np.all(kept <= GUARANTEED_SHARE * usual):
@@ -355,23 +364,23 @@ class LinearLogObserver(LogObserver):
             return self._held()
         if self.model is None:
             self.carried, self.excess = self._shown_excess(), np.zeros_like(self.excess)
-            known = self.inputs if self.observer.dt > 0.0 else ()
-            self.model, self.held = self.gap_model.start(self.seen, known, self.fault), self.v[: self.nu]
+            inputs = self.inputs if self.observer.dt > 0.0 else ()
+            self.model, self.held = self.gap_model.start(self.seen, inputs, self.fault), self.v[: self.nu]
             if self.observer.dt == 0.0:
                 self._propagate(seconds, u)
         else:
             self._propagate(seconds, u)
         # What is measured is taken; what is not, the model says.
-        told = ~np.isfinite(values)
-        self.bridged &= not told[: self.nu].any()
-        v = np.where(told, np.concatenate([u, self.gap_model.outputs(self.model, u, self.fault)]), values)
-        self._unknown_inputs(np.where(told, np.nan, values)[: self.nu])
+        from_model = ~np.isfinite(values)
+        self.bridged &= not from_model[: self.nu].any()
+        v = np.where(from_model, np.concatenate([u, self.gap_model.outputs(self.model, u, self.fault)]), values)
+        self._unknown_inputs(np.where(from_model, np.nan, values)[: self.nu])
         if self.observer.dt == 0.0:
             self._flow(seconds, v)
             transition, constant, _ = self._hold(seconds)
-            self.left = transition @ self.left + constant * told
+            self.left = transition @ self.left + constant * from_model
         else:
-            self.left = self.observer.Az @ self.left + self.b * told
+            self.left = self.observer.Az @ self.left + self.b * from_model
         row = np.asarray(self.observer.Cz @ self.z + self.d @ v + self.observer.added)
         self._taken(v)
         row[self.observer.fault_rows] = self.fault[self.told_faults]
@@ -383,12 +392,12 @@ class LinearLogObserver(LogObserver):
 
     def _unknown_inputs(self, u: FloatArray) -> None:
         """Follow how far inputs may have moved that are missing (NaN in ``u (nu,)``)."""
-        before, known = self.v[: self.nu], taken_inputs(self.moves, self.v[: self.nu], u, is_first=False)
-        lowest, highest, change, count, _ = known.history
-        returned = np.where((count == 0.0) & (self.moves[3] > 0.0), np.abs(known.u - before), 0.0)
+        before, taken = self.v[: self.nu], taken_inputs(self.moves, self.v[: self.nu], u, is_first=False)
+        lowest, highest, change, count, _ = taken.history
+        returned = np.where((count == 0.0) & (self.moves[3] > 0.0), np.abs(taken.u - before), 0.0)
         # In one sample an input is off by what it has changed since; in several it may have come and gone.
         moved = np.where(count > 1.0, np.minimum(count * change, highest - lowest), returned)
-        self.moves, self.reach = known.history, np.maximum(self.reach, moved)
+        self.moves, self.reach = taken.history, np.maximum(self.reach, moved)
 
     def _propagate(self, seconds: float, u: FloatArray) -> None:
         before, model = self.v[: self.nu], _running(self.model)

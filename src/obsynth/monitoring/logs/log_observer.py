@@ -83,10 +83,10 @@ class LogObserver(ABC):
     @property
     def lags(self) -> list[tuple[str, int]]:
         """Name and delay in samples of what lags: the states (together where they lag alike), and each fault."""
-        found = list(zip(self.estimated, (*self.state_delays, *self.fault_delays), strict=True))
+        delays = list(zip(self.estimated, (*self.state_delays, *self.fault_delays), strict=True))
         if len(set(self.state_delays)) == 1:
-            found[: len(self.state_names)] = [("xhat", self.state_delays[0])]
-        return [(name, delay) for name, delay in found if delay]
+            delays[: len(self.state_names)] = [("xhat", self.state_delays[0])]
+        return [(name, delay) for name, delay in delays if delay]
 
     @abstractmethod
     def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
@@ -120,8 +120,8 @@ class LogObserver(ABC):
     def resume(self, data: Mapping[str, Any]) -> None:
         """Go on from what `as_dict` returned."""
         if any(data[name] != value for name, value in self.options.items()):
-            told = " or ".join(name.replace("_", "-") for name in sorted(self.options))
-            raise SpecError(f"The saved state is of a run with another {told}: use the same options.", path="state")
+            listed = " or ".join(name.replace("_", "-") for name in sorted(self.options))
+            raise SpecError(f"The saved state is of a run with another {listed}: use the same options.", path="state")
         self.settled_at, self.phase = data["settled_at"], data["phase"]
         for key, name in self.saved.items():
             own = getattr(self, name)

@@ -80,9 +80,9 @@ class OperatingPointCheck:
             if not (time - self._begin <= FIRST_SECONDS and self._taken < MOST_FIRST_ROWS):
                 break
             self._taken += 1
-            known = np.isfinite(row)
-            self._sum[known] += row[known]
-            self._count[known] += 1.0
+            finite = np.isfinite(row)
+            self._sum[finite] += row[finite]
+            self._count[finite] += 1.0
 
     def alarm_of_the_start(self, design: ObserverDesign, alarms: Sequence[AlarmEvent]) -> tuple[str, ...]:
         """Return a text where an alarm of a linear design may be its initial-condition response: when the warm-up
@@ -100,9 +100,9 @@ class OperatingPointCheck:
             return ()
         noise = np.linalg.norm(plant.Dw, axis=1)
         started = np.abs(self._start[len(self._start) - observer.By.shape[1] :])
-        if len(noise) != len(started) or not np.any(known := np.isfinite(started) & (noise > 0.0)):
+        if len(noise) != len(started) or not np.any(comparable := np.isfinite(started) & (noise > 0.0)):
             return ()
-        shares = np.where(known, started, 0.0) / np.where(known, noise, 1.0)
+        shares = np.where(comparable, started, 0.0) / np.where(comparable, noise, 1.0)
         worst = int(np.argmax(shares))
         if shares[worst] * SETTLED_TO <= 1.0:
             return ()
@@ -225,11 +225,11 @@ class LogRun:
         if self.resumed_from is None:
             return self._taken(chunk)
         try:
-            found = self._taken(chunk)
+            rows = self._taken(chunk)
         except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError) as error:
             raise damaged_state(self.resumed_from) from error
         self.resumed_from = None
-        return found
+        return rows
 
     def _taken(self, chunk: FloatArray) -> list[list[Any]]:
         if self.later is None:
@@ -249,13 +249,13 @@ class LogRun:
     def estimates(self, times: Sequence[float], values: FloatArray) -> list[Row]:
         """Return the estimates at rows as they come, deviations ``values (rows, nu + ny)``; those whose stamps do not
         rise are left out."""
-        found, at, read = list[Row](), list[float](), values
+        rows, at, read = list[Row](), list[float](), values
         values, memory = self._unrepeated_rows(times, values)
         complete = np.asarray(np.isfinite(values).all(axis=1))
-        while (done := len(found)) < len(times):
+        while (done := len(rows)) < len(times):
             status = self.clock.stale(times[done])
             if status:
-                found.append(Row(status, np.full(len(self.observer.columns), np.nan)))
+                rows.append(Row(status, np.full(len(self.observer.columns), np.nan)))
                 at.append(math.nan)
                 continue
             if self.observer.takes_pieces and complete[done]:
@@ -266,21 +266,21 @@ class LogRun:
                 taken = self.observer.take_piece(own, values[done:end], intervals) if intervals else []
                 if taken:
                     self.clock.take(times[done : done + len(taken)], intervals[: len(taken)])
-                    found += taken
+                    rows += taken
                     at += own[: len(taken)]
-                    self._remember(memory, len(found))
+                    self._remember(memory, len(rows))
                     continue
-            found.append(self._single(times[done], values[done], self.rows + done + 1))
+            rows.append(self._single(times[done], values[done], self.rows + done + 1))
             at.append(self.clock.at(times[done]))
-            self._remember(memory, len(found))
-        if found and self.rows == 0:
-            self.first.status = found[0].status
-        self.rows += len(found)
+            self._remember(memory, len(rows))
+        if rows and self.rows == 0:
+            self.first.status = rows[0].status
+        self.rows += len(rows)
         self.first.take(times, values)
-        counts = [None] * len(found) if memory is None else list(memory[:, 1])
+        counts = [None] * len(rows) if memory is None else list(memory[:, 1])
         return [
             row._replace(time=time, deviations=v, at=own, repeated=equal)
-            for row, time, v, own, equal in zip(found, times, read, at, counts, strict=True)
+            for row, time, v, own, equal in zip(rows, times, read, at, counts, strict=True)
         ]
 
     def _unrepeated_rows(self, times: Sequence[float], values: FloatArray) -> tuple[FloatArray, FloatArray | None]:
@@ -346,10 +346,10 @@ class LogRun:
             estimates = [np.concatenate([row.values, self._recovered_in(row)]) for row in taken]
         self.statuses.update(row.status for row in taken)
         self.repeated.take(np.array([self._outputs_of(row) for row in taken]))
-        shown: list[list[float]] = (np.array(estimates) + self._point).tolist()
+        absolute: list[list[float]] = (np.array(estimates) + self._point).tolist()
         rows: list[list[Any]] = [
             [row.time, row.status, *(row.time - lag for lag in self._lags), *cells]
-            for row, cells in zip(taken, shown, strict=True)
+            for row, cells in zip(taken, absolute, strict=True)
         ]
         if self._levels or self.monitor is not None:
             first = self.rows - len(rows) + 1
@@ -394,23 +394,23 @@ class LogRun:
         if self.monitor is not None:
             for missed in row.missed:
                 self._watching, _ = self.monitor.step(self._watching, self._sample(self.monitor, missed))
-            self._watching, seen = self.monitor.step(self._watching, self._sample(self.monitor, row))
-            more = seen.more or (math.nan,) * len(self.monitor.columns)
-            cells = [*(np.array(more) + self._shifts).tolist(), seen.statistic, seen.threshold]
-            undecided = math.isnan(seen.statistic) and (undecided or not self._levels)
-            if seen.alarm:
-                evidence = seen.statistic / seen.threshold if seen.threshold else math.inf
-                kind, known = self.monitor.kind, bool(seen.fault) or not self.monitor.fault_names
+            self._watching, output = self.monitor.step(self._watching, self._sample(self.monitor, row))
+            more = output.more or (math.nan,) * len(self.monitor.columns)
+            cells = [*(np.array(more) + self._shifts).tolist(), output.statistic, output.threshold]
+            undecided = math.isnan(output.statistic) and (undecided or not self._levels)
+            if output.alarm:
+                evidence = output.statistic / output.threshold if output.threshold else math.inf
+                kind, distinguished = self.monitor.kind, bool(output.fault) or not self.monitor.fault_names
                 self.events.take(
-                    kind, seen.fault, evidence, time, number, [*before, *cells], distinguished=known,
-                    ranking=seen.ranking,
+                    kind, output.fault, evidence, time, number, [*before, *cells], distinguished=distinguished,
+                    ranking=output.ranking,
                 )  # fmt: skip
                 self.alarms.setdefault(self.monitor.kind, time)
-                self.isolated = self.isolated or seen.fault
+                self.isolated = self.isolated or output.fault
                 self.alarm_rows.setdefault(self.monitor.kind, number)
                 since = self.events.shelved_since(kind)
-                told = seen.fault if math.isnan(since) else SHELVED.format(self._shown_time(since))
-                names.append(f"{kind}: {told}" if told else kind)
+                fault_text = output.fault if math.isnan(since) else SHELVED.format(self._shown_time(since))
+                names.append(f"{kind}: {fault_text}" if fault_text else kind)
         for name, evidence in self._stuck(row):
             self.events.take(name, "", evidence, time, number, [*before, *cells])
             self.alarms.setdefault(name, time)
@@ -431,8 +431,8 @@ class LogRun:
         if self.unrepeated is None or row.repeated is None:
             return []
         shares = row.repeated / (self.unrepeated.longest + STUCK_ALARM_ROWS)
-        found = zip(self.observer.output_names, shares.tolist(), strict=True)
-        return [(f"{STUCK_SENSOR} {name}", share) for name, share in found if share > 1.0]
+        by_output = zip(self.observer.output_names, shares.tolist(), strict=True)
+        return [(f"{STUCK_SENSOR} {name}", share) for name, share in by_output if share > 1.0]
 
     def _sample(self, monitor: Monitor, row: Row) -> Sample:
         """Return what a monitor takes of a row."""
@@ -513,8 +513,8 @@ def resume_state(path: Path, run: LogRun, digest: str) -> None:
     """Let a run go on from a saved state."""
     # The state is written again at the end, so it is no input that has to be kept.
     document = read_json(path, is_protected=False)
-    known = isinstance(document, dict) and document.get("kind") == RUN_STATE_KIND
-    if not known or document.get("schema_version") != RUN_STATE_VERSION:
+    is_run_state = isinstance(document, dict) and document.get("kind") == RUN_STATE_KIND
+    if not is_run_state or document.get("schema_version") != RUN_STATE_VERSION:
         raise SpecError(f"{path} is no saved state of a run.", path=str(path))
     body = document.get("run")
     try:
@@ -546,8 +546,8 @@ def _meant(name: str, names: Sequence[str]) -> str:
 def _fits(own: Any, saved: Any) -> bool:
     """Whether a saved state has the parts of a run's own one; what has no value yet may hold numbers and arrays."""
     if isinstance(own, np.ndarray):
-        found = saved.get(BY_COLUMNS) if isinstance(saved, dict) else saved
-        return isinstance(found, np.ndarray) and _alike(own.shape, found.shape)
+        saved_array = saved.get(BY_COLUMNS) if isinstance(saved, dict) else saved
+        return isinstance(saved_array, np.ndarray) and _alike(own.shape, saved_array.shape)
     if isinstance(own, Mapping):
         if not isinstance(saved, dict) or saved.keys() != own.keys():
             return False

@@ -39,21 +39,21 @@ def log_table(
     the stamps."""
     data = data if isinstance(data, str | Path) else as_frame(data)
     header = _header(data, [time, *names])
-    there = [name for name in dict.fromkeys(names) if column_of(header, name) and name != time]
+    present = [name for name in dict.fromkeys(names) if column_of(header, name) and name != time]
     # A log without stamps is read like others: a column stands where they would.
     has_stamps = column_of(header, time) is not None
-    first = time if has_stamps else next(iter(there), None)
+    first = time if has_stamps else next(iter(present), None)
     if first is None:
         return {}, header, ()
-    signals = LogSignals(tuple(there), (first, *there), np.ones(len(there)), np.zeros(len(there)), {})
+    signals = LogSignals(tuple(present), (first, *present), np.ones(len(present)), np.zeros(len(present)), {})
     stamps = Stamps()
     stamps.are_missing = not has_stamps
     rows = np.concatenate(list(chunks(data, signals, stamps, CHUNK_ROWS)))
-    found, times = dict(zip(there, rows[:, 1:].T, strict=True)), rows[:, 0]
+    columns, times = dict(zip(present, rows[:, 1:].T, strict=True)), rows[:, 0]
     if stamps.is_dated:
         # Seconds since 1970 in double precision have lost what is below a microsecond.
         times = np.round(times - times[0], SECOND_DECIMALS)
-    return {**({time: times} if has_stamps else {}), **found}, header, stamps.warnings()
+    return {**({time: times} if has_stamps else {}), **columns}, header, stamps.warnings()
 
 
 def _header(data: Any, wanted: Sequence[str]) -> list[str]:
@@ -84,10 +84,10 @@ def _header(data: Any, wanted: Sequence[str]) -> list[str]:
 def parsed_rows(rows: str | slice | Sequence[int] | None, count: int) -> tuple[int, int]:
     """Return first row and one past the last of ``"a:b"``, a slice or a pair, as Python counts."""
     if isinstance(rows, str):
-        found = re.fullmatch(r"\s*(-?\d*)\s*:\s*(-?\d*)\s*", rows)
-        if found is None:
+        match = re.fullmatch(r"\s*(-?\d*)\s*:\s*(-?\d*)\s*", rows)
+        if match is None:
             raise SpecError(f"rows is {rows!r}: give a:b, such as 0:56 for the first 56 rows.", path="rows")
-        rows = slice(*(int(text) if text else None for text in found.groups()))
+        rows = slice(*(int(text) if text else None for text in match.groups()))
     elif isinstance(rows, (Sequence, np.ndarray)):
         if len(rows) != 2 or not all(isinstance(row, (int, np.integer)) for row in rows):
             raise SpecError(f"rows is {list(rows)}: give the first row and one past the last.", path="rows")
@@ -96,9 +96,9 @@ def parsed_rows(rows: str | slice | Sequence[int] | None, count: int) -> tuple[i
         require_kind(rows, slice, "rows", "a:b, a slice, or the first row and one past the last")
     first, last, step = (rows or slice(None)).indices(count)
     if step != 1 or last <= first:
-        asked = rows if isinstance(rows, slice) else slice(None)
-        told = ":".join("" if end is None else str(end) for end in (asked.start, asked.stop))
-        asked_for = f"rows {told} holds nothing" if told != ":" else "The log is empty"
+        wanted = rows if isinstance(rows, slice) else slice(None)
+        range_text = ":".join("" if end is None else str(end) for end in (wanted.start, wanted.stop))
+        asked_for = f"rows {range_text} holds nothing" if range_text != ":" else "The log is empty"
         raise SpecError(f"{asked_for}: the log has {count} rows.", path="rows")
     if isinstance(rows, slice) and any(end is not None and abs(end) > count for end in (rows.start, rows.stop)):
         raise SpecError(f"rows asks for {rows.start}:{rows.stop}, but the log has {count} rows.", path="rows")

@@ -37,25 +37,25 @@ class RecoveredStates:
         self.flags: Mapping[str, str] = {recovery.names[i]: flags[i] for i in places}
         self.point = np.array([recovery.operating_point.get(name, 0.0) for name in self.names])
         states, faults = len(observer.state_names), recovery.from_fault.shape[1]
-        known = faults if faults == len(observer.fault_names) else 0
-        self._map = np.hstack([recovery.from_state, recovery.from_fault[:, :known]])[places]
+        estimated_faults = faults if faults == len(observer.fault_names) else 0
+        self._map = np.hstack([recovery.from_state, recovery.from_fault[:, :estimated_faults]])[places]
         self._inputs = recovery.from_input[places]
         used = self._map.any(axis=0)
-        delays = np.array([*observer.state_delays, *observer.fault_delays[:known]], dtype=np.int64)
+        delays = np.array([*observer.state_delays, *observer.fault_delays[:estimated_faults]], dtype=np.int64)
         self.delay = int(np.max(delays[used], initial=0))
         self._ages = np.where(used, self.delay - delays, 0)
-        self._used, self._columns = used, np.arange(states + known)
+        self._used, self._columns = used, np.arange(states + estimated_faults)
         self._rows: deque[FloatArray] = deque(maxlen=self.delay + 1)
         self._known = np.zeros(len(observer.input_names))
 
     @classmethod
     def of(
-        cls, recovery: StateRecovery | None, observer: LogObserver, asked: str | Sequence[str] | None = None
+        cls, recovery: StateRecovery | None, observer: LogObserver, wanted: str | Sequence[str] | None = None
     ) -> RecoveredStates | None:
         """Return the recovery of a design, of all states or of those asked for; `None` where there is nothing."""
         if recovery is None:
             return None
-        names = _asked_for(recovery, asked)
+        names = _asked_for(recovery, wanted)
         if not names:
             return None
         # Of a large map its operator knows the number of states from which the others follow.
@@ -63,8 +63,8 @@ class RecoveredStates:
         states = recovery.from_state.shape[1] if operator is None else operator.state_count
         if states != len(observer.state_names):
             return None
-        found = cls(recovery, observer, names)
-        return found if found.names else None
+        recovered = cls(recovery, observer, names)
+        return recovered if recovered.names else None
 
     def take(self, row: Row) -> FloatArray:
         """Return the recovered states, deviations; NaN where they are not known."""
@@ -91,12 +91,12 @@ class RecoveredStates:
         self._known = data["known"]
 
 
-def _asked_for(recovery: StateRecovery, asked: str | Sequence[str] | None) -> tuple[str, ...]:
-    if asked is None:
+def _asked_for(recovery: StateRecovery, wanted: str | Sequence[str] | None) -> tuple[str, ...]:
+    if wanted is None:
         return recovery.names if len(recovery.names) <= MOST_RECOVERED else ()
-    if isinstance(asked, str) and asked in ("all", "none"):
-        return recovery.names if asked == "all" else ()
-    names = (asked,) if isinstance(asked, str) else tuple(asked)
+    if isinstance(wanted, str) and wanted in ("all", "none"):
+        return recovery.names if wanted == "all" else ()
+    names = (wanted,) if isinstance(wanted, str) else tuple(wanted)
     for name in names:
         index_of(name, recovery.names, what="The plant as written")
     return names
@@ -108,5 +108,5 @@ def _kept(recovery: StateRecovery, observer: LogObserver, name: str) -> bool:
         return False
     row = recovery.names.index(name)
     own = np.arange(len(observer.state_names)) == observer.state_names.index(name)
-    others = (recovery.from_input, recovery.from_fault, recovery.from_disturbance)
-    return bool(np.array_equal(recovery.from_state[row], own)) and not any(matrix[row].any() for matrix in others)
+    other_maps = (recovery.from_input, recovery.from_fault, recovery.from_disturbance)
+    return bool(np.array_equal(recovery.from_state[row], own)) and not any(matrix[row].any() for matrix in other_maps)

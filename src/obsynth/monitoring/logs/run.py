@@ -311,16 +311,16 @@ def run_on_data(
     if state is not None:
         save_state(Path(state), run, digest)
     table = gathered.frame() if out is None else None
-    shown = {} if run.recovered is None else dict(run.recovered.flags)
-    found = zip(run.observer.output_names, run.repeated.stuck(), strict=True)
-    stuck = {name: tuple((first + 1, last + 1) for first, last in runs) for name, runs in found if runs}
+    recovered_flags = {} if run.recovered is None else dict(run.recovered.flags)
+    runs_by_output = zip(run.observer.output_names, run.repeated.stuck(), strict=True)
+    stuck = {name: tuple((first + 1, last + 1) for first, last in runs) for name, runs in runs_by_output if runs}
     start = () if resumed else run.first.alarm_of_the_start(design, run.events.events())
     return DataRun(
         rows=run.rows,
         statuses=dict(run.statuses),
         alarms=dict(run.alarms),
         isolated=run.isolated,
-        recovered=shown,
+        recovered=recovered_flags,
         outliers=dict(getattr(run.observer, "outliers", {})),
         warnings=(*run.observer.notes, *stamps.warnings(), *run.first.warnings(), *start, *stuck_texts(stuck)),
         digest=digest,
@@ -406,9 +406,9 @@ def _run_rows(
                 for row in chunk:
                     with held:
                         is_whole = False
-                        found = run.take(row[None])
+                        output_rows = run.take(row[None])
                         is_whole = True
-                        sink(found)
+                        sink(output_rows)
                         if run.rows % state_every == 0:
                             save()
                 progress(run.rows)

@@ -115,20 +115,20 @@ class LogSignals:
                 # It is formed from the samples of its input, in the unit of these.
                 name = base[0]
             behind = WITH_UNIT.fullmatch(header[place])
-            found = below[i + 1].strip("[]() ") if i + 1 < len(below) else "" if behind is None else behind[2]
-            if not found or name not in self.units:
+            unit = below[i + 1].strip("[]() ") if i + 1 < len(below) else "" if behind is None else behind[2]
+            if not unit or name not in self.units:
                 continue
             try:
-                way = conversion(found, self.units[name])
+                way = conversion(unit, self.units[name])
             except SpecError as error:
                 raise SpecError(
-                    f"{name} is in {found} in the data, and in {self.units[name]} in the plant: {error}; or state the "
+                    f"{name} is in {unit} in the data, and in {self.units[name]} in the plant: {error}; or state the "
                     f"factor (--scale {shlex.quote(name)}=FACTOR).",
                     path=f"columns.{name}",
                 ) from error
             if way is not None and way != (1.0, 0.0):
                 factors[i], shifts[i] = way
-                stamps.notes.append(f"{name} is converted from {found} to {self.units[name]}.")
+                stamps.notes.append(f"{name} is converted from {unit} to {self.units[name]}.")
         return factors, shifts
 
     def measured(self, rows: FloatArray) -> FloatArray:
@@ -142,26 +142,26 @@ class LogSignals:
 
     def positions(self, header: tuple[str, ...]) -> list[int]:
         """Return where in a header each column is that is read."""
-        found = [column_of(header, name) for name in self.columns]
+        matches = [column_of(header, name) for name in self.columns]
         for i, name in enumerate(self.columns):
             # A derivative that has no column is formed from that of its input.
-            base = derivative_of(name, self.columns) if found[i] is None else None
-            found[i] = found[i] if base is None else found[self.columns.index(base[0])]
-        missing = sorted({name for name, there in zip(self.columns, found, strict=True) if there is None})
+            base = derivative_of(name, self.columns) if matches[i] is None else None
+            matches[i] = matches[i] if base is None else matches[self.columns.index(base[0])]
+        missing = sorted({name for name, present in zip(self.columns, matches, strict=True) if present is None})
         if missing:
             raise SpecError(
                 f"The data have no column {', '.join(map(repr, missing))}; they have "
                 f"{', '.join(map(repr, header)) or 'none'}. {_advice(header, missing)}",
                 path="data",
             )
-        there = [name for name in found if name is not None]
-        repeated = sorted({name for name in there if header.count(name) > 1})
+        present = [name for name in matches if name is not None]
+        repeated = sorted({name for name in present if header.count(name) > 1})
         if repeated:
             raise SpecError(
                 f"The data have more than one column {', '.join(map(repr, repeated))}: give each a name of its own.",
                 path="data",
             )
-        return [header.index(name) for name in there]
+        return [header.index(name) for name in present]
 
     def estimates_point(self, observer: LogObserver) -> FloatArray:
         """Return what is added to the columns of estimates: the operating point of states and faults."""
@@ -195,15 +195,15 @@ def column_of(header: Sequence[str], name: str) -> str | None:
     if name in header:
         return name
     name = _one_spelling(name)
-    same = [each for each in header if not each.isascii() and _one_spelling(each) == name]
+    same = [column for column in header if not column.isascii() and _one_spelling(column) == name]
     if len(same) == 1:
         return same[0]
-    found = [
-        each
-        for each in header
-        if (unit := WITH_UNIT.fullmatch(_one_spelling(each) if not each.isascii() else each)) and unit[1] == name
+    with_unit = [
+        column
+        for column in header
+        if (unit := WITH_UNIT.fullmatch(_one_spelling(column) if not column.isascii() else column)) and unit[1] == name
     ]
-    return found[0] if len(found) == 1 else None
+    return with_unit[0] if len(with_unit) == 1 else None
 
 
 def _one_spelling(name: str) -> str:
@@ -213,8 +213,8 @@ def _one_spelling(name: str) -> str:
 
 def date_place(header: Sequence[str], places: Sequence[int]) -> int | None:
     """Return where dates stand that times of day, which are the first of the columns that are read, may lack."""
-    found = [i for i, name in enumerate(header) if name.strip().lower() in _DATE_NAMES and i not in places]
-    return found[0] if len(found) == 1 else None
+    dates = [i for i, name in enumerate(header) if name.strip().lower() in _DATE_NAMES and i not in places]
+    return dates[0] if len(dates) == 1 else None
 
 
 def with_date(date: str, text: str) -> str:
@@ -226,7 +226,7 @@ def with_date(date: str, text: str) -> str:
 def status_places(header: Sequence[str], places: Sequence[int]) -> list[int | None]:
     """Return where the status of each column stands that is read ``(1 + nu + ny,)``: a column that is called as it with
     a word such as ``status`` behind, or right of it by such a word alone."""
-    found: list[int | None] = [None]
+    by_column: list[int | None] = [None]
     lower = [name.strip().lower() for name in header]
     for place in places[1:]:
         unit = WITH_UNIT.fullmatch(lower[place])
@@ -237,16 +237,16 @@ def status_places(header: Sequence[str], places: Sequence[int]) -> list[int | No
             if name.startswith(base) and name[len(base) :].strip(" ._-:()[]/") in _STATUS_NAMES
         ]
         beside = [place + 1] if place + 1 < len(lower) and lower[place + 1] in _STATUS_NAMES else []
-        found.append(next((i for i in (*own, *beside) if i not in places), None))
-    return found
+        by_column.append(next((i for i in (*own, *beside) if i not in places), None))
+    return by_column
 
 
 def _advice(header: tuple[str, ...], missing: list[str]) -> str:
     if len(header) == 1 and any(mark in header[0] for mark in ":#~^ "):
         return "Separate columns by commas, semicolons, tabs or bars."
-    found = next((name for kind in _TIME_NAMES for name in header if name.lower().startswith(kind)), None)
-    found = found or next((name for name in header if name.lower() == "t"), None)
-    if TIME_HEADER in missing and found is not None:
-        return f"If {found!r} is the time: --time-column {found!r}, or columns={{'time': {found!r}}}."
+    time_like = next((name for kind in _TIME_NAMES for name in header if name.lower().startswith(kind)), None)
+    time_like = time_like or next((name for name in header if name.lower() == "t"), None)
+    if TIME_HEADER in missing and time_like is not None:
+        return f"If {time_like!r} is the time: --time-column {time_like!r}, or columns={{'time': {time_like!r}}}."
     first = next((name for name in missing if name != TIME_HEADER), TIME_HEADER)
     return f"Map it: --map {shlex.quote(first)}=YOUR_COLUMN."

@@ -36,13 +36,13 @@ def time_columns(header: Sequence[str]) -> tuple[int, ...]:
     return tuple(i for i, name in enumerate(header) if name == TIME_HEADER or name.startswith(f"{TIME_HEADER} of "))
 
 
-def dated(rows: Sequence[Sequence[Any]], places: Sequence[int], shown: Callable[[float], Any]) -> list[list[Any]]:
+def dated(rows: Sequence[Sequence[Any]], places: Sequence[int], date_of: Callable[[float], Any]) -> list[list[Any]]:
     """Return rows in which the times are dates."""
-    found = [list(row) for row in rows]
-    for row in found:
+    with_dates = [list(row) for row in rows]
+    for row in with_dates:
         for place in places:
-            row[place] = shown(row[place])
-    return found
+            row[place] = date_of(row[place])
+    return with_dates
 
 
 def text_sink(stream: TextIO, header: Sequence[str], stamps: Stamps) -> Sink:
@@ -97,8 +97,8 @@ class FrameSink:
         if not self._count:
             return pd.DataFrame([], columns=self._header)
         columns = zip(self._header, self._others, self._numbers, strict=True)
-        found = [pd.Series(others or kept[: self._count], name=name, copy=False) for name, others, kept in columns]
-        frame = pd.DataFrame(dict(enumerate(found)), copy=False)
+        series = [pd.Series(objects or kept[: self._count], name=name, copy=False) for name, objects, kept in columns]
+        frame = pd.DataFrame(dict(enumerate(series)), copy=False)
         frame.columns = pd.Index(self._header)
         return frame
 

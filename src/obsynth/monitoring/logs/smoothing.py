@@ -71,24 +71,24 @@ class LaterRows:
         if not waiting:
             return
         first = waiting[0][1]
-        found = self.chain.smoothed(first, waiting[-1][1])
+        smoothed = self.chain.smoothed(first, waiting[-1][1])
         for row, k in waiting:
-            yield self._shown(row, k, found[k - first])
+            yield self._shown(row, k, smoothed[k - first])
 
-    def _shown(self, row: Row, k: int, found: Smoothed) -> tuple[Row, Any, Smoothed]:
+    def _shown(self, row: Row, k: int, smoothed: Smoothed) -> tuple[Row, Any, Smoothed]:
         nx = len(self.logged.state_names)
         if row.status in STALE:
-            return row, self.chain.row(k), found
-        theta, spread = parameters_of(found, nx)
+            return row, self.chain.row(k), smoothed
+        theta, spread = parameters_of(smoothed, nx)
         own = (
-            found.x[:nx],
+            smoothed.x[:nx],
             theta,
-            deviations_in(found.factor, found.diffuse)[:nx],
+            deviations_in(smoothed.factor, smoothed.diffuse)[:nx],
             np.sqrt(np.einsum("ij,ij->i", spread, spread)),
         )
         estimated = np.concatenate(own)
         values = np.concatenate((estimated, row.values[len(estimated) :]))
-        return row._replace(values=values), self.chain.row(k), found
+        return row._replace(values=values), self.chain.row(k), smoothed
 
 
 @arguments_checked
@@ -211,13 +211,17 @@ def smooth(
 
 def _smoothed_log(run: LogRun, data: Any, lag: int | None) -> Estimates:
     later = LaterRows(run.observer, lag)
-    found: list[tuple[Row, Any, Smoothed]] = []
+    smoothed_rows: list[tuple[Row, Any, Smoothed]] = []
     for time, deviations in samples(data, run.signals):
-        found.extend(later.take(run.estimates([time], deviations[None])[0]))
-    found.extend(later.flush())
-    known = smoothed_estimates(later.logged.observer, [row for _, row, _ in found], [sample for _, _, sample in found])
+        smoothed_rows.extend(later.take(run.estimates([time], deviations[None])[0]))
+    smoothed_rows.extend(later.flush())
+    estimates = smoothed_estimates(
+        later.logged.observer, [row for _, row, _ in smoothed_rows], [sample for _, _, sample in smoothed_rows]
+    )
     point = run.signals.estimates_point(run.observer)
     nx, nq = len(run.observer.state_names), len(run.observer.fault_names)
     return replace(
-        known, states=read_only(known.states + point[:nx]), faults=read_only(known.faults + point[nx : nx + nq])
+        estimates,
+        states=read_only(estimates.states + point[:nx]),
+        faults=read_only(estimates.faults + point[nx : nx + nq]),
     )

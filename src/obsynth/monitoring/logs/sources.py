@@ -65,22 +65,22 @@ def chunks(
 ) -> Iterator[FloatArray]:
     """Yield ``(rows, 1 + nu + ny)``: time and signals, in order; NaN where a sample is missing.  Inputs are those that
     act in a row as the design takes it.  The first rows are left out up to the time ``after``."""
-    found = _differenced(_without_days(_chunks(data, signals, stamps, rows), stamps), stamps, goes_on=after is None)
+    blocks = _differenced(_without_days(_chunks(data, signals, stamps, rows), stamps), stamps, goes_on=after is None)
     if after is not None:
-        found = _later(found, after)
+        blocks = _later(blocks, after)
     if not signals.delay or not signals.inputs:
-        yield from found
+        yield from blocks
     elif signals.delay > 0:
-        yield from _delayed(found, signals, stamps)
+        yield from _delayed(blocks, signals, stamps)
     else:
-        yield from _advanced(found, signals)
+        yield from _advanced(blocks, signals)
     # Whether columns hold numbers is known at the end, wherever the words in them stand.
     stamps.require_numbers()
 
 
-def _without_days(found: Iterator[FloatArray], stamps: Stamps) -> Iterator[FloatArray]:
+def _without_days(blocks: Iterator[FloatArray], stamps: Stamps) -> Iterator[FloatArray]:
     """Yield rows, of which the first ones must not be stamped in days."""
-    for count, chunk in enumerate(found):
+    for count, chunk in enumerate(blocks):
         if not count:
             stamps.require_no_days(chunk[:, 0])
         yield chunk
@@ -97,39 +97,39 @@ def _differenced(found: Iterator[FloatArray], stamps: Stamps, *, goes_on: bool) 
         yield chunk
 
 
-def _later(found: Iterator[FloatArray], after: float) -> Iterator[FloatArray]:
+def _later(blocks: Iterator[FloatArray], after: float) -> Iterator[FloatArray]:
     """Yield rows from the first one on whose time is later."""
     is_begun = False
-    for chunk in found:
+    for chunk in blocks:
         first = 0 if is_begun else int(np.argmax(chunk[:, 0] > after))
         is_begun = is_begun or bool(chunk[first, 0] > after)
         if is_begun:
             yield chunk[first:]
 
 
-def _delayed(found: Iterator[FloatArray], signals: LogSignals, stamps: Stamps) -> Iterator[FloatArray]:
+def _delayed(blocks: Iterator[FloatArray], signals: LogSignals, stamps: Stamps) -> Iterator[FloatArray]:
     """Yield rows with the inputs of so many rows before; the first ones hold their own."""
     inputs = slice(1, 1 + signals.inputs)
-    for chunk in found:
+    for chunk in blocks:
         if stamps.earlier is None:
             stamps.earlier = np.repeat(chunk[:1, inputs], signals.delay, axis=0)
-        whole = np.vstack([stamps.earlier, chunk[:, inputs]])
-        stamps.earlier = whole[len(chunk) :]
-        chunk[:, inputs] = whole[: len(chunk)]
+        joined = np.vstack([stamps.earlier, chunk[:, inputs]])
+        stamps.earlier = joined[len(chunk) :]
+        chunk[:, inputs] = joined[: len(chunk)]
         yield chunk
 
 
-def _advanced(found: Iterator[FloatArray], signals: LogSignals) -> Iterator[FloatArray]:
+def _advanced(blocks: Iterator[FloatArray], signals: LogSignals) -> Iterator[FloatArray]:
     """Yield rows with the inputs of so many rows after, for which they wait; the last ones hold the last."""
     inputs, wait = slice(1, 1 + signals.inputs), -signals.delay
     kept: FloatArray | None = None
-    for chunk in found:
-        whole = chunk if kept is None else np.vstack([kept, chunk])
-        ready = max(len(whole) - wait, 0)
-        kept = whole[ready:].copy()
+    for chunk in blocks:
+        joined = chunk if kept is None else np.vstack([kept, chunk])
+        ready = max(len(joined) - wait, 0)
+        kept = joined[ready:].copy()
         if ready:
-            done = whole[:ready].copy()
-            done[:, inputs] = whole[wait : wait + ready, inputs]
+            done = joined[:ready].copy()
+            done[:, inputs] = joined[wait : wait + ready, inputs]
             yield done
     if kept is not None and len(kept):
         # Of a short log fewer rows than these are left.
@@ -163,9 +163,9 @@ def _chunks(data: Data, signals: LogSignals, stamps: Stamps, rows: int) -> Itera
         # Of numbers a part says no less than the whole: no copy of all of them is made.
         parts = range(0, max(len(frame), 1), rows) if numbers else range(1)
         size = rows if numbers else max(len(frame), 1)
-        for whole in _converted((frame.iloc[start : start + size] for start in parts), signals, stamps):
-            for start in range(0, len(whole), rows):
-                yield whole[start : start + rows]
+        for block in _converted((frame.iloc[start : start + size] for start in parts), signals, stamps):
+            for start in range(0, len(block), rows):
+                yield block[start : start + rows]
 
 
 def samples(data: Data, signals: LogSignals) -> Iterator[tuple[float, FloatArray]]:
@@ -246,11 +246,11 @@ def _converted(frames: Iterator[pd.DataFrame], signals: LogSignals, stamps: Stam
 
 def _without_bad(values: FloatArray, name: str, states: pd.Series, done: int, stamps: Stamps) -> FloatArray:
     """Return samples ``(n,)`` without those of which their status says that they are bad."""
-    said = [str(cell).strip() for cell in states]
-    bad = np.array([is_bad(text) for text in said], dtype=bool)
+    texts = [str(cell).strip() for cell in states]
+    bad = np.array([is_bad(text) for text in texts], dtype=bool)
     if bad.any():
         first = int(np.argmax(bad))
-        stamps.take_bad(name, done + first + 1, said[first], str(states.name), count=int(bad.sum()))
+        stamps.take_bad(name, done + first + 1, texts[first], str(states.name), count=int(bad.sum()))
     return np.where(bad, np.nan, values)
 
 
@@ -258,9 +258,9 @@ def _times(column: pd.Series, done: int, stamps: Stamps, dates: pd.Series | None
     """Return a column of time stamps as seconds; ``dates`` may stand beside times of day."""
     import pandas as pd
 
-    found = stamps.read_column(column)
-    if found is not None:
-        return found
+    seconds = stamps.read_column(column)
+    if seconds is not None:
+        return seconds
     if pd.api.types.is_numeric_dtype(column):
         stamps.take_number()
         return stamps.seconds(_numbers(column, done))
@@ -277,9 +277,9 @@ def _numbers(column: pd.Series, done: int, stamps: Stamps | None = None) -> Floa
     if pd.api.types.is_complex_dtype(column):
         raise SpecError(f"The column {str(column.name)!r} holds complex numbers: give real ones.", path="columns")
     if pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column):
-        found = np.asarray(column.to_numpy(dtype=np.float64, na_value=np.nan))
-        if stamps is not None and not np.isnan(found).all():
+        numbers = np.asarray(column.to_numpy(dtype=np.float64, na_value=np.nan))
+        if stamps is not None and not np.isnan(numbers).all():
             stamps.numeric.add(str(column.name))
-        return found
+        return numbers
     texts = [None if pd.isna(cell) else str(cell) for cell in column]
     return np.array([number_in_cell(text, done + i + 1, str(column.name), stamps) for i, text in enumerate(texts)])

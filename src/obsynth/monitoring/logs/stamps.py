@@ -114,13 +114,13 @@ def _is_number(text: str) -> bool:
 
 def _clock(text: str) -> str:
     """Return a time of day, with what stands before it, as ISO 8601 writes it; other texts as they are."""
-    found = _CLOCK.fullmatch(text)
-    if found is None:
+    match = _CLOCK.fullmatch(text)
+    if match is None:
         return text
-    hour, rest, half = int(found.group(1)), found.group(2), (found.group(3) or "").lower()
+    hour, minutes, half = int(match.group(1)), match.group(2), (match.group(3) or "").lower()
     if half and not 1 <= hour <= _HALF_DAY:
         return text
-    return f"T{hour % _HALF_DAY + _HALF_DAY * (half == 'p') if half else hour:02}{rest}"
+    return f"T{hour % _HALF_DAY + _HALF_DAY * (half == 'p') if half else hour:02}{minutes}"
 
 
 def _with_named_month(text: str) -> str:
@@ -138,18 +138,18 @@ def _zone(text: str) -> tuple[str, str]:
     clock = text.partition(":")[2]
     if not clock or (clock[-1].isdigit() and "+" not in clock and "-" not in clock):
         return text, ""
-    found = _ZONE.fullmatch(text)
-    if found is None or not any(found.groups()[1:]):
+    match = _ZONE.fullmatch(text)
+    if match is None or not any(match.groups()[1:]):
         return text, ""
-    body, _, sign, hours, minutes = found.groups()
+    body, _, sign, hours, minutes = match.groups()
     return body, f"{sign or '+'}{hours or '0':0>2}:{minutes or '00'}"
 
 
 def zone_of(name: str) -> tzinfo:
     """Return a time zone: a name such as ``Europe/Berlin``, or an offset such as ``+01:00``; raise `SpecError`."""
-    found = _OFFSET.fullmatch(name)
-    if found is not None:
-        sign, hours, minutes = found.groups()
+    match = _OFFSET.fullmatch(name)
+    if match is not None:
+        sign, hours, minutes = match.groups()
         offset = timedelta(hours=int(hours), minutes=int(minutes or 0))
         return timezone(-offset if sign == "-" else offset)
     try:
@@ -164,12 +164,12 @@ def zone_of(name: str) -> tzinfo:
 
 def _per_second(unit: str) -> float:
     """Return how many of a unit of time are a second."""
-    found = _UNITS_OF_TIME.get(str(unit).strip().lower()) if str(unit).strip() else None
-    if found is None:
+    count = _UNITS_OF_TIME.get(str(unit).strip().lower()) if str(unit).strip() else None
+    if count is None:
         raise SpecError(
             f"{unit!r} is no unit of time: give one of s, ms, us, ns, min, h, d (or days).", path="time_unit"
         )
-    return found
+    return count
 
 
 class Stamps:
@@ -233,8 +233,8 @@ class Stamps:
 
     def take_bad(self, column: str, row: int, text: str, status: str, *, count: int = 1) -> None:
         """Count cells that are bad by the column of their status, the first of which is in a row and says a text."""
-        known, first_row, first_text, _ = self.bad.get(column, (0, row, text, status))
-        self.bad[column] = (known + count, first_row, first_text, status)
+        earlier_count, first_row, first_text, _ = self.bad.get(column, (0, row, text, status))
+        self.bad[column] = (earlier_count + count, first_row, first_text, status)
 
     def take_mark(self, column: str, row: int, cell: str, mark: str, *, may_group: bool) -> None:
         """Take which decimal mark a number of a column has, or one that may group thousands instead: a log in which it
@@ -245,19 +245,19 @@ class Stamps:
             self.decimals[column] = mark
         else:
             return
-        for (name, seen), (first_row, first) in self.groups.items():
-            known = {self.decimals[name]} if name in self.decimals else set(self.decimals.values())
-            if known and seen not in known:
+        for (name, group_mark), (first_row, first) in self.groups.items():
+            decimal_marks = {self.decimals[name]} if name in self.decimals else set(self.decimals.values())
+            if decimal_marks and group_mark not in decimal_marks:
                 raise SpecError(
                     f"Row {first_row}, column {name!r}: in {first!r} the mark may group thousands, as the decimals of "
-                    f"other numbers begin with {min(known)!r}. Leave out what groups thousands.",
+                    f"other numbers begin with {min(decimal_marks)!r}. Leave out what groups thousands.",
                     path=f"row {first_row}",
                 )
 
     def take_header(self, header: Sequence[str], wanted: Sequence[str], places: Sequence[int]) -> None:
         """Take the units that stand behind names of columns, which are called otherwise where they are ``wanted``."""
-        found = WITH_UNIT.fullmatch(header[places[0]])
-        per_second = None if found is None else _UNITS_OF_TIME.get(found.group(2).strip().lower())
+        match = WITH_UNIT.fullmatch(header[places[0]])
+        per_second = None if match is None else _UNITS_OF_TIME.get(match.group(2).strip().lower())
         if per_second is not None:
             self._take_unit(per_second, header[places[0]])
         for i, name in enumerate(wanted):
@@ -329,21 +329,21 @@ class Stamps:
             elapsed = _ELAPSED.fullmatch(cell)
             if elapsed is not None:
                 self.take_number()
-                hours, minutes, rest = elapsed.groups()
-                return 3600.0 * int(hours) + 60.0 * int(minutes) + float(rest.replace(",", "."))
+                hours, minutes, seconds_text = elapsed.groups()
+                return 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds_text.replace(",", "."))
         if self.is_dated is not False:
-            text_of_date, found = cell, None
+            text_of_date, moment = cell, None
             if cell[4:5] == "-":
                 with suppress(ValueError):
-                    found = datetime.fromisoformat(cell)
-            if found is None:
+                    moment = datetime.fromisoformat(cell)
+            if moment is None:
                 text_of_date = self._as_iso(cell, row, column)
                 with suppress(ValueError):
-                    found = datetime.fromisoformat(text_of_date)
-            if found is not None:
+                    moment = datetime.fromisoformat(text_of_date)
+            if moment is not None:
                 if self.is_dated is None and _PART_OF_A_SECOND.search(text_of_date):
                     self.digits = "microseconds"
-                return self._seconds(found, row, column)
+                return self._seconds(moment, row, column)
         raise SpecError(
             f"Row {row}, column {column!r}: {text!r} is no time stamp: {self._expected()}.", path=f"row {row}"
         )
@@ -351,9 +351,9 @@ class Stamps:
     def seconds(self, numbers: FloatArray) -> FloatArray:
         """Return seconds from stamps that are numbers ``(rows,)``: those too large for seconds since 1970 count parts
         of one."""
-        known = np.abs(numbers[np.isfinite(numbers)])
-        if self.per_second is None and known.size:
-            first = float(known[0])
+        sizes = np.abs(numbers[np.isfinite(numbers)])
+        if self.per_second is None and sizes.size:
+            first = float(sizes[0])
             self.per_second = 1.0
             if _LARGEST_SECONDS <= first < _LARGEST_SECONDS * _PARTS[-1]:
                 self.per_second = next(parts for parts in _PARTS if first < _LARGEST_SECONDS * parts)
@@ -361,16 +361,16 @@ class Stamps:
 
     def require_no_days(self, seconds: FloatArray) -> None:
         """Raise `SpecError` for stamps ``(rows,)`` of the first rows that can only be serial days, taken as seconds."""
-        known = seconds[np.isfinite(seconds)]
+        finite = seconds[np.isfinite(seconds)]
         if self.is_dated is not False or self.per_second not in (None, 1.0) or self.has_unit:
             return
-        if known.size < _ROWS_OF_DAYS:
+        if finite.size < _ROWS_OF_DAYS:
             return
-        steps = np.diff(known)
-        within = any(low <= known[0] and known[-1] <= high for low, high in _SERIAL_DAYS)
+        steps = np.diff(finite)
+        within = any(low <= finite[0] and finite[-1] <= high for low, high in _SERIAL_DAYS)
         if within and np.all(steps > 0.0) and np.max(steps) <= _STEP_IN_DAYS:
             raise SpecError(
-                f"The time begins with {float(known[0]):.10g} and rises by {float(np.median(steps)):.3g} a row: these "
+                f"The time begins with {float(finite[0]):.10g} and rises by {float(np.median(steps)):.3g} a row: these "
                 "are serial days of a spreadsheet or of MATLAB, not seconds. State the unit (time_unit, --time-unit "
                 "days), or in the name of the column, 'time [d]' or 'time [s]'.",
                 path="data",
@@ -387,16 +387,16 @@ class Stamps:
         elif slashed is not None and len(slashed.group(1)) > 2:
             year, _, month, day, time = slashed.groups()
         elif slashed is not None:
-            one, _, two, year, time = slashed.groups()
-            if self.day_first is None and max(int(one), int(two)) > _MONTHS:
-                self.day_first = int(one) > _MONTHS
-            if self.day_first is None and one != two:
+            first_part, _, second_part, year, time = slashed.groups()
+            if self.day_first is None and max(int(first_part), int(second_part)) > _MONTHS:
+                self.day_first = int(first_part) > _MONTHS
+            if self.day_first is None and first_part != second_part:
                 raise SpecError(
                     f"Row {row}, column {column!r}: {cell!r} may begin with the day or the month: write dates with "
                     f"the year first, such as {year}-12-31.",
                     path=f"row {row}",
                 )
-            day, month = (one, two) if self.day_first else (two, one)
+            day, month = (first_part, second_part) if self.day_first else (second_part, first_part)
         elif _NAMED_MONTH.fullmatch(cell):
             return _with_named_month(cell) + zone
         else:
@@ -420,13 +420,15 @@ class Stamps:
                 self._dated(zone)
             moments = (column if zone is None else column.dt.tz_convert("UTC").dt.tz_localize(None)).to_numpy()
             # Apart, so that the fraction keeps its digits, and in seconds, of which no date has too many.
-            whole = moments.astype("datetime64[s]")
-            parts = np.where(missing, 0, (moments - whole).astype("timedelta64[ns]").astype(np.int64))
+            whole_seconds = moments.astype("datetime64[s]")
+            parts = np.where(missing, 0, (moments - whole_seconds).astype("timedelta64[ns]").astype(np.int64))
             if np.any(parts):
                 self.digits = "microseconds"
-            seconds = whole.astype(np.int64) + parts * _NANO
+            seconds = whole_seconds.astype(np.int64) + parts * _NANO
             if zone is None and self.stated is not None:
-                dates = [datetime.min if gone else date for date, gone in zip(whole.tolist(), missing, strict=True)]
+                dates = [
+                    datetime.min if gone else date for date, gone in zip(whole_seconds.tolist(), missing, strict=True)
+                ]
                 local = [
                     math.nan if gone else self._local(date, row, str(column.name)).timestamp()
                     for row, (date, gone) in enumerate(zip(dates, missing, strict=True), 1)
@@ -446,8 +448,8 @@ class Stamps:
 
     def moment(self, seconds: float) -> datetime:
         """Return the date and time of some seconds, to the microsecond, with the log's zone if it names one."""
-        found = _EPOCH + timedelta(seconds=math.floor(seconds)) + round((seconds % 1.0) * _MICROSECONDS) * _MICROSECOND
-        return found.replace(tzinfo=None) if self.zone is None else found.astimezone(self.zone)
+        utc = _EPOCH + timedelta(seconds=math.floor(seconds)) + round((seconds % 1.0) * _MICROSECONDS) * _MICROSECOND
+        return utc.replace(tzinfo=None) if self.zone is None else utc.astimezone(self.zone)
 
     def _dated(self, zone: tzinfo | None) -> None:
         """Take the first stamp as a date in a zone, or in none."""
@@ -460,15 +462,15 @@ class Stamps:
         self.is_dated, self.are_local = True, zone is None
         self.zone = self.stated if zone is None else zone
 
-    def _local(self, found: datetime, row: int, column: str) -> datetime:
+    def _local(self, moment: datetime, row: int, column: str) -> datetime:
         """Return a date that names no zone in the stated one. Of an hour that comes twice, as clocks go back, it is the
         second one where the first would not come after the stamps before it."""
-        first, second = (found.replace(tzinfo=self.stated, fold=fold) for fold in (0, 1))
+        first, second = (moment.replace(tzinfo=self.stated, fold=fold) for fold in (0, 1))
         seconds = first.timestamp()
         if (ahead := second.utcoffset()) != (before := first.utcoffset()):
             if before is not None and ahead is not None and before < ahead:
                 raise SpecError(
-                    f"Row {row}, column {column!r}: there is no {found.isoformat(sep=' ')} in {self.stated}, where "
+                    f"Row {row}, column {column!r}: there is no {moment.isoformat(sep=' ')} in {self.stated}, where "
                     "clocks go forward then. If the clock of the log does not, name its offset (--time-zone +01:00).",
                     path=f"row {row}",
                 )
@@ -480,31 +482,31 @@ class Stamps:
             self.latest = seconds
         return first
 
-    def _note_of_autumn(self, found: datetime, seconds: float, row: int) -> None:
+    def _note_of_autumn(self, moment: datetime, seconds: float, row: int) -> None:
         """Say what dates without a zone may be that fall by an hour, as clocks do in autumn."""
         fallen = self.latest - seconds
         if LEAST_FALL <= fallen <= AUTUMN_FALL and not any("clocks go back" in note for note in self.notes):
             before = self.moment(self.latest).isoformat(sep=" ")
             self.notes.append(
-                f"Row {row}: the time falls from {before} to {found.isoformat(sep=' ')}, as where clocks go back in "
+                f"Row {row}: the time falls from {before} to {moment.isoformat(sep=' ')}, as where clocks go back in "
                 "autumn. The stamps name no time zone: state it (time_zone, --time-zone Europe/Berlin), so that no "
                 "row of this hour is left out."
             )
         self.latest = max(self.latest, seconds)
 
-    def _seconds(self, found: datetime, row: int, column: str) -> float:
+    def _seconds(self, moment: datetime, row: int, column: str) -> float:
         if self.is_dated is None:
-            self._dated(found.tzinfo)
-        if (found.tzinfo is None) != bool(self.are_local):
+            self._dated(moment.tzinfo)
+        if (moment.tzinfo is None) != bool(self.are_local):
             raise SpecError(
                 f"Row {row}, column {column!r}: stamps with a time zone and without one cannot be mixed in one log.",
                 path=f"row {row}",
             )
         if self.are_local and self.stated is not None:
-            found = self._local(found, row, column)
+            moment = self._local(moment, row, column)
         elif self.are_local:
-            self._note_of_autumn(found, (found.replace(tzinfo=UTC) - _EPOCH).total_seconds(), row)
-        past = (found if found.tzinfo is not None else found.replace(tzinfo=UTC)) - _EPOCH
+            self._note_of_autumn(moment, (moment.replace(tzinfo=UTC) - _EPOCH).total_seconds(), row)
+        past = (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)) - _EPOCH
         return past.days * _DAY_SECONDS + past.seconds + past.microseconds * _MICRO
 
     def _expected(self) -> str:

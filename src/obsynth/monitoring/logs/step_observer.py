@@ -94,15 +94,15 @@ class SteppingLogObserver(LogObserver):
         """Take one sample, or none of it: `None` where numbers are no finite ones any more."""
         before = self.state
         u = u if self.state.k else self._begun(u)
-        found: Evidence
+        evidence: Evidence
         try:
             with np.errstate(all="ignore"):
                 kept = None if self.chain is None else self.chain.add
-                self.state, found = self._stepping().accept(self.state, y, u, kept)
+                self.state, evidence = self._stepping().accept(self.state, y, u, kept)
         except (np.linalg.LinAlgError, ValueError):
             return None
-        if found.is_finite:
-            return found
+        if evidence.is_finite:
+            return evidence
         self.state = before
         return None
 
@@ -118,51 +118,57 @@ class SteppingLogObserver(LogObserver):
             )
         return self.intervals.over(self.seconds)
 
-    def _values(self, found: Evidence) -> FloatArray:
+    def _values(self, evidence: Evidence) -> FloatArray:
         """Return a row: estimates, standard deviations, innovation at the parameters of one sample before."""
         residual = np.full(self.directions, np.nan)
         # The correction of the start by early constraints has no more directions, but may have fewer.
-        residual[: min(len(found.gap), self.directions)] = found.gap[: self.directions]
-        deviations = np.sqrt(np.diag(found.parameter_covariance))
-        return np.concatenate([found.x, found.theta, found.state_deviations, deviations, residual])
+        residual[: min(len(evidence.gap), self.directions)] = evidence.gap[: self.directions]
+        deviations = np.sqrt(np.diag(evidence.parameter_covariance))
+        return np.concatenate([evidence.x, evidence.theta, evidence.state_deviations, deviations, residual])
 
     def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
         """Take one row."""
         nu, fresh = len(self.input_names), self.u is None
         # After rows that nothing stands for the observer starts again: no step has that length.
         self.seconds = self.dt if missing else seconds
-        known = np.isfinite(values)
-        if self.u is None and not self.is_recursive and not known[:nu].all():
+        finite = np.isfinite(values)
+        if self.u is None and not self.is_recursive and not finite[:nu].all():
             # A nonlinear model has no zero to begin with: it begins when all inputs are known.
             return Row(GAP, np.full(len(self.columns), np.nan), missing)
-        u, y = (np.where(known, values, np.nan)[part] for part in (slice(nu), slice(nu, None)))
+        u, y = (np.where(finite, values, np.nan)[part] for part in (slice(nu), slice(nu, None)))
         if missing:
             self._begin()
             fresh = True
         total = self.state.refused[1]
-        found, spoiled, restarted = self._found(y, u, may_restart=self.may_restart and not fresh)
+        evidence, spoiled, restarted = self._evidence_of(y, u, may_restart=self.may_restart and not fresh)
         self.u, fresh = self._begun(u), fresh or restarted
         if fresh:
             self.settled_at, self.phase = self._after(time, self.warm_up), WARM_UP
-        elif nu and not known[:nu].all():
+        elif nu and not finite[:nu].all():
             # A step took inputs that nobody measured.
             self.settled_at = self._after(time, self.warm_up)
             self.phase = WARM_UP if self.phase == WARM_UP else RECOVERING
         # A filter that begins with y(1) does not miss y(0).
-        received = (known[nu:] & ~self._refused(total)) | ~self.observer.timing.expected(self.state.k - 1)
+        received = (finite[nu:] & ~self._refused(total)) | ~self.observer.timing.expected(self.state.k - 1)
         if fresh and self.is_recursive:
             received = np.ones_like(received)
-        status = self._status(time, known[:nu], received, spoiled=spoiled)
-        whole = not spoiled and bool(known[:nu].all() and received.all())
-        return Row(status, self._values(found), missing, found, unsure=self._unsure(found, whole=whole, fresh=fresh))
+        status = self._status(time, finite[:nu], received, spoiled=spoiled)
+        complete = not spoiled and bool(finite[:nu].all() and received.all())
+        return Row(
+            status,
+            self._values(evidence),
+            missing,
+            evidence,
+            unsure=self._unsure(evidence, complete=complete, fresh=fresh),
+        )
 
-    def _unsure(self, found: Evidence, *, whole: bool, fresh: bool) -> FloatArray | None:
+    def _unsure(self, evidence: Evidence, *, complete: bool, fresh: bool) -> FloatArray | None:
         """Return by how many times the deviations of faults are above those before samples were missing, after a row
         that is ``whole`` or lacks some; ``None`` where none is."""
-        before, self.spread = self.spread, np.sqrt(np.diag(found.parameter_covariance))
+        before, self.spread = self.spread, np.sqrt(np.diag(evidence.parameter_covariance))
         if fresh:
             self.usual = np.zeros_like(before)
-        elif not whole:
+        elif not complete:
             self.usual = np.where(self.usual > 0.0, self.usual, before)
         self.usual = np.where(self.spread > self.usual, self.usual, 0.0)
         if not self.usual.any():
@@ -173,11 +179,11 @@ class SteppingLogObserver(LogObserver):
         """Return which outputs of the last sample were left out as outliers: of which more are than before it."""
         return np.asarray(self.state.refused[1] > total) & (self.observer.outliers == "gate")
 
-    def _found(self, y: FloatArray, u: FloatArray, *, may_restart: bool) -> tuple[Evidence, bool, bool]:
+    def _evidence_of(self, y: FloatArray, u: FloatArray, *, may_restart: bool) -> tuple[Evidence, bool, bool]:
         """Take one sample; return also whether its outputs were left out, and whether the observer started again."""
-        found = self._safe(y, u)
-        if found is not None:
-            return found, False, False
+        evidence = self._safe(y, u)
+        if evidence is not None:
+            return evidence, False, False
         try:
             return self._required(u), True, False
         except ObsynthError:
@@ -185,8 +191,8 @@ class SteppingLogObserver(LogObserver):
             if not may_restart:
                 raise
         self._begin()
-        found = self._safe(y, u)
-        return (self._required(u), True, True) if found is None else (found, False, True)
+        evidence = self._safe(y, u)
+        return (self._required(u), True, True) if evidence is None else (evidence, False, True)
 
     def _status(self, time: float, inputs: np.ndarray, outputs: np.ndarray, *, spoiled: bool) -> str:
         if spoiled or not inputs.all() or not outputs.any():
@@ -205,13 +211,13 @@ class SteppingLogObserver(LogObserver):
 
     def _required(self, u: FloatArray) -> Evidence:
         """Take one sample without outputs."""
-        found = self._taken(np.full(len(self.output_names), np.nan), u)
-        if found is None:
+        evidence = self._taken(np.full(len(self.output_names), np.nan), u)
+        if evidence is None:
             raise SpecError(
                 "the estimates are no finite numbers any more: the model is unstable, or the inputs are too large.",
                 path="inputs",
             )
-        return found
+        return evidence
 
 
 def _irregular_steps(observer: RecursiveObserver, design: ObserverDesign) -> IrregularSteps | None:

@@ -74,8 +74,8 @@ class _Output:
         """Take samples ``(n,)`` that were measured in the rows of these ``numbers (n,)``."""
         if not len(values):
             return
-        known = np.concatenate([self._tail, values])
-        third = np.diff(known, n=3)
+        recent = np.concatenate([self._tail, values])
+        third = np.diff(recent, n=3)
         signs = third[:-1] * third[1:]
         self._reversals += int(np.sum(signs < 0.0))
         self._pairs += int(np.sum(signs != 0.0))
@@ -87,8 +87,8 @@ class _Output:
         self._sizes.update(np.frexp(changes)[1].tolist())
         self._step = float(np.min(np.abs(changes), initial=self._step))
         before = () if self._run is None else self._run.before
-        said = np.concatenate([before, changes])
-        self._turns += int(np.sum(said[max(len(before), 1) :] * said[max(len(before), 1) - 1 : -1] < 0.0))
+        all_changes = np.concatenate([before, changes])
+        self._turns += int(np.sum(all_changes[max(len(before), 1) :] * all_changes[max(len(before), 1) - 1 : -1] < 0.0))
         self._opening = np.concatenate([self._opening, changes])[:LAST_CHANGES]
         earlier = () if self._run is None else self._run.lengths
         edges = np.append(begins, len(values))
@@ -100,13 +100,13 @@ class _Output:
             if self._run is not None:
                 self._end(self._run)
                 earlier = (*earlier, self._run.length)
-            shift, runs = len(said) - len(begins) + 1, [*earlier, *lengths.tolist()]
+            shift, runs = len(all_changes) - len(begins) + 1, [*earlier, *lengths.tolist()]
             for i in [*np.flatnonzero(lengths[:-1] >= LEAST_RUN), len(lengths) - 1]:
                 run = _Repeats(
                     int(lengths[i]),
                     int(numbers[edges[i]]),
                     int(numbers[edges[i + 1] - 1]),
-                    tuple(said[max(i + shift - LAST_CHANGES, 0) : i + shift].tolist()),
+                    tuple(all_changes[max(i + shift - LAST_CHANGES, 0) : i + shift].tolist()),
                     tuple(runs[max(i + len(earlier) - LAST_CHANGES + 1, 0) : i + len(earlier)]),
                 )
                 if i < len(lengths) - 1:
@@ -116,7 +116,7 @@ class _Output:
             self._lengths.update(lengths[:-1].tolist())
             if len(self._long) > 2 * MOST_STUCK_RUNS:
                 self._long = self._longest(self._long)
-        self._tail = known[-LAST_CHANGES - 1 :]
+        self._tail = recent[-LAST_CHANGES - 1 :]
 
     def _end(self, run: _Repeats) -> None:
         self._lengths[run.length] += 1
@@ -138,13 +138,13 @@ class _Output:
             return []
         counts, runs = self._all_runs()
         for count in range(min(len(runs), counts.total() - LEAST_OTHER_RUNS), 0, -1):
-            shortest, others = runs[count - 1].length, counts - Counter(run.length for run in runs[:count])
-            least, mean, longest, size = _longest_tenth(others)
+            shortest, other_lengths = runs[count - 1].length, counts - Counter(run.length for run in runs[:count])
+            least, mean, longest, size = _longest_tenth(other_lengths)
             above = mean - least
             chance = size * (above / (1.0 + above)) ** (shortest - least)
             if shortest >= TIMES_USUAL * longest and chance < EXPECTED_RUNS:
-                found = [run for run in runs[:count] if not self._rests(run)]
-                return [(run.first, run.last) for run in sorted(found, key=lambda run: run.first)]
+                stuck_runs = [run for run in runs[:count] if not self._rests(run)]
+                return [(run.first, run.last) for run in sorted(stuck_runs, key=lambda run: run.first)]
         return []
 
     @property
@@ -187,10 +187,10 @@ class _Output:
 
     def _usual_change(self) -> float:
         """Return the median change, as the power of two below it."""
-        half, seen = 0.5 * self._sizes.total(), 0
+        half, count = 0.5 * self._sizes.total(), 0
         for power in sorted(self._sizes):
-            seen += self._sizes[power]
-            if seen >= half:
+            count += self._sizes[power]
+            if count >= half:
                 return float(np.ldexp(0.5, power))
         return 0.0
 
@@ -226,10 +226,10 @@ class RepeatedValues:
         numbers = np.arange(self._rows, self._rows + len(values))
         self._waiting, self._waits, self._rows = [], 0, self._rows + len(values)
         for output, column in zip(self._outputs, values.T, strict=True):
-            seen = np.isfinite(column)
+            measured = np.isfinite(column)
             # Wild numbers have differences that overflow, which are no repeats.
             with np.errstate(over="ignore", invalid="ignore"):
-                output.take(numbers[seen], column[seen])
+                output.take(numbers[measured], column[measured])
 
     def stuck(self) -> list[list[tuple[int, int]]]:
         """Return by output the rows in which it is stuck."""
@@ -247,11 +247,11 @@ def stuck_rows(values: FloatArray) -> list[tuple[int, int]]:
 def without_repeats(values: FloatArray, stuck: Iterable[Sequence[tuple[int, int]]]) -> FloatArray:
     """Return outputs ``(n, ny)`` with NaN for what each repeats in the rows in which it is stuck: no noise of its
     sensor is there."""
-    found = np.array(values)
+    outputs = np.array(values)
     for i, runs in enumerate(stuck):
         for first, last in runs:
-            found[first + 1 : last + 1, i] = np.nan
-    return found
+            outputs[first + 1 : last + 1, i] = np.nan
+    return outputs
 
 
 def rising(times: Sequence[float], earlier: float = -np.inf) -> NDArray[np.bool_]:
@@ -265,17 +265,17 @@ def longest_repeats(logs: Sequence[FloatArray]) -> FloatArray:
     """Return from which equal sample in a row on each output says nothing any more ``(ny,)``, from normal logs
     ``(n, ny)``: `TIMES_USUAL` times as many as there ever are where it is not stuck, or the second one where there are
     never two; that costs one sample where it is chance. Infinite where it is not known."""
-    found = np.full(logs[0].shape[1], np.inf)
-    for i in range(len(found)):
+    limits = np.full(logs[0].shape[1], np.inf)
+    for i in range(len(limits)):
         outputs = [_Output() for _ in logs]
         for output, log in zip(outputs, logs, strict=True):
-            seen = np.flatnonzero(np.isfinite(log[:, i]))
+            measured = np.flatnonzero(np.isfinite(log[:, i]))
             with np.errstate(over="ignore", invalid="ignore"):
-                output.take(seen.astype(np.float64), log[seen, i])
+                output.take(measured.astype(np.float64), log[measured, i])
         usual = [output.longest_usual() for output in outputs]
         if all(usual):
-            found[i] = np.ceil(TIMES_USUAL * max(usual)) if max(usual) > 1 else 2.0
-    return found
+            limits[i] = np.ceil(TIMES_USUAL * max(usual)) if max(usual) > 1 else 2.0
+    return limits
 
 
 class Unrepeated:
@@ -290,22 +290,22 @@ class Unrepeated:
     def of_rows(self, values: FloatArray, counted: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
         """Return outputs ``(n, ny)`` without what they repeat in rows that are ``counted (n,)``, and the memory after
         each row ``(n, 2, ny)``; nothing is remembered yet."""
-        found, after = np.array(values), np.empty((len(values), 2, len(self.longest)))
+        outputs, after = np.array(values), np.empty((len(values), 2, len(self.longest)))
         rows = np.arange(1, len(values) + 1)
         for i, (last, equal) in enumerate(self.memory.T.tolist()):
-            seen = np.flatnonzero(np.isfinite(values[:, i]) & counted)
-            own = values[seen, i]
+            measured = np.flatnonzero(np.isfinite(values[:, i]) & counted)
+            own = values[measured, i]
             place, goes_on = np.arange(len(own)), np.diff(own, prepend=last) == 0.0
             if not equal:
                 goes_on[:1] = False
             begun = np.maximum.accumulate(np.where(goes_on, -1, place))
             counts = place - begun + np.where(begun < 0, equal, 1.0)
-            found[seen[counts >= self.longest[i]], i] = np.nan
+            outputs[measured[counts >= self.longest[i]], i] = np.nan
             # What is remembered after a row is what its last sample made it.
-            latest = np.searchsorted(seen + 1, rows, side="right")
+            latest = np.searchsorted(measured + 1, rows, side="right")
             after[:, 0, i] = np.concatenate([[last], own])[latest]
             after[:, 1, i] = np.concatenate([[equal], counts])[latest]
-        return found, after
+        return outputs, after
 
 
 def _rows(first: int, last: int) -> str:
@@ -313,14 +313,14 @@ def _rows(first: int, last: int) -> str:
 
 
 def stuck_texts(
-    stuck: Mapping[str, Sequence[tuple[int, int]]], shown: Callable[[int, int], str] = _rows, more: str = ""
+    stuck: Mapping[str, Sequence[tuple[int, int]]], rows_text: Callable[[int, int], str] = _rows, more: str = ""
 ) -> Iterator[str]:
     """Yield a sentence on each output that is stuck: ``shown`` says its rows, ``more`` what to do if its sensor was."""
     for name, runs in stuck.items():
         if runs:
-            where = ", ".join(shown(*run) for run in runs[:MOST_RUNS_TOLD])
-            others = f", and {len(runs) - MOST_RUNS_TOLD} more times" if len(runs) > MOST_RUNS_TOLD else ""
+            where = ", ".join(rows_text(*run) for run in runs[:MOST_RUNS_TOLD])
+            further = f", and {len(runs) - MOST_RUNS_TOLD} more times" if len(runs) > MOST_RUNS_TOLD else ""
             yield (
-                f"{name} repeats one value in {where}{others}, for longer than it otherwise does. Look whether its "
+                f"{name} repeats one value in {where}{further}, for longer than it otherwise does. Look whether its "
                 f"sensor was stuck{more}."
             )

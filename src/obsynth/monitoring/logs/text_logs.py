@@ -65,7 +65,7 @@ def number_in_cell(
     if cell.lower() in MISSING_TEXTS:
         return float("nan")
     try:
-        found = number_in_text(cell.replace(",", ".") if comma and "." not in cell else cell)
+        number = number_in_text(cell.replace(",", ".") if comma and "." not in cell else cell)
         if comma and stamps is not None and ("," in cell or "." in cell):
             mark = "." if "." in cell else ","
             if stamps.decimals.get(column) != mark:
@@ -73,11 +73,11 @@ def number_in_cell(
     except ValueError:
         grouped = _GROUPED.fullmatch(cell)
         if grouped is not None and stamps is not None:
-            whole, mark, decimals = grouped[1], grouped[3] or "", grouped[4] or ""
+            integer_part, mark, decimals = grouped[1], grouped[3] or "", grouped[4] or ""
             if mark:
                 stamps.take_mark(column, row, cell, mark, may_group=False)
             stamps.numeric.add(column)
-            return float(re.sub(r"[^\d+-]", "", whole) + "." + decimals)
+            return float(re.sub(r"[^\d+-]", "", integer_part) + "." + decimals)
         if stamps is not None and ("#" in cell or not any(letter.isdigit() for letter in cell)):
             stamps.take_word(column, row, cell)
             return float("nan")
@@ -91,7 +91,7 @@ def number_in_cell(
         raise SpecError(f"Row {row}, column {column!r}: {text!r} is no number.{advice}", path=f"row {row}") from None
     if stamps is not None:
         stamps.numeric.add(column)
-    return found
+    return number
 
 
 def _as_windows(error: UnicodeError) -> tuple[str, int]:
@@ -185,11 +185,11 @@ def opened_text(
         and not any(column_of(_names(head, separator), name) for separator in SEPARATORS for name in wanted)
     ):
         head = next(lines, "")
-    told = _SEPARATOR_LINE.fullmatch(head)
-    head = next(lines, "") if told else head
-    if not told and not _named(head, wanted):
+    separator_line = _SEPARATOR_LINE.fullmatch(head)
+    head = next(lines, "") if separator_line else head
+    if not separator_line and not _named(head, wanted):
         head, lines = _after_remarks(head, lines, wanted, notes)
-    separator = told.group(1) if told else _separator_of(head, wanted)
+    separator = separator_line.group(1) if separator_line else _separator_of(head, wanted)
     # A name in quotes may go on in the next line.
     table = _cells(itertools.chain([head], lines), separator)
     return tuple(unquoted(name.strip()) for name in next(table, [])), separator != ",", table
@@ -224,9 +224,11 @@ def _together(rows: Iterator[FloatArray], count: int) -> Iterator[FloatArray]:
 
 def _separator_of(head: str, wanted: Sequence[str]) -> str:
     """Return what separates the columns of a log: what finds the columns that are read, or finds most."""
-    found = {separator: _names(head, separator) for separator in SEPARATORS}
-    whole = next((s for s, names in found.items() if all(column_of(names, name) for name in wanted)), None)
-    return whole or max(SEPARATORS, key=lambda s: len(found[s]))
+    names_by_separator = {separator: _names(head, separator) for separator in SEPARATORS}
+    complete = next(
+        (s for s, names in names_by_separator.items() if all(column_of(names, name) for name in wanted)), None
+    )
+    return complete or max(SEPARATORS, key=lambda s: len(names_by_separator[s]))
 
 
 def _names(head: str, separator: str) -> Sequence[str]:

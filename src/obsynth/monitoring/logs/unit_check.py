@@ -79,10 +79,10 @@ class UnitCheck:
         self._done = True
         if len(self._rows) < LEAST_ROWS:
             return
-        found = self._change(np.array(self._rows))
-        if found is None:
+        explanation = self._change(np.array(self._rows))
+        if explanation is None:
             return
-        name, change = found
+        name, change = explanation
         if change.shift:
             remedy = f"convert its column, or name its unit in the header and in the plant: {name} (K)"
         else:
@@ -121,10 +121,10 @@ class UnitCheck:
         nu = self._signals.names.index(observer.plant.output_names[0])
         if not np.isfinite(rows[:, :nu]).all() or not _mean_square(observer, rows, nu) > UNEXPLAINED:
             return None
-        found = [(_mean_square(observer, new, nu), i, change) for i, change, new in self._changed(rows)]
-        if not found:
+        squares = [(_mean_square(observer, new, nu), i, change) for i, change, new in self._changed(rows)]
+        if not squares:
             return None
-        value, i, change = min(found, key=lambda one: one[0])
+        value, i, change = min(squares, key=lambda one: one[0])
         # What would be explained without the signal, too, shows no unit: a small factor makes anything as good as zero.
         if not value < EXPLAINED or not _mean_square(observer, self._after(rows, i, NOTHING), nu) > EXPLAINED:
             return None
@@ -147,15 +147,15 @@ class UnitCheck:
 def _mean_square(observer: Any, rows: Sequence[FloatArray] | FloatArray, nu: int) -> float:
     """Return the mean square of innovations per output, without the row where it is largest; infinite where a sample
     cannot be taken."""
-    state, found = observer.init(), []
+    state, squares = observer.init(), []
     for row in rows:
         try:
             with np.errstate(all="ignore"):
-                state, said = observer.accept(state, row[nu:], row[:nu])
+                state, estimate = observer.accept(state, row[nu:], row[:nu])
         except (ObsynthError, np.linalg.LinAlgError, ValueError):
             return np.inf
         degrees = int(np.isfinite(row[nu:]).sum())
         if degrees and state.k > 1:
-            found.append(float(said.nis) / degrees)
-    known = sorted(found)[:-1]
-    return float(np.mean(known)) if known and np.isfinite(known).all() else np.inf
+            squares.append(float(estimate.nis) / degrees)
+    kept = sorted(squares)[:-1]
+    return float(np.mean(kept)) if kept and np.isfinite(kept).all() else np.inf

@@ -54,10 +54,10 @@ def _of_columns(columns: Mapping[str, Any], path: str) -> pd.DataFrame:
     """Return a frame of columns ``(rows,)``, which may be matrices of one row or column."""
     import pandas as pd
 
-    found: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
     for name, values in columns.items():
         if isinstance(values, pd.Series):
-            found[name] = values.reset_index(drop=True)
+            arrays[name] = values.reset_index(drop=True)
             continue
         array = np.asarray(values)
         if array.ndim != 1 and array.size != max(array.shape, default=0):
@@ -66,12 +66,12 @@ def _of_columns(columns: Mapping[str, Any], path: str) -> pd.DataFrame:
                 "matrix a name of its own.",
                 path=f"{path}.{name}",
             )
-        found[name] = array.ravel()
-    lengths = {name: len(values) for name, values in found.items()}
+        arrays[name] = array.ravel()
+    lengths = {name: len(values) for name, values in arrays.items()}
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{name!r} {count}" for name, count in lengths.items())
-        raise SpecError(f"The columns have different numbers of rows: {told}.", path=path)
-    return pd.DataFrame(found)
+        listed = ", ".join(f"{name!r} {count}" for name, count in lengths.items())
+        raise SpecError(f"The columns have different numbers of rows: {listed}.", path=path)
+    return pd.DataFrame(arrays)
 
 
 @contextmanager
@@ -110,8 +110,8 @@ def _sheet_text(path: Path, wanted: Sequence[str]) -> str:
         book = openpyxl.load_workbook(path, read_only=True, data_only=True)
         sheets = [[list(row) for row in sheet.iter_rows(values_only=True)] for sheet in book.worksheets]
     except Exception as error:  # readers of damaged bytes raise what comes
-        told = " ".join(str(error).split()) or type(error).__name__
-        raise SpecError(f"{path} cannot be read: openpyxl says {told!r}.", path=str(path)) from error
+        cause = " ".join(str(error).split()) or type(error).__name__
+        raise SpecError(f"{path} cannot be read: openpyxl says {cause!r}.", path=str(path)) from error
     finally:
         if book is not None:
             book.close()
@@ -159,18 +159,18 @@ def mat_channels(path: Path) -> list[tuple[str, str, Any]]:
             "save(..., '-v7'), or as CSV with writetable.",
             path=str(path),
         ) from error
-    found: list[tuple[str, str, Any]] = []
+    channels: list[tuple[str, str, Any]] = []
     for name, value in held.items():
         if name.startswith("__"):
             continue
         fields = getattr(value, "_fieldnames", None)
-        found += [("", name, value)] if fields is None else [(name, own, getattr(value, own)) for own in fields]
-    return found
+        channels += [("", name, value)] if fields is None else [(name, own, getattr(value, own)) for own in fields]
+    return channels
 
 
-def channel_frame(found: Mapping[str, Any], path: Path) -> pd.DataFrame:
+def channel_frame(arrays: Mapping[str, Any], path: Path) -> pd.DataFrame:
     """Return a frame of arrays by the names of the columns that are read."""
-    for name, values in found.items():
+    for name, values in arrays.items():
         array = np.asarray(values)
         if array.dtype.names is not None or array.dtype.kind not in "biufcmMUO":
             raise SpecError(
@@ -178,4 +178,4 @@ def channel_frame(found: Mapping[str, Any], path: Path) -> pd.DataFrame:
                 "columns (in MATLAB table2struct(T, 'ToScalar', true), or writetable as CSV).",
                 path=str(path),
             )
-    return _of_columns(dict(found), str(path))
+    return _of_columns(dict(arrays), str(path))

@@ -39,15 +39,15 @@ class WindowLogObserver(LogObserver):
             self.state, self.complete = self.observer.skip(self.state, missing), 0
             self.phase = RECOVERING if self.phase == OK else self.phase
         nu, k = len(self.input_names), self.state.k
-        found = np.where(np.isfinite(values), values, np.nan)
+        signals = np.where(np.isfinite(values), values, np.nan)
         with np.errstate(over="ignore", invalid="ignore"):
-            self.state, value = self.observer.advance(self.state, found[nu:], found[:nu])
-        known = bool(np.isfinite(values).all())
-        self.complete = min(self.complete + 1, self.observer.samples) if known else 0
+            self.state, value = self.observer.advance(self.state, signals[nu:], signals[:nu])
+        complete = bool(np.isfinite(values).all())
+        self.complete = min(self.complete + 1, self.observer.samples) if complete else 0
         status = GAP
-        if known:
+        if complete:
             full = self.complete == self.observer.samples and k >= self.observer.samples
             self.phase = OK if full else RECOVERING if self.phase in (OK, RECOVERING) else WARM_UP
             status = self.phase
         row_values = np.array([value])
-        return Row(status, row_values, missing, LinearSample(row_values, found[:nu], found[nu:], 0))
+        return Row(status, row_values, missing, LinearSample(row_values, signals[:nu], signals[nu:], 0))

@@ -120,10 +120,10 @@ def plot_data(
     panels = new_panels(axes, len(plans), size=(WIDTH, PANEL_HEIGHT * max(len(plans), 1) + 0.6))
     units = {} if design is None else dict(design.plant.units)
     # A marked alarm explains the red rows as well.
-    told = {"alarm"} if any(part == "faults" and name in run.alarms for part, name in plans) else set[str]()
+    explained = {"alarm"} if any(part == "faults" and name in run.alarms for part, name in plans) else set[str]()
     drawing = _Drawing(run, run.table, units, design)
     for panel, (part, name) in zip(panels, plans, strict=True):
-        _shade(panel, run.table, told, _alarm_rows(run, run.table, part, name))
+        _shade(panel, run.table, explained, _alarm_rows(run, run.table, part, name))
         getattr(drawing, part)(panel, name)
         legend_above(panel)
         tidy(panel)
@@ -226,8 +226,8 @@ class _Drawing:
             if where.any():
                 panel.fill_between(times, low, high, where=where, label=band, **BAND_STYLE)
             if contradicted.any():
-                told = "interval not valid: the alarm contradicts its noise"
-                panel.fill_between(times, low, high, where=contradicted, label=told, **CONTRADICTED_STYLE)
+                not_valid = "interval not valid: the alarm contradicts its noise"
+                panel.fill_between(times, low, high, where=contradicted, label=not_valid, **CONTRADICTED_STYLE)
         panel.plot(times, values, label="estimate", **ESTIMATE_STYLE)
         if adaptive:
             limit = table[f"threshold {column}"].to_numpy(float)
@@ -278,9 +278,9 @@ class _Drawing:
         names = [name for name in self.table.columns if name.startswith("share ")]
         values = 100.0 * np.nan_to_num(self.table[names].to_numpy(float))
         order = np.argsort(-values.mean(axis=0), kind="stable")
-        shown, others = order[: MOST_DRAWN - 1], order[MOST_DRAWN - 1 :]
-        parts = [values[:, i] for i in shown] + ([values[:, others].sum(axis=1)] if len(others) else [])
-        labels = [names[i].removeprefix("share ") for i in shown] + (["other constants"] if len(others) else [])
+        drawn, rest_of_them = order[: MOST_DRAWN - 1], order[MOST_DRAWN - 1 :]
+        parts = [values[:, i] for i in drawn] + ([values[:, rest_of_them].sum(axis=1)] if len(rest_of_them) else [])
+        labels = [names[i].removeprefix("share ") for i in drawn] + (["other constants"] if len(rest_of_them) else [])
         panel.stackplot(
             self.table["time"], parts, labels=labels, colors=LINE_COLOURS[: len(parts)], alpha=0.7, linewidth=0.0
         )
@@ -332,7 +332,7 @@ def _alarm_rows(run: DataRun, table: Any, part: str, column: str) -> Any:
     return texts.map(lambda text: any(map(concerns, text.split("; ")))).to_numpy(bool)
 
 
-def _shade(panel: Axes, table: Any, told: set[str], alarms: Any) -> None:
+def _shade(panel: Axes, table: Any, explained: set[str], alarms: Any) -> None:
     """Shade the rows in which nothing is decided, and those with an alarm; each is explained in one panel."""
     undecided = ~table["status"].isin(DECIDING).to_numpy()
     marks = [(undecided, _UNDECIDED_ROWS, "warm-up or gap"), (alarms, _ALARM, "alarm")]
@@ -340,6 +340,6 @@ def _shade(panel: Axes, table: Any, told: set[str], alarms: Any) -> None:
     for where, style, label in marks:
         edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int64)))
         for begin, end in edges.reshape(-1, 2):
-            new = None if label in told else label
-            told.add(label)
+            new = None if label in explained else label
+            explained.add(label)
             panel.axvspan(times.iloc[begin], times.iloc[min(end, len(times) - 1)], label=new, **style)

@@ -35,8 +35,8 @@ def _range(name: str, text: str) -> tuple[float, float]:
 
 
 def _log_arguments(options: argparse.Namespace) -> dict[str, Any]:
-    given = {"rows": options.rows, "columns": columns_of(options), "scales": dict(numbers_of(options.scale))}
-    return {name: value for name, value in given.items() if value}
+    arguments = {"rows": options.rows, "columns": columns_of(options), "scales": dict(numbers_of(options.scale))}
+    return {name: value for name, value in arguments.items() if value}
 
 
 def run_linearise(options: argparse.Namespace) -> int:
@@ -55,8 +55,8 @@ def run_linearise(options: argparse.Namespace) -> int:
     free: Any = [name for name in options.free if "=" not in name]
     bounded = dict(pair(name) for name in options.free if "=" in name)
     if bounded:
-        whole = (float("-inf"), float("inf"))
-        free = {name: whole for name in free} | {name: _range(name, text) for name, text in bounded.items()}
+        unbounded = (float("-inf"), float("inf"))
+        free = {name: unbounded for name in free} | {name: _range(name, text) for name, text in bounded.items()}
     own = (options.at, options.given, options.free, options.fault, options.disturbance, options.drift)
     if spec is not None and isinstance(spec.plant, DescriptorSystem) and not any(own):
         # The point that the spec states, with its tolerances and noise.
@@ -71,26 +71,26 @@ def run_linearise(options: argparse.Namespace) -> int:
             disturbances=options.disturbance,
             drift=options.drift,
         )
-    found = None
+    comparison = None
     if options.data is not None:
-        found = validity(model, linear, options.data, **_log_arguments(options))
+        comparison = validity(model, linear, options.data, **_log_arguments(options))
     if target is not None:
         write_atomically(target, plant_document(linear, options.system.name))
-    told = linear_plant_text(linear) if found is None else f"{linear_plant_text(linear)}\n{found}"
+    summary = linear_plant_text(linear) if comparison is None else f"{linear_plant_text(linear)}\n{comparison}"
     emit(
         options,
         {
             "system": options.system,
             "file": target,
             "operating_point": dict(linear.operating_point),
-            "validity": None if found is None else found.to_dict(),
+            "validity": None if comparison is None else comparison.to_dict(),
             **{name: getattr(linear, name) for name in ("E", "A", "B", "C", "Bf", "Df", "Bd")},
             **{
                 name: list(getattr(linear, name))
                 for name in ("state_names", "input_names", "output_names", "fault_names", "disturbance_names")
             },
         },
-        told,
+        summary,
     )
     return 0
 
@@ -103,8 +103,8 @@ def run_calibrate(options: argparse.Namespace) -> int:
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
         plant, spec = load_plant(options.system)
-        asked = _asked(spec, options)
-        log, digest = asked.pop("log"), asked.pop("digest", None)
+        arguments = _asked(spec, options)
+        log, digest = arguments.pop("log"), arguments.pop("digest", None)
         if log is None:
             raise SpecError("There is no log: give --data, or calibrate.log in the spec.", path="calibrate.log")
         protect(log)
@@ -115,20 +115,20 @@ def run_calibrate(options: argparse.Namespace) -> int:
                 f"{written} is in another folder than {options.system}, whose files it refers to: write it to that "
                 "folder.", path="write-spec",
             )  # fmt: skip
-        found = calibrate(plant, log, progress=report_stage, **asked)
-        if digest is not None and digest != found.box.digest:
+        calibration = calibrate(plant, log, progress=report_stage, **arguments)
+        if digest is not None and digest != calibration.box.digest:
             raise SpecError(
-                f"The log {log} is not the one that the spec names: its digest is {found.box.digest}, and "
+                f"The log {log} is not the one that the spec names: its digest is {calibration.box.digest}, and "
                 f"calibrate.digest {digest}.", path="calibrate.digest",
             )  # fmt: skip
-    told = {name: value for name, value in asked.items() if name not in ("log", "digest")}
-    data = {"kind": CALIBRATION_KIND, "system": options.system.name, **found.to_dict()}
+    stated = {name: value for name, value in arguments.items() if name not in ("log", "digest")}
+    data = {"kind": CALIBRATION_KIND, "system": options.system.name, **calibration.to_dict()}
     if target is not None:
-        write_atomically(target, calibration_text({**data, "asked": plain(told)}))
+        write_atomically(target, calibration_text({**data, "asked": plain(stated)}))
     if written is not None:
         beside = target if target is not None and target.parent == written.parent else None
-        write_atomically(written, calibrated_spec(options.system, found, calibration=beside))
-    emit(options, {"file": target, **data}, f"{found}\n  digest of the log: {found.box.digest}")
+        write_atomically(written, calibrated_spec(options.system, calibration, calibration=beside))
+    emit(options, {"file": target, **data}, f"{calibration}\n  digest of the log: {calibration.box.digest}")
     return 0
 
 
@@ -136,34 +136,36 @@ def _asked(spec: Spec | None, options: argparse.Namespace) -> dict[str, Any]:
     """Return the arguments of `calibrate`: of the spec, those of its nonlinear method, and of the command line."""
     from obsynth.plants.dae import DAEModel
 
-    asked: dict[str, Any] = {"log": None}
+    arguments: dict[str, Any] = {"log": None}
     if spec is not None:
         if isinstance(spec.plant, DAEModel):
             method = spec.options
             if isinstance(method.get("Q"), dict):
-                asked["noisy"] = [name for name, variance in method["Q"].items() if variance > 0.0]
+                arguments["noisy"] = [name for name, variance in method["Q"].items() if variance > 0.0]
             for name in ("dt", "initial_state", "initial_covariance"):
                 if method.get(name) is not None:
-                    asked[name] = _without_offsets(method[name], spec)
-        asked |= spec.noise or {}
-        if "sensor_noise" in asked:
+                    arguments[name] = _without_offsets(method[name], spec)
+        arguments |= spec.noise or {}
+        if "sensor_noise" in arguments:
             # White noise is calibrated anew.
-            coloured = {name: item for name, item in asked["sensor_noise"].items() if isinstance(item, dict)}
-            asked["sensor_noise"] = coloured or None
-        asked |= dict(spec.calibrate or {})
-        if asked["log"] is not None:
-            asked["log"] = spec.path.parent / asked["log"]
+            coloured = {name: item for name, item in arguments["sensor_noise"].items() if isinstance(item, dict)}
+            arguments["sensor_noise"] = coloured or None
+        arguments |= dict(spec.calibrate or {})
+        if arguments["log"] is not None:
+            arguments["log"] = spec.path.parent / arguments["log"]
     if options.data is not None:
-        asked["log"] = options.data
-    asked |= _log_arguments(options)
-    asked["unknown"] = dict(asked.get("unknown", {})) | {name: _range(name, text) for name, text in options.unknown}
+        arguments["log"] = options.data
+    arguments |= _log_arguments(options)
+    arguments["unknown"] = dict(arguments.get("unknown", {})) | {
+        name: _range(name, text) for name, text in options.unknown
+    }
     late = None if spec is None or spec.inputs is None else spec.input_delay(spec.model or spec.plant)
     if late is not None:
-        asked["input_delay"] = late
+        arguments["input_delay"] = late
     for name in ("input_delay", "level"):
         if getattr(options, name) is not None:
-            asked[name] = getattr(options, name)
-    return asked
+            arguments[name] = getattr(options, name)
+    return arguments
 
 
 def _without_offsets(stated: Any, spec: Spec) -> Any:
@@ -182,8 +184,8 @@ def run_validate(options: argparse.Namespace) -> int:
     protect(options.data)
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"running {options.gains} over {options.data}")
-        found = validate(
+        validation = validate(
             with_input_delay(design, options), options.data, progress=report_stage, **_log_arguments(options)
         )
-    emit(options, {"gains": options.gains, "data": options.data, **found.to_dict()}, str(found))
-    return 0 if found.passed else VerificationError.exit_code
+    emit(options, {"gains": options.gains, "data": options.data, **validation.to_dict()}, str(validation))
+    return 0 if validation.passed else VerificationError.exit_code

@@ -66,7 +66,7 @@ def run_of(
         if is_followed
         else rows_done(options.data, quiet=is_quiet or out is sys.stdout) as progress,
     ):
-        found = run_on_data(
+        run = run_on_data(
             design,
             log,
             out,
@@ -82,9 +82,9 @@ def run_of(
             units_as_is=getattr(options, "units_as_is", False),
             **more,
         )
-    for text in found.warnings:
+    for text in run.warnings:
         print(f"Warning: {text}", file=sys.stderr)
-    return found
+    return run
 
 
 def health() -> Callable[[int], None]:
@@ -139,13 +139,13 @@ def monitor_settings(design: ObserverDesign, options: argparse.Namespace) -> dic
     from obsynth.observers.linear.observer import LinearObserver
 
     table = LINEAR_OPTIONS if isinstance(design.observer, LinearObserver) else PARAMETER_OPTIONS
-    given = stated_settings(options)
+    stated = stated_settings(options)
     if getattr(options, "prove", None) is not None:
-        del given["window"]  # it is that of the proof
-    refuse_idle(table, options.monitor, given, called=flag_of)
-    given["constants"] = own_tolerances(design, options.monitor)
+        del stated["window"]  # it is that of the proof
+    refuse_idle(table, options.monitor, stated, called=flag_of)
+    stated["constants"] = own_tolerances(design, options.monitor)
     acting = table.get(options.monitor, ())
-    settings = {name: value for name, value in given.items() if name in acting and value is not None}
+    settings = {name: value for name, value in stated.items() if name in acting and value is not None}
     return {**settings, "unverified": options.unverified}
 
 
@@ -177,30 +177,30 @@ def monitor_of(design: ObserverDesign, options: argparse.Namespace, *, has_scena
     )
 
 
-def summary_of_run(found: DataRun, watched: Monitor | None) -> str:
+def summary_of_run(run: DataRun, watched: Monitor | None) -> str:
     """Return what a run was, in a few lines."""
     from obsynth.monitoring.alarms.events import alarm_notes, alarm_rows, silence, time_in_alarm
 
-    counts = ", ".join(f"{count} {status}" for status, count in found.statuses.items())
-    lines = [f"{found.rows} rows: {counts}."]
-    if found.recovered:
-        states = [f"{name} ({kind.replace('needs', 'with')})" for name, kind in found.recovered.items()]
+    counts = ", ".join(f"{count} {status}" for status, count in run.statuses.items())
+    lines = [f"{run.rows} rows: {counts}."]
+    if run.recovered:
+        states = [f"{name} ({kind.replace('needs', 'with')})" for name, kind in run.recovered.items()]
         lines.append(f"Also estimated, of the plant as written: {listed(states)}.")
-    if found.outliers:
-        told = ", ".join(f"{count} of {name}" for name, count in found.outliers.items())
-        count = sum(found.outliers.values())
-        lines.append(f"{count} outlier{'s' if count != 1 else ''}: {told}.")
-    for name, time in found.alarms.items():
-        first = next((event for event in found.events if event.by == name), None)
+    if run.outliers:
+        listed_outliers = ", ".join(f"{count} of {name}" for name, count in run.outliers.items())
+        count = sum(run.outliers.values())
+        lines.append(f"{count} outlier{'s' if count != 1 else ''}: {listed_outliers}.")
+    for name, time in run.alarms.items():
+        first = next((event for event in run.events if event.by == name), None)
         clear = watched is not None and name == watched.kind and first is not None and first.clear
         fault = f" Probable fault: {first.fault}." if clear and first is not None else ""
-        by = f"threshold of {name}" if name in found.thresholds else f"monitor: {name}"
-        lines.append(f"First alarm {found.stamps.shown(time)} ({by}).{fault}")
-    rows, more = alarm_rows(found.events, found.stamps.shown)
+        by = f"threshold of {name}" if name in run.thresholds else f"monitor: {name}"
+        lines.append(f"First alarm {run.stamps.shown(time)} ({by}).{fault}")
+    rows, more = alarm_rows(run.events, run.stamps.shown)
     table = [*(text_table(rows) if rows else []), *([f"and {more} more"] if more else [])]
-    lines += [*(f"  {line}" for line in table), *alarm_notes(found.events), *time_in_alarm(found.events, found.rows)]
-    if watched is not None or found.thresholds:
-        lines += silence(found, watched.kind if watched else "any threshold")
+    lines += [*(f"  {line}" for line in table), *alarm_notes(run.events), *time_in_alarm(run.events, run.rows)]
+    if watched is not None or run.thresholds:
+        lines += silence(run, watched.kind if watched else "any threshold")
     if watched is not None:
         lines.append(f"The {watched.kind} threshold: {watched.statement}.")
     return "\n".join(lines)
@@ -265,13 +265,13 @@ def certificate_target(options: argparse.Namespace) -> Path | None:
     return output_file(options.prove, CERTIFICATE, options, option="--prove")
 
 
-def alarm_of_run(design: ObserverDesign, options: argparse.Namespace, found: DataRun, target: Path) -> dict[str, Any]:
+def alarm_of_run(design: ObserverDesign, options: argparse.Namespace, run: DataRun, target: Path) -> dict[str, Any]:
     """Return whether the first alarm of a run is proved, in words, and the certificate's file."""
-    row = found.alarm_rows.get("pointwise")
+    row = run.alarm_rows.get("pointwise")
     if row is None:
         return {"proved": False, "row": None, "statement": "No alarm: there is nothing to prove.", "file": None}
     window = options.window or WINDOW
-    tried = [min(row + int(share * window), found.rows) for share in _LATER]
+    tried = [min(row + int(share * window), run.rows) for share in _LATER]
     for last in dict.fromkeys(max(number, 2) for number in tried):
         proof = proof_of(design, options, last)
         if proof.proved:

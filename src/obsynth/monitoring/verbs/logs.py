@@ -35,8 +35,8 @@ def run_run(options: argparse.Namespace) -> int:
                 "--input-delay is for one gain set: state inputs.hold in the specs of a folder.", path="--input-delay"
             )
         return int(registered("run_many")(options))
-    for name, given in (("--jobs", options.jobs is not None), ("--cluster", options.cluster is not None)):
-        if given:
+    for name, is_given in (("--jobs", options.jobs is not None), ("--cluster", options.cluster is not None)):
+        if is_given:
             raise SpecError(
                 f"{name} spreads the gain sets of a folder: {options.gains} is one gain set. Leave {name} out.",
                 path=name,
@@ -49,7 +49,7 @@ def run_run(options: argparse.Namespace) -> int:
     certificate = certificate_target(options)
     design, mark = gains_to_hand_on(options.gains, unverified=options.unverified)
     watched = monitor_of(design, options)
-    found = run_of(
+    run = run_of(
         design,
         options,
         watched,
@@ -61,7 +61,7 @@ def run_run(options: argparse.Namespace) -> int:
         state=options.state,
         **({} if options.state_every is None else {"state_every": options.state_every}),
     )
-    proof = None if certificate is None else alarm_of_run(design, options, found, certificate)
+    proof = None if certificate is None else alarm_of_run(design, options, run, certificate)
     if options.json:
         print_json(
             {
@@ -69,7 +69,7 @@ def run_run(options: argparse.Namespace) -> int:
                 **({} if proof is None else {"proof": proof}),
                 "gains": str(options.gains),
                 "file": str(out),
-                **found.as_dict(),
+                **run.as_dict(),
                 **({"unverified": mark} if mark else {}),
                 "monitor": None if watched is None else {"kind": watched.kind, "statement": watched.statement},
             }
@@ -77,7 +77,7 @@ def run_run(options: argparse.Namespace) -> int:
     elif not options.quiet:
         # The estimates themselves may be on stdout.
         stream = sys.stderr if out is sys.stdout else sys.stdout
-        print(*([mark] if mark else []), summary_of_run(found, watched), sep="\n", file=stream)
+        print(*([mark] if mark else []), summary_of_run(run, watched), sep="\n", file=stream)
         if proof is not None:
             print(proof["statement"], *(["Certificate:", proof["file"]] if proof["file"] else []), file=stream)
     return 0
@@ -111,21 +111,21 @@ def run_prove_alarm(options: argparse.Namespace) -> int:
 
     design = load(options.gains)  # `prove_alarm` verifies it
     target = None if options.out is None else output_file(options.out, CERTIFICATE, options)
-    found = proof_of(design, options, options.row, state_bounds=numbers_of(options.state_bound) or None)
-    file = str(found.save(target)) if found.proved and target is not None else None
+    proof = proof_of(design, options, options.row, state_bounds=numbers_of(options.state_bound) or None)
+    file = str(proof.save(target)) if proof.proved and target is not None else None
     emit(
         options,
         {
             "gains": options.gains,
-            "proved": found.proved,
-            "row": found.row,
-            "window": found.window,
-            "margin": found.margin,
-            "statement": found.statement,
-            "origin": found.origin,
+            "proved": proof.proved,
+            "row": proof.row,
+            "window": proof.window,
+            "margin": proof.margin,
+            "statement": proof.statement,
+            "origin": proof.origin,
             "file": file,
         },
-        found.statement + (f"\nCertificate: {file}" if file else ""),
+        proof.statement + (f"\nCertificate: {file}" if file else ""),
     )
     return 0
 
@@ -159,12 +159,12 @@ def run_plot(options: argparse.Namespace) -> int:
     parts = [part.strip() for part in options.show.split(",") if part.strip()]
     design, mark = gains_to_hand_on(options.gains, unverified=options.unverified)
     watched = monitor_of(design, options, has_scenario=True)
-    found = run_of(design, options, watched)
+    run = run_of(design, options, watched)
     from obsynth.monitoring.plots.data import panel_count, plot_data
 
     if target is not None:
-        count = panel_count(found, parts, design=design)
-        written_picture(target, count, lambda axes: plot_data(found, design=design, show=parts, axes=axes))
+        count = panel_count(run, parts, design=design)
+        written_picture(target, count, lambda axes: plot_data(run, design=design, show=parts, axes=axes))
     else:
         import matplotlib as mpl
         import matplotlib.pyplot as plt
@@ -173,10 +173,10 @@ def run_plot(options: argparse.Namespace) -> int:
             raise SpecError(
                 "There is no screen to open a window on: give --out a file (.png, .svg or .pdf).", path="--out"
             )
-        plot_data(found, design=design, show=parts)
+        plot_data(run, design=design, show=parts)
         plt.show()
     if options.json or not options.quiet:
-        told = "\n".join([*([mark] if mark else []), summary_of_run(found, watched)])
+        text = "\n".join([*([mark] if mark else []), summary_of_run(run, watched)])
         unverified = {"unverified": mark} if mark else {}
-        emit(options, {"gains": options.gains, "file": target, **found.as_dict(), **unverified}, told)
+        emit(options, {"gains": options.gains, "file": target, **run.as_dict(), **unverified}, text)
     return 0

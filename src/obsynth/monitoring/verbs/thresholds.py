@@ -31,7 +31,7 @@ def run_thresholds(options: argparse.Namespace) -> int:
     if target is not None and target.suffix.lower() != ".json":
         raise SpecError(f"{target}: thresholds are written as JSON (.json).", path="--out")
     design, _ = gains_to_hand_on(options.gains, unverified=options.unverified)
-    found = learn_thresholds(
+    learned = learn_thresholds(
         with_input_delay(design, options),
         sys.stdin if is_stream else Path(logs[0]) if len(logs) == 1 else [Path(log) for log in logs],
         false_alarms=options.false_alarms or FALSE_ALARM_RATE,
@@ -43,43 +43,43 @@ def run_thresholds(options: argparse.Namespace) -> int:
         gap=options.gap,
         warm_up=options.warm_up,
     )
-    file = None if target is None else found.save(target)
-    levels = dict(zip(found.statistics.names, found.levels.tolist(), strict=True))
-    if not found.holds:
+    file = None if target is None else learned.save(target)
+    levels = dict(zip(learned.statistics.names, learned.levels.tolist(), strict=True))
+    if not learned.holds:
         print(
-            f"Warning: the rate needs {found.needed} rows without faults, and {found.rows} are given."
-            if found.rows < found.needed
-            else f"Warning: {100 * found.healthy_time.expected:.2g} % of healthy time is in alarm.",
+            f"Warning: the rate needs {learned.needed} rows without faults, and {learned.rows} are given."
+            if learned.rows < learned.needed
+            else f"Warning: {100 * learned.healthy_time.expected:.2g} % of healthy time is in alarm.",
             file=sys.stderr,
         )
-    lines = [f"{found.statement[0].upper()}{found.statement[1:]}.", f"Monitored: {', '.join(found.columns)}."]
-    if found.seldom:
-        lines.append(f"Left out (missing in most rows): {', '.join(found.seldom)}.")
-    if dependent := [name for name in found.left_out if name not in found.seldom]:
+    lines = [f"{learned.statement[0].upper()}{learned.statement[1:]}.", f"Monitored: {', '.join(learned.columns)}."]
+    if learned.seldom:
+        lines.append(f"Left out (missing in most rows): {', '.join(learned.seldom)}.")
+    if dependent := [name for name in learned.left_out if name not in learned.seldom]:
         lines.append(f"Left out (redundant or too slowly varying): {', '.join(dependent)}.")
-    estimates_are_left_out = not any(name.startswith("fhat[") for name in found.columns)
-    if found.left_out and expects_fault_courses(design) and estimates_are_left_out:
+    estimates_are_left_out = not any(name.startswith("fhat[") for name in learned.columns)
+    if learned.left_out and expects_fault_courses(design) and estimates_are_left_out:
         lines.append(
             "Once the estimate follows a fault, these return to zero: an alarm comes at the onset of the fault or "
             "not at all. Give run a level for the estimate as well (--threshold)."
         )
-    lines += found.notes
+    lines += learned.notes
     emit(
         options,
         {
             "gains": options.gains,
             "file": file,
-            "holds": found.holds,
-            "statement": found.statement,
-            "notes": list(found.notes),
-            "rows": found.rows,
-            "needed": found.needed,
-            "rows_per_alarm": found.every,
-            "watched": list(found.columns),
-            "left_out": list(found.left_out),
+            "holds": learned.holds,
+            "statement": learned.statement,
+            "notes": list(learned.notes),
+            "rows": learned.rows,
+            "needed": learned.needed,
+            "rows_per_alarm": learned.every,
+            "watched": list(learned.columns),
+            "left_out": list(learned.left_out),
             "levels": levels,
-            "logs": found.logs,
-            "healthy_time": found.healthy_time._asdict(),
+            "logs": learned.logs,
+            "healthy_time": learned.healthy_time._asdict(),
         },
         "\n".join(lines),
     )
