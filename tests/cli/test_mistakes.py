@@ -168,6 +168,8 @@ def test_what_is_given_instead_of_a_plant_or_a_method_is_named() -> None:
 def test_a_misspelt_function_is_asked_about() -> None:
     with pytest.raises(AttributeError, match="Did you mean 'fault_estimation_filter'"):
         _ = obsynth.fault_estimation_filer
+    with pytest.raises(AttributeError, match="Did you mean 'plot_faults'"):
+        _ = obsynth.plotting.plot_fault
     with pytest.raises(AttributeError, match=r"no attribute 'zzz'$"):
         _ = obsynth.zzz
 
