@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import obsynth
+from obsynth.cli.main import main
 from obsynth.plants.input_derivatives import difference_quotients
 from obsynth.plants.transformations.index_reduction import with_input_derivatives
 
@@ -168,3 +169,43 @@ def test_differences_go_on_from_chunk_to_chunk():
             part, before = difference_quotients(times[place : place + 1], values[place : place + 1], order, before)
             parts.extend(part)
         assert parts == whole.tolist()
+
+
+CAM = """
+schema_version: 1
+name: cam
+plant:
+  dt: 0
+  state_names: [x, q, speed, force]
+  input_names: [u]
+  output_names: [y1, y2]
+  E: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
+  A: [[-1, 1, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 1, -1]]
+  B: [[0], [0], [-1], [0]]
+  C: [[1, 0, 0, 0], [1, 0, 0, 2]]
+  Bf: [[1], [0], [0], [0]]
+  fault_names: [leak]
+  sensor_noise: {y1: 0.01, y2: 0.01}
+method: {id: ui-pi-observer}
+scenario:
+  horizon: 60 s
+  sample_time: 50 ms
+  inputs: {u: {kind: sine, amplitude: 1, frequency: 0.05}}
+  faults: {leak: {kind: step, size: 0.5, start: 30 s}}
+"""
+
+
+@pytest.mark.long
+def test_a_spec_is_designed_simulated_and_run_by_commands(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "spec.yaml").write_text(CAM, encoding="utf-8")
+    assert main(["design", "--system", "spec.yaml"]) == 0
+    assert main(["simulate", "--system", "spec.yaml", "--gains", "cam.gains.json", "--out", "run.csv"]) == 0
+    pd.read_csv("run.csv")[["time", "u", "y1", "y2"]].to_csv("log.csv", index=False)
+    assert main(["run", "--gains", "cam.gains.json", "--data", "log.csv", "--out", "est.csv"]) == 0
+    assert "derivative of u is formed from u by differences" in capsys.readouterr().err
+    assert abs(pd.read_csv("est.csv")["fhat[leak]"].iloc[-1] - SIZE) < 0.02
+    # A plant with other signals is still another plant.
+    (tmp_path / "other.yaml").write_text(CAM.replace("[u]", "[drive]").replace("{u:", "{drive:"), encoding="utf-8")
+    assert main(["simulate", "--system", "other.yaml", "--gains", "cam.gains.json", "--out", "o.csv"]) == 2
+    assert "is for a plant with other signals" in capsys.readouterr().err

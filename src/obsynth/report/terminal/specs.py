@@ -11,6 +11,10 @@ from typing import TYPE_CHECKING, Any
 from obsynth.errors import SpecError
 from obsynth.files.inputs import protect
 from obsynth.files.outputs import FileKind
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.input_derivatives import derivative_of
+from obsynth.plants.pencil import structure_of
+from obsynth.plants.transformations.exact_elimination import EXACT_ELIMINATION_UP_TO
 from obsynth.report.terminal.arguments import refuse_given
 from obsynth.report.terminal.output import gains_to_hand_on, output_file
 from obsynth.specs.loader import design_of_spec
@@ -38,8 +42,12 @@ def designed_or_loaded(
 
 def require_same_signals(design: ObserverDesign, gains: Path, spec: Spec) -> None:
     """Raise `SpecError` unless a gain set is for a plant with the inputs and outputs of a spec's plant."""
-    # States may differ: a method may have eliminated some.
-    if any(getattr(design.plant, name) != getattr(spec.plant, name) for name in ("input_names", "output_names")):
+    # States may differ: a method may have eliminated some, and then derivatives of known inputs are inputs as well, and
+    # outputs that need those of other signals are left out.
+    inputs, outputs = spec.plant.input_names, design.plant.output_names
+    kept = tuple(name for name in design.plant.input_names if name in inputs or derivative_of(name, inputs) is None)
+    left = set(spec.plant.output_names) - set(outputs) if _is_of_high_index(spec.plant) else set()
+    if kept != inputs or tuple(name for name in spec.plant.output_names if name not in left) != outputs:
         raise SpecError(f"{gains} is for a plant with other signals than that of {spec.path}.", path=str(gains))
     own, stated = (getattr(plant, "constants", None) or {} for plant in (design.plant, spec.plant))
     others = [name for name, value in own.items() if stated.get(name, value) != value]
@@ -83,3 +91,9 @@ def prepared(
         refuse_given(options, ("unverified",), "a gain set: give --gains, as what is designed here is verified")
     target = None if options.out is None else spec_output(options.out, kind, spec, options, option="--out")
     return spec, scenario, target, designed_or_loaded(spec, options.gains, report_stage, unverified=options.unverified)
+
+
+def _is_of_high_index(plant: Any) -> bool:
+    """Whether a plant is a linear one of index 2 or more, whose design may be for other signals."""
+    small = isinstance(plant, DescriptorSystem) and plant.nx <= EXACT_ELIMINATION_UP_TO
+    return small and (structure_of(plant).index or 0) > 1
