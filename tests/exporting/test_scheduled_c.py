@@ -40,12 +40,12 @@ int main(void)
 _STATUSES = ("ok", "warm-up", "gap", "recovering", "out")
 
 
-def _compiled(design: ObserverDesign, folder: Path) -> Path:
+def _compiled(design: ObserverDesign, folder: Path, main: str = _MAIN) -> Path:
     observer = design.scheduled[1]
     obsynth.export(design, folder / "region.c")
     sizes = {"NU": len(observer.input_names), "NY": len(observer.output_names), "NX": len(observer.state_names),
              "NF": len(observer.fault_names)}  # fmt: skip
-    (folder / "main.c").write_text("\n".join(f"#define {k} {v}" for k, v in sizes.items()) + _MAIN)
+    (folder / "main.c").write_text("\n".join(f"#define {k} {v}" for k, v in sizes.items()) + main)
     flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-O1", "-fsanitize=undefined", "-fno-sanitize-recover"]
     run = subprocess.run(
         ["gcc", *flags, "main.c", "region.c", "-lm", "-o", "region"], cwd=folder, capture_output=True, text=True
@@ -96,6 +96,29 @@ def test_c_equals_the_run_on_a_log(name: str, tmp_path: Path) -> None:
     assert [_STATUSES[int(status)] for status in found[:, 0]] == run.status.tolist()
     assert {"ok", "out", "gap", "warm-up"} <= set(run.status)
     numbers = run[list(observer.row_names)].to_numpy()
+    assert np.array_equal(np.isnan(numbers), np.isnan(found[:, 1:]))
+    assert np.nanmax(np.abs(numbers - found[:, 1:]) / np.maximum(np.abs(numbers), 1.0)) < 1e-12
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler")
+def test_c_of_a_kalman_filter_has_states_and_innovations(tmp_path: Path) -> None:
+    plant = PolytopicSystem(
+        plant={"A": [["0.8 + 0.3 * v", 0.3], [-0.2, "0.9 - 0.2 * v"]], "B": [[0], [1]], "C": [[1, 0]], "D": [[0.5]],
+               "dt": 1.0},
+        scheduling={"v": [-1, 1]},
+    )  # fmt: skip
+    design = obsynth.descriptor_kalman(plant, Q=0.1, R=0.1)
+    main = _MAIN.replace("states, faults, residuals", "states, residuals").replace(", faults[NF]", "")
+    main = main.replace('        for (i = 0; i < NF; i++) printf(" %.17g", faults[i]);\n', "")
+    main = main.replace("residuals[NF]", "residuals[NY]").replace("i < NF", "i < NY")
+    rng = np.random.default_rng(0)
+    rows = np.column_stack([rng.standard_normal(200), rng.uniform(-1, 1, 200), rng.standard_normal(200)])
+    rows[50, 1], rows[80, 1], rows[120, 2] = np.nan, 1.5, np.nan
+    found = _in_c(_compiled(design, tmp_path, main), rows)
+    log = pd.DataFrame(np.column_stack([np.arange(200.0), rows]), columns=["time", "u1", "v", "y1"])
+    run = obsynth.run_on_data(design, log).table
+    assert [_STATUSES[int(status)] for status in found[:, 0]] == run.status.tolist()
+    numbers = run[list(design.scheduled[1].row_names)].to_numpy()
     assert np.array_equal(np.isnan(numbers), np.isnan(found[:, 1:]))
     assert np.nanmax(np.abs(numbers - found[:, 1:]) / np.maximum(np.abs(numbers), 1.0)) < 1e-12
 
