@@ -81,40 +81,39 @@ def drift_in_operation(design: obsynth.ObserverDesign, samples: int = 1000) -> f
     return float(np.max(np.abs(found.faults - 1.0)))
 
 
-TOLD = "is constant, rounding as the observer runs"
-
-
-def test_rounding_in_operation_under_a_constant_fault_is_told_where_it_matters() -> None:
-    """The row on constant faults is of exact arithmetic: proved to 1e-3, and 1e4 of the fault off as it runs."""
+def test_rounding_in_operation_under_a_constant_fault_is_limited() -> None:
+    """To 1e-11 in exact arithmetic, and 1e4 of the fault off as it runs: such an observer is refused."""
     good, bad = chain(4, 0.3, 0.5), plant_of(1048)
-    ordinary, large = ui_pi_observer(good), ui_pi_observer(bad)
-    assert not any(TOLD in note for note in ordinary.notes)
-    assert drift_in_operation(ordinary) < 1e-9
-    (note,) = [note for note in large.notes if TOLD in note]
-    assert large.report["constant fault"].passed
-    told = float(re.search(r"about ([0-9.e+]+) of the fault", note).group(1))
-    # A first-order size of one rounding of each number, against a run: of the same order.
-    assert told / 100.0 <= drift_in_operation(large) <= 100.0 * told
-    assert told > 1.0
+    ordinary = ui_pi_observer(good)
+    assert drift_in_operation(ordinary) <= ordinary.report["constant fault"].value < 1e-9
+    with pytest.raises(VerificationError, match="was tried with its defaults and is verified for this plant") as error:
+        ui_pi_observer(bad)
+    (row,) = error.value.report.failures
+    assert row.name == "constant fault"
+    assert row.value > 1.0
+    exact = float(re.search(r"together: ([0-9.e-]+) in exact arithmetic", row.detail).group(1))
+    assert exact < 1e-9
     other = obsynth.functional_filter(bad)
-    assert not any(TOLD in note for note in other.notes)
-    assert drift_in_operation(other) < 1e-3
+    assert drift_in_operation(other) <= other.report["constant fault"].value < 1e-3
 
 
-@pytest.mark.parametrize("seed", [3008, 3014, 3028, 3035])
-def test_what_is_not_told_is_small_in_operation(seed: int) -> None:
+@pytest.mark.parametrize("seed", [3008, 3014, 3028, 3034, 3035])
+def test_what_is_verified_is_right_in_operation(seed: int) -> None:
     plant = plant_of(seed)
     for method in ("ui-pi-observer", "fault-estimation-filter", "functional-filter"):
         try:
             design = obsynth.design(plant, method)
         except obsynth.ObsynthError:
             continue
-        if not any(TOLD in note for note in design.notes):
-            assert drift_in_operation(design) < 1e-2, method
+        row = design.report["constant fault"]
+        assert row.value <= 1e-3
+        # An observer that takes more than 1e5 samples to settle is judged in exact arithmetic, and its row says so.
+        if "is not counted" not in row.detail:
+            assert drift_in_operation(design) <= row.value, method
 
 
 @pytest.mark.long
-def test_another_method_that_is_right_at_constant_faults_is_named() -> None:
+def test_where_no_method_is_right_at_constant_faults_none_is_named() -> None:
     plant = plant_of(1189)
     with pytest.raises(VerificationError, match="No other method that estimates faults is verified") as error:
         ui_pi_observer(plant)
@@ -122,7 +121,3 @@ def test_another_method_that_is_right_at_constant_faults_is_named() -> None:
     for other in ("functional-filter", "fault-estimation-filter", "optimal-filter"):
         with pytest.raises(obsynth.ObsynthError):
             obsynth.design(plant, other)
-    hidden = plant_of(1357)
-    with pytest.raises(VerificationError, match="functional-filter was tried with its defaults and is verified"):
-        ui_pi_observer(hidden)
-    assert obsynth.functional_filter(hidden).report.passed

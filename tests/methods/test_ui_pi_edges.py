@@ -188,7 +188,8 @@ def test_coordinates_that_need_more_digits_than_are_printed_are_told() -> None:
     plant = DescriptorSystem(
         np.eye(3), shear @ a @ back, C=np.eye(3)[[0, 2]] @ back, Bf=shear @ [[0.0], [1], [0]], dt=1.0
     )
-    design = ui_pi_observer(plant)
+    # As it runs in double precision the estimate of a constant fault is off by 1.5e-3 of it for the same reason.
+    design = ui_pi_observer(plant, steady_error_limit=0.1)
     digits = design.certificate.claims["digits"]
     assert digits > 9
     assert any(f"stable with {digits:.0f} significant digits" in note for note in design.notes)

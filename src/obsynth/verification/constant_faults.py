@@ -13,13 +13,15 @@ A plant with a pole at ``lambda``, or too near to it for a state that ever settl
 does not stay there.  Of these the errors
 alone are looked at, ``(lambda - A_z) e = -k``, with k and j what a constant fault leaves of the identities of z and of
 the estimates.
+
+Where x and z are known, what rounding adds as the observer runs in double precision (`rounding_in_operation`) counts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import flint
 import numpy as np
@@ -31,12 +33,13 @@ from obsynth.numerics.ranks import HIDDEN_MODE_TOLERANCE
 from obsynth.observers.linear.modes import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import Ball
+from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.extended_balls import Enclosed, ExtendedBall
 from obsynth.proofs.linear_equations import enclosed_solution
 from obsynth.proofs.products import as_ball
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.verification.error_system import PRINTED_SHARE, ErrorModel, natural_scaling
+from obsynth.verification.rounding_in_operation import as_it_runs, rounding_in_operation
 
 #: What an estimate may miss of a constant fault in the end, as a share of it, where no option says otherwise.
 STEADY_ERROR = 1e-3
@@ -47,6 +50,13 @@ STEADY_BITS, MOST_STATES_IN_BITS = (212, 848, 3392), 300
 #: A state that takes more than one over this samples (or times the slowest decay of the observer) to settle is none
 #: that settles: it differs from the one for faults that grow at this rate.
 SLOWEST_SETTLING, ALIKE = 1e-7, 0.5
+
+#: What rounding adds as an observer runs counts where the plant's state settles in one over this: slower ones are left,
+#: or held, before they are where rounding of their outputs matters.
+SLOWEST_COUNTED = 1e-5
+
+#: Outputs and states are known well enough for what rounding adds to them where they are to this share of the largest.
+KNOWN_SHARE = 0.01
 
 #: Name of the row.
 CONSTANT_FAULT = "constant fault"
@@ -111,16 +121,16 @@ def constant_fault_row(given: ConstantFaults, limit: float, printed_digits: int 
         limit = max(limit, PRINTED_SHARE)
     claim = "the estimate of a constant fault equals it in the end, up to this share"
     source = "stored numbers and plant together, outward rounded"
-    sizes = _sizes(given)
+    sizes, settles = _sizes(given), _settles(model, SLOWEST_SETTLING)
     missed = _decided(given, _missed_together, sizes, limit)
     detail = "of plant and observer together, in exact arithmetic"
-    if missed is None or not missed <= limit:
-        alone = _decided(given, _missed_alone, sizes, limit) if not _settles(model) else None
-        if alone is not None:
-            missed, detail = (
-                alone,
-                "of the errors alone, in exact arithmetic: the plant's state does not settle with such a fault",
-            )
+    if missed is not None and missed <= limit and settles:
+        missed, detail = _as_it_runs(given, sizes, missed)
+    elif not settles:
+        alone = _decided(given, _missed_alone, sizes, limit)
+        if alone is not None and not (missed is not None and missed <= limit):
+            missed, detail = alone, "of the errors alone, in exact arithmetic"
+        detail += ": the plant's state does not settle with such a fault, and rounding as it runs is not counted"
     if missed is None:
         if _order(model) > MOST_STATES_IN_BITS:
             return information(CONSTANT_FAULT, claim, np.nan, source=source, status="assumed", detail="not decided")
@@ -188,17 +198,94 @@ def _goal(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed:
 
 def _missed_together(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed | None:
     """Return what the estimates of plant and observer together miss ``(nf, columns)``."""
-    plant, own = given.model.plant, given.own
+    settled = _settled(given, given.model.observer, kind)
+    if settled is None:
+        return None
+    missed: Enclosed = settled.estimates - _goal(given, kind)
+    return missed
+
+
+class _Settled(NamedTuple):
+    """Enclosed outputs, observer's states that reach a fault estimate, and fault estimates under constant faults."""
+
+    outputs: Any
+    states: Any
+    estimates: Any
+
+
+def _settled(given: ConstantFaults, observer: LinearObserver, kind: type[Enclosed]) -> _Settled | None:
+    """Return where plant and an observer settle; ``None`` where no such state is enclosed."""
+    plant, own, rows = given.model.plant, given.own, observer.fault_rows
     e, a, c = (kind.exact(part) for part in (plant.E, plant.A, plant.C))
     state = enclosed_solution(e - a if plant.dt > 0.0 else -a, kind.exact(plant.Bf[:, own]))
     if state is None:
         return None
     seen = c @ state + kind.exact(plant.Df[:, own])
-    observer = given.model.observer
-    driven = kind.exact(observer.By) @ seen
-    shown = _shown(observer, driven, kind)
-    direct = kind.exact(observer.Dy[observer.fault_rows]) @ seen
-    return None if shown is None else shown + direct - _goal(given, kind)
+    inner = _driven(observer, kind.exact(observer.By) @ seen, kind)
+    if inner is None:
+        return None
+    kept = _seen_by_faults(observer)
+    shown = kind.exact(observer.Cz[rows][:, kept]) @ inner + kind.exact(observer.Dy[rows]) @ seen
+    return _Settled(seen, inner, shown)
+
+
+def _as_it_runs(given: ConstantFaults, sizes: FloatArray, missed: float) -> tuple[float, str]:
+    """Return what the estimates miss at most as the observer runs in double precision, and how that was found."""
+    try:
+        observer = as_it_runs(given.model.observer)
+    except (ValueError, np.linalg.LinAlgError):  # Numbers that are none.
+        return np.nan, "of plant and observer together: the observer cannot be sampled"
+    known = _magnitudes(given, observer)
+    if known is None:
+        return np.nan, "of plant and observer together, in exact arithmetic: rounding as it runs is not enclosed"
+    outputs, states, apart = known
+    with np.errstate(all="ignore"):
+        added = rounding_in_operation(observer, _seen_by_faults(observer), outputs, states)
+        rounding = float(np.max((added + apart) * sizes, initial=0.0))
+    sampled = "" if given.model.observer.dt > 0.0 else f", sampled every {observer.dt:.3g} s"
+    detail = (
+        f"of plant and observer together: {missed:.2g} in exact arithmetic, and as it runs in double precision{sampled}"
+    )
+    if not _settles(given.model, SLOWEST_COUNTED) or _settling_time(observer) > 1.0 / SLOWEST_COUNTED:
+        bound = f"adds at most {rounding:.2g}" if np.isfinite(rounding) else "has no proved bound"
+        slow = "once plant and observer have settled, which takes so long (over 1e5 samples) that it is not counted"
+        return missed, f"{detail}, rounding {bound} {slow}"
+    return float(rounded_up(np.asarray(missed + rounding), 1)), f"{detail}, rounding adds at most {rounding:.2g}"
+
+
+def _settling_time(observer: LinearObserver) -> float:
+    """Return in how many samples the slowest of the states that reach a fault estimate decays to 1/e."""
+    kept = _seen_by_faults(observer)
+    slowest = float(np.max(np.abs(np.linalg.eigvals(observer.Az[np.ix_(kept, kept)])), initial=0.0))
+    return 1.0 / (1.0 - slowest) if slowest < 1.0 else np.inf
+
+
+def _magnitudes(given: ConstantFaults, observer: LinearObserver) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Return bounds on the outputs, on the states and on what sampling changes of the estimates; ``None`` without."""
+    many = _order(given.model) > MOST_STATES_IN_BITS
+    known = None
+    for bits in (0,) if many else (0, *STEADY_BITS):
+        kind: type[Any] = ExtendedBall if bits else Ball
+        with flint.ctx.workprec(bits or STEADY_BITS[0]):
+            settled = _settled(given, observer, kind)
+            exact = settled if observer is given.model.observer else _settled(given, given.model.observer, kind)
+            if settled is None or exact is None:
+                continue
+            parts: list[Any] = [settled.outputs, settled.states, settled.estimates - exact.estimates]
+            balls = [part if isinstance(part, Ball) else as_ball(part.content) for part in parts]
+        if observer is given.model.observer:
+            balls[2] = Ball.exact(np.zeros(balls[2].midpoint.shape))
+        outputs, states, apart = (ball.magnitude for ball in balls)
+        if all(np.all(np.isfinite(size)) for size in (outputs, states, apart)):
+            known = outputs, states, apart
+            if all(_is_narrow(ball) for ball in balls[:2]):
+                break
+    return known
+
+
+def _is_narrow(ball: Ball) -> bool:
+    """Return whether each column is known to a share of its largest entry; one that may be zero is not."""
+    return bool(np.all(ball.radius <= KNOWN_SHARE * np.max(np.abs(ball.midpoint), axis=0, initial=0.0)))
 
 
 def _missed_alone(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed | None:
@@ -228,12 +315,18 @@ def _missed_alone(given: ConstantFaults, kind: type[Enclosed]) -> Enclosed | Non
 
 def _shown(observer: LinearObserver, driven: Enclosed, kind: type[Enclosed]) -> Enclosed | None:
     """Return what the fault estimates show in the end of what drives the observer's state all the time."""
+    state = _driven(observer, driven, kind)
+    kept = _seen_by_faults(observer)
+    return None if state is None else kind.exact(observer.Cz[observer.fault_rows][:, kept]) @ state
+
+
+def _driven(observer: LinearObserver, driven: Enclosed, kind: type[Enclosed]) -> Enclosed | None:
+    """Return where the observer's states that reach a fault estimate settle under what drives all of them."""
     kept = _seen_by_faults(observer)
     taking = kind.exact(np.eye(observer.order)[kept])
     az = kind.exact(observer.Az[np.ix_(kept, kept)])
     pencil = kind.exact(np.eye(len(kept))) - az if observer.dt > 0.0 else -az
-    state = enclosed_solution(pencil, taking @ driven)
-    return None if state is None else kind.exact(observer.Cz[observer.fault_rows][:, kept]) @ state
+    return enclosed_solution(pencil, taking @ driven)
 
 
 @remembered
@@ -245,15 +338,15 @@ def _seen_by_faults(observer: LinearObserver) -> IntArray:
     return np.flatnonzero(kept)
 
 
-def _settles(model: ErrorModel) -> bool:
-    """Return whether the plant's state under constant faults settles in a time that matters."""
+def _settles(model: ErrorModel, rate: float) -> bool:
+    """Return whether the plant's state under constant faults settles: in one over a rate, in samples or as above."""
     plant, observer = model.plant, model.observer
     if _grows(plant):
         return False
     slowest = 1.0
     if plant.dt == 0.0 and observer.order:
         slowest = float(np.min(np.abs(poles_of(observer).real)))
-    held, growing = (_state_at(plant, _point(plant) + rate) for rate in (0.0, SLOWEST_SETTLING * slowest))
+    held, growing = (_state_at(plant, _point(plant) + growth) for growth in (0.0, rate * slowest))
     if held is None or growing is None:
         return False
     with np.errstate(all="ignore"):
