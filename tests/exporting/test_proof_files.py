@@ -50,6 +50,7 @@ CLAIMS: dict[str, tuple[obsynth.DescriptorSystem, dict[str, Any], set[str]]] = {
         {"identities", "stable", "rounding", "fault models", "deviation"},
     ),
     "detection-filter": (NOISY, {}, {"identities", "stable", "rounding", "gain"}),
+    "optimal-filter": (SAMPLED, {}, {"identities", "stable", "rounding"}),
     "guaranteed-test": (SAMPLED, TEST, {"threshold", "least"}),
 }  # fmt: skip
 EACH = pytest.mark.parametrize("method", CLAIMS)
@@ -128,6 +129,14 @@ def test_a_file_of_integers_alone(method: str) -> None:
         return [] if isinstance(value, (str, bool)) or value is None else [value]
 
     assert {type(value) for value in numbers(proof(method))} == {int}
+
+
+def test_what_an_optimal_filter_claims_besides_is_named() -> None:
+    """Its gain and the least of any filter are proved by `verify` alone: the file says so."""
+    assert "gain" in design_of("optimal-filter").certificate.claims
+    left = proof("optimal-filter")["not_covered"]
+    assert "the gain of this filter" in left
+    assert any("no causal filter has less" in text for text in left)
 
 
 def test_the_program_imports_nothing_but_the_standard_library() -> None:

@@ -76,6 +76,7 @@ _NOT_COVERED: Mapping[str, list[str]] = {
     "ui-pi-observer": ["that the poles are the claimed ones: their decay alone", "a region of poles"],
     "functional-filter": ["deviations with random walks of the faults", "that estimates are free of other faults"],
     "detection-filter": ["the least sensitivity to faults over the band"],
+    "optimal-filter": ["the gain of this filter", "that no causal filter has less", "the fault map"],
     "guaranteed-test": ["the mean threshold over tolerances", "that no test is insensitive to more faults"],
 }  # fmt: skip
 
@@ -210,7 +211,7 @@ class _Proof:
             self.left.append("the error system: what the observer follows is not known")
         else:
             self._of_the_error_system(self.model)
-        self.left += _NOT_COVERED.get(self.design.method, [])
+        self.left += _NOT_COVERED.get(self.design.method, ["what the method claims by rows of its own"])
         if self.design.source is not None:
             self.left.append(
                 "that the plant follows from the plant as written (elimination, sampling): `obsynth verify` repeats it"
