@@ -220,7 +220,7 @@ def _exit_codes() -> list[str]:
 
 
 def _command(name: str, verb: Any) -> list[str]:
-    parser = command_line._fill(name, argparse.ArgumentParser(prog=f"obsynth {name}"))
+    parser = command_line._with_verb(name, argparse.ArgumentParser(prog=f"obsynth {name}"))
     lines = [f"## obsynth {name}", "", _text(verb.told), ""]
     lines += ["```sh", EXAMPLES[name], "```", ""]
     rows = []

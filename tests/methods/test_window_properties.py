@@ -364,7 +364,7 @@ def remainder_plant(**changes: Any) -> Any:
 
 
 def test_a_remainder_is_of_a_plant_with_one_disturbance_for_each_state_and_output() -> None:
-    assert regions._apart(remainder_plant(), 1)
+    assert regions._represents_remainder(remainder_plant(), 1)
     whole = remainder_plant().linear[0]
     for changes in (
         {"E": np.diag([1.0, 2.0])},
@@ -373,7 +373,7 @@ def test_a_remainder_is_of_a_plant_with_one_disturbance_for_each_state_and_outpu
         {"Dd": 0.5 * whole.Dd},
         {"Bd": whole.Bd[:, [0, 2, 1, 3]]},
     ):
-        assert not regions._apart(remainder_plant(**changes), 1), changes
+        assert not regions._represents_remainder(remainder_plant(**changes), 1), changes
 
 
 @pytest.mark.parametrize(

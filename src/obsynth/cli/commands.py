@@ -36,7 +36,7 @@ def run_design(options: argparse.Namespace) -> int:
         spec = obsynth.load_spec(options.system)
         gains_file = default_gains(spec) if options.output is None else options.output
         target = spec_output(gains_file, GAIN_SET, spec, options, option="--output")
-        _ask(spec)
+        _print_questions(spec)
         design = design_of_spec(spec, progress=report_stage)
         file = write_atomically(target, gain_set_bytes(design, spec=spec.path))
     from obsynth.report.summary import summary
@@ -86,7 +86,7 @@ def default_gains(spec: obsynth.Spec) -> Path:
 def run_check(options: argparse.Namespace) -> int:
     """Run ``check``: structure, and the existence conditions of every method."""
     spec = obsynth.load_spec(options.system)
-    _ask(spec)
+    _print_questions(spec)
     from obsynth.report.plants import check_report, diagnosis_report, is_unclear, print_methods
 
     if not isinstance(spec.plant, obsynth.DescriptorSystem):
@@ -139,7 +139,7 @@ def run_check(options: argparse.Namespace) -> int:
     return 0 if passed else SolverError.exit_code if undecided else PreconditionError.exit_code
 
 
-def _ask(spec: obsynth.Spec) -> None:
+def _print_questions(spec: obsynth.Spec) -> None:
     """Ask on stderr what may not be meant, as it may be the reason for all that follows."""
     from obsynth.analysis.structure import questions
 

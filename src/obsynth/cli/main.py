@@ -101,7 +101,7 @@ def obsynth_parser(words: Collection[str] | None = None) -> argparse.ArgumentPar
             formatter_class=Folded if verb.epilog else argparse.HelpFormatter,
         )
         if words is None or name in words:
-            _fill(name, own)
+            _with_verb(name, own)
     return parser
 
 
@@ -116,7 +116,7 @@ def _parser(name: str, description: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _fill(name: str, parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+def _with_verb(name: str, parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.set_defaults(verb=name)
     if name in EXAMPLES:
         parser.description = f"{parser.description}\n\nexample:\n  {EXAMPLES[name]}"
@@ -195,7 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def design_command(arguments: Sequence[str] | None = None) -> int:
     """Run ``design``, which is ``obsynth design``."""
-    return _run(_fill("design", _parser("design", VERBS["design"].told)), arguments)
+    return _run(_with_verb("design", _parser("design", VERBS["design"].told)), arguments)
 
 
 def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
@@ -237,7 +237,7 @@ def _options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -
 
 def _refuse_words(prog: str, verb: str, unknown: Sequence[str]) -> NoReturn:
     """End the program as words that a verb does not take do: with its usage, and what may be meant."""
-    own = _fill(verb, Parser(prog=prog if prog == verb else f"{prog} {verb}"))
+    own = _with_verb(verb, Parser(prog=prog if prog == verb else f"{prog} {verb}"))
     known = [
         *own._option_string_actions,
         *(name for setting in settings_of(VERBS[verb].arguments) for name in setting.names),

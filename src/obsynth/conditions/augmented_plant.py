@@ -75,7 +75,7 @@ def decouple(plant: DescriptorSystem) -> Decoupled:
     generic = np.random.default_rng(0).standard_normal((nx, nx))
     # Where no equation has a derivative, ut is the rounding of the whole inverse.
     size = largest_singular_value(inverse) if inverse.size else 0.0
-    z = _completing(ut, nu, plant.A.T @ annihilator.T, generic @ annihilator.T, size)
+    z = _rank_completion(ut, nu, plant.A.T @ annihilator.T, generic @ annihilator.T, size)
     return Decoupled(
         (ut + z @ nu) @ annihilator,
         (dt + z @ nd) @ undisturbed,
@@ -86,7 +86,9 @@ def decouple(plant: DescriptorSystem) -> Decoupled:
     )
 
 
-def _completing(ut: FloatArray, nu: FloatArray, target: FloatArray, generic: FloatArray, size: float) -> FloatArray:
+def _rank_completion(
+    ut: FloatArray, nu: FloatArray, target: FloatArray, generic: FloatArray, size: float
+) -> FloatArray:
     """Return Z such that ``ut + Z nu`` has full column rank; ``[ut; nu]`` has, so what ut lacks, nu sees.
 
     Kernel directions of ut go outside its range, near where ``target`` sends them, or else ``generic``: no choice hangs

@@ -198,7 +198,7 @@ def _theorem(
     if region is not None:
         moving, still = P3.T @ A_o - (Y + decay * Z) @ C_o, P3.T + Z @ C_o  # P3' (A_o - J_o C_o), P3' (I + L_o C_o)
         P = variables["P_region"] = cp.Variable((n, n), symmetric=True, name="P_region")
-        constraints["region"] = _region(_fitting(region, float(delta)), P, moving, still, float(delta), margin)
+        constraints["region"] = _region(_fitting_region(region, float(delta)), P, moving, still, float(delta), margin)
     if safe:
         constraints["scale"] = lmi.at_least(P3 + P3.T, 2.0)
     size = cp.norm(cp.hstack([Y, Z]), "fro") + cp.norm(P3, "fro")
@@ -222,7 +222,7 @@ def _theorem(
     )
 
 
-def _fitting(region: Any, delta: float) -> LMIRegion:
+def _fitting_region(region: Any, delta: float) -> LMIRegion:
     """Return a region that holds ``-1 / delta``, without which its inequality has no solution."""
     where = checked_region(region)
     if not where.contains([-1.0 / delta]):

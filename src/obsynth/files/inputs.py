@@ -106,7 +106,7 @@ def special_kind(path: Path) -> str | None:
     return _SPECIAL.get(stat.S_IFMT(os.stat(path).st_mode))
 
 
-def _meant(path: Path) -> str:
+def _similar_files(path: Path) -> str:
     """Return a question with the files of the folder whose names are close to a wrong one; empty where none is."""
     import difflib
 
@@ -126,7 +126,7 @@ def input_file(path: Path, *, where: str | None = None, is_protected: bool = Tru
         if path.is_dir():
             raise SpecError(f"{path} is a folder: give the name of a file.", path=place)
         if not path.exists():
-            raise SpecError(f"{path} does not exist.{_meant(path)}", path=place)
+            raise SpecError(f"{path} does not exist.{_similar_files(path)}", path=place)
         kind = special_kind(path)
     except (OSError, ValueError) as error:
         raise SpecError(f"{path!s} cannot be read: {reason(error)}.", path=place) from error

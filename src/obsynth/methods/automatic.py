@@ -118,11 +118,11 @@ def one_line(text: str) -> str:
     for mark in ("Measure one of:", "Leave out one of:"):
         head, separator, tail = flat.rpartition(mark)
         if separator:
-            return f"{_cut(head)} {mark}{tail}"
-    return _cut(flat)
+            return f"{_first_sentences(head)} {mark}{tail}"
+    return _first_sentences(flat)
 
 
-def _cut(text: str) -> str:
+def _first_sentences(text: str) -> str:
     """Return so many whole sentences of a text as have room, and the first in any case."""
     first, *sentences = re.split(r"(?<=[.]) (?=[A-Z])", (without_opening(text) or text).strip())
     for sentence in sentences:

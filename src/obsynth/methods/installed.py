@@ -37,7 +37,7 @@ class MethodPlaces(UserDict[str, str]):
         super().__init__(OWN)
         self._asked = False
 
-    def _ask(self) -> None:
+    def _add_registered(self) -> None:
         """Take in what other packages register; obsynth's own ids stay what they are."""
         if self._asked:
             return
@@ -49,19 +49,19 @@ class MethodPlaces(UserDict[str, str]):
 
     def __contains__(self, key: object) -> bool:
         if key not in self.data:
-            self._ask()
+            self._add_registered()
         return key in self.data
 
     def __missing__(self, key: str) -> str:
-        self._ask()
+        self._add_registered()
         return self.data[key]
 
     def __iter__(self) -> Iterator[str]:
-        self._ask()
+        self._add_registered()
         return iter(self.data)
 
     def __len__(self) -> int:
-        self._ask()
+        self._add_registered()
         return len(self.data)
 
 

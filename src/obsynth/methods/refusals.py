@@ -120,7 +120,7 @@ def with_advice(
     elif error.condition in OF_THE_KIND:
         return error
     else:
-        text = _nothing(plant)
+        text = _no_remedy(plant)
     return PreconditionError(
         " ".join([str(error), *notes, text]),
         condition=error.condition,
@@ -136,7 +136,7 @@ def _named_assumption(error: PreconditionError, plant: DescriptorSystem, method:
     text = without_opening(str(error))
     if text is None or plant.nx > MOST_FOR_ONE or "faults" not in method.purposes:
         return error
-    alternatives = [name for name in _methods_for_faults(method) if _takes(name, plant)]
+    alternatives = [name for name in _methods_for_faults(method) if _exists(name, plant)]
     states = bool(getattr(method, "states", None))
     if states:
         # Of the methods for faults these estimate the whole state, with faults that follow their models.
@@ -167,7 +167,7 @@ def _methods_for_faults(own: Method) -> list[str]:
     ]
 
 
-def _takes(name: str, plant: DescriptorSystem) -> bool:
+def _exists(name: str, plant: DescriptorSystem) -> bool:
     """Whether a method exists for a plant, decided on the numbers as written."""
     method = method_class(name)
     try:
@@ -193,7 +193,7 @@ def _drops(plant: DescriptorSystem, holds: Callable[[DescriptorSystem], bool]) -
     return droppable
 
 
-def _nothing(plant: DescriptorSystem) -> str:
+def _no_remedy(plant: DescriptorSystem) -> str:
     if plant.nx > MOST_FOR_ONE:
         return f"With {plant.nx} states, ask obsynth.sensor_sets which sensors would help."
     return "Neither one more measured state nor one unknown input or fault less would help."
@@ -214,7 +214,7 @@ def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) ->
         raise PreconditionError(
             "Unclear: gains were found, but they are so large that rounding of the outputs to double "
             f"precision alone moves the estimate of {name!r} by {least[worst]:.2g} of the fault at every frequency "
-            f"tried. {_doubt(plant, observer, worst).described(plant)}",
+            f"tried. {_deciding_digit(plant, observer, worst).described(plant)}",
             condition="gains against rounding",
             signals=(name,),
             unclear=True,
@@ -244,7 +244,7 @@ def _under_constant_faults(plant: DescriptorSystem, observer: LinearObserver) ->
             )
 
 
-def _doubt(plant: DescriptorSystem, observer: LinearObserver, fault: int) -> Unclear:
+def _deciding_digit(plant: DescriptorSystem, observer: LinearObserver, fault: int) -> Unclear:
     """Return the last digit of a number of the plant, or else of the observer, that moves an estimate most."""
     worst_witness = max(
         (witness for point in _points(plant) for witness in last_digits(plant, observer, fault, point)),

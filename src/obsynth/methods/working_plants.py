@@ -63,16 +63,20 @@ def working_plant(
         progress("reducing the index")
         notes = (f"The plant has index 2 or more: {transformation.description}.", *notes)
         return WorkingPlant(
-            transformation.plant, _through(recovery, transformation), notes, " ".join(notes), transformation.dropped
+            transformation.plant,
+            _composed_recovery(recovery, transformation),
+            notes,
+            " ".join(notes),
+            transformation.dropped,
         )
     if not plant.is_sparse:
         return WorkingPlant(plant, recovery)
     progress("eliminating the algebraic states")
     transformation = eliminate_algebraic_states(plant)
-    return WorkingPlant(transformation.plant, _through(recovery, transformation), transformation.notes)
+    return WorkingPlant(transformation.plant, _composed_recovery(recovery, transformation), transformation.notes)
 
 
-def _through(recovery: StateRecovery | None, transformation: Transformation) -> StateRecovery:
+def _composed_recovery(recovery: StateRecovery | None, transformation: Transformation) -> StateRecovery:
     return transformation.recovery if recovery is None else recovery.then(transformation.recovery)
 
 

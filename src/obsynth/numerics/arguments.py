@@ -291,11 +291,11 @@ def _problem_with_kind(value: Any, name: str, kind: Any) -> str | None:
             expected.append("a list of names")
         elif plain != "NoneType" and not (option is str and Path in options):
             expected.append(_WORDS.get(plain, f"an obsynth.{plain}"))
-    hint = _instead(value, [(get_origin(option) or option).__name__ for option in options])
+    hint = _suggestion(value, [(get_origin(option) or option).__name__ for option in options])
     return f"{name} is {a_kind(value)}: give {' or '.join(dict.fromkeys(expected))}.{hint}"
 
 
-def _instead(value: Any, expected: Sequence[str]) -> str:
+def _suggestion(value: Any, expected: Sequence[str]) -> str:
     """Return what may have been meant by a value of another kind, as a sentence after a blank; or nothing."""
     if "DescriptorSystem" in expected and isinstance(value, (str, Path)):
         return f" The plant of a spec is obsynth.load_spec({str(value)!r}).plant."

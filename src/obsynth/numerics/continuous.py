@@ -45,7 +45,7 @@ class ContinuousNorms:
     _known: list[tuple[tuple[FloatArray, ...], HinfNorm]] = field(default_factory=list, init=False, repr=False)
 
     @cached_property
-    def _turned(self) -> tuple[float, FloatArray, FloatArray, Modes] | None:
+    def _in_discrete_time(self) -> tuple[float, FloatArray, FloatArray, Modes] | None:
         """w, ``(w I - A)^-1``, the matrix in discrete time and its modes; ``None`` where A is not stable."""
         a, identity = self.a, np.eye(len(self.a))
         own = Modes.of(a)
@@ -76,9 +76,9 @@ class ContinuousNorms:
         return self._known[-1][1]
 
     def _between(self, b: FloatArray, c: FloatArray, d: FloatArray) -> HinfNorm:
-        if self._turned is None:
+        if self._in_discrete_time is None:
             return HinfNorm(np.inf, np.inf, np.nan)
-        w, resolvent, turned, modes = self._turned
+        w, resolvent, turned, modes = self._in_discrete_time
         through = resolvent @ b
         norm = hinf_norm(
             turned, np.sqrt(2.0 * w) * through, np.sqrt(2.0 * w) * c @ resolvent, d + c @ through, modes=modes

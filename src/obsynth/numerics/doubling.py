@@ -289,7 +289,7 @@ def _doubled(
             if stepped is None:
                 return None
             # A step adds to the last equation; the first of a lower order stands alone.
-            power, back, change = stepped[0], _added(None if part else back, stepped[1]), symmetric(stepped[2])
+            power, back, change = stepped[0], _symmetric_sum(None if part else back, stepped[1]), symmetric(stepped[2])
             solution = solution + change if part is None else change
             full, before = lifts.full(solution), full
             # The change itself is known far below rounding of the solution, where nothing was lifted.
@@ -310,7 +310,7 @@ def _doubled(
     return None
 
 
-def _added(back: FloatArray | ThinBack | None, added: FloatArray | ThinBack) -> FloatArray | ThinBack:
+def _symmetric_sum(back: FloatArray | ThinBack | None, added: FloatArray | ThinBack) -> FloatArray | ThinBack:
     """Return the sum of what was there and what a step adds, its symmetric part."""
     if isinstance(back, ThinBack) and isinstance(added, ThinBack):
         rows, r = np.concatenate([back.rows, added.rows]), len(back.rows)
@@ -365,13 +365,13 @@ def compared_gain(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, le
     many states with few outputs a solution that takes less time and loses fewer digits.
     """
     if len(a) >= FEWEST_STATES and 0 < len(c) <= b.shape[1]:
-        verdict = _compared(a.T, c.T, b.T, d.T, level)
+        verdict = _is_reached(a.T, c.T, b.T, d.T, level)
         if verdict is not None:
             return verdict
-    return _compared(a, b, c, d, level)
+    return _is_reached(a, b, c, d, level)
 
 
-def _compared(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float) -> bool | None:
+def _is_reached(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float) -> bool | None:
     process, cross = c.T @ c, c.T @ d
     gap = d.T @ d - level**2 * np.eye(b.shape[1])
     refuted = False

@@ -123,19 +123,19 @@ def least_estimation(
         limit, angle = _non_causal_limit(white.plain if white.noise else core)
         least = _invisible_at(white.plain, angle) if white.noise else limit
         least = max(least, _invisible_from_rest(white.plain))
-        level = _norm(_closed(core, K, Z0))
+        level = _norm(_error_system(core, K, Z0))
         better = _search(core, (K, Z0), least, level)
         if better is not None:
             K, Z0, level = better
         decays = tuple(_decays(core, share * level) for share in WORST_LEVELS)
-    closed = _closed(white.plain, K, Z0)
+    closed = _error_system(white.plain, K, Z0)
     gain = _norm(closed) if norm == "hinf" else _deviation(closed)
     return LeastEstimation(*white.restored(problem, K, Z0), gain, limit, angle, white.noise, decays)
 
 
 def achieved(white: Whitened, K: FloatArray, Z0: FloatArray, norm: str) -> float:
     """Return the norm (``"hinf"``, ``"h2"``) from w to the error with gains on the innovation."""
-    closed = _closed(white.plain, K, Z0)
+    closed = _error_system(white.plain, K, Z0)
     return _norm(closed) if norm == "hinf" else _deviation(closed)
 
 
@@ -289,7 +289,7 @@ def _central(problem: EstimationProblem, P: FloatArray) -> tuple[FloatArray, Flo
     return gains[: len(A)], gains[len(A) :]
 
 
-def _closed(
+def _error_system(
     problem: EstimationProblem, K: FloatArray, Z0: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     return (
@@ -349,7 +349,7 @@ def _search(
             low = level
         else:
             gains = _central(problem, P)
-            if _norm(_closed(problem, *gains)) <= level * (1.0 + NORM_ABOVE_LEVEL):
+            if _norm(_error_system(problem, *gains)) <= level * (1.0 + NORM_ABOVE_LEVEL):
                 high, best = level, gains
             else:
                 low = level

@@ -115,7 +115,7 @@ class LogBalance:
             solved, exponents = self._solved(entries, weights, ridge)
         # What the entries leave open would be rounding over the ridge: of exact residuals nothing is left of it.
         for _ in range(RESIDUAL_CORRECTIONS):
-            before, exponents = exponents, exponents + solved(self._missed(entries, weights, exponents, ridge))
+            before, exponents = exponents, exponents + solved(self._normal_residual(entries, weights, exponents, ridge))
             if np.array_equal(before, exponents):
                 break
             to_a_half = np.abs(np.abs(exponents - np.round(exponents)) - 0.5)
@@ -123,7 +123,9 @@ class LogBalance:
                 break
         return np.asarray(np.round(exponents) if whole else exponents, dtype=np.float64)
 
-    def _missed(self, entries: _Entries, weights: FloatArray, exponents: FloatArray, ridge: float) -> FloatArray:
+    def _normal_residual(
+        self, entries: _Entries, weights: FloatArray, exponents: FloatArray, ridge: float
+    ) -> FloatArray:
         """Return what is left of the normal equations."""
         parts = _whole_parts(weights * entries.logarithms(exponents))
         missed = -ridge * exponents - sum(map(entries.sums, parts[::-1]))

@@ -189,11 +189,11 @@ class ModalResponse:
             widths = widths / POINTS_BESIDE
             # Of a few peaks numbers are faster than arrays.
             peaks = zip(tried.tolist(), gains.tolist(), widths.tolist(), strict=True)
-            centres = np.array([_top(angles, sizes, step) for angles, sizes, step in peaks])
+            centres = np.array([_peak_angle(angles, sizes, step) for angles, sizes, step in peaks])
         return np.asarray(np.minimum(np.maximum(centres, 0.0), np.pi))
 
 
-def _top(angles: list[float], sizes: list[float], step: float) -> float:
+def _peak_angle(angles: list[float], sizes: list[float], step: float) -> float:
     """Return the angle of the largest of some sizes, or of the top of a parabola through three points next to it."""
     best = sizes.index(max(sizes))
     if not 0 < best < len(sizes) - 1:

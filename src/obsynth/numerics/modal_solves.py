@@ -78,7 +78,7 @@ class ModalSolves:
         solutions, missed, unsolved = np.zeros_like(targets), targets, np.ones(len(points), dtype=bool)
         with np.errstate(all="ignore"):
             for _ in range(MOST_CORRECTIONS):
-                solutions = solutions + self._roughly(points, missed)
+                solutions = solutions + self._times_approximate_inverse(points, missed)
                 missed = targets - self._applied(points, solutions)
                 bound = self._rounding(points, solutions, targets)
                 # Where squares overflow nothing is known of either.
@@ -90,7 +90,7 @@ class ModalSolves:
             solutions[place] = next(resolved(e, self.A.T, targets[place].T, points[[place]]))[0].T
         return solutions
 
-    def _roughly(self, points: ComplexArray, rows: ComplexArray) -> ComplexArray:
+    def _times_approximate_inverse(self, points: ComplexArray, rows: ComplexArray) -> ComplexArray:
         """Return rows times the inverse, as well as the eigenvectors have it."""
         moved = (rows @ self.vectors) * (self.weights / (1.0 + (points[:, None] - self.at) * self.values))[:, None, :]
         flat = moved.reshape(-1, moved.shape[2])

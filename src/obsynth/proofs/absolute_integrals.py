@@ -93,7 +93,7 @@ def interval_columns(
     cuts = halvings(a.center, b.center, length, pieces=pieces, shared=shared)
     modes = _modes(a, length, apart=len(set(cuts)) > 1)
     widths = [length * 2.0 ** -int(level) for level in cuts]
-    reached = _reached(a, b)
+    reached = _reached_states(a, b)
     nodes, second, fourth = (
         [_within(matrix, reached) for matrix in ones] for ones in zip(*_motions(a, b, widths), strict=True)
     )
@@ -181,7 +181,7 @@ def _groups(cuts: list[int], shared: int) -> list[tuple[int, int]]:
     return groups
 
 
-def _reached(a: AffineMatrix, b: AffineMatrix) -> np.ndarray:
+def _reached_states(a: AffineMatrix, b: AffineMatrix) -> np.ndarray:
     """Return which states each column can reach at all ``(n, m)``."""
     moving = (a.magnitude > 0.0).astype(np.float64)
     reached = b.magnitude > 0.0

@@ -49,12 +49,12 @@ class AffineMatrix:
     @property
     def spread(self) -> FloatArray:
         """What the affine parts add to the centre at most, rounded up."""
-        return _up(np.abs(self.parts).sum(axis=0), self.count + 1)
+        return _rounded_up(np.abs(self.parts).sum(axis=0), self.count + 1)
 
     @property
     def magnitude(self) -> FloatArray:
         """Upper bound of the absolute value on the whole box."""
-        return _up(np.abs(self.center) + self.spread + self.radius, 3)
+        return _rounded_up(np.abs(self.center) + self.spread + self.radius, 3)
 
     @property
     def is_certain(self) -> bool:
@@ -78,7 +78,7 @@ class AffineMatrix:
             return other
         size = self.magnitude + other.magnitude
         radius = self.radius + other.radius + gamma(self.count + 2) * size
-        return AffineMatrix(self.center + other.center, self.parts + other.parts, _up(radius, 5))
+        return AffineMatrix(self.center + other.center, self.parts + other.parts, _rounded_up(radius, 5))
 
     def __neg__(self) -> AffineMatrix:
         """Return the negative; exact."""
@@ -114,17 +114,17 @@ class AffineMatrix:
     def scaled(self, factor: float) -> AffineMatrix:
         """Return ``factor`` times every member."""
         radius = abs(factor) * (self.radius + gamma(self.count + 2) * self.magnitude)
-        return AffineMatrix(factor * self.center, factor * self.parts, _up(radius, 5))
+        return AffineMatrix(factor * self.center, factor * self.parts, _rounded_up(radius, 5))
 
     def enlarged(self, radius: FloatArray) -> AffineMatrix:
         """Return this with a larger remainder."""
-        return AffineMatrix(self.center, self.parts, _up(self.radius + radius, 2))
+        return AffineMatrix(self.center, self.parts, _rounded_up(self.radius + radius, 2))
 
     def on(self, lower: FloatArray, upper: FloatArray) -> AffineMatrix:
         """Return the same matrix on the sub-box ``lower <= q <= upper``, as a function of new unknowns in -1 .. 1."""
         middle, half = (lower + upper) / 2.0, (upper - lower) / 2.0
         rounding = gamma(4 * self.count + 4) * self.magnitude
-        return AffineMatrix(self.at(middle), self.parts * half[:, None, None], _up(self.radius + rounding, 3))
+        return AffineMatrix(self.at(middle), self.parts * half[:, None, None], _rounded_up(self.radius + rounding, 3))
 
     def __getitem__(self, places: tuple[Sequence[int] | slice, Sequence[int] | slice]) -> AffineMatrix:
         """Return rows and columns, by slices or lists of numbers."""
@@ -162,7 +162,7 @@ def affine_inverse(matrix: AffineMatrix) -> AffineMatrix:
             "the deviation, which must be below 1): give smaller tolerances.",
             condition="regularity",
         )
-    series = (deviation + np.eye(size)).enlarged(_up(bound @ (bound @ neumann), 2 * size + 4))
+    series = (deviation + np.eye(size)).enlarged(_rounded_up(bound @ (bound @ neumann), 2 * size + 4))
     return series @ near
 
 
@@ -180,7 +180,7 @@ def affine_exponential(matrix: AffineMatrix) -> AffineMatrix:
     # With row sums of at most 1/2, the terms that are left out are less than twice the first of them.
     bound, remainder = small.magnitude, np.eye(size)
     for k in range(1, TERMS + 2):
-        remainder = _up(bound @ remainder / k, size + 3)
+        remainder = _rounded_up(bound @ remainder / k, size + 3)
     # Which entries of a power, the first or later, can be other than zero.
     pattern = bound > 0.0
     for _ in range(len(bound).bit_length()):
@@ -200,6 +200,6 @@ def affine_zero_order_hold(a: AffineMatrix, inputs: AffineMatrix, step: float) -
     return transition[:nx, :nx], transition[:nx, nx:]
 
 
-def _up(value: FloatArray, operations: int) -> FloatArray:
+def _rounded_up(value: FloatArray, operations: int) -> FloatArray:
     """Round up what was computed with so many roundings, where it is not zero for want of terms."""
     return np.where(value > 0.0, rounded_up(value, operations), 0.0)

@@ -150,7 +150,7 @@ def coprime(values: list[int]) -> list[int]:
 @lru_cache(maxsize=1 << 14)
 def written_fraction(value: float) -> Fraction:
     """Return the rational number that a finite double was written as."""
-    return Fraction(*_written(float(value)))
+    return Fraction(*_ratio_as_written(float(value)))
 
 
 def written_rows(matrix: FloatArray) -> tuple[tuple[Fraction, ...], ...]:
@@ -159,18 +159,18 @@ def written_rows(matrix: FloatArray) -> tuple[tuple[Fraction, ...], ...]:
 
 
 @lru_cache(maxsize=1 << 14)
-def _written(value: float) -> tuple[int, int]:
+def _ratio_as_written(value: float) -> tuple[int, int]:
     """Return numerator and denominator, which may have common factors, of what a finite double was written as."""
     digits, power = _decimal(value)
     # In the order of what they cost: digits that count are not more than all.
-    if len(digits) > LOSSLESS_DIGITS and _is_short(value) and _count(digits) > LOSSLESS_DIGITS:
+    if len(digits) > LOSSLESS_DIGITS and _is_short(value) and _digits_that_count(digits) > LOSSLESS_DIGITS:
         return value.as_integer_ratio()
     return (int(digits) * 10**power, 1) if power >= 0 else (int(digits), int(10**-power))
 
 
 def is_computed(value: float) -> bool:
     """Whether a double has so many digits that it was computed, and is known only to its last digit."""
-    return not _is_short(value) and _count(_decimal(value)[0]) > LOSSLESS_DIGITS
+    return not _is_short(value) and _digits_that_count(_decimal(value)[0]) > LOSSLESS_DIGITS
 
 
 def holds_computed(matrix: FloatArray) -> bool:
@@ -190,7 +190,7 @@ def written_matrix(matrix: FloatArray) -> fmpq_mat:
     (rows, columns), values = matrix.shape, np.ravel(matrix).tolist()
     decimals = {value: _decimal(value) for value in set(values)}
     if any(len(decimals[value][0]) > LOSSLESS_DIGITS for value in _split_entries(matrix)[0]):
-        return fmpq_mat(rows, columns, [fmpq(*_written(value)) for value in values])
+        return fmpq_mat(rows, columns, [fmpq(*_ratio_as_written(value)) for value in values])
     # Whole numbers of one power of ten.
     powers = [0, *(power for _, power in decimals.values())]
     least = min(powers)
@@ -267,7 +267,7 @@ def _decimal(value: float) -> tuple[str, int]:
     return whole + part, int(exponent or 0) - len(part)
 
 
-def _count(digits: str) -> int:
+def _digits_that_count(digits: str) -> int:
     """Return how many digits of a decimal count."""
     return len(digits.lstrip("-").strip("0")) or 1
 
@@ -299,7 +299,7 @@ def locate_roots(polynomial: fmpz_poly, *, discrete: bool) -> tuple[Root, ...]:
     # Origin: under the mirror of the unit circle it goes to infinity, and reversing has dropped it.
     remaining = primitive(fmpq_poly(polynomial) / fmpq_poly(common)) if common.degree() > 0 else polynomial
     for part, may_lie_on_boundary in ((common, True), (remaining, False)):
-        roots += _isolated(part, discrete=discrete, may_lie_on_boundary=may_lie_on_boundary)
+        roots += _roots_with_sides(part, discrete=discrete, may_lie_on_boundary=may_lie_on_boundary)
     roots.sort(key=lambda root: -(abs(root.value) if discrete else root.value.real))
     return tuple(roots)
 
@@ -314,7 +314,7 @@ def primitive(polynomial: fmpq_poly) -> fmpz_poly:
     return fmpz_poly([sign * coefficient // content for coefficient in numerator.coeffs()])
 
 
-def _isolated(polynomial: fmpz_poly, *, discrete: bool, may_lie_on_boundary: bool) -> list[Root]:
+def _roots_with_sides(polynomial: fmpz_poly, *, discrete: bool, may_lie_on_boundary: bool) -> list[Root]:
     """Return the roots with their sides; more digits until each is distinguished from the boundary, or shown to be on
     it."""
     if polynomial.degree() <= 0:

@@ -108,7 +108,7 @@ class Interval:
         if exponent.is_point:
             ends = self.low**exponent.low, self.high**exponent.low
             return Interval.outward(min(ends), max(ends), FUNCTION_ROUNDINGS)
-        return _rising(math.exp)(exponent * _rising(math.log)(self))
+        return _increasing(math.exp)(exponent * _increasing(math.log)(self))
 
     def _whole_power(self, n: int) -> Interval:
         if n < 0:
@@ -270,7 +270,7 @@ def _unbounded(text: str) -> PreconditionError:
     return PreconditionError(f"{text} on the region. Give a smaller range.", condition="boundedness")
 
 
-def _rising(function: Callable[[float], float]) -> Callable[[Interval], Interval]:
+def _increasing(function: Callable[[float], float]) -> Callable[[Interval], Interval]:
     def taken(x: Interval) -> Interval:
         try:
             return Interval.outward(function(x.low), function(x.high), FUNCTION_ROUNDINGS)
@@ -301,7 +301,7 @@ def _waves(function: Callable[[float], float], first_peak: float) -> Callable[[I
 def _tan(x: Interval) -> Interval:
     if math.floor(x.low / math.pi + 0.5) != math.floor(x.high / math.pi + 0.5):
         raise _unbounded(f"the argument of tan lies between {x.low:.4g} and {x.high:.4g} and meets a pole")
-    return _rising(math.tan)(x)
+    return _increasing(math.tan)(x)
 
 
 def _cosh(x: Interval) -> Interval:
@@ -311,7 +311,7 @@ def _cosh(x: Interval) -> Interval:
 
 
 def _acos(x: Interval) -> Interval:
-    return -_rising(math.asin)(x) + Interval.outward(math.pi / 2.0, math.pi / 2.0)
+    return -_increasing(math.asin)(x) + Interval.outward(math.pi / 2.0, math.pi / 2.0)
 
 
 def _absolute(x: Interval) -> Interval:
@@ -337,16 +337,16 @@ _OF_ONE: dict[Callable[..., Any], Callable[[Interval], Interval]] = {
     np.sin: _waves(math.sin, math.pi / 2.0),
     np.cos: _waves(math.cos, 0.0),
     np.tan: _tan,
-    np.arcsin: _rising(math.asin),
+    np.arcsin: _increasing(math.asin),
     np.arccos: _acos,
-    np.arctan: _rising(math.atan),
-    np.sinh: _rising(math.sinh),
+    np.arctan: _increasing(math.atan),
+    np.sinh: _increasing(math.sinh),
     np.cosh: _cosh,
-    np.tanh: _rising(math.tanh),
-    np.exp: _rising(math.exp),
-    np.log: _rising(math.log),
-    np.log10: _rising(math.log10),
-    np.sqrt: _rising(math.sqrt),
+    np.tanh: _increasing(math.tanh),
+    np.exp: _increasing(math.exp),
+    np.log: _increasing(math.log),
+    np.log10: _increasing(math.log10),
+    np.sqrt: _increasing(math.sqrt),
     np.abs: _absolute,
     np.sign: _constant(np.sign, "sign"),
     np.floor: _constant(np.floor, "floor"),

@@ -240,7 +240,7 @@ def rounded(matrix: Any, bits: int, *, symmetric: bool = False) -> Dyadic:
     size, columns = int(matrix.nrows()), int(matrix.ncols())
     entries = [_mantissa(value) for value in matrix.entries()]
     rows = [entries[i * columns : (i + 1) * columns] for i in range(size)]
-    place = min((_top(rows[i][i]) for i in range(min(size, columns)) if rows[i][i][0]), default=0)
+    place = min((_highest_bit(rows[i][i]) for i in range(min(size, columns)) if rows[i][i][0]), default=0)
     exponent = place - bits
     integers = [[_shifted(man, exp - exponent) for man, exp in row] for row in rows]
     if symmetric:
@@ -255,7 +255,7 @@ def _mantissa(ball: Any) -> tuple[int, int]:
     return int(mantissa), int(exponent)
 
 
-def _top(value: tuple[int, int]) -> int:
+def _highest_bit(value: tuple[int, int]) -> int:
     return abs(value[0]).bit_length() + value[1]
 
 

@@ -207,8 +207,8 @@ def _design_from(data: dict[str, Any]) -> ObserverDesign:
     if not isinstance(data.get("kind"), (str, type(None))) or data.get("kind") not in DESIGN_KINDS:
         raise SpecError(f"A design of the kind {data['kind']!r} is unknown to this obsynth.", path="kind")
     kind, observer = types_of(data.get("kind"))
-    plant, recovery = _made("plant", kind, **data["plant"]), data["recovery"]
-    source = None if data.get("source") is None else _made("source", PlantSource.from_dict, data["source"])
+    plant, recovery = _made_from("plant", kind, **data["plant"]), data["recovery"]
+    source = None if data.get("source") is None else _made_from("source", PlantSource.from_dict, data["source"])
     if source is not None and isinstance(plant, DescriptorSystem):
         # What a disturbance may do between samples follows from the plant as written; `verify` compares both.
         note_source(source.plant, plant, sample_time=source.sample_time)
@@ -218,12 +218,12 @@ def _design_from(data: dict[str, Any]) -> ObserverDesign:
         plant=plant,
         options=data["options"],
         gains=data["gains"],
-        observer=_made("observer", observer.from_dict, data["observer"]),
-        certificate=_made("certificate", Certificate, **data["certificate"]),
+        observer=_made_from("observer", observer.from_dict, data["observer"]),
+        certificate=_made_from("certificate", Certificate, **data["certificate"]),
         solver=data["solver"],
         notes=tuple(data["notes"]),
-        recovery=None if recovery is None else _made("recovery", _recovery_from, plant, recovery),
-        report=_made("report", VerificationReport.from_dict, data["report"]),
+        recovery=None if recovery is None else _made_from("recovery", _recovery_from, plant, recovery),
+        report=_made_from("report", VerificationReport.from_dict, data["report"]),
         source=source,
         input_delay=data.get("input_delay", 0),
     )
@@ -255,7 +255,7 @@ def _checked_parts(body: Any) -> dict[str, Any]:
     return body
 
 
-def _made(part: str, make: Callable[..., _Made], *values: Any, **named: Any) -> _Made:
+def _made_from(part: str, make: Callable[..., _Made], *values: Any, **named: Any) -> _Made:
     """Return what a part describes; what cannot be made of it is a `SpecError`."""
     try:
         return make(*values, **named)

@@ -150,7 +150,7 @@ def _resolved(
             elif isinstance(plant, (DescriptorSystem, PolytopicSystem)):
                 actuator, acts = _actuator(plant, name, scenario), profile.active(steps, dt)
                 for ends in (left, right):
-                    added = _missing(profile, ends[:, actuator], acts, left[:, actuator])
+                    added = _lost_command(profile, ends[:, actuator], acts, left[:, actuator])
                     ends[:, column] += np.where(acts, added, 0.0)
         before += len(names)
     _form_derivatives(plant.input_names, scenario, left, right, dt)
@@ -180,7 +180,7 @@ def _form_derivatives(
             left[:, column] = right[:, column] = quotients
 
 
-def _missing(profile: Profile, commanded: FloatArray, acts: np.ndarray, before: FloatArray) -> FloatArray:
+def _lost_command(profile: Profile, commanded: FloatArray, acts: np.ndarray, before: FloatArray) -> FloatArray:
     """Return what a failing actuator adds to the command."""
     if isinstance(profile, LostEffectiveness):
         return np.asarray(-profile.share * commanded)
@@ -211,7 +211,7 @@ def _actuator(plant: DescriptorSystem | PolytopicSystem, fault: str, scenario: S
     return inputs[0]
 
 
-def _none() -> FloatArray:
+def _no_signals() -> FloatArray:
     return np.zeros((0, 0))
 
 
@@ -240,11 +240,11 @@ class Trajectory:
     outputs: FloatArray
     inputs: FloatArray
     faults: FloatArray
-    disturbances: FloatArray = field(default_factory=_none)
-    noise: FloatArray = field(default_factory=_none)
-    time: FloatArray = field(default_factory=_none)
+    disturbances: FloatArray = field(default_factory=_no_signals)
+    noise: FloatArray = field(default_factory=_no_signals)
+    time: FloatArray = field(default_factory=_no_signals)
     inconsistency: float = 0.0
-    residuals: FloatArray = field(default_factory=_none)
+    residuals: FloatArray = field(default_factory=_no_signals)
 
     def __post_init__(self) -> None:
         freeze(self, *(name for name, value in vars(self).items() if isinstance(value, np.ndarray)))

@@ -136,7 +136,7 @@ class Simulation:
             ("faults", estimates.fault_names, self.fault_errors, estimates.fault_deviations, self.fault_warm_up),
             ("states", estimates.state_names, self.state_errors, estimates.state_deviations, self.state_warm_up),
         ):
-            table[kind] = {name: _sizes(errors[warm_up:, i]) for i, name in enumerate(names)}
+            table[kind] = {name: _error_sizes(errors[warm_up:, i]) for i, name in enumerate(names)}
             if estimates.has_deviations:
                 for i, row in enumerate(table[kind].values()):
                     row["within_band"] = float(np.mean(np.abs(errors[:, i]) <= BAND_WIDTH * deviations[:, i]))
@@ -324,7 +324,7 @@ def aligned_errors(estimates: FloatArray, truth: FloatArray, delays: tuple[int, 
     return errors
 
 
-def _sizes(errors: FloatArray) -> dict[str, float]:
+def _error_sizes(errors: FloatArray) -> dict[str, float]:
     """Return root mean square and largest absolute value of what is not NaN."""
     known = errors[~np.isnan(errors)]
     if not known.size:

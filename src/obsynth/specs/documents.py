@@ -303,8 +303,8 @@ def _of_likely_kinds(items: Sequence[Any], document: Any) -> list[Any]:
             groups.setdefault(loc[:place], {}).setdefault(str(loc[place]), []).append(inner)
     for path, kinds in groups.items():
         by_kind = [_of_likely_kinds(errors, document) for errors in kinds.values()]
-        least = min(_strange(errors, path) for errors in by_kind)
-        likely = [errors for errors in by_kind if _strange(errors, path) == least]
+        least = min(_wrong_kinds(errors, path) for errors in by_kind)
+        likely = [errors for errors in by_kind if _wrong_kinds(errors, path) == least]
         if len(likely) > 1 and all(len(errors) == 1 for errors in likely):
             kinds_wanted = list(dict.fromkeys(_kind_wanted(errors[0]) for errors in likely))
             likely_errors.append(
@@ -328,7 +328,7 @@ def _kind_in(loc: Sequence[Any], document: Any, problem: str) -> int | None:
     return None
 
 
-def _strange(items: Sequence[Any], path: Sequence[Any]) -> tuple[int, int]:
+def _wrong_kinds(items: Sequence[Any], path: Sequence[Any]) -> tuple[int, int]:
     """Return how many errors say that a value at a path is of another kind, and how many there are."""
     at_once = 0
     for item in items:
@@ -342,7 +342,7 @@ def _kind_wanted(item: Any) -> str:
     """Return what a value should have been, by an error that says that it is of another kind."""
     if "<rows>" in item["loc"]:
         return "a list of rows, such as [[1, 0], [0, 1]]"
-    return _wanted(item["type"], item.get("ctx", {})).removeprefix("one of ")
+    return _wanted_in_words(item["type"], item.get("ctx", {})).removeprefix("one of ")
 
 
 def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str]:
@@ -373,7 +373,9 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
     elif kind == "string_pattern_mismatch":
         text = f"use letters, digits, '.', '_' and '-' only (at most 100), not {described(value)}."
     else:
-        expected = "a list of numbers" if in_rows and kind in ("list_type", "too_short") else _wanted(kind, context)
+        expected = (
+            "a list of numbers" if in_rows and kind in ("list_type", "too_short") else _wanted_in_words(kind, context)
+        )
         expected = "a list of rows, such as [[1, 0], [0, 1]]" if in_rows and not numbers else expected
         actual = "an empty one" if kind in ("too_short", "string_too_short") else described(value)
         text = f"must be {expected}, not {actual}."
@@ -382,7 +384,7 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
     return ".".join([*([prefix] if prefix else []), *names]), f"{place} {text}" if place else text
 
 
-def _wanted(kind: str, context: Mapping[str, Any]) -> str:
+def _wanted_in_words(kind: str, context: Mapping[str, Any]) -> str:
     if kind == "kinds":
         return str(context["wanted"])
     if kind == "literal_error":

@@ -240,7 +240,7 @@ def evaluate(
             if report_runs is not None:
                 report_runs(finished, runs)
     parts = {name: np.concatenate([part[name] for part in results]) for name in results[0]}
-    return _summed(parts, design, bench, watched=monitor is not None, level=confidence)
+    return _evaluation(parts, design, bench, watched=monitor is not None, level=confidence)
 
 
 def _require_fit(
@@ -307,7 +307,7 @@ def _judged_parameters(watched: ParameterMonitor, bench: Bench, estimates: Estim
     return false, float(k), float(not acted[names.index(alarm.parameter)])
 
 
-def _summed(
+def _evaluation(
     parts: Mapping[str, FloatArray], design: ObserverDesign, bench: Bench, *, watched: bool, level: float
 ) -> Evaluation:
     onset = bench.onset

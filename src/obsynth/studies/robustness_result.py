@@ -163,8 +163,11 @@ class Robustness:
         yield "constants", f"{len(self.box.names)} with a tolerance ({names}), {self.box.variation}, {self.box.origin}"
         if self.not_covered:
             yield "linear model", self.not_covered
-        yield "regular, index 1", VERDICTS[self.regular] + (self._where() if self.regular == "refuted" else "")
-        where = self._where() if self.stable == "refuted" and self.regular != "refuted" else ""
+        yield (
+            "regular, index 1",
+            VERDICTS[self.regular] + (self._place_of_failure() if self.regular == "refuted" else ""),
+        )
+        where = self._place_of_failure() if self.stable == "refuted" and self.regular != "refuted" else ""
         lasting = ", ".join(f"{value.real:.4g}" if not value.imag else f"{value:.4g}" for value in self.untouched)
         but = f", but for the mode at {lasting}, which no constant touches" if lasting else ""
         yield "plant stable", VERDICTS[self.stable] + where + (f" ({self.boxes} boxes)" if self.boxes else "") + but
@@ -180,12 +183,12 @@ class Robustness:
             share = self.largest_tolerance
             percent = "" if share is None else f" ({100.0 * share:.3g} %)"
             yield "largest tolerances", f"{self.largest_factor:.4g} times those stated{percent}"
-        yield "main contributors", _top(self.blame)
-        yield "rows of the plant", _top(self.rows)
+        yield "main contributors", _largest_shares(self.blame)
+        yield "rows of the plant", _largest_shares(self.rows)
         for name, gain in self.vertex_gains.items():
             yield f"largest gain, {name}", f"{gain:.4g} at a vertex, from the disturbances"
 
-    def _where(self) -> str:
+    def _place_of_failure(self) -> str:
         if not self.breaking:
             return ""
         return " at " + ", ".join(f"{name} = {value:.6g}" for name, value in self.breaking.items())
@@ -247,7 +250,7 @@ def robustness_statement(claims: Mapping[str, Any], design: ObserverDesign, dige
     return f"For every plant with {box}: {', '.join(words)}{linear}. Gain set {digest[:SHOWN_DIGITS]}."
 
 
-def _top(shares: Mapping[str, float]) -> str:
+def _largest_shares(shares: Mapping[str, float]) -> str:
     largest = sorted(shares.items(), key=lambda item: -item[1])[:MOST_BLAMED]
     return (
         ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in largest if share > LISTED_BLAME_SHARE) or "nothing"

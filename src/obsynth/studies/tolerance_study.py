@@ -260,7 +260,7 @@ def tolerance_study(
         if progress is not None:
             progress(f"tolerance {100.0 * share:.3g} %")
         scaled = _scaled(design, share / known)
-        without, with_one = _both(scaled, quiet, chosen, runs)
+        without, with_one = _healthy_and_faulty(scaled, quiet, chosen, runs)
         for j, constants in enumerate((None, scaled.linear[0])):
             watched = monitor(
                 scaled, quiet, constants=constants, disturbance_bounds=disturbance_bounds, noise_bound=noise_bound
@@ -285,17 +285,17 @@ def _scaled(design: ObserverDesign, factor: float) -> ObserverDesign:
     return design.replace(plant=plant.replace(uncertainty=uncertain.with_box(uncertain.box.scaled(factor))))
 
 
-def _both(design: ObserverDesign, scenario: Scenario, fault: str, runs: int) -> tuple[Runs, Runs]:
+def _healthy_and_faulty(design: ObserverDesign, scenario: Scenario, fault: str, runs: int) -> tuple[Runs, Runs]:
     """Return the same runs without and with a fault of size 1, each of a plant drawn from the box."""
     faulty = scenario.replace(faults={fault: Step(size=1.0, start=ONSET * scenario.horizon)})
     by_case: list[list[Runs]] = [[], []]
     for i, true in enumerate(drawn_designs(design, runs, scenario.seed)):
         for batch, case in zip(by_case, (scenario, faulty), strict=True):
             batch.append(make_bench(true, case).run([scenario.seed + i]))
-    return _together(by_case[0]), _together(by_case[1])
+    return _joined(by_case[0]), _joined(by_case[1])
 
 
-def _together(runs: list[Runs]) -> Runs:
+def _joined(runs: list[Runs]) -> Runs:
     signals = ("states", "outputs", "inputs", "faults", "disturbances", "rows")
     joined: dict[str, Any] = {name: np.concatenate([getattr(run, name) for run in runs], axis=1) for name in signals}
     return Runs(**joined, observer=runs[0].observer)

@@ -97,13 +97,13 @@ def fault_margins(plant: DescriptorSystem, isolable: np.ndarray, at_rest: np.nda
         if responses is None or not isolable[i, i]:
             continue
         faults, unknown = responses
-        effect = _left(faults[:, i], unknown)[0]
+        effect = _remaining_length(faults[:, i], unknown)[0]
         for j in range(nf):
             if isolable[i, j] and j != i:
-                pairs[i, j] = _ratio(effect, _left(faults[:, i], np.hstack([faults[:, [j]], unknown]))[0])
+                pairs[i, j] = _ratio(effect, _remaining_length(faults[:, i], np.hstack([faults[:, [j]], unknown]))[0])
         pairs[i, i] = 1.0
         other_faults = [j for j in range(nf) if j != i]
-        own, sizes = _left(faults[:, i], np.hstack([faults[:, other_faults], unknown]))
+        own, sizes = _remaining_length(faults[:, i], np.hstack([faults[:, other_faults], unknown]))
         alone[i] = _ratio(effect, own)
         alike[i, other_faults] = np.abs(sizes[: nf - 1])
         if own > 0.0:
@@ -143,7 +143,7 @@ def _responses(
     return comparable[:, : plant.nf], comparable[:, plant.nf :]
 
 
-def _left(column: ComplexArray, beside: ComplexArray) -> tuple[float, ComplexArray]:
+def _remaining_length(column: ComplexArray, beside: ComplexArray) -> tuple[float, ComplexArray]:
     """Return the length of what is left of a column beside others of any size, and the sizes that come nearest."""
     if not beside.shape[1]:
         return float(np.linalg.norm(column)), np.zeros(0, dtype=np.complex128)

@@ -29,7 +29,7 @@ def exact_residual_order(A: fmpq_mat, C: fmpq_mat, F: fmpq_mat, G: fmpq_mat, K: 
         # Equations of the fault alone, which a plant that is not regular may have.
         if _from_column(rows, known + n).nrows():
             return 0
-        rows = _kept(rows, known + n)
+        rows = _independent_rows(rows, known + n)
         without = _from_column(rows, known)
         if without.nrows() <= free:
             break
@@ -41,7 +41,7 @@ def exact_residual_order(A: fmpq_mat, C: fmpq_mat, F: fmpq_mat, G: fmpq_mat, K: 
     for order in range(n + 1):
         if _from_column(equations, n).nrows():
             return order
-        z, f = _split(_kept(equations, n), 0, n)
+        z, f = _split(_independent_rows(equations, n), 0, n)
         if not z.nrows():
             break
         equations = blocks([[z * A, z * F, f]])
@@ -59,7 +59,7 @@ def _echelon(rows: fmpq_mat) -> list[list[fmpq]]:
     return reduced.tolist()[:rank]
 
 
-def _kept(rows: fmpq_mat, columns: int) -> fmpq_mat:
+def _independent_rows(rows: fmpq_mat, columns: int) -> fmpq_mat:
     """Return independent combinations of rows whose first columns are independent; what has none of them goes."""
     listed = [row for row in _echelon(rows) if any(value != 0 for value in row[:columns])]
     return fmpq_mat(len(listed), rows.ncols(), [value for row in listed for value in row])
@@ -101,7 +101,7 @@ def residual_orders(
     orders: list[int | None] = [0 if is_alone else None for is_alone in alone.tolist()]
     scale = largest_singular_value(C)
     for order in range(n + 1):
-        new, hidden, terms = _beside(basis, new, scale)
+        new, hidden, terms = _added_directions(basis, new, scale)
         present = _present_faults(hidden, terms)
         orders = [
             order if shows and known is None else known for known, shows in zip(orders, present.tolist(), strict=True)
@@ -131,7 +131,7 @@ def _of_degree_zero(
     for _ in range(n + 1):
         left, values, _ = full_svd(w)
         rank = int(np.count_nonzero(values > RANK_TOLERANCE * size))
-        new, hidden, terms = _beside(free, rows.combined(left[:, rank:].T), scale)
+        new, hidden, terms = _added_directions(free, rows.combined(left[:, rank:].T), scale)
         alone |= _present_faults(hidden, terms)
         rows, w = rows.combined(left[:, :rank].T), left[:, :rank].T @ w
         if not len(new.z):
@@ -142,7 +142,7 @@ def _of_degree_zero(
     return rows.joined(free), alone
 
 
-def _beside(basis: _Rows, rows: _Rows, scale: float) -> tuple[_Rows, FloatArray, FloatArray]:
+def _added_directions(basis: _Rows, rows: _Rows, scale: float) -> tuple[_Rows, FloatArray, FloatArray]:
     """Return what rows add to an orthonormal basis, orthonormal; fault parts of what adds nothing, and their terms."""
     z, f = rows
     terms = np.linalg.norm(f, axis=(0, 1))

@@ -82,7 +82,7 @@ class SensorResponses:
             return shares
         for table in self.tables:
             goal = table[:, self.nd + fault][rows]
-            parts = _outside(table[:, columns][rows], goal)
+            parts = _norm_outside(table[:, columns][rows], goal)
             size = np.linalg.norm(goal, axis=1)
             shares = np.maximum(shares, np.where(size > 0.0, parts / np.where(size > 0.0, size, 1.0), 0.0))
         return np.where(shares > SHOWN_PART, shares, 0.0)
@@ -101,7 +101,7 @@ def _solution(matrix: ComplexArray | FloatArray, right: FloatArray) -> tuple[Com
     return x, np.abs(inverse) @ (np.abs(matrix) @ np.abs(x) + np.abs(right))
 
 
-def _outside(span: ComplexArray, vector: ComplexArray) -> NDArray[np.float64]:
+def _norm_outside(span: ComplexArray, vector: ComplexArray) -> NDArray[np.float64]:
     """Return the norm of the part of each vector ``(N, m)`` outside the span of columns ``(N, m, c)``."""
     if span.shape[2] == 0:
         return np.asarray(np.linalg.norm(vector, axis=1))
@@ -149,10 +149,10 @@ class SensorSearch:
     @cached_property
     def had(self) -> list[Task]:
         """The tasks that the plant reaches with no sensor added."""
-        return [task for task in self.tasks(self.plant, self.faults) if reached(self._bare, task)]
+        return [task for task in self.tasks(self.plant, self.faults) if reached(self._without_candidates, task)]
 
     @cached_property
-    def _bare(self) -> DecoupledFaults:
+    def _without_candidates(self) -> DecoupledFaults:
         return DecoupledFaults(self.plant, exactly=False)
 
     def reachable(self) -> list[Task]:

@@ -75,7 +75,7 @@ def _form_conditions(judge: Evaluator) -> Iterator[Condition]:
         "none. Name the fault to estimate in Bf or Df.",
         of_the_method=True,
     )
-    (normal_rank, index, dynamic), floating = _form(judge)
+    (normal_rank, index, dynamic), floating = _pencil_facts(judge)
     yield _condition(
         "regularity",
         "a regular pencil (det(A - sE) not identically zero)",
@@ -110,7 +110,7 @@ def _form_conditions(judge: Evaluator) -> Iterator[Condition]:
     )
 
 
-def _form(judge: Evaluator) -> tuple[tuple[int, int, int], bool]:
+def _pencil_facts(judge: Evaluator) -> tuple[tuple[int, int, int], bool]:
     """Return normal rank, index (0 for a plant that is not regular) and the number of dynamic states, and whether
     floating-point ranks tell so: such a no is none."""
     plant, numbers = judge.plant, judge.numbers

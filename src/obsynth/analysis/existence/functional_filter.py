@@ -70,12 +70,12 @@ def _fault_conditions(
     """Return whether one fault, whose model has these poles, can be estimated, free of others and unknown inputs."""
     name = plant.fault_names[fault]
     decoupled = decoupled_fault(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
-    visible = _visibility(plant, decoupled, f"{name} detectable", _rest(plant, fault))
+    visible = _visibility(plant, decoupled, f"{name} detectable", _other_signals(plant, fault))
     if not decoupled.visible:
         return (visible,)
     lost = [point for point in points if not decoupled.shows_at(point)]
     doubtful = [point for point in lost if _may_show(decoupled, point)]
-    shares = {point: _named(plant, decoupled).last_share(point) for point in points}
+    shares = {point: _named_columns(plant, decoupled).last_share(point) for point in points}
     least = min(points, key=lambda point: shares[point], default=dc_point(plant.dt))
     share = f", at the poles of its model at least {shares[least]:.2g} of it reaches the outputs" if shares else ""
     follows = Condition(
@@ -109,7 +109,7 @@ def _may_show(decoupled: DecoupledFault, point: complex | None = None) -> bool:
     return exact.visible if point is None else exact.shows_at(point)
 
 
-def _named(plant: DescriptorSystem, decoupled: DecoupledFault) -> NamedPencil:
+def _named_columns(plant: DescriptorSystem, decoupled: DecoupledFault) -> NamedPencil:
     """Return what the fault must not be a combination of, and the fault itself in the last column."""
     columns = {name: [*decoupled.removed, decoupled.number] for name in ("Bf", "Df")}
     return Evaluator(plant).named(FullRank([["A", "Bd", "Bf"], ["C", "Dd", "Df"]], columns))
@@ -117,7 +117,7 @@ def _named(plant: DescriptorSystem, decoupled: DecoupledFault) -> NamedPencil:
 
 def _in_doubt(condition: Condition, plant: DescriptorSystem, decoupled: DecoupledFault, point: complex) -> Condition:
     """Return the condition as one that rounding of the data could change."""
-    named, name = _named(plant, decoupled), plant.fault_names[decoupled.number]
+    named, name = _named_columns(plant, decoupled), plant.fault_names[decoupled.number]
     share = named.last_share(point)
     other = f"hides {name} at {'z' if plant.dt > 0.0 else 's'} = {pole_text(point)}, and no filter estimates it"
     doubt = Evaluator(plant).doubt(named, other, point=point, tolerance=max(ROUNDING_LEVEL, share), last=True)
@@ -156,7 +156,7 @@ def _visibility(plant: DescriptorSystem, decoupled: DecoupledFault, name: str, u
     )
 
 
-def _rest(plant: DescriptorSystem, fault: int) -> str:
+def _other_signals(plant: DescriptorSystem, fault: int) -> str:
     names = [*plant.disturbance_names, *(name for j, name in enumerate(plant.fault_names) if j != fault)]
     return ", ".join(names) or "the initial state"
 

@@ -61,7 +61,9 @@ def identifiability_condition(
 ) -> Condition:
     """Return the condition that outputs tell the parameters from each other and from the state."""
     still = all(matrix.is_constant for matrix in (plant.E, plant.A, plant.C, plant.Phi, plant.Psi))
-    decision, (parameters, shares, states) = _steady(plant) if still else _along(plant, early=early)
+    decision, (parameters, shares, states) = (
+        _decided_at_rest(plant) if still else _decided_along_horizon(plant, early=early)
+    )
     if still and constant is not None:
         settled, numbers = decision, constant.numbers
         if numbers is not None:
@@ -109,7 +111,7 @@ def _explained(
 
 
 @remembered
-def _steady(plant: TimeVaryingDescriptorSystem) -> tuple[RankDecision, _Kernel]:
+def _decided_at_rest(plant: TimeVaryingDescriptorSystem) -> tuple[RankDecision, _Kernel]:
     """Decide about a time-invariant plant by its state and parameters at rest."""
     decision = decide_rank(_at_rest(plant).A, expected=plant.nx + plant.nq, equilibrated=False)
     return decision, _steady_kernel(plant, decision.rank)
@@ -131,7 +133,7 @@ def _steady_kernel(plant: TimeVaryingDescriptorSystem, rank: int) -> _Kernel:
 
 
 @remembered
-def _along(plant: TimeVaryingDescriptorSystem, *, early: bool) -> tuple[RankDecision, _Kernel]:
+def _decided_along_horizon(plant: TimeVaryingDescriptorSystem, *, early: bool) -> tuple[RankDecision, _Kernel]:
     """Decide along the horizon, by the whitened traces of the parameters for noise of unit size everywhere."""
     late = early_rows(plant, early=early)
     steps = plant.horizon or STEPS_WITHOUT_HORIZON

@@ -260,7 +260,7 @@ def named_pencil(
             nothing = as_array([[Fraction(0)] * (height * len(picked))], (height, len(picked)))
             blocks[-1].append(nothing if name is None else exact[name][:, picked])
             moving[-1].append(exact["E"] if name == "A" else nothing)
-            owners[-1].append(_owned(name, height, picked))
+            owners[-1].append(_owners(name, height, picked))
             own = None if sized is None or name is None else np.abs(getattr(sized, name)[:, picked])
             terms[-1].append(nearest(nothing) if own is None else own)
     return NamedPencil(
@@ -289,7 +289,7 @@ def named_augmented(
     middle[:, nx : nx + count] = phi
     slope[:, nx : nx + count] = rational(np.eye(count))
     if of_the_model:
-        owners[:, nx : nx + count] = _owned("Phi", count, range(count))
+        owners[:, nx : nx + count] = _owners("Phi", count, range(count))
     # An entry of Bf or Df can be changed through a state of the model that is a fault by itself.
     alone = [np.flatnonzero(cw[:, j] != 0) for j in range(count)]
     single = [int(rows[0]) if len(rows) == 1 and cw[rows[0], j] == 1 else -1 for j, rows in enumerate(alone)]
@@ -320,7 +320,7 @@ def named_augmented(
     )
 
 
-def _owned(name: Cell, height: int, columns: Sequence[int]) -> Rational:
+def _owners(name: Cell, height: int, columns: Sequence[int]) -> Rational:
     owners = np.empty((height, len(columns)), dtype=object)
     if name is not None:
         for i in range(height):

@@ -122,7 +122,7 @@ def _in_order(plant: PolytopicSystem, exactly: bool, made: list[FilterOverRegion
     if directions is None:
         return
     Bf0, Delta = directions
-    reach = _reach(Delta)
+    reach = _inverse_bound(Delta)
     yield Condition(
         "effectiveness",
         "Delta(mu) of Bf(mu) = Bf0 Delta(mu) is nonsingular on the whole region: a fault does not lose its effect",
@@ -190,7 +190,7 @@ def _direction_condition(plant: PolytopicSystem, directions: object) -> Conditio
     )
 
 
-def _reach(Delta: tuple[FloatArray, ...]) -> float | None:
+def _inverse_bound(Delta: tuple[FloatArray, ...]) -> float | None:
     """Return a proved bound on ``|Delta^-1|`` over the hull; ``None`` without a proof."""
     count = len(Delta[0])
     if not count or all(np.array_equal(matrix, np.eye(count)) for matrix in Delta):

@@ -84,7 +84,7 @@ class PlantNumbers:
         """Whether all of them are rational."""
         return self.bits is None
 
-    def _precisely(self) -> Any:
+    def _with_many_bits(self) -> Any:
         """Compute with as many bits as the enclosures have."""
         return flint.ctx.workprec(self.bits or flint.ctx.prec)
 
@@ -94,17 +94,17 @@ class PlantNumbers:
 
     def as_own(self, matrix: fmpq_mat) -> Any:
         """Return a rational matrix as one of these numbers."""
-        with self._precisely():
+        with self._with_many_bits():
             return matrix if self.exact else arb_mat(matrix)
 
     def product(self, left: Any, right: Any) -> Any:
         """Return a product."""
-        with self._precisely():
+        with self._with_many_bits():
             return left * right
 
     def rank(self, matrix: Any) -> int:
         """Return the rank of a matrix; of enclosures to digits."""
-        with self._precisely():
+        with self._with_many_bits():
             return rank_of(matrix) if self.exact else rank_to_digits(matrix.tolist())
 
     def columns(self, name: str, kept: Sequence[int] | None) -> Any:

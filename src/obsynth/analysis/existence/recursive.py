@@ -142,7 +142,9 @@ def detectability_condition(plant: TimeVaryingDescriptorSystem) -> Condition:
     hidden = [complex(z) for z, out in zip(zeros.values, outside, strict=True) if out]
     if hidden:
         return _hidden_modes(plant, tall_e, tall_a, hidden)
-    return Condition("detectability", _detectable(plant), True, 0.0, 0.0, _DETECTABLE, _dying(len(zeros.values)))
+    return Condition(
+        "detectability", _detectable(plant), True, 0.0, 0.0, _DETECTABLE, _decaying_modes(len(zeros.values))
+    )
 
 
 def _decided_detectability(judge: Evaluator) -> Condition:
@@ -151,7 +153,9 @@ def _decided_detectability(judge: Evaluator) -> Condition:
     tall_e, tall_a = judge.pencil(NoZeroOutside())
 
     def holding(facts: SystemFacts) -> Condition:
-        return Condition("detectability", _detectable(plant), True, 0.0, 0.0, _DETECTABLE, _dying(len(facts.zeros)))
+        return Condition(
+            "detectability", _detectable(plant), True, 0.0, 0.0, _DETECTABLE, _decaying_modes(len(facts.zeros))
+        )
 
     def lost(facts: SystemFacts) -> Condition:
         return _hidden_modes(plant, tall_e, tall_a, facts.outside or [1 + 0j])
@@ -163,7 +167,7 @@ def _detectable(plant: TimeVaryingDescriptorSystem | DescriptorSystem) -> str:
     return f"rank [A - zE; C] = {plant.nx} for all |z| >= 1"
 
 
-def _dying(count: int) -> str:
+def _decaying_modes(count: int) -> str:
     return f"{count} unobservable mode(s), all of which decay" if count else "observable"
 
 

@@ -67,25 +67,25 @@ class Existence:
 
 
 @remembered
-def _known(_plant: DescriptorSystem) -> dict[tuple[bool, *tuple[bytes, ...]], tuple[Condition, ...]]:
+def _condition_cache(_plant: DescriptorSystem) -> dict[tuple[bool, *tuple[bytes, ...]], tuple[Condition, ...]]:
     """Return the cache of the conditions of a plant with a fault model: synthesis and verification ask for them."""
     return {}
 
 
 def existence_conditions(plant: DescriptorSystem, model: Exosystem) -> tuple[Condition, ...]:
     """Return the existence conditions of the unknown-input PI observer."""
-    return _known(plant).get(_key(model, exactly=True)) or existence(plant, model).conditions
+    return _condition_cache(plant).get(_cache_key(model, exactly=True)) or existence(plant, model).conditions
 
 
 def existence(plant: DescriptorSystem, model: Exosystem, *, exactly: bool = True) -> Existence:
     """Return the existence conditions of the unknown-input PI observer, and the plant to design for."""
     judge = Evaluator(plant.dense(), exactly)
     outcome = reconsidered(judge, lambda judge: _decided(judge, model), lambda each: each.conditions)
-    _known(plant)[_key(model, exactly=exactly)] = outcome.conditions
+    _condition_cache(plant)[_cache_key(model, exactly=exactly)] = outcome.conditions
     return outcome
 
 
-def _key(model: Exosystem, *, exactly: bool) -> tuple[bool, *tuple[bytes, ...]]:
+def _cache_key(model: Exosystem, *, exactly: bool) -> tuple[bool, *tuple[bytes, ...]]:
     """Return what the conditions depend on besides the plant: the numbers of the fault model, to the last digit."""
     parts = (model.Phi, model.Cw, model.eigenvalues)
     # A negative zero is a zero.

@@ -53,7 +53,7 @@ def index_doubt(judge: Evaluator, detectability: FaultDetectability) -> Unclear 
     direction = np.linalg.svd(detectability.Upsilon / lengths)[2][-1] / lengths
     direction = direction / direction[int(np.argmax(np.abs(direction)))]
     for digits in WITNESS_DIGITS:
-        witness = _changed(plant, units, detectability.indexes, np.round(direction, digits))
+        witness = _column_changes(plant, units, detectability.indexes, np.round(direction, digits))
         if witness is not None and (best is None or witness.size < best.size):
             best = witness
         if best is not None and best.size <= ROUNDING_LEVEL:
@@ -72,15 +72,15 @@ def _is_in_doubt(judge: Evaluator, detectability: FaultDetectability) -> bool:
     # Of computed data only floating point has spoken: what they were rounded to may say otherwise.
     if judge.numbers is None:
         return False
-    exact = _exact(judge.plant)
+    exact = _exact_matrices(judge.plant)
     if exact is None:
         return False
     a, c, faults, _ = exact
-    columns = [c * _moved(a, faults, fault, index) for fault, index in enumerate(detectability.indexes)]
+    columns = [c * _visible_direction(a, faults, fault, index) for fault, index in enumerate(detectability.indexes)]
     return int(blocks([columns]).rank()) == rank.expected
 
 
-def _exact(plant: DescriptorSystem) -> tuple[fmpq_mat, fmpq_mat, fmpq_mat, fmpq_mat] | None:
+def _exact_matrices(plant: DescriptorSystem) -> tuple[fmpq_mat, fmpq_mat, fmpq_mat, fmpq_mat] | None:
     """Return ``T A``, C, ``T Bf`` and T of the plant as written, with its sensor faults as states."""
     plant = Witness((), 0.0).plant(plant)
     numbers = numbers_with_fault_states(plant, numbers_of(plant))
@@ -90,7 +90,7 @@ def _exact(plant: DescriptorSystem) -> tuple[fmpq_mat, fmpq_mat, fmpq_mat, fmpq_
     return t * numbers.matrices["A"], numbers.matrices["C"], t * numbers.matrices["Bf"], t
 
 
-def _moved(a: fmpq_mat, faults: fmpq_mat, fault: int, index: int | None) -> fmpq_mat:
+def _visible_direction(a: fmpq_mat, faults: fmpq_mat, fault: int, index: int | None) -> fmpq_mat:
     """Return the vector of a fault that becomes visible."""
     vector = picked_columns(faults, [fault])
     for _ in range(int(index or 1) - 1):
@@ -98,17 +98,17 @@ def _moved(a: fmpq_mat, faults: fmpq_mat, fault: int, index: int | None) -> fmpq
     return vector
 
 
-def _changed(
+def _column_changes(
     plant: DescriptorSystem, units: PlantUnits, indexes: tuple[int | None, ...], direction: np.ndarray
 ) -> Witness | None:
     """Return the changes of the column of the fault whose share of the direction is one, where there are any."""
-    numbers, chosen = _exact(plant), int(np.argmax(np.abs(direction)))
+    numbers, chosen = _exact_matrices(plant), int(np.argmax(np.abs(direction)))
     if numbers is None:
         return None
     a, c, faults, t = numbers
     # Of shares that rounding has made alike another one may be the first of the largest, with the other sign.
     shares = [_scalar(Fraction(float(share)) / Fraction(float(direction[chosen]))) for share in direction]
-    parts = [c * _moved(a, faults, fault, index) * shares[fault] for fault, index in enumerate(indexes)]
+    parts = [c * _visible_direction(a, faults, fault, index) * shares[fault] for fault, index in enumerate(indexes)]
     residual, maps, through = sum(parts[1:], start=parts[0]), list["fmpq_mat"](), t
     for _ in range(int(indexes[chosen] or 1)):
         maps.append(c * through)
@@ -144,14 +144,14 @@ def _scalar(value: Fraction) -> fmpq_mat:
 
 
 @remembered
-def _decided(_plant: DescriptorSystem) -> dict[bool, tuple[Condition, ...]]:
+def _condition_cache(_plant: DescriptorSystem) -> dict[bool, tuple[Condition, ...]]:
     """Return the cache of the conditions of a plant, decided exactly or not: synthesis and verification use it."""
     return {}
 
 
 def fault_filter_conditions(plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
     """Return the existence conditions of the fault-estimation filter, in order; the list ends at the first failure."""
-    return _decided(plant).get(exactly) or examine_fault_filter(plant, exactly=exactly)[0]
+    return _condition_cache(plant).get(exactly) or examine_fault_filter(plant, exactly=exactly)[0]
 
 
 def examine_fault_filter(
@@ -164,7 +164,7 @@ def examine_fault_filter(
     if merged is not None and not merged.exact and not result[0][-1].holds:
         # The outputs as written show more than the merged ones, by their rounding: that is unclear, not a refusal.
         result = _decide(dense, exactly)
-    _decided(plant)[exactly] = result[0]
+    _condition_cache(plant)[exactly] = result[0]
     return result
 
 

@@ -61,7 +61,7 @@ class EntryChange:
             ]
             place += f" ({', '.join(signals)})"
             place = place.replace("fault ", "parameter ") if parameters else place
-        return f"{place} from {_number(self.before)} to {_after(self.before, self.after)}"
+        return f"{place} from {_number(self.before)} to {_new_number(self.before, self.after)}"
 
 
 @dataclass(frozen=True)
@@ -112,15 +112,14 @@ class Unclear:
         if self.witness is None:
             witness = f"{self.other}; no single entries were found that do it."
         elif not self.witness.changes:
-            witness = f"the {_kind(plant)} as it is rounded to double precision {self.other}."
+            witness = f"the {_plant_in_words(plant)} as it is rounded to double precision {self.other}."
         else:
-            witness = (
-                f"the {_kind(plant)} with {self.witness.described(plant, parameters=self.parameters)} {self.other}."
-            )
+            change = self.witness.described(plant, parameters=self.parameters)
+            witness = f"the {_plant_in_words(plant)} with {change} {self.other}."
         return f"Tolerance: {self.tolerance:.1g} of the largest scaled entry. Witness: {witness} {self.decider}"
 
 
-def _kind(plant: DescriptorSystem) -> str:
+def _plant_in_words(plant: DescriptorSystem) -> str:
     exact = plant.exact
     if exact is None:
         return "plant"
@@ -161,7 +160,7 @@ def _number(value: Fraction) -> str:
     return repr(float(value)) if float(value) != int(float(value)) else str(int(float(value)))
 
 
-def _after(before: Fraction, after: Fraction) -> str:
+def _new_number(before: Fraction, after: Fraction) -> str:
     """Return the new number, as a difference where it is nearer to the old one than doubles tell."""
     if abs(after - before) * 10**12 > abs(before):
         return _number(after)

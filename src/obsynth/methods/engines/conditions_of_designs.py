@@ -37,7 +37,7 @@ def conditions_of(design: ObserverDesign) -> Conditions:
     return makers[design.method](design)
 
 
-def _put(problem: Conditions, **values: Any) -> Conditions:
+def _with_values(problem: Conditions, **values: Any) -> Conditions:
     """Give variables their values, symmetric ones exactly so."""
     for name, value in values.items():
         variable, number = problem.variables[name], np.asarray(value, dtype=np.float64)
@@ -58,7 +58,7 @@ def _wang(design: ObserverDesign) -> Conditions:
     P = factor.T @ factor
     # L = L0 + P^-1 Y (I - Upsilon W): of all Y, the one that has no part along Upsilon.
     values = {"P": P, "Y": P @ (gains["L"] - problem.data["L0"])}
-    return _put(problem, **values, **({} if gamma is not None else {"gamma_squared": 0.0}))
+    return _with_values(problem, **values, **({} if gamma is not None else {"gamma_squared": 0.0}))
 
 
 def _filasova(design: ObserverDesign) -> Conditions:
@@ -71,7 +71,7 @@ def _filasova(design: ObserverDesign) -> Conditions:
     J = np.vstack([gains["J"], loop @ gains["M"]])
     L = np.vstack([gains["L"], loop @ gains["N"]])
     P3 = matrices["P3"]
-    return _put(problem, P1=matrices["P1"], P3=P3, Y=P3.T @ (J - decay * L), Z=P3.T @ L)
+    return _with_values(problem, P1=matrices["P1"], P3=P3, Y=P3.T @ (J - decay * L), Z=P3.T @ L)
 
 
 def _share_pasand(design: ObserverDesign) -> Conditions:
@@ -87,7 +87,7 @@ def _share_pasand(design: ObserverDesign) -> Conditions:
     undisturbed, injection, _ = direct_part(plant)
     injected = np.vstack([injection, np.zeros((model.order, plant.ny))])
     gain = (K_a - U_a @ injected) @ undisturbed.T
-    return _put(problem, P=np.eye(len(X)), Y=np.linalg.solve(X, gain))
+    return _with_values(problem, P=np.eye(len(X)), Y=np.linalg.solve(X, gain))
 
 
 def _kalman(design: ObserverDesign) -> Conditions:
@@ -103,4 +103,4 @@ def _kalman(design: ObserverDesign) -> Conditions:
     X = data["X"]
     P = X.T @ discrete_lyapunov((steady.L @ data["A"]).T, np.eye(len(X))) @ X
     driven = np.linalg.solve(X, np.hstack([steady.L @ data["W"], -steady.K @ data["V"]]))
-    return _put(problem, P=P, Y=P @ np.linalg.solve(X, S), Z=driven.T @ P @ driven)
+    return _with_values(problem, P=P, Y=P @ np.linalg.solve(X, S), Z=driven.T @ P @ driven)

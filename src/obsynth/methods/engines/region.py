@@ -99,7 +99,9 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
     if n == 0:
         return np.zeros((0, problem.C.shape[0])), {}
     # What one way cannot find, the other may.
-    attempts = [_partly, _by_inequality] if n > MOST_MOVED_STATES else [_by_inequality, _partly]
+    attempts = (
+        [_by_moving_outer_poles, _by_inequality] if n > MOST_MOVED_STATES else [_by_inequality, _by_moving_outer_poles]
+    )
     failures: list[SolverError] = []
     for attempt in attempts:
         try:
@@ -119,7 +121,7 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
     raise failures[attempts.index(_by_inequality)]
 
 
-def _partly(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
+def _by_moving_outer_poles(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
     """Move only those poles into the region that a Kalman gain of the same rate leaves outside.
 
     With ``F - K C = V diag(T1, T2) V^-1``, T1 inside, a gain ``V [0; K2]`` makes ``T2 - K2 C V2`` of T2.

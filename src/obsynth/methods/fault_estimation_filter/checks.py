@@ -68,7 +68,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield from claim_rows(plant, claims)
     yield from recovery_rows(plant, design.recovery)
     tracking, factor = design.certificate.matrices.get("tracking"), design.certificate.matrices.get("P_factor")
-    lag = _whole(claimed(claims, "state_lag"))
+    lag = _whole_lag(claimed(claims, "state_lag"))
     fitting = _fits(plant, observer, tracking, factor, lag)
     yield fitting_check("observer, certificate and plant have matching signals and shapes", fits=fitting)
     if not fitting or tracking is None or factor is None:
@@ -147,7 +147,7 @@ def _with_sensor_faults(plant: DescriptorSystem) -> DescriptorSystem | None:
         return None
 
 
-def _whole(lag: float) -> int:
+def _whole_lag(lag: float) -> int:
     """Return a lag as a number of samples, -1 when it is none."""
     return int(lag) if np.isfinite(lag) and lag == int(lag) else -1
 

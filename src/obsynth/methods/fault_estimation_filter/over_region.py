@@ -86,7 +86,10 @@ def _synthesis(
         matrices[WITNESSES[1]] = np.array(certificate.witness.G)
     claims = {"region_decay": certificate.decay, "state_lag": 0.0}
     if plant.nd:
-        claims |= {"gamma": _above(certificate.level * parts.reach), "gamma_min": certificate.least * parts.reach}
+        claims |= {
+            "gamma": _rounded_above(certificate.level * parts.reach),
+            "gamma_min": certificate.least * parts.reach,
+        }
     return Synthesis(
         options=method.as_plain(),
         gains=gains,
@@ -177,7 +180,7 @@ def _realised(
     return observer, tracking
 
 
-def _above(value: float) -> float:
+def _rounded_above(value: float) -> float:
     """Return a number that no rounding of a product and its quotient brings below ``value``."""
     return value * (1.0 + 8.0 * float(np.finfo(np.float64).eps))
 

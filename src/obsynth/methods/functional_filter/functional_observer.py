@@ -89,26 +89,26 @@ def _structure(model: FilterModel, moving: FloatArray, rate: float, *, any_pole:
     """Return the rows to follow: those asked for that are not known, and as many more as it takes."""
     a, c = model.A, model.C
     ca = c @ a
-    rows = _beside(moving, c)
+    rows = _rows_beside(moving, c)
     while True:
         sigma = np.vstack([rows, ca, c])
         moved = rows @ a
-        more = _beside(moved, sigma)
+        more = _rows_beside(moved, sigma)
         if not len(more):
             structure = _Structure(rows, _combinations(moved, sigma), _left_null(sigma))
             if not len(rows) or _assignable(*structure.pair, rate, model.dt, any_pole=any_pole):
                 return structure
             # With C A among the rows nothing of the outputs' motion is left unused.
-            more = _beside(ca, np.vstack([rows, c]))
+            more = _rows_beside(ca, np.vstack([rows, c]))
             if not len(more):
-                more = _beside(np.eye(len(a)), np.vstack([rows, c]))
+                more = _rows_beside(np.eye(len(a)), np.vstack([rows, c]))
             if not len(more):
                 # What is left moves with zeros of the plant: slower than wished by default, but it decays.
                 return structure
         rows = np.vstack([rows, more])
 
 
-def _beside(rows: FloatArray, spanning: FloatArray) -> FloatArray:
+def _rows_beside(rows: FloatArray, spanning: FloatArray) -> FloatArray:
     """Return orthonormal rows that span what ``rows`` have beside the span of ``spanning``."""
     if not rows.size:
         return np.zeros((0, rows.shape[1]))

@@ -111,11 +111,11 @@ def default_rates(
             middle = 0.5 * (low + high)
             low, high = (low, middle) if missed(middle, seconds) <= RATE_REACHED else (middle, high)
     walks = 10.0**high * unit
-    slow_gain = _forgetting(model, walks, _known(gain(high)), seconds, lag)
+    slow_gain = _forgetting_gain(model, walks, _required_gain(gain(high)), seconds, lag)
     return walks, replace(slow_gain, step_time_and_miss=(seconds, step_misses(model, slow_gain, seconds)))
 
 
-def _forgetting(model: FilterModel, walks: FloatArray, gain: KalmanGain, seconds: float, lag: int) -> KalmanGain:
+def _forgetting_gain(model: FilterModel, walks: FloatArray, gain: KalmanGain, seconds: float, lag: int) -> KalmanGain:
     """Return the gain, or one for the same walks whose errors do not stay for good, where there is one."""
     speed = slowest_decay(model.A - gain.K @ model.C, model.dt)
     for times in TOO_SLOW:
@@ -135,12 +135,12 @@ def step_misses(model: FilterModel, gain: KalmanGain, seconds: float) -> float:
     worst = 0.0
     start = model.drive @ np.linalg.pinv(model.estimate[:, model.order :])
     for share in ASKED_AT:
-        error = model.estimate @ _after(a, share * seconds, model.dt) @ start
+        error = model.estimate @ _transition_after(a, share * seconds, model.dt) @ start
         worst = max(worst, float(np.max(np.abs(error), initial=0.0)))
     return worst
 
 
-def _after(a: FloatArray, seconds: float, dt: float) -> FloatArray:
+def _transition_after(a: FloatArray, seconds: float, dt: float) -> FloatArray:
     from scipy.linalg import expm
 
     if dt > 0.0:
@@ -148,7 +148,7 @@ def _after(a: FloatArray, seconds: float, dt: float) -> FloatArray:
     return np.asarray(expm(a * seconds))
 
 
-def _known(gain: KalmanGain | None) -> KalmanGain:
+def _required_gain(gain: KalmanGain | None) -> KalmanGain:
     if gain is None:
         raise SolverError("The Riccati equation of the filter has no stable solution: give fault_rate, or poles.")
     return gain

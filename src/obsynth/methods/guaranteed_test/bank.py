@@ -113,7 +113,7 @@ def tests_of(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]) -
                 name=f"test of {name}",
                 options={field: getattr(own, field) for field in design.options},
                 gains={key.removesuffix(ending): gain for key, gain in design.gains.items() if key.endswith(ending)},
-                observer=_cut(observer, window, fault, registers, length),
+                observer=_single_observer(observer, window, fault, registers, length),
                 certificate=Certificate({**matrices, "trade_off": table[:, [0, fault + 1]]}, claims),
                 notes=(),
             )
@@ -121,7 +121,7 @@ def tests_of(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]) -
     return tuple(tests)
 
 
-def _cut(observer: LinearObserver, window: Any, fault: int, registers: int, length: int) -> LinearObserver:
+def _single_observer(observer: LinearObserver, window: Any, fault: int, registers: int, length: int) -> LinearObserver:
     """Return the row of one test with its own registers, named as the test alone has it."""
     at, own = slice(fault * registers, fault * registers + length), [fault]
     estimated = window.question.course != "step"

@@ -47,7 +47,7 @@ def _middles(matrix: Any) -> FloatArray:
     return np.array([float(entry.mid()) for entry in matrix.entries()]).reshape(matrix.nrows(), matrix.ncols())
 
 
-def _away(matrix: Any, values: FloatArray) -> FloatArray:
+def _distance_from(matrix: Any, values: FloatArray) -> FloatArray:
     """Return how far the entries of a matrix in balls are from doubles at most, in their order."""
     sizes = [float(abs(entry - value).upper()) for entry, value in zip(matrix.entries(), values.tolist(), strict=True)]
     # The conversion rounds to nearest.
@@ -157,7 +157,9 @@ class Condensed:
         if refine:
             repaired[first:] = weights
             repaired[:first] = _middles(equations)[:, 0]
-        distance = np.concatenate([_away(equations, repaired[:first]), _away(exact, repaired[first:])])
+        distance = np.concatenate(
+            [_distance_from(equations, repaired[:first]), _distance_from(exact, repaired[first:])]
+        )
         corrected = np.ones(len(repaired), dtype=bool)
         corrected[first:] = False
         corrected[first + chosen] = True
@@ -218,7 +220,7 @@ class Condensed:
     @staticmethod
     def _put(witness: FloatArray, distance: FloatArray, places: np.ndarray, exact: Any) -> None:
         witness[places] = _middles(exact)[:, 0]
-        distance[places] = np.maximum(_away(exact, witness[places]), np.finfo(np.float64).tiny)
+        distance[places] = np.maximum(_distance_from(exact, witness[places]), np.finfo(np.float64).tiny)
 
     @cached_property
     def _noise_columns(self) -> np.ndarray:

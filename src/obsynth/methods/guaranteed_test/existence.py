@@ -94,7 +94,7 @@ def detectability(problem: WindowProblem, options: TestOptions) -> tuple[Conditi
         for window in _decisive(problem, options, lag):
             if has_test(window):
                 return detectability_condition(window, True, ""), lag
-    return detectability_condition(window, False, _why(problem, options, window)), lags[-1]
+    return detectability_condition(window, False, _hiding_in_words(problem, options, window)), lags[-1]
 
 
 def _decisive(problem: WindowProblem, options: TestOptions, lag: int) -> Iterator[Window]:
@@ -172,7 +172,7 @@ def detectability_condition(window: Window, holds: bool, detail: str) -> Conditi
     )
 
 
-def _why(problem: WindowProblem, options: TestOptions, window: Window) -> str:
+def _hiding_in_words(problem: WindowProblem, options: TestOptions, window: Window) -> str:
     """Return in words what hides the fault."""
     fault, varies = problem.fault, isinstance(problem.plant, TimeVaryingDescriptorSystem)
     point = proved_ray(window)

@@ -46,7 +46,7 @@ def remainder_check(design: ObserverDesign, read: Callable[[Mapping[str, Any]], 
         )
         fits = plant.disturbance_names[len(own) :] == tuple(bounds) and plant.dt == options.sample_time
         ratios = [value / max(options.disturbance_bounds[name], np.finfo(float).tiny) for name, value in bounds.items()]
-        worst = max(ratios) if fits and _apart(design, len(own)) else np.inf
+        worst = max(ratios) if fits and _represents_remainder(design, len(own)) else np.inf
     except (ObsynthError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         reason = str(error)
     return upper_bound_check(
@@ -61,7 +61,7 @@ def remainder_check(design: ObserverDesign, read: Callable[[Mapping[str, Any]], 
     )
 
 
-def _apart(design: ObserverDesign, own: int) -> bool:
+def _represents_remainder(design: ObserverDesign, own: int) -> bool:
     """Whether the last disturbances are one for each state and each output, and nothing else is uncertain."""
     plant, _ = design.linear
     nx, ny = plant.nx, plant.ny

@@ -121,12 +121,12 @@ def fitting_claims(design: ObserverDesign) -> bool:
         and ("adaptation_low" in claims) == ("adaptation_high" in claims)
         and ("disk_centre" in claims) == ("disk_radius" in claims)
         and set(design.gains) == set(gains)
-        and all(_is(design.gains[name], shape) for name, shape in gains.items())
-        and all(_is(design.certificate.matrices.get(name), shape) for name, shape in matrices.items())
+        and all(_has_shape(design.gains[name], shape) for name, shape in gains.items())
+        and all(_has_shape(design.certificate.matrices.get(name), shape) for name, shape in matrices.items())
     )
 
 
-def _is(matrix: FloatArray | None, shape: tuple[int, int]) -> bool:
+def _has_shape(matrix: FloatArray | None, shape: tuple[int, int]) -> bool:
     return matrix is not None and matrix.shape == shape and bool(np.all(np.isfinite(matrix)))
 
 

@@ -80,13 +80,13 @@ def certified(
     certificates = _gain_certificates(plant, method, gains)
     if certificates is None:
         return gains
-    gains = _judged(replace(gains, gain_certificates=certificates))
+    gains = _with_proofs(replace(gains, gain_certificates=certificates))
     if gains.proved_in_double_precision:
         return gains
     own = explicit_certificate(observer.Az, observer.Cz[: observer.order], decay=decay) if method.theorem == 1 else None
     if own is None:
         return gains
-    other = _judged(replace(gains, P1=own[0], P3=own[1], delta=own[2]))
+    other = _with_proofs(replace(gains, P1=own[0], P3=own[1], delta=own[2]))
     return gains if gains.proved and not other.proved_in_double_precision else other
 
 
@@ -105,7 +105,7 @@ def _gain_certificates(plant: DescriptorSystem, method: PdObserver, gains: PdGai
     return certificates
 
 
-def _judged(gains: PdGains) -> PdGains:
+def _with_proofs(gains: PdGains) -> PdGains:
     """Return the gains with the outcome of proving their certificate."""
     proofs = [
         prove_symmetric_positive(gains.P1),
@@ -147,5 +147,5 @@ def _certified_range(plant: DescriptorSystem, gains: PdGains, ends: tuple[float,
         ends=p1,
         observer=realise_pd_observer(plant, with_faults_as_states(plant), gain_j, gain_l),
     )
-    moved = _judged(moved)
+    moved = _with_proofs(moved)
     return replace(moved, proved=proved and moved.proved)

@@ -115,7 +115,7 @@ def _vertices(observer: ScheduledObserver, tracking: FloatArray, nx: int) -> lis
     return [vertex_of(place) for place in range(observer.count)]
 
 
-def _moves(matrices: Mapping[str, FloatArray]) -> bool:
+def _is_rated(matrices: Mapping[str, FloatArray]) -> bool:
     """Whether the certificate of the gain is one with several matrices and no slack: coefficients in the parameter."""
     P = matrices.get(GAIN_WITNESSES[0])
     return P is not None and P.ndim == 3 and len(P) > 1 and GAIN_WITNESSES[1] not in matrices
@@ -137,7 +137,7 @@ def _proved_rows(design: ObserverDesign, plant: PolytopicSystem, observer: Sched
         claim = (
             f"the l2 gain from what drives the fault models (for steps: {drive}) to the errors of the fault estimates "
         )
-        rate = plant.scheduling.rate_of_weight if _moves(matrices) and not plant.is_discrete else None
+        rate = plant.scheduling.rate_of_weight if _is_rated(matrices) and not plant.is_discrete else None
         if rate is not None:
             claim += f"is below this, {courses(plant.scheduling, rate)}"
             yield rated_gain_row(REGION_GAIN_ROW, claim, vertices, list(matrices[GAIN_WITNESSES[0]]), rate, level)

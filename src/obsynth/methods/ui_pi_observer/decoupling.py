@@ -76,7 +76,7 @@ def decoupling_norms(
     # How many trajectories there are at almost every frequency: where there seem to be more, rounding hides the rest.
     counts = [min(basis.shape[1] for basis in bases) for bases in moved]
     norms = [DecouplingNorm(0.0, 0.0, 0.0) for _ in groups]
-    for some in _parts(points, max(scaled.nx + scaled.nd, observer.order)):
+    for some in _point_slices(points, max(scaled.nx + scaled.nd, observer.order)):
         passing = _Passing.of(observer, units, points[some])
         for place, (rows, inputs) in enumerate(groups):
             if counts[place] == 0:
@@ -87,7 +87,7 @@ def decoupling_norms(
     return norms
 
 
-def _parts(points: ComplexArray, order: int) -> list[slice]:
+def _point_slices(points: ComplexArray, order: int) -> list[slice]:
     """Return the points in parts whose matrices of an order fit into the room for them."""
     size = max(1, ENTRIES_AT_ONCE // max(1, order**2))
     return [slice(start, start + size) for start in range(0, len(points), size)]
@@ -98,7 +98,7 @@ def trajectories_of(
 ) -> list[list[ComplexArray]]:
     """Return, for each group of unknown inputs, trajectories ``(nx + inputs, count)`` at each point, of unit norm."""
     bases_by_group: list[list[ComplexArray]] = [[] for _ in groups]
-    for some in _parts(points, plant.nx + plant.nd):
+    for some in _point_slices(points, plant.nx + plant.nd):
         none = np.zeros_like(plant.Bd)
         pencils = pencils_at(np.hstack([plant.E, none]), np.hstack([plant.A, plant.Bd]), points[some])
         null_bases, columns, sure = _null_spaces(pencils)

@@ -171,10 +171,10 @@ def _residuals(
     blocks |= {"K": ("K_a", slice(0, nx), slice(None)), "F": ("K_a", slice(nx, count), slice(None))}
     for letter, matrix in same.items():
         if letter in gains:
-            yield _same(gains[letter], matrix)
+            yield _difference(gains[letter], matrix)
     for letter, (name, rows, columns) in blocks.items():
         if letter in gains and name in gains:
-            yield _same(gains[letter], gains[name][rows, columns])
+            yield _difference(gains[letter], gains[name][rows, columns])
     if "Hhat" in gains and "U" in gains:
         yield residual(gains["Hhat"], -gains["U"] @ plant.Bf, factors=((gains["U"], plant.Bf),))
     if "Jhat" in gains:
@@ -196,7 +196,7 @@ def _injection(
     yield residual(observer.By, -observer.Az @ gains["D_a"], -gains["K_a"], factors=terms)
 
 
-def _same(listed: FloatArray, matrix: FloatArray) -> Residual:
+def _difference(listed: FloatArray, matrix: FloatArray) -> Residual:
     if not listed.size:
         return Residual(0.0, 1.0)
     missed = np.abs(listed - matrix)

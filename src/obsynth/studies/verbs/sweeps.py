@@ -56,7 +56,7 @@ def run_sweep(options: argparse.Namespace) -> int:
 
     table = FileKind("the table of a sweep", rb"\Acase,")
     outcome, files = _carried_out(options, options.out, ("designs", table, "sweep.png"), work, draw)
-    _tell(options, outcome, files, "cases")
+    _print_outcome(options, outcome, files, "cases")
     return 0
 
 
@@ -129,7 +129,7 @@ def run_many(options: argparse.Namespace) -> int:
         lambda fleet: fleet.plot() if "run" in fleet.counts else None,
     )
     if options.json or not options.quiet:
-        _tell(options, fleet, files, "runs")
+        _print_outcome(options, fleet, files, "runs")
     return 0
 
 
@@ -154,7 +154,7 @@ def _carried_out(
             return outcome, write_together(contents)
 
 
-def _tell(options: argparse.Namespace, outcome: Any, files: tuple[Path, ...], unit: str) -> None:
+def _print_outcome(options: argparse.Namespace, outcome: Any, files: tuple[Path, ...], unit: str) -> None:
     """Print the table of a sweep or of many runs, and the files."""
     header, rows = outcome.rows()
     if options.json:

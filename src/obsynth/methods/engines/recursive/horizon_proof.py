@@ -49,7 +49,7 @@ def horizon_proof(
     stated: RecursiveObserver, shipped: RecursiveObserver, steps: int, *, gains: Gains = gain_steps
 ) -> HorizonProof | None:
     """Return what can be proved of the first steps of a shipped observer on the stated plant; `None` for nothing."""
-    if stated.plant.nx > MOST_PROVED_STATES or _kind(stated) != _kind(shipped):
+    if stated.plant.nx > MOST_PROVED_STATES or _layout_of_gains(stated) != _layout_of_gains(shipped):
         return None  # the rows on what fits say so
     errors, joint, lengths, bias, last = _followed(stated.without_walk, shipped.without_walk, steps, gains)
     if stated.adaptation is not None and stated.adaptation.form == "random-walk":
@@ -61,7 +61,7 @@ def horizon_proof(
     return HorizonProof(steps, bias, mean, span, together, last)
 
 
-def _kind(observer: RecursiveObserver) -> tuple[object, ...]:
+def _layout_of_gains(observer: RecursiveObserver) -> tuple[object, ...]:
     """Return what gains of two observers must have in common to be compared."""
     form = None if observer.adaptation is None else observer.adaptation.form == "random-walk"
     plant = observer.plant
@@ -84,13 +84,13 @@ def _followed(
         step = gain_step.step if step is None else step
         # Steps of another size (corrections of x(0)) are stacks of their own.
         if len(waiting) == AT_ONCE or (waiting and _sizes(*waiting[0]) != _sizes(step, gain_step)):
-            bias = max(bias, _closed(waiting, errors, joint, lengths, units))
+            bias = max(bias, _product_closed(waiting, errors, joint, lengths, units))
             waiting = []
         waiting.append((step, gain_step))
         last = gain_step
     if last is None:
         raise SpecError("The plant has no steps.", path="horizon")
-    bias = max(bias, _closed(waiting, errors, joint, lengths, units))
+    bias = max(bias, _product_closed(waiting, errors, joint, lengths, units))
     return errors, joint, lengths, bias, last
 
 
@@ -115,7 +115,7 @@ def _sizes(step: StepMatrices, gain_step: GainStep) -> tuple[tuple[int, ...], ..
     return step.H.shape, step.A.shape, gain_step.gain.shape, gain_step.learn.shape
 
 
-def _closed(
+def _product_closed(
     pairs: list[tuple[StepMatrices, GainStep]],
     errors: list[Ball],
     joint: list[Ball],
