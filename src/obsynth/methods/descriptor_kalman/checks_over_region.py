@@ -127,13 +127,13 @@ def _proved_rows(
         level,
         discrete=True,
     )
-    found = max(_deviation_at_rest(vertex) for vertex in vertices)
+    at_rest = max(_deviation_at_rest(vertex) for vertex in vertices)
     yield information(
         FROZEN_ROW,
         "the largest root mean square at a vertex at which the parameters rest: no claim below it can be true",
-        found,
+        at_rest,
         source="Lyapunov equation at every vertex",
-        detail=f"{found / level:.3f} of what is proved" if level > 0.0 else "",
+        detail=f"{at_rest / level:.3f} of what is proved" if level > 0.0 else "",
     )
     decay = claimed(claims, "region_decay")
     yield decay_row(vertices, witness, decay, discrete=True, words=words)

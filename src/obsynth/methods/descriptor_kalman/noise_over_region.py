@@ -46,8 +46,8 @@ class NoiseOverRegion:
                 "not cover: state independent noises, or give Q and R.",
                 path="Dw",
             )
-        missing = tuple(name for name, given in (("Q", Q), ("R", R)) if given is None and not plant.nw)
-        Q, R = (1.0 if name in missing else given for name, given in (("Q", Q), ("R", R)))
+        missing = tuple(name for name, covariance in (("Q", Q), ("R", R)) if covariance is None and not plant.nw)
+        Q, R = (1.0 if name in missing else covariance for name, covariance in (("Q", Q), ("R", R)))
         process, sensor = _constant(Q, plant.nx, "Q"), _constant(R, plant.ny, "R")
         return cls(
             tuple(v.Bw for v in plant.vertices)
@@ -69,18 +69,18 @@ class NoiseOverRegion:
         return {name: None if value is None else value.tolist() for name, value in (("Q", self.Q), ("R", self.R))}
 
 
-def _constant(given: Any, size: int, name: str) -> FloatArray | None:
+def _constant(covariance: Any, size: int, name: str) -> FloatArray | None:
     """Return a constant covariance; ``None`` for the plant's own noise."""
-    if given is None:
+    if covariance is None:
         return None
-    if callable(given) or np.ndim(given) not in (0, 2) or isinstance(given, str):
+    if callable(covariance) or np.ndim(covariance) not in (0, 2) or isinstance(covariance, str):
         raise SpecError(
             f"{name} changes with k, or is no matrix: over a region give a constant covariance ({size} x {size}), or a "
             "number.",
             path=name,
         )
-    matrix = as_matrix(given, name)
-    matrix = float(matrix[0, 0]) * np.eye(size) if np.ndim(given) == 0 else matrix
+    matrix = as_matrix(covariance, name)
+    matrix = float(matrix[0, 0]) * np.eye(size) if np.ndim(covariance) == 0 else matrix
     require_shape(matrix.shape, (size, size), name)
     covariance_factor(matrix, name)  # refused here where it is none
     return matrix

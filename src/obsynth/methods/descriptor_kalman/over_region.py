@@ -45,14 +45,14 @@ MARGIN = 1e-3
 EXACT_STATE = 1e-9
 
 
-def synthesise_over_region(plant: PolytopicSystem, asked: Method, *, progress: Callable[[str], None]) -> Synthesis:
+def synthesise_over_region(plant: PolytopicSystem, method: Method, *, progress: Callable[[str], None]) -> Synthesis:
     """Return a scheduled Kalman filter with its certificate; see `obsynth.descriptor_kalman`."""
-    options, plain = asked.as_given(), type(asked)().as_given()
-    given = [name for name in NOT_OVER_REGION if options[name] is not plain[name]]
-    if given:
+    options, plain = method.as_given(), type(method)().as_given()
+    unsupported = [name for name in NOT_OVER_REGION if options[name] is not plain[name]]
+    if unsupported:
         raise SpecError(
-            f"A Kalman filter over a region has no {', '.join(given)}: leave it out. It takes Q and R.",
-            path=f"method.options.{given[0]}",
+            f"A Kalman filter over a region has no {', '.join(unsupported)}: leave it out. It takes Q and R.",
+            path=f"method.options.{unsupported[0]}",
         )
     progress("checking the existence conditions over the region")
     require_all(kalman_conditions_over_region(plant))
@@ -65,20 +65,20 @@ def synthesise_over_region(plant: PolytopicSystem, asked: Method, *, progress: C
     errors = _errors(plant, noise, T, N)
     lyapunov = "common" if steps is None else "vertex"
     weighted = _with_outputs(errors, 1.0 / sizes)
-    found = certified(weighted, goal="power", margin=MARGIN, lyapunov=lyapunov, steps=steps)
-    gains = found.gains * (plant.count if len(found.gains) == 1 else 1)
+    certificate = certified(weighted, goal="power", margin=MARGIN, lyapunov=lyapunov, steps=steps)
+    gains = certificate.gains * (plant.count if len(certificate.gains) == 1 else 1)
     progress("building the realisation and its certificate")
     claim = certified(errors, goal="power", gains=gains, lyapunov=lyapunov, steps=steps)
     decay = proved_decay(errors, gains, claim.witness)
     letters = {"L": T, "K": N} | {f"S[{i + 1}]": S for i, S in enumerate(gains)}
     return Synthesis(
-        options={**asked.as_plain(), **noise.stated()},
+        options={**method.as_plain(), **noise.stated()},
         gains=letters,
         observer=_observer(plant, T, N, gains, decay),
         certificate=Certificate(
             {"tracking": T, **_stored(claim.witness)}, {"region_deviation": claim.level, "region_decay": decay}
         ),
-        solver={"engine": "lmi", "runs": [*found.runs, *claim.runs]},
+        solver={"engine": "lmi", "runs": [*certificate.runs, *claim.runs]},
         notes=_notes(plant, decay, steps, noise),
     )
 
@@ -108,10 +108,10 @@ def _constant_gains(plant: PolytopicSystem, noise: NoiseOverRegion, sizes: Float
 
     for places in (range(plant.count), ()):
         try:
-            found = certified(_with_outputs(problem(places), 1.0 / sizes), goal="power", gain="constant")
+            certificate = certified(_with_outputs(problem(places), 1.0 / sizes), goal="power", gain="constant")
         except SolverError:
             continue
-        return L0 + found.gains[0] @ N1, K0 + found.gains[0] @ N2
+        return L0 + certificate.gains[0] @ N1, K0 + certificate.gains[0] @ N2
     raise SolverError(
         "No Kalman filter of the middle of the region was found by its inequality. State Q and R in the units of "
         "equations and outputs, or take a smaller region."
@@ -218,5 +218,5 @@ def _notes(plant: PolytopicSystem, decay: float, steps: float | None, noise: Noi
 
 
 def _stored(witness: Witness) -> dict[str, FloatArray]:
-    found = {WITNESSES[0]: np.array(witness.P)}
-    return found if witness.G is None else {**found, WITNESSES[1]: np.array(witness.G)}
+    stored = {WITNESSES[0]: np.array(witness.P)}
+    return stored if witness.G is None else {**stored, WITNESSES[1]: np.array(witness.G)}
