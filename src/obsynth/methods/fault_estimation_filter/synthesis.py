@@ -44,8 +44,8 @@ from obsynth.methods.fault_estimation_filter.printed_gains import paper_weight_r
 from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
 from obsynth.methods.fault_estimation_filter.search import NOMINAL_GAIN, FoundGains, found_within
 from obsynth.methods.fault_estimation_filter.small_gains import PrintedInequality
-from obsynth.methods.fault_estimation_filter.weights import least_gains_by_weight
-from obsynth.methods.method import Synthesis
+from obsynth.methods.fault_estimation_filter.weights import least_gains_by_weight, price_in_words
+from obsynth.methods.method import Synthesis, silent
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.linear.means import averaged
 from obsynth.observers.linear.observer import LinearObserver
@@ -59,6 +59,11 @@ _OF_OUTPUTS = ("N", "L", "W", "R")
 
 #: A free weight is taken by default where it lowers the least gain by this share: it may add noise.
 WORTH_A_FREE_WEIGHT = 0.05
+
+#: With more states the filter with the other weight is not designed beside it: it takes as long as the one that is.
+MOST_STATES_COMPARED = 8
+
+_PRICES = "What is shipped for each, and its H2 norm from unit noise on each output to the estimates:"
 
 #: Coordinates in which a certificate is looked for before the gain is judged again.
 FIRST_TRIES = 4
@@ -164,6 +169,9 @@ def _synthesised(
     prepared = prepare(plant, s) if prepared is None or s is not None else prepared
     limit = method.residual_weight_limit
     free, remarks = weight_by_gain(plant, prepared, method)
+    other = None
+    if remarks and plant.nx <= MOST_STATES_COMPARED:
+        other = _of_other_weight(plant, held, prepared, replace(method, weight="paper" if free else "free"))
     problem, parts = gain_problem(prepared, free_weight=free)
     # Where nothing disturbs the estimates, a small share of what disturbances could do is proved.
     nominal = NOMINAL_GAIN * max(problem.disturbance_size, NOMINAL_GAIN)
@@ -193,6 +201,9 @@ def _synthesised(
         witnesses |= proof
     records = [*outcome.least.records, *outcome.records]
     resolved = method.as_plain() | {"weight": "free" if free else "paper", "S": None if s is None else s.tolist()}
+    if other is not None:
+        both = {free: price_in_words(level, gains, observer), not free: other}
+        remarks = (*remarks, f"{_PRICES} Free W: {both[True]}. The paper's W: {both[False]}.")
     if method.mean > 1:
         # Registers hold estimates, which see no state: nothing of the plant is tracked there.
         zeros = np.zeros(((method.mean - 1) * plant.nf, tracking.shape[1]))
@@ -212,6 +223,17 @@ def _synthesised(
         {"engine": "lmi" if any("settings" in record for record in records) else "riccati", "runs": records},
         (*remarks, *notes(plant, prepared.detectability, observer, largest_zero=conditions[-1].value)),
     )
+
+
+def _of_other_weight(
+    plant: DescriptorSystem, held: Sequence[Condition], prepared: PreparedPlant, method: FaultEstimationFilter
+) -> str | None:
+    """Return what the filter with the weight that is not taken gains and costs; ``None`` where there is none."""
+    try:
+        made = _synthesised(plant, held, prepared, replace(method, mean=1), silent)
+    except ObsynthError:
+        return None
+    return price_in_words(made.certificate.claims["gamma"], made.gains, made.linear_observer)
 
 
 def weight_by_gain(

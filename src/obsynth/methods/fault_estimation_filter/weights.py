@@ -1,13 +1,28 @@
-"""What a free residual weight W is worth: the least gain with the paper's W = Upsilon^+, and with any left inverse."""
+"""What a free residual weight W is worth, and what it costs: gains and noise with the paper's W and with a free one."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import numpy as np
+
 from obsynth.analysis.existence.restricted_equivalent import PreparedPlant
 from obsynth.methods.fault_estimation_filter.convex_problem import centred, gain_problem
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.central_filter import search_least_gain
+from obsynth.numerics.least_estimation import gramian
+from obsynth.observers.linear.observer import LinearObserver
 
 #: A least gain below this share of what disturbances can do is zero but for rounding.
 AS_NOTHING = 1e-9
+
+
+def price_in_words(gamma: float, gains: Mapping[str, FloatArray], observer: LinearObserver) -> str:
+    """Return gamma, the norm of W and the H2 norm of the fault estimates from unit noise on each output."""
+    shown, direct = observer.Cz[observer.fault_rows], observer.Dy[observer.fault_rows]
+    covariance = gramian(observer.Az, observer.By @ observer.By.T)
+    noise = float(np.sqrt(np.trace(shown @ covariance @ shown.T + direct @ direct.T)))
+    return f"gamma {gamma:.5g}, |W| {np.linalg.norm(gains['W'], 2):.4g}, noise {noise:.4g}"
 
 
 def least_gains_by_weight(prepared: PreparedPlant) -> tuple[float, float]:
