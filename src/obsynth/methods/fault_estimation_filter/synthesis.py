@@ -171,7 +171,7 @@ def _synthesised(
     free, remarks = weight_by_gain(plant, prepared, method)
     other = None
     if remarks and plant.nx <= MOST_STATES_COMPARED:
-        other = _of_other_weight(plant, held, prepared, replace(method, weight="paper" if free else "free"))
+        other = _of_other_weight(plant, conditions, prepared, replace(method, weight="paper" if free else "free"))
     problem, parts = gain_problem(prepared, free_weight=free)
     # Where nothing disturbs the estimates, a small share of what disturbances could do is proved.
     nominal = NOMINAL_GAIN * max(problem.disturbance_size, NOMINAL_GAIN)
@@ -226,11 +226,11 @@ def _synthesised(
 
 
 def _of_other_weight(
-    plant: DescriptorSystem, held: Sequence[Condition], prepared: PreparedPlant, method: FaultEstimationFilter
+    plant: DescriptorSystem, conditions: Sequence[Condition], prepared: PreparedPlant, method: FaultEstimationFilter
 ) -> str | None:
     """Return what the filter with the weight that is not taken gains and costs; ``None`` where there is none."""
     try:
-        made = _synthesised(plant, held, prepared, replace(method, mean=1), silent)
+        made = _synthesised(plant, conditions, prepared, replace(method, mean=1), silent)
     except ObsynthError:
         return None
     return price_in_words(made.certificate.claims["gamma"], made.gains, made.linear_observer)
