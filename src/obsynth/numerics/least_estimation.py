@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from obsynth.errors import PreconditionError, SolverError
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.decoupling_windows import EstimationProblem, Model
+from obsynth.numerics.gramians import gramian
 from obsynth.numerics.matrix_equations import continuous_lyapunov, continuous_riccati, discrete_riccati
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.ranks import BOUNDARY_RANK_TOLERANCE, WINDOW_RANK_TOLERANCE
@@ -56,10 +57,6 @@ ZERO_SHARE = 1e-9
 LONGEST_FROM_REST, MOST_INPUTS_FROM_REST = 60, 360
 #: A kernel counts where the other singular values are above this share.
 CLEAR_KERNEL = 1e-5
-#: Squarings of a sum over all samples.
-MOST_DOUBLINGS = 60
-#: A sum over all samples is complete when its last doubling adds no more than this share.
-DOUBLED_SHARE = 1e-17
 #: Outputs that show w by less than this share of the problem's sizes do not show it.
 BLIND_SHARE = 1e-10
 #: Directions that w reaches by less than this share are not reached.
@@ -454,19 +451,6 @@ def _decays(problem: EstimationProblem, level: float) -> NDArray[np.complex128]:
     except np.linalg.LinAlgError:
         return np.zeros(0, dtype=complex)
     return np.asarray(np.linalg.eigvals(problem.A - K @ CL), dtype=complex)
-
-
-def gramian(a: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return ``sum_k a^k weight a'^k`` by doubling: of a stable matrix, near the boundary too."""
-    total, power = np.array(weight), np.array(a)
-    with np.errstate(all="ignore"):
-        for _ in range(MOST_DOUBLINGS):
-            added = power @ total @ power.T
-            total, power = total + added, power @ power
-            size = float(np.linalg.norm(added))
-            if not np.isfinite(size) or size <= DOUBLED_SHARE * float(np.linalg.norm(total)):
-                break
-    return np.asarray(total)
 
 
 def realised(problem: EstimationProblem, K: FloatArray, Z0: FloatArray, ny: int) -> Model:

@@ -10,7 +10,7 @@ from obsynth.analysis.existence.restricted_equivalent import PreparedPlant
 from obsynth.methods.fault_estimation_filter.convex_problem import centred, gain_problem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.central_filter import search_least_gain
-from obsynth.numerics.least_estimation import gramian
+from obsynth.numerics.gramians import gramian
 from obsynth.observers.linear.observer import LinearObserver
 
 #: A least gain below this share of what disturbances can do is zero but for rounding.

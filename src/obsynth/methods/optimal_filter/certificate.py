@@ -13,7 +13,7 @@ from obsynth.methods.optimal_filter.error_channel import ErrorChannel
 from obsynth.methods.optimal_filter.fault_maps import Designed
 from obsynth.methods.optimal_filter.realisation import Followed
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.least_estimation import gramian
+from obsynth.numerics.gramians import gramian
 from obsynth.numerics.matrix_equations import bounded_real_matrix
 from obsynth.numerics.standard_form import INFINITE_EIGENVALUE
 from obsynth.observers.linear.observer import LinearObserver

@@ -20,7 +20,7 @@ from obsynth.methods.optimal_filter.realisation import minimal
 from obsynth.methods.registry import method_class
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.decoupling_windows import Model
-from obsynth.numerics.least_estimation import gramian
+from obsynth.numerics.gramians import gramian
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import hinf_norm
 from obsynth.observers.linear.observer import LinearObserver
