@@ -102,16 +102,16 @@ class Alarms:
 
 
 def linear_alarms(
-    found: Realisation,
+    realisation: Realisation,
     thresholds: Mapping[str, float] | None,
     warm_up: float | None,
     monitor: ExportedMonitor | None,
 ) -> Alarms:
     """Return the alarms of a linear observer."""
-    observer = found.observer
+    observer = realisation.observer
     columns = (*observer.row_names[observer.fault_rows], *observer.row_names[observer.residual_rows])
     # That of the design itself, as runs have it: sampling changes no mode.
-    seconds = checked_warm_up(warm_up, transient(found.running))
+    seconds = checked_warm_up(warm_up, transient(realisation.running))
     # A file may hold finite numbers alone: an observer that never settles raises no alarm.
     seconds = seconds if math.isfinite(seconds) else _NEVER
     return Alarms.of(columns, observer.fault_names, thresholds, seconds, monitor)

@@ -121,8 +121,8 @@ def _source(design: ObserverDesign, prefix: str, header: str, digest: str) -> st
         "DIVIDES": int(not observer.effectiveness_is_one),
         "GIVES_WEIGHTS": int(held.gives_weights),
     }
-    shown = [("states", nx, 0), ("faults", nf, nx), ("residuals", nr, nx + nf)]
-    copied = " ".join(f"for (i = 0; i < {n}; i++) {{ {to}[i] = rows[{at} + i]; }}" for to, n, at in shown if n)
+    groups = [("states", nx, 0), ("faults", nf, nx), ("residuals", nr, nx + nf)]
+    copied = " ".join(f"for (i = 0; i < {n}; i++) {{ {to}[i] = rows[{at} + i]; }}" for to, n, at in groups if n)
     taken = "for (i = 0; i < U_COUNT; i++) {\n        TAKE_ONE\n    }".replace("TAKE_ONE", _TAKEN) if nu else ""
     values = "\n        ".join(f"a[{i}] = {_c_text(text, held.names)};" for i, text in enumerate(held.expressions))
     body = filled_template(
@@ -193,10 +193,10 @@ def _arguments(observer: ScheduledObserver, prefix: str) -> list[str]:
 def _c_text(expression: Expression, names: tuple[str, ...]) -> str:
     """Return an expression of parameters ``p[i]`` as C; those with jumps are no functions of a region."""
 
-    def operation(given: Callable[..., Any]) -> Callable[..., Any]:
-        if given not in _C_FUNCTIONS or given is step_function:
+    def operation(function: Callable[..., Any]) -> Callable[..., Any]:
+        if function not in _C_FUNCTIONS or function is step_function:
             raise SpecError(f"{expression.text!r} has a function that is not written as C.", path="scheduling")
-        return lambda *parts: _C_FUNCTIONS[given].format(*(_operand(part) for part in parts))
+        return lambda *parts: _C_FUNCTIONS[function].format(*(_operand(part) for part in parts))
 
     return _operand(expression.translated({name: f"p[{i}]" for i, name in enumerate(names)}, operation))
 

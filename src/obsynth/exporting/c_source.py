@@ -119,21 +119,23 @@ def status_lines(prefix: str) -> list[str]:
     ]
 
 
-def header_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
+def header_text(realisation: Realisation, prefix: str, alarms: Alarms) -> str:
     """Return the header."""
-    observer, upper = found.observer, prefix.upper()
-    before, after = found.operating_point
-    units: Mapping[str, str] = found.design.plant.units
+    observer, upper = realisation.observer, prefix.upper()
+    before, after = realisation.operating_point
+    units: Mapping[str, str] = realisation.design.plant.units
     lines = [
-        comment(f"Observer {quoted(found.design.name)} by {quoted(found.design.method)}, written by obsynth."),
-        *([comment(found.note)] if found.note else []),
-        comment(quoted(verification_words(found.design))),
+        comment(
+            f"Observer {quoted(realisation.design.name)} by {quoted(realisation.design.method)}, written by obsynth."
+        ),
+        *([comment(realisation.note)] if realisation.note else []),
+        comment(quoted(verification_words(realisation.design))),
         *(comment(line) for line in alarm_comments(alarms)),
         f"#ifndef {upper}_H",
         f"#define {upper}_H",
         "",
         comment("sha256 of the gain set"),
-        f'#define {upper}_SHA256 "{found.digest}"',
+        f'#define {upper}_SHA256 "{realisation.digest}"',
         comment("seconds between samples"),
         f"#define {upper}_DT {observer.dt!r}",
         comment("outputs that may be watched"),
@@ -141,25 +143,25 @@ def header_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
         "",
         *status_lines(prefix),
         "",
-        *_state_struct(found, prefix, alarms),
+        *_state_struct(realisation, prefix, alarms),
         "",
-        comment("Start where the design does." if found.start.any() else "Start at rest."),
+        comment("Start where the design does." if realisation.start.any() else "Start at rest."),
         f"void {prefix}_reset({prefix}_state *state);",
         "",
         comment("Take one sample of each signal, write the estimates at that sample, and advance."),
         comment("Signals are deviations from the operating point; a missing one is NaN. Returns 0; or 1 if a sample"),
         comment("is missing: the model of the plant replaces it, fault estimates are held, and residuals are NaN."),
-        *signal_comments("u", "", found.inputs[: len(observer.input_names)], before, units),
+        *signal_comments("u", "", realisation.inputs[: len(observer.input_names)], before, units),
         *signal_comments("y", "", observer.output_names, before[len(observer.input_names) :], units),
         *signal_comments("states", "xhat", observer.state_names, after, units, observer.state_delays),
         *signal_comments(
             "faults", "fhat", observer.fault_names, after[len(observer.state_names) :], units, observer.fault_delays
         ),
         *signal_comments("residuals", "r", observer.residual_names, None, units),
-        f"{_step_signature(found, prefix)};",
+        f"{_step_signature(realisation, prefix)};",
         "",
         comment("The same with signals and estimates as they are, not as deviations."),
-        f"{_step_signature(found, prefix, 'take')};",
+        f"{_step_signature(realisation, prefix, 'take')};",
         "",
         "#endif",
     ]
@@ -168,35 +170,35 @@ def header_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
 
 def alarm_comments(alarms: Alarms) -> list[str]:
     """Return what C says of alarms."""
-    found = [f"alarm[{i}]: {quoted(name)}" for i, name in enumerate(alarms.levels)]
+    lines = [f"alarm[{i}]: {quoted(name)}" for i, name in enumerate(alarms.levels)]
     if alarms.monitor is not None:
-        found += [f"Monitor: {quoted(alarms.monitor.statement)}"]
-        found += [f"monitor.fault {i}: {quoted(name)}" for i, name in enumerate(alarms.fault_names)]
-    return found
+        lines += [f"Monitor: {quoted(alarms.monitor.statement)}"]
+        lines += [f"monitor.fault {i}: {quoted(name)}" for i, name in enumerate(alarms.fault_names)]
+    return lines
 
 
-def _state_struct(found: Realisation, prefix: str, alarms: Alarms) -> list[str]:
+def _state_struct(realisation: Realisation, prefix: str, alarms: Alarms) -> list[str]:
     """Return what the observer remembers, as C declares it."""
-    observer, gap = found.observer, found.gap
+    observer, gap = realisation.observer, realisation.gap
     nz, nu, ny = observer.order, len(observer.input_names), len(observer.output_names)
-    shown = len(observer.fault_names) + len(observer.residual_names)
+    compared = len(observer.fault_names) + len(observer.residual_names)
     sizes = {
         "z": nz,
         "v": nu + ny,
         "measured": nu + ny,
         "inputs": gap.kept_inputs * nu,
         "fault": gap.faults,
-        "shown": shown,
+        "shown": compared,
         "seen": gap.seen,
         "model": gap.states,
         "left": nz * (nu + ny),
         "held": nu,
         "moves": 4 * nu,
         "reach": nu,
-        "changes": shown,
+        "changes": compared,
         "excess": nz * (nu + ny),
-        "carried": shown,
-        "grown": shown,
+        "carried": compared,
+        "grown": compared,
     }
     watched = max(len(alarms.levels), 1)
     return [
@@ -219,27 +221,33 @@ def _state_struct(found: Realisation, prefix: str, alarms: Alarms) -> list[str]:
     ]
 
 
-def source_text(found: Realisation, prefix: str, header: str, alarms: Alarms) -> str:
+def source_text(realisation: Realisation, prefix: str, header: str, alarms: Alarms) -> str:
     """Return the source."""
-    observer, gap = found.observer, found.gap
+    observer, gap = realisation.observer, realisation.gap
     groups = {"states": observer.state_rows, "faults": observer.fault_rows, "residuals": observer.residual_rows}
-    said: dict[str, dict[str, FloatArray]] = {
-        target: {"z": found.running.Cz[rows], "u": found.running.Du[rows], "y": found.running.Dy[rows]}
+    output_products: dict[str, dict[str, FloatArray]] = {
+        target: {
+            "z": realisation.running.Cz[rows],
+            "u": realisation.running.Du[rows],
+            "y": realisation.running.Dy[rows],
+        }
         for target, rows in groups.items()
         if rows.stop > rows.start
     }
-    moved: dict[str, dict[str, FloatArray]] = {"next": found.transition}
-    large = any(_form(matrix) != PLAIN for parts in (*said.values(), *moved.values()) for matrix in parts.values())
+    moved: dict[str, dict[str, FloatArray]] = {"next": realisation.transition}
+    large = any(
+        _form(matrix) != PLAIN for parts in (*output_products.values(), *moved.values()) for matrix in parts.values()
+    )
     tables = [
         line
-        for target, parts in {**said, **moved}.items()
+        for target, parts in {**output_products, **moved}.items()
         for signal, matrix in parts.items()
         if matrix.size
         for line in _tables(f"{target}_{signal}", matrix)
     ]
-    before, after = found.operating_point
+    before, after = realisation.operating_point
     constants = {
-        "start": found.start.reshape(1, -1),
+        "start": realisation.start.reshape(1, -1),
         "point_before": before.reshape(1, -1),
         **({"point_after": after.reshape(1, -1)} if len(observer.state_names) + len(observer.fault_names) else {}),
         "levels": np.array([list(alarms.levels.values())]),
@@ -248,8 +256,8 @@ def source_text(found: Realisation, prefix: str, header: str, alarms: Alarms) ->
     return (
         "\n".join(
             [
-                comment(f"sha256 of the gain set: {found.digest}"),
-                comment(quoted(verification_words(found.design))),
+                comment(f"sha256 of the gain set: {realisation.digest}"),
+                comment(quoted(verification_words(realisation.design))),
                 f'#include "{included(header)}"',
                 "",
                 "#include <math.h>",
@@ -262,12 +270,12 @@ def source_text(found: Realisation, prefix: str, header: str, alarms: Alarms) ->
                 "#define ABS(x) ((x) < 0 ? -(x) : (x))",
                 f"#define MODEL {int(gap.exists)}",
                 f"#define SOLVED {int(gap.solved)}",
-                f"#define STRAIGHT {int(found.straight)}",
+                f"#define STRAIGHT {int(realisation.straight)}",
                 f"#define WARM_UP_SECONDS {alarms.warm_up!r}",
                 f"#define SETTLING_SLACK {SETTLING_SLACK!r}",
                 f"#define LEFT_SHARE ((REAL){gap.left_share!r})",
                 "enum {",
-                *(f"    {name} = {value}," for name, value in _sizes(found).items()),
+                *(f"    {name} = {value}," for name, value in _sizes(realisation).items()),
                 "};",
                 "",
                 *([comment(ADVICE), ""] if large else []),
@@ -277,21 +285,21 @@ def source_text(found: Realisation, prefix: str, header: str, alarms: Alarms) ->
                 *integer_table("watched", range(len(alarms.levels))),
                 "",
                 template("products.c"),
-                *_products("say", ("z", "u", "y"), said, tuple(groups)),
-                *_products("next_of", tuple(found.transition), moved, ("next",)),
+                *_products("say", ("z", "u", "y"), output_products, tuple(groups)),
+                *_products("next_of", tuple(realisation.transition), moved, ("next",)),
                 alarms.source(prefix),
-                _step_text(found, prefix, alarms),
+                _step_text(realisation, prefix, alarms),
             ]
         )
         + "\n"
     )
 
 
-def _sizes(found: Realisation) -> dict[str, int]:
+def _sizes(realisation: Realisation) -> dict[str, int]:
     """Return the sizes that the C text has as names."""
-    observer, gap = found.observer, found.gap
+    observer, gap = realisation.observer, realisation.gap
     nu, ny = len(observer.input_names), len(observer.output_names)
-    shown = len(observer.fault_names) + len(observer.residual_names)
+    compared = len(observer.fault_names) + len(observer.residual_names)
     return {
         "Z_COUNT": observer.order,
         "U_COUNT": nu,
@@ -299,8 +307,8 @@ def _sizes(found: Realisation) -> dict[str, int]:
         "V_COUNT": nu + ny,
         "STATE_COUNT": len(observer.state_names),
         "FAULT_COUNT": len(observer.fault_names),
-        "SHOWN_COUNT": shown,
-        "WATCHED_COUNT": shown + 1,
+        "SHOWN_COUNT": compared,
+        "WATCHED_COUNT": compared + 1,
         "MODEL_STATES": gap.states,
         "SEEN_COUNT": gap.seen,
         "PLANT_FAULTS": gap.faults,
@@ -310,11 +318,11 @@ def _sizes(found: Realisation) -> dict[str, int]:
 
 
 def _products(
-    name: str, given: Sequence[str], blocks: dict[str, dict[str, FloatArray]], targets: Sequence[str]
+    name: str, signals: Sequence[str], blocks: dict[str, dict[str, FloatArray]], targets: Sequence[str]
 ) -> list[str]:
     """Return a function that writes products of vectors into its targets, by the macros of ``products.c``."""
-    arguments = [f"const REAL *{signal}" for signal in given] + [f"REAL *{target}" for target in targets]
-    body = ["int i;", "int j;", *(f"(void){word};" for word in ("i", "j", *given, *targets))]
+    arguments = [f"const REAL *{signal}" for signal in signals] + [f"REAL *{target}" for target in targets]
+    body = ["int i;", "int j;", *(f"(void){word};" for word in ("i", "j", *signals, *targets))]
     for target in (target for target in targets if target in blocks):
         rows = max(map(len, blocks[target].values()))
         parts = [(signal, _form(matrix), matrix.shape[1]) for signal, matrix in blocks[target].items() if matrix.size]
@@ -328,15 +336,15 @@ def _products(
     return [f"static void {name}({', '.join(arguments)})", "{", *(f"    {line}" for line in body), "}", ""]
 
 
-def _step_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
+def _step_text(realisation: Realisation, prefix: str, alarms: Alarms) -> str:
     """Return everything that follows the tables: start, step, and the step of signals as they are."""
-    observer = found.observer
+    observer = realisation.observer
     nu, ny = len(observer.input_names), len(observer.output_names)
     nx, nf, nr = len(observer.state_names), len(observer.fault_names), len(observer.residual_names)
     watched = alarms.monitor is not None
-    arguments = ", ".join(_step_arguments(found, prefix))
+    arguments = ", ".join(_step_arguments(realisation, prefix))
     taken = (("v", "u", nu, 0), ("v + U_COUNT", "y", ny, nu))
-    shown = (("faults", "shown", nf), ("residuals", "shown + FAULT_COUNT", nr))
+    copied_out = (("faults", "shown", nf), ("residuals", "shown + FAULT_COUNT", nr))
     estimates = (("states", nx, 0), ("faults", nf, nx))
     signals = [("deviation", nu), ("deviation + U_COUNT", ny), ("states", nx), ("faults", nf), ("residuals", nr)]
     return filled_template(
@@ -345,7 +353,7 @@ def _step_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
         {
             "STATES_SCRATCH": "" if nx else "REAL states[1] = {0};",
             "COPY_IN": " ".join(f"copied({to}, {of}, {n});" for to, of, n, _ in taken if n),
-            "COPY_OUT": " ".join(f"copied({to}, {of}, {n});" for to, of, n in shown if n),
+            "COPY_OUT": " ".join(f"copied({to}, {of}, {n});" for to, of, n in copied_out if n),
             "MONITOR_RESET": "monitor_reset(&s->monitor);" if watched else "",
             "MONITOR_UNREPEAT": "monitor_unrepeat(&s->monitor, v + U_COUNT);" if watched else "",
             "MONITOR_STEP": (
@@ -406,8 +414,8 @@ def table_lines(name: str, matrix: FloatArray) -> Iterator[str]:
     yield from ("};", "")
 
 
-def _step_arguments(found: Realisation, prefix: str) -> list[str]:
-    observer = found.observer
+def _step_arguments(realisation: Realisation, prefix: str) -> list[str]:
+    observer = realisation.observer
     inputs = {"u": observer.input_names, "y": observer.output_names}
     outputs = {"states": observer.state_names, "faults": observer.fault_names, "residuals": observer.residual_names}
     return [
@@ -417,8 +425,8 @@ def _step_arguments(found: Realisation, prefix: str) -> list[str]:
     ]
 
 
-def _step_signature(found: Realisation, prefix: str, name: str = "step") -> str:
-    return f"int {prefix}_{name}({', '.join(_step_arguments(found, prefix))})"
+def _step_signature(realisation: Realisation, prefix: str, name: str = "step") -> str:
+    return f"int {prefix}_{name}({', '.join(_step_arguments(realisation, prefix))})"
 
 
 def signal_comments(
@@ -439,9 +447,9 @@ def signal_comments(
 
 def filled_table(table: FloatArray) -> FloatArray:
     """Return a table without an empty side, which C has not."""
-    found = np.zeros(tuple(max(size, 1) for size in table.shape))
-    found[: table.shape[0], : table.shape[1]] = table
-    return found
+    filled = np.zeros(tuple(max(size, 1) for size in table.shape))
+    filled[: table.shape[0], : table.shape[1]] = table
+    return filled
 
 
 def integer_table(name: str, values: Sequence[object], kind: str = "int") -> list[str]:
@@ -459,5 +467,7 @@ def filled_template(name: str, prefix: str, words: Mapping[str, str], package: s
     text = template(name, package)
     for word in (word for word, value in words.items() if not value):
         text = re.sub(rf"^ *{word}\n", "", text, flags=re.MULTILINE)
-    known = {**words, "PREFIX": prefix, "UPPER": prefix.upper()}
-    return re.sub("|".join(sorted(known, key=len, reverse=True)), lambda found: known[found.group()], text)
+    replacements = {**words, "PREFIX": prefix, "UPPER": prefix.upper()}
+    return re.sub(
+        "|".join(sorted(replacements, key=len, reverse=True)), lambda found: replacements[found.group()], text
+    )

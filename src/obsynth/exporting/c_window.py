@@ -33,8 +33,8 @@ def require_fixed(design: ObserverDesign, suffix: str) -> None:
             "is exported as C (.c) only, without tolerances.",
             path="disturbance_bounds",
         )
-    for name, asked in (("exact", design.options.get("exact")), ("missing", design.options.get("missing") == "solve")):
-        if asked:
+    for name, is_on in (("exact", design.options.get("exact")), ("missing", design.options.get("missing") == "solve")):
+        if is_on:
             raise SpecError(
                 f"Design {design.name!r} has the option {name!r}: it solves linear programmes at each row, which "
                 "exported code does not. Design it without: the fixed test, with its weights and thresholds, can be "
@@ -48,33 +48,33 @@ def is_window(design: ObserverDesign) -> bool:
     return is_guaranteed(design) and not design.linear[1].state_names
 
 
-def window_c_texts(found: Realisation, prefix: str, header: str) -> tuple[str, str]:
+def window_c_texts(realisation: Realisation, prefix: str, header: str) -> tuple[str, str]:
     """Return source and header."""
-    test = GuaranteedTest.of(found.design)
-    observer, count = found.observer, len(test.tests)
+    test = GuaranteedTest.of(realisation.design)
+    observer, count = realisation.observer, len(test.tests)
     length = observer.order // count + 1
     nu, ny = len(observer.input_names), len(observer.output_names)
     sizes = {"TESTS": count, "LENGTH": length, "WIDTH": nu + ny, "NU": nu}
     tables = {
-        "weights": _weights(found, count, length),
-        "limits": np.array([[one.threshold for one in test.tests]]),
+        "weights": _weights(realisation, count, length),
+        "limits": np.array([[row_test.threshold for row_test in test.tests]]),
         "constants": observer.added[None],
-        "rounding": np.array([one.certificate.matrices["rounding"].ravel() for one in test.tests]),
+        "rounding": np.array([row_test.certificate.matrices["rounding"].ravel() for row_test in test.tests]),
     }
     taken = ([f"const double u[{nu}]"] if nu else []) + [f"const double y[{ny}]"]
     arguments = [f"{prefix}_state *state", *taken, f"double values[{count}]", f"double thresholds[{count}]"]
     signature = f"int {prefix}_step({', '.join(arguments)})"
     upper = prefix.upper()
-    names, groups = found.design.linear[0].fault_names, groups_of(test) if is_bank(test) else None
-    told = [test.fault] if groups is None else [" or ".join(names[k] for k in group) for group in groups]
+    names, groups = realisation.design.linear[0].fault_names, groups_of(test) if is_bank(test) else None
+    group_texts = [test.fault] if groups is None else [" or ".join(names[k] for k in group) for group in groups]
     declared = [
         comment(f"Test {quoted(test.name)} by {quoted(test.method)}, written by obsynth."),
-        *([comment(quoted(found.mark))] if found.mark else []),
+        *([comment(quoted(realisation.mark))] if realisation.mark else []),
         f"#ifndef {upper}_H",
         f"#define {upper}_H",
         "",
         comment("sha256 of the gain set"),
-        f'#define {upper}_SHA256 "{found.digest}"',
+        f'#define {upper}_SHA256 "{realisation.digest}"',
         comment("seconds between samples; samples of a window"),
         f"#define {upper}_DT {observer.dt!r}",
         f"#define {upper}_LENGTH {length}",
@@ -91,7 +91,7 @@ def window_c_texts(found: Realisation, prefix: str, header: str) -> tuple[str, s
         comment("Take one sample: deviations from the operating point, NaN where one is missing. A window that is not"),
         comment("complete has no verdict: its values are NaN. Returns the number, from 1, of the test that stands out"),
         comment("above its threshold, or 0. An alarm of a test means, while all bounds hold:"),
-        *(comment(f"{number}: {quoted(name)}") for number, name in enumerate(told, 1)),
+        *(comment(f"{number}: {quoted(name)}") for number, name in enumerate(group_texts, 1)),
         *(comment(f"u[{k}]: {quoted(name)}") for k, name in enumerate(observer.input_names)),
         *(comment(f"y[{k}]: {quoted(name)}") for k, name in enumerate(observer.output_names)),
         f"{signature};",
@@ -101,8 +101,8 @@ def window_c_texts(found: Realisation, prefix: str, header: str) -> tuple[str, s
     copied = "for (i = 0; i < NU; i++) {\n        newest[i] = u[i];\n    }" if nu else ""
     body = filled_template("window_test.c", prefix, {"SIGNATURE": signature, "COPY_INPUTS": copied})
     source = [
-        comment(f"sha256 of the gain set: {found.digest}"),
-        *([comment(quoted(found.mark))] if found.mark else []),
+        comment(f"sha256 of the gain set: {realisation.digest}"),
+        *([comment(quoted(realisation.mark))] if realisation.mark else []),
         f'#include "{included(header)}"',
         "",
         "#include <math.h>",
@@ -115,9 +115,9 @@ def window_c_texts(found: Realisation, prefix: str, header: str) -> tuple[str, s
     return "\n".join([*source, "", body]), "\n".join(declared) + "\n"
 
 
-def _weights(found: Realisation, count: int, length: int) -> FloatArray:
+def _weights(realisation: Realisation, count: int, length: int) -> FloatArray:
     """Return a row for each test: its weights of inputs and outputs at each sample of the window, newest first."""
-    observer = found.observer
+    observer = realisation.observer
     newest, older = np.hstack([observer.Du, observer.Dy]), np.hstack([observer.Bu, observer.By])
-    each = [np.vstack([newest[[k]], older[k * (length - 1) : (k + 1) * (length - 1)]]) for k in range(count)]
-    return np.array([weights.ravel() for weights in each])
+    by_test = [np.vstack([newest[[k]], older[k * (length - 1) : (k + 1) * (length - 1)]]) for k in range(count)]
+    return np.array([weights.ravel() for weights in by_test])

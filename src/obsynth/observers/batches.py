@@ -72,28 +72,28 @@ def _of_trial(inputs: FloatArray, trials: slice | int) -> FloatArray:
 
 def _in_c(observer: DAEObserver, y: FloatArray, u: FloatArray, note: Callable[[int], object]) -> dict[str, FloatArray]:
     library, begin = observer.library, 0
-    found: list[dict[str, FloatArray]] = []
+    chunks: list[dict[str, FloatArray]] = []
     while begin < len(y):
         trials = slice(begin, min(begin + max(1, BATCH_SAMPLES_PER_CALL // y.shape[1]), len(y)))
         taken, parts = library.batch(y[trials], _of_trial(u, trials))
-        found.append({name: part[:taken] for name, part in parts.items()})
+        chunks.append({name: part[:taken] for name, part in parts.items()})
         begin += taken
         if begin < trials.stop:
             # The message is written there.
-            found.append({name: part[None] for name, part in _one(observer, y, u, begin).items()})
+            chunks.append({name: part[None] for name, part in _one(observer, y, u, begin).items()})
             begin += 1
         note(begin)
-    return {name: np.concatenate([parts[name] for parts in found]) for name in BATCH_PARTS}
+    return {name: np.concatenate([parts[name] for parts in chunks]) for name in BATCH_PARTS}
 
 
 def _in_casadi(
     observer: DAEObserver, y: FloatArray, u: FloatArray, note: Callable[[int], object]
 ) -> dict[str, FloatArray]:
-    found = []
+    trials_of_parts = []
     for trial in range(len(y)):
-        found.append(_one(observer, y, u, trial))
+        trials_of_parts.append(_one(observer, y, u, trial))
         note(trial + 1)
-    return {name: np.array([parts[name] for parts in found]) for name in BATCH_PARTS}
+    return {name: np.array([parts[name] for parts in trials_of_parts]) for name in BATCH_PARTS}
 
 
 def _one(observer: DAEObserver, y: FloatArray, u: FloatArray, trial: int) -> dict[str, FloatArray]:
@@ -183,15 +183,14 @@ def _one_by_one(
     signals: Any = observer if isinstance(observer, LinearObserver) else observer.plant
     is_linear = signals is observer
     outputs, inputs = batch_record(y, u, len(signals.output_names), signals.input_names)
-    found = [observer.run(outputs[i], _of_trial(inputs, i)) for i in range(len(outputs))]
+    runs = [observer.run(outputs[i], _of_trial(inputs, i)) for i in range(len(outputs))]
     deviating = ("fault_covariances", "state_deviations", "nis", "nis_degrees")
     names = ("states", "faults", "residuals", *(() if is_linear else deviating))
-    stacked: dict[str, Any] = {name: read_only(np.stack([getattr(each, name) for each in found])) for name in names}
+    stacked: dict[str, Any] = {name: read_only(np.stack([getattr(run, name) for run in runs])) for name in names}
     if is_linear:
-        return replace(found[0], **stacked)
-    width = max(each.innovations.shape[1] for each in found)
+        return replace(runs[0], **stacked)
+    width = max(run.innovations.shape[1] for run in runs)
     wide = [
-        np.pad(each.innovations, ((0, 0), (0, width - each.innovations.shape[1])), constant_values=np.nan)
-        for each in found
+        np.pad(run.innovations, ((0, 0), (0, width - run.innovations.shape[1])), constant_values=np.nan) for run in runs
     ]
-    return replace(found[0], **stacked, innovations=read_only(np.stack(wide)))
+    return replace(runs[0], **stacked, innovations=read_only(np.stack(wide)))

@@ -68,12 +68,12 @@ def checked_sizes(value: Any, names: Sequence[str]) -> FloatArray | None:
     from these or from values by name; ``None`` where nothing is said."""
     if value is None:
         return None
-    found = named_vector(value, names, np.zeros(len(names)), "outlier_sizes")
-    for name, size in zip(names, found, strict=True):
+    sizes = named_vector(value, names, np.zeros(len(names)), "outlier_sizes")
+    for name, size in zip(names, sizes, strict=True):
         if size < 0.0:
             path = f"outlier_sizes.{name}"
             raise SpecError(f"{path} is {size:g}: give how far off an outlier is at least, in its unit.", path=path)
-    return read_only(found)
+    return read_only(sizes)
 
 
 def no_refusals(outputs: int) -> FloatArray:
@@ -135,8 +135,8 @@ def robust_advance(
     off, gone = np.where(far, y - mean, 0.0), far
     if kind == "gate":
         # A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off.
-        known = np.zeros(len(y), dtype=bool) if sizes is None else sizes > FAR_OUT * usual
-        gone = far & (~_follows(state.refused, off, known) | (np.abs(y) > NO_SQUARE))
+        far_outliers = np.zeros(len(y), dtype=bool) if sizes is None else sizes > FAR_OUT * usual
+        gone = far & (~_follows(state.refused, off, far_outliers) | (np.abs(y) > NO_SQUARE))
         received = np.where(gone, np.nan, y)
     else:
         pulled = mean + reach * np.sign(y - mean)
@@ -160,25 +160,27 @@ def _wary(state: Any, sizes: FloatArray) -> BoolArray | None:
     return np.asarray((sizes > 0.0) & (waiting != 0.0)) if waiting.any() else None
 
 
-def _follows(refused: FloatArray, off: FloatArray, known: BoolArray) -> BoolArray:
+def _follows(refused: FloatArray, off: FloatArray, far_outliers: BoolArray) -> BoolArray:
     """Return which samples ``off (ny,)`` their prediction go on with what was off before: with what was believed, or as
     far as the one that was left out: after `LONGEST_LEFT_OUT` of them, or on its side where the sensor's outliers are
     not ``known (ny,)`` to be further off than any sample."""
-    row, _, left, believed = refused
-    sizes, others = np.abs(off), np.abs(left)
+    row, _, left_out, believed = refused
+    sizes, left_out_sizes = np.abs(off), np.abs(left_out)
     with np.errstate(over="ignore"):
         on = (off * np.sign(believed) > 0.0) & (sizes <= COMPARABLE * np.abs(believed))
-        like = (others > 0.0) & (sizes <= COMPARABLE * others) & (others <= COMPARABLE * sizes)
-    return np.asarray(on | like & ((~known & (off * np.sign(left) > 0.0)) | (np.abs(row) >= LONGEST_LEFT_OUT)))
+        like = (left_out_sizes > 0.0) & (sizes <= COMPARABLE * left_out_sizes) & (left_out_sizes <= COMPARABLE * sizes)
+    return np.asarray(
+        on | like & ((~far_outliers & (off * np.sign(left_out) > 0.0)) | (np.abs(row) >= LONGEST_LEFT_OUT))
+    )
 
 
 def _remembered(refused: FloatArray, y: FloatArray, far: BoolArray, gone: BoolArray, off: FloatArray) -> FloatArray:
     """Return the memory of outliers after a sample, of which those that are ``far (ny,)`` are ``off`` by so much, and
     some are ``gone``: left out or pulled. A missing sample leaves it as it was."""
-    row, total, left, believed = refused
+    row, total, left_out, believed = refused
     counts = np.where(far, np.where(off < 0.0, -1.0, 1.0) * (np.abs(row) + 1.0), 0.0)
-    after = np.stack([counts, total + gone, *(np.where(far, np.where(which, off, old), 0.0)
-                      for which, old in ((gone, left), (~gone, believed)))])  # fmt: skip
+    after = np.stack([counts, total + gone, *(np.where(far, np.where(chosen, off, old), 0.0)
+                      for chosen, old in ((gone, left_out), (~gone, believed)))])  # fmt: skip
     return np.where(np.isnan(y) & np.array([[True], [False], [True], [True]]), refused, after)
 
 
@@ -201,9 +203,9 @@ def _judged(
         far = (np.abs(y - mean) > reach) | (np.abs(y) > NO_SQUARE)
         ratios, unknown = np.zeros(len(y)), np.isinf(usual)
         for i in np.flatnonzero(unknown & ~np.isnan(y) & ~far):
-            others = np.where(far | (np.arange(len(y)) == i), np.nan, y)
+            other_outputs = np.where(far | (np.arange(len(y)) == i), np.nan, y)
             try:
-                means, spread = predicted(state, others, u)
+                means, spread = predicted(state, other_outputs, u)
             except (SolverError, np.linalg.LinAlgError, ValueError):
                 continue
             mean[i], reach[i] = means[i], max(limit * np.sqrt(spread[i, i]), least[i])
@@ -225,22 +227,22 @@ def beside_others(off: FloatArray, covariance: FloatArray) -> tuple[FloatArray, 
     """Return how far each sample ``(ny,)`` is from what all others of its row say of it, and the deviation of that,
     where they are ``off (ny,)`` their prediction by so much, with ``covariance (ny, ny)``; NaN of one that is missing,
     and of all where the covariance is singular."""
-    found = np.full((2, len(off)), np.nan)
-    seen = np.flatnonzero(~np.isnan(off))
-    sizes = np.sqrt(np.diag(covariance)[seen])
+    distances = np.full((2, len(off)), np.nan)
+    measured = np.flatnonzero(~np.isnan(off))
+    sizes = np.sqrt(np.diag(covariance)[measured])
     try:
-        inverse = np.linalg.inv(covariance[np.ix_(seen, seen)] / np.outer(sizes, sizes))
+        inverse = np.linalg.inv(covariance[np.ix_(measured, measured)] / np.outer(sizes, sizes))
     except np.linalg.LinAlgError:
-        return found[0], found[1]
+        return distances[0], distances[1]
     own = np.diag(inverse)
-    found[:, seen] = sizes * (inverse @ (off[seen] / sizes)) / own, sizes / np.sqrt(own)
-    return found[0], found[1]
+    distances[:, measured] = sizes * (inverse @ (off[measured] / sizes)) / own, sizes / np.sqrt(own)
+    return distances[0], distances[1]
 
 
 def checked_state_bounds(value: Any, names: Sequence[str]) -> FloatArray | None:
     """Return lower and upper bounds ``(nx, 2)`` from rows or from pairs by name; ``None`` where there are none."""
-    found = named_bounds(value, names, "state_bounds")
-    return read_only(found) if np.isfinite(found).any() else None
+    bounds = named_bounds(value, names, "state_bounds")
+    return read_only(bounds) if np.isfinite(bounds).any() else None
 
 
 def projected(x: FloatArray, factor: FloatArray, bounds: FloatArray) -> FloatArray:
@@ -261,11 +263,11 @@ def projected(x: FloatArray, factor: FloatArray, bounds: FloatArray) -> FloatArr
     sides, least = np.vstack(rows), np.concatenate(gaps)
     target = np.zeros(factor.shape[1] + 1)
     target[-1] = 1.0
-    weights, rest = nnls(np.vstack((sides.T, least)), target)
+    weights, distance = nnls(np.vstack((sides.T, least)), target)
     residual = np.vstack((sides.T, least)) @ weights - target
     moved = x
     # Without a rest no e keeps all of them: a state that is known exactly stands in the way.
-    if rest > 0.0 and residual[-1] < 0.0:
+    if distance > 0.0 and residual[-1] < 0.0:
         # The shortest e that reaches the ends that hold it, without the cancellation of the ratio of residuals.
         held = weights > 0.0
         moved = x + factor @ np.linalg.lstsq(sides[held], least[held], rcond=None)[0]

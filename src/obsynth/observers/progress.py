@@ -28,7 +28,7 @@ PATIENCE = 2.0
 
 @contextmanager
 def shown_progress(
-    progress: bool | Callable[[int], None] | None, total: int, what: str
+    progress: bool | Callable[[int], None] | None, total: int, unit: str
 ) -> Iterator[Callable[[int], object]]:
     """Show how much of a long run is done, by a bar that appears late and is gone at the end."""
     if callable(progress):
@@ -40,25 +40,25 @@ def shown_progress(
         yield bool
         return
     begin = time.monotonic()
-    shown: list[tuple[Progress, TaskID]] = []
+    bars: list[tuple[Progress, TaskID]] = []
 
     def update(done: int) -> None:
-        if not shown:
+        if not bars:
             if time.monotonic() - begin < PATIENCE:
                 return
             from rich.console import Console
             from rich.progress import Progress
 
             bar = Progress(console=Console(stderr=True), transient=True)
-            shown.append((bar, bar.add_task(what, total=total)))
+            bars.append((bar, bar.add_task(unit, total=total)))
             bar.start()
-        bar, task = shown[0]
+        bar, task = bars[0]
         bar.update(task, completed=done)
 
     try:
         yield update
     finally:
-        for bar, _ in shown:
+        for bar, _ in bars:
             bar.stop()
 
 

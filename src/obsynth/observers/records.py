@@ -32,8 +32,8 @@ def require_names(names: Any, field: str) -> None:
 
 def require_delays(names: tuple[str, ...], delays: Any) -> None:
     """Raise `SpecError` unless there is a delay of 0 or more samples for each signal."""
-    whole = isinstance(delays, tuple) and all(is_whole(delay) and delay >= 0 for delay in delays)
-    if not whole or len(names) != len(delays):
+    are_counts = isinstance(delays, tuple) and all(is_whole(delay) and delay >= 0 for delay in delays)
+    if not are_counts or len(names) != len(delays):
         raise SpecError("The observer needs one delay >= 0, in samples, for each signal.", path="delays")
 
 
@@ -106,58 +106,58 @@ def whole_record(
     return outputs, inputs
 
 
-def named_vector(value: Any, names: Sequence[str], default: FloatArray, what: str) -> FloatArray:
+def named_vector(value: Any, names: Sequence[str], default: FloatArray, option: str) -> FloatArray:
     """Return numbers ``(len(names),)`` from an array or from values by name; the default where nothing is said."""
     if not isinstance(value, Mapping):
-        return finite_vector(value, names, default, what)
+        return finite_vector(value, names, default, option)
     vector = np.array(default)
     for name, entry in value.items():
         if name not in names and not suggestion(name, names):
-            raise SpecError(f"{what} has no signal named {name!r}; there are: {', '.join(names)}.", path=what)
-        vector[index_of(name, names, what=what)] = real_number(entry, f"{what}.{name}")
+            raise SpecError(f"{option} has no signal named {name!r}; there are: {', '.join(names)}.", path=option)
+        vector[index_of(name, names, what=option)] = real_number(entry, f"{option}.{name}")
     return vector
 
 
 def named_covariance(
-    value: Any, names: Sequence[str], what: str, default: FloatArray | None, *, others: FloatArray | None = None
+    value: Any, names: Sequence[str], option: str, default: FloatArray | None, *, others: FloatArray | None = None
 ) -> FloatArray:
     """Return a covariance from a matrix, one variance, or variances by name, beside which ``others`` have theirs."""
     if value is None:
         if default is None:
             raise SpecError(
-                f"{what} is missing: give variances, for example by the names {', '.join(names)}.", path=what
+                f"{option} is missing: give variances, for example by the names {', '.join(names)}.", path=option
             )
         return np.diag(default)
     if isinstance(value, Mapping):
         variances = np.zeros(len(names)) if others is None else others
-        return np.diag(named_vector(value, names, variances, what))
+        return np.diag(named_vector(value, names, variances, option))
     empty = isinstance(value, (list, tuple, np.ndarray)) and not np.asarray(value, dtype=object).size
-    matrix = np.zeros((0, 0)) if empty else as_matrix(value, what)
+    matrix = np.zeros((0, 0)) if empty else as_matrix(value, option)
     return float(matrix[0, 0]) * np.eye(len(names)) if np.ndim(value) == 0 else matrix
 
 
-def named_bounds(value: Any, names: Sequence[str], what: str) -> FloatArray:
+def named_bounds(value: Any, names: Sequence[str], option: str) -> FloatArray:
     """Return lower and upper bounds ``(n, 2)`` from rows or from pairs by name; infinite where nothing is said."""
-    found = np.tile([-np.inf, np.inf], (len(names), 1))
+    bounds = np.tile([-np.inf, np.inf], (len(names), 1))
     if value is None:
-        return found
+        return bounds
     if isinstance(value, Mapping):
-        pairs = {index_of(name, names, what=what): pair for name, pair in value.items()}
+        pairs = {index_of(name, names, what=option): pair for name, pair in value.items()}
     else:
         rows = np.asarray(value, dtype=object) if isinstance(value, (list, tuple, np.ndarray)) else np.zeros(0)
-        if rows.shape != found.shape:
-            raise SpecError(f"{what} must be {len(names)} pairs [low, high], or pairs by name.", path=what)
+        if rows.shape != bounds.shape:
+            raise SpecError(f"{option} must be {len(names)} pairs [low, high], or pairs by name.", path=option)
         pairs = {i: list(row) for i, row in enumerate(rows)}
     for i, pair in pairs.items():
-        path = f"{what}.{names[i]}"
+        path = f"{option}.{names[i]}"
         if np.shape(pair) != (2,) or not all(map(is_number, pair)):
             raise SpecError(f"{path} is {pair!r}: give [low, high].", path=path)
         if not pair[0] < pair[1]:
             raise SpecError(
                 f"{path}: the lower bound ({pair[0]:g}) must be below the upper one ({pair[1]:g}).", path=path
             )
-        found[i] = pair
-    return found
+        bounds[i] = pair
+    return bounds
 
 
 def batch_record(
@@ -170,15 +170,15 @@ def batch_record(
     if np.isinf(outputs).any():
         raise SpecError("y holds an infinity: mark a missing sample by NaN.", path="y")
     trials, samples = outputs.shape[:2]
-    known = np.zeros((samples, 0)) if u is None and not nu else real_array(u, "u")
-    if known.shape not in ((samples, nu), (trials, samples, nu)):
+    inputs = np.zeros((samples, 0)) if u is None and not nu else real_array(u, "u")
+    if inputs.shape not in ((samples, nu), (trials, samples, nu)):
         raise SpecError(
-            f"u has shape {known.shape}, but {(samples, nu)} or {(trials, samples, nu)} is needed.", path="u"
+            f"u has shape {inputs.shape}, but {(samples, nu)} or {(trials, samples, nu)} is needed.", path="u"
         )
-    if not np.isfinite(known).all():
-        *trial, k, i = np.argwhere(~np.isfinite(known))[0]
+    if not np.isfinite(inputs).all():
+        *trial, k, i = np.argwhere(~np.isfinite(inputs))[0]
         where = f" of trial {trial[0]}" if trial else ""
         raise SpecError(
-            f"The input {input_names[i]!r}{where} is {known[*trial, k, i]} at k = {k}: inputs must be known.", path="u"
+            f"The input {input_names[i]!r}{where} is {inputs[*trial, k, i]} at k = {k}: inputs must be known.", path="u"
         )
-    return outputs, known
+    return outputs, inputs

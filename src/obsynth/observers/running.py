@@ -216,8 +216,8 @@ class RunningObserver(Generic[State, Row]):
 
         Whatever is raised, the state is left as it was.
         """
-        self.state, found = self.observer.step(self.state, y, u)
-        return found
+        self.state, estimates = self.observer.step(self.state, y, u)
+        return estimates
 
     def raw_step(self, y: FloatArray, u: FloatArray) -> Row:
         """Take one sample without checking it; return what is known at it.
@@ -253,11 +253,11 @@ def named_estimates(observer: StepObserver, *, states: FloatArray, faults: Float
 
 def changed(observer: Robust, **options: Any) -> Robust:
     """Return the observer with other options; the steps of a nonlinear one are built once."""
-    found = replace(observer, **options)
+    other = replace(observer, **options)
     if "steps" in vars(observer):
         # What these options do stands outside of the compiled steps.
-        vars(found)["steps"] = type(observer.steps)(found, observer.steps.graph)
-    return found
+        vars(other)["steps"] = type(observer.steps)(other, observer.steps.graph)
+    return other
 
 
 def as_run(observer: Robust, outliers: str | None = None, *, stated: str | None = None) -> Robust:

@@ -31,7 +31,7 @@ def checked_sensors(value: Any, names: Sequence[str]) -> dict[str, dict[str, int
         return None
     if not isinstance(value, Mapping):
         raise SpecError("sensors must be a mapping by name, such as {y1: {every: 5, delay: 2}}.", path="sensors")
-    found: dict[str, dict[str, int]] = {}
+    timings: dict[str, dict[str, int]] = {}
     for name, entry in value.items():
         index_of(name, names, what="sensors")
         if not isinstance(entry, Mapping) or not set(entry) <= {"every", "delay"}:
@@ -49,8 +49,8 @@ def checked_sensors(value: Any, names: Sequence[str]) -> dict[str, dict[str, int
                 )
             timing[key] = int(count)
         if timing != {"every": 1, "delay": 0}:
-            found[str(name)] = timing
-    return found or None
+            timings[str(name)] = timing
+    return timings or None
 
 
 class WaitingState(NamedTuple):
@@ -116,19 +116,19 @@ class SensorTiming:
 
     def arriving(self, y: FloatArray) -> FloatArray:
         """Return rows as they arrive from outputs ``(..., samples, ny)`` at their own times; NaN where nothing does."""
-        found = np.full_like(y, np.nan)
-        for i, (every, delay) in enumerate(zip(self.every, self.delays, strict=True)):
-            taken = y[..., : max(y.shape[-2] - delay, 0) : every, i]
-            found[..., delay::every, i] = taken
-        return found
+        arrived = np.full_like(y, np.nan)
+        for i, (period, delay) in enumerate(zip(self.every, self.delays, strict=True)):
+            taken = y[..., : max(y.shape[-2] - delay, 0) : period, i]
+            arrived[..., delay::period, i] = taken
+        return arrived
 
     def in_order(self, y: FloatArray) -> FloatArray:
         """Return outputs ``(samples, ny)`` at their own times from rows as they arrive."""
-        found = np.full_like(y, np.nan)
-        for i, (every, delay) in enumerate(zip(self.every, self.delays, strict=True)):
-            taken = y[delay::every, i]
-            found[: len(taken) * every : every, i] = taken
-        return found
+        ordered = np.full_like(y, np.nan)
+        for i, (period, delay) in enumerate(zip(self.every, self.delays, strict=True)):
+            taken = y[delay::period, i]
+            ordered[: len(taken) * period : period, i] = taken
+        return ordered
 
     def begun(self, first: Any) -> Any:
         """Return the state before the first sample."""
@@ -161,10 +161,10 @@ class SensorTiming:
         return WaitingState(tuple(states[kept]), after, outputs[kept], inputs[kept]), row
 
 
-def require_plain(observer: Any, what: str) -> None:
+def require_plain(observer: Any, user: str) -> None:
     """Raise `SpecError` where an observer has sensors of their own times, or bounds on states."""
     for option in ("sensors", "state_bounds"):
         if getattr(observer, option) is not None:
             raise SpecError(
-                f"{what} has no {option}: leave the option out of the design, or run it by obsynth run.", path=option
+                f"{user} has no {option}: leave the option out of the design, or run it by obsynth run.", path=option
             )

@@ -73,9 +73,9 @@ class _DAELinearisation(StepLinearisation):
             x = x - self.steps.part(after, "K") @ row.part("innovation")
         else:
             x = x - self.steps.part(after, "Upsilon") @ (self.steps.part(after, "theta") - theta)
-        seen = row.seen
+        measured = row.seen
         _, H, L = self.steps.graph.functions.outputs(x, theta)
-        R = self.steps.settings.R[np.ix_(seen, seen)]
+        R = self.steps.settings.R[np.ix_(measured, measured)]
         noise, missing = np.asarray(row.part("noise") @ self.Q), row.part("missing")
         if missing.any():
             noise = np.hstack((noise, covariance_factor(0.5 * (missing + missing.T), "covariance")))
@@ -85,9 +85,9 @@ class _DAELinearisation(StepLinearisation):
             row.part("F"),
             row.part("G"),
             noise,
-            row.innovation[seen],
-            H[seen],
-            L[seen],
+            row.innovation[measured],
+            H[measured],
+            L[measured],
             R,
         )
 
@@ -134,17 +134,17 @@ class _ConstantParameters(_DAELinearisation):
         right = np.zeros((nx + count, 1 + self.nq))
         right[:nx, 1:], right[nx:, 0], right[nx:, 1:] = self.steps.part(after, "Upsilon"), y - expected, -L
         root = covariance_factor(at.R, "R") if count else np.zeros((0, 0))
-        known = np.vstack((at.F @ node.factor, np.zeros((count, node.factor.shape[1]))))
-        found, back = joint_step(
-            np.vstack((np.eye(nx), H)), known, stacked_noise(at.noise, root), right, np.zeros((nx + count, 0))
+        spread = np.vstack((at.F @ node.factor, np.zeros((count, node.factor.shape[1]))))
+        solved, back = joint_step(
+            np.vstack((np.eye(nx), H)), spread, stacked_noise(at.noise, root), right, np.zeros((nx + count, 0))
         )
         # Its way back is written about the parameters of this sample.
         offset = back.offset.copy()
         offset[:, 0] -= offset[:, 1:] @ theta
         return Node(
             self._origin(after),
-            found.factor,
-            found.diffuse,
+            solved.factor,
+            solved.diffuse,
             back._replace(offset=offset),
             self._learnt(before, after, at, node.factor),
         )
@@ -168,8 +168,8 @@ class _ConstantParameters(_DAELinearisation):
         root = np.linalg.cholesky(weight)
         noise = np.linalg.solve(root, np.linalg.cholesky(Sigma))
         v, G = np.linalg.solve(root, at.e + Omega @ at.theta), np.linalg.solve(root, Omega)
-        found = self._information(after, v, G, noise)
-        return found if found is None else found._replace(is_reset=after.resets > before.resets)
+        information = self._information(after, v, G, noise)
+        return information if information is None else information._replace(is_reset=after.resets > before.resets)
 
     def _information(
         self, after: DAEState, v: FloatArray, G: FloatArray, noise: FloatArray
@@ -192,8 +192,8 @@ class _WalkingParameters(_DAELinearisation):
         spread = self.steps.part(state, "spread")
         if self.steps.settings.form == "augmented-kalman":
             P, cross = self.steps.part(state, "P"), self.steps.part(state, "cross")
-            whole = np.block([[P, cross], [cross.T, spread]])
-            factor = covariance_factor(0.5 * (whole + whole.T), "covariance")
+            joint = np.block([[P, cross], [cross.T, spread]])
+            factor = covariance_factor(0.5 * (joint + joint.T), "covariance")
         else:
             root = covariance_factor(0.5 * (spread + spread.T), "spread")
             factor = stacked_noise(self.own_factor(state), root)
@@ -224,11 +224,11 @@ class _WalkingParameters(_DAELinearisation):
             noise = np.hstack((noise, F @ begun))
         right = np.concatenate((np.zeros(nx + nq), at.e))[:, None]
         root = covariance_factor(at.R, "R") if count else np.zeros((0, 0))
-        known = np.vstack((F @ factor, np.zeros((count, factor.shape[1]))))
+        spread = np.vstack((F @ factor, np.zeros((count, factor.shape[1]))))
         rows = np.vstack((np.eye(nx + nq), np.hstack((at.H, at.L))))
-        found, back = joint_step(rows, known, stacked_noise(noise, root), right, np.zeros((len(rows), 0)))
+        solved, back = joint_step(rows, spread, stacked_noise(noise, root), right, np.zeros((len(rows), 0)))
         # The observer's own estimate, which keeps to the bounds.
-        return Node(self._posterior(after)[:, None], found.factor, found.diffuse, back)
+        return Node(self._posterior(after)[:, None], solved.factor, solved.diffuse, back)
 
 
 class _RecursiveLinearisation(StepLinearisation):
@@ -256,44 +256,49 @@ class _RecursiveLinearisation(StepLinearisation):
 
     def begun(self, state: RecursiveState) -> Node:
         """Return the node of a state from which a chain begins."""
-        known, nq = state.parameters, len(state.parameters.theta)
+        parameters, nq = state.parameters, len(state.parameters.theta)
         information = None
         if nq:
             information = ParameterInformation(
-                known.theta, known.triangle, known.spread, np.zeros(0), np.zeros((0, nq)), np.zeros((0, 0))
+                parameters.theta,
+                parameters.triangle,
+                parameters.spread,
+                np.zeros(0),
+                np.zeros((0, nq)),
+                np.zeros((0, 0)),
             )
         return Node(np.column_stack((state.x, state.Upsilon)), state.factor, state.diffuse, None, information)
 
     def next(self, node: Node, before: RecursiveState, after: RecursiveState, row: RawEstimate, u: FloatArray) -> Node:
         """Return the node of the next sample."""
-        known = taken_inputs(before.inputs, before.u, u, is_first=False)
-        step = self.recursion.step_of(before, known)
-        return self._linked(node, step, before.u, row.y, known.u)._replace(
+        inputs = taken_inputs(before.inputs, before.u, u, is_first=False)
+        step = self.recursion.step_of(before, inputs)
+        return self._linked(node, step, before.u, row.y, inputs.u)._replace(
             information=self._information(before, after, row)
         )
 
     def _linked(self, node: Node, step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray) -> Node:
         """Take a step from inputs ``before`` to the sample ``y`` with inputs ``u``."""
         ne, right = len(step.A), right_side(step, node.origin[:, 0], node.origin[:, 1:], before, y, u)
-        known, unknown = (np.zeros((len(step.H), part.shape[1])) for part in (node.factor, node.diffuse))
-        known[:ne], unknown[:ne] = step.A @ node.factor, step.A @ node.diffuse
+        spread, unknown = (np.zeros((len(step.H), part.shape[1])) for part in (node.factor, node.diffuse))
+        spread[:ne], unknown[:ne] = step.A @ node.factor, step.A @ node.diffuse
         kept = ~np.isnan(right[:, 0])
-        parts = (step.H, known, step.noise, right, unknown)
+        parts = (step.H, spread, step.noise, right, unknown)
         complete = bool(kept.all())
-        found, back = joint_step(*(parts if complete else tuple(part[kept] for part in parts)), complete=complete)
-        return Node(*found, back)
+        solved, back = joint_step(*(parts if complete else tuple(part[kept] for part in parts)), complete=complete)
+        return Node(*solved, back)
 
     def _information(
         self, before: RecursiveState, after: RecursiveState, row: RawEstimate
     ) -> ParameterInformation | None:
-        known = after.parameters
-        if not len(known.theta):
+        parameters = after.parameters
+        if not len(parameters.theta):
             return None
-        G = row.regressor if row.regressor.size else np.zeros((len(row.innovation), len(known.theta)))
+        G = row.regressor if row.regressor.size else np.zeros((len(row.innovation), len(parameters.theta)))
         return ParameterInformation(
-            known.theta,
-            known.triangle,
-            known.spread,
+            parameters.theta,
+            parameters.triangle,
+            parameters.spread,
             row.innovation,
             G,
             np.eye(len(row.innovation)),
@@ -301,24 +306,24 @@ class _RecursiveLinearisation(StepLinearisation):
         )
 
 
-def smoothed_estimates(observer: SmoothedObserver, rows: list[Any], found: list[Smoothed]) -> Estimates:
+def smoothed_estimates(observer: SmoothedObserver, rows: list[Any], smoothed: list[Smoothed]) -> Estimates:
     """Return the estimates of smoothed samples; innovations and what belongs to them are those of the observer."""
     if isinstance(observer, RecursiveObserver):
-        known = recursive_estimates(observer, rows)
+        filtered = recursive_estimates(observer, rows)
     else:
         gathered = GatheredRows(observer)
         for row in rows:
             gathered.add(row)
-        known = gathered.estimates()
+        filtered = gathered.estimates()
     nx = len(observer.state_names)
-    parameters = [parameters_of(sample, nx) for sample in found]
-    deviations = [deviations_in(sample.factor, sample.diffuse)[:nx] for sample in found]
-    spreads = np.array([spread @ spread.T for _, spread in parameters]).reshape(known.fault_covariances.shape)
+    parameters = [parameters_of(sample, nx) for sample in smoothed]
+    deviations = [deviations_in(sample.factor, sample.diffuse)[:nx] for sample in smoothed]
+    spreads = np.array([spread @ spread.T for _, spread in parameters]).reshape(filtered.fault_covariances.shape)
     return replace(
-        known,
-        states=read_only(np.array([sample.x[:nx] for sample in found]).reshape(known.states.shape)),
-        state_deviations=read_only(np.array(deviations).reshape(known.states.shape)),
-        faults=read_only(np.array([theta for theta, _ in parameters]).reshape(known.faults.shape)),
+        filtered,
+        states=read_only(np.array([sample.x[:nx] for sample in smoothed]).reshape(filtered.states.shape)),
+        state_deviations=read_only(np.array(deviations).reshape(filtered.states.shape)),
+        faults=read_only(np.array([theta for theta, _ in parameters]).reshape(filtered.faults.shape)),
         fault_covariances=read_only(spreads),
     )
 
@@ -346,11 +351,11 @@ def smoothed_record(observer: SmoothedObserver, y: ArrayLike, u: ArrayLike | Non
         inputs = checked_inputs(observer.model, u, len(outputs))
     if not len(outputs):
         return observer.run(outputs, inputs)
-    state, chain, found = observer.init(), SmootherHistory(linearisation_of(observer)), list[Smoothed]()
+    state, chain, smoothed = observer.init(), SmootherHistory(linearisation_of(observer)), list[Smoothed]()
     for k in range(len(outputs)):
         state, _ = observer.accept(state, outputs[k], inputs[k], chain.add)
         if lag is not None and k >= lag:
             # Values that come later than that change the samples behind them.
-            found.append(chain.smoothed(k - lag, k)[0])
-    found += chain.smoothed(len(found), len(outputs) - 1)
-    return smoothed_estimates(observer, chain.rows, found)
+            smoothed.append(chain.smoothed(k - lag, k)[0])
+    smoothed += chain.smoothed(len(smoothed), len(outputs) - 1)
+    return smoothed_estimates(observer, chain.rows, smoothed)

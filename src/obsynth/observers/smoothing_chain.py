@@ -114,18 +114,18 @@ class SmootherHistory:
     def smoothed(self, first: int, last: int) -> list[Smoothed]:
         """Return the samples from k ``first`` to k ``last`` as those up to ``last`` say, in this order."""
         node = self.nodes[last - self.begin]
-        known = nothing_later(node.factor.shape[1], node.diffuse.shape[1], node.origin.shape[1])
+        coordinates = nothing_later(node.factor.shape[1], node.diffuse.shape[1], node.origin.shape[1])
         nq = 0 if node.information is None else len(node.information.theta)
         later: Later = (np.zeros((0, nq + 1)), np.zeros((nq, 0)))
-        found = []
+        samples = []
         for k in range(last, first - 1, -1):
             node = self.nodes[k - self.begin]
-            found.append(_smoothed(self.links, node, known, later))
+            samples.append(_smoothed(self.links, node, coordinates, later))
             if k > first and node.back is not None:
-                known = stepped_back(known, node.back)
+                coordinates = stepped_back(coordinates, node.back)
                 if node.information is not None:
                     later = with_information(later, node.information, self.links.forgetting)
-        return found[::-1]
+        return samples[::-1]
 
     def row(self, k: int) -> Any:
         """Return what the observer said at a sample."""
@@ -151,9 +151,13 @@ class SmootherHistory:
         self.rows.append(row)
 
 
-def _smoothed(links: StepLinearisation, node: Node, known: SquareRootGaussian, later: Later) -> Smoothed:
-    both = np.hstack((node.factor, node.diffuse))
-    x, factor, diffuse = node.origin + both @ known.mean, both @ known.factor, both @ known.diffuse
+def _smoothed(links: StepLinearisation, node: Node, coordinates: SquareRootGaussian, later: Later) -> Smoothed:
+    directions = np.hstack((node.factor, node.diffuse))
+    x, factor, diffuse = (
+        node.origin + directions @ coordinates.mean,
+        directions @ coordinates.factor,
+        directions @ coordinates.diffuse,
+    )
     theta, spread = np.zeros(0), np.zeros((0, 0))
     if node.information is not None:
         theta, spread = beside(node.information, later)

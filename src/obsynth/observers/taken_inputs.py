@@ -68,8 +68,8 @@ def taken_inputs(history: FloatArray, held: FloatArray, u: FloatArray, *, is_fir
     # Lists of few numbers are compared in a tenth of the time of arrays.
     lowest_yet, highest_yet, change_yet, absent, _ = history.tolist()
     if used is None and not any(absent):
-        known = zip(lowest_yet, u.tolist(), highest_yet, held.tolist(), change_yet, strict=True)
-        if all(low <= now <= high and abs(now - before) <= most for low, now, high, before, most in known):
+        histories = zip(lowest_yet, u.tolist(), highest_yet, held.tolist(), change_yet, strict=True)
+        if all(low <= now <= high and abs(now - before) <= most for low, now, high, before, most in histories):
             return TakenInputs(u, history, None, None)
         after = history.copy()
         np.minimum(history[0], u, out=after[0])

@@ -85,8 +85,8 @@ class MissingSamples:
         lags = set(observer.state_delays) or {0}
         #: Inputs from the moment on of which the estimates are.
         self.kept_inputs = max(lags) + 1
-        known = estimates_all_states(plant, observer) or solver is not None
-        self.model = None if len(lags) > 1 or not known else GapModel.of(plant)
+        gives_states = estimates_all_states(plant, observer) or solver is not None
+        self.model = None if len(lags) > 1 or not gives_states else GapModel.of(plant)
         #: Numbers of the plant's faults that are estimated; the others are held to be absent.
         self.estimated_faults = [plant.fault_names.index(name) for name in observer.fault_names]
         #: How many states are known at a measured row, from which the model starts.
@@ -95,10 +95,10 @@ class MissingSamples:
     @cached_property
     def noise(self) -> FloatArray:
         """Variances that the stated noise of the sensors gives fault estimates and residuals, zero if not known."""
-        observer, shown = self.observer, slice(len(self.observer.state_names), None)
+        observer, compared = self.observer, slice(len(self.observer.state_names), None)
         if observer.dt > 0.0 and observer.By.shape[1] == self.plant.ny:
-            return noise_variances(observer, self.plant.Dw)[shown]
-        return np.zeros(len(observer.Cz[shown]))
+            return noise_variances(observer, self.plant.Dw)[compared]
+        return np.zeros(len(observer.Cz[compared]))
 
 
 def estimates_all_states(plant: DescriptorSystem, observer: LinearObserver) -> bool:

@@ -33,10 +33,10 @@ GRID_REACH = 30.0
 @remembered
 def modes_of(observer: LinearObserver) -> Modes:
     """Return the modes of a shipped ``Az``."""
-    found = Modes.of(observer.Az)
-    for part in found:
+    modes = Modes.of(observer.Az)
+    for part in modes:
         part.setflags(write=False)
-    return found
+    return modes
 
 
 @remembered
@@ -91,19 +91,19 @@ def noise_variances(observer: LinearObserver, noise: FloatArray) -> FloatArray:
             if not np.abs(more).max(initial=0.0) > np.finfo(float).eps * np.abs(covariance).max(initial=0.0):
                 break
             covariance, power = covariance + more, power @ power
-        found = np.einsum("ij,jk,ik->i", observer.Cz, covariance, observer.Cz) + (through**2).sum(axis=1)
-    return np.where(np.isfinite(found), found, 0.0)
+        variances = np.einsum("ij,jk,ik->i", observer.Cz, covariance, observer.Cz) + (through**2).sum(axis=1)
+    return np.where(np.isfinite(variances), variances, 0.0)
 
 
-def checked_warm_up(asked: float | None, default: float) -> float:
+def checked_warm_up(stated: float | None, default: float) -> float:
     """Return the warm-up in seconds."""
-    return default if asked is None else real_number(asked, "warm_up", "seconds, 0 or more", least=0.0)
+    return default if stated is None else real_number(stated, "warm_up", "seconds, 0 or more", least=0.0)
 
 
 def frequency_grid(observer: LinearObserver) -> FloatArray:
     """Return frequencies in rad/s around the poles of an observer, zero included; up to pi/dt in discrete time."""
-    found = speeds(poles_of(observer), observer.dt) if observer.order else np.ones(1)
-    alive = found[np.isfinite(found) & (found > 0.0)]
+    frequencies = speeds(poles_of(observer), observer.dt) if observer.order else np.ones(1)
+    alive = frequencies[np.isfinite(frequencies) & (frequencies > 0.0)]
     low = float(np.min(alive, initial=1.0 if not alive.size else np.inf)) / GRID_REACH
     high = float(np.max(alive, initial=1.0 if not alive.size else 0.0)) * GRID_REACH
     if observer.dt > 0.0:

@@ -75,12 +75,12 @@ class LinearObserver(EstimateRows, Observer[LinearState, FloatArray]):
     def __post_init__(self) -> None:
         for field in NAME_FIELDS:
             require_names(getattr(self, field), field)
-        given = {name: as_matrix(getattr(self, name), name) for name in ("Az", "Bu", "By", "Cz", "Du", "Dy")}
-        nz, nu, ny = given["Az"].shape[0], len(self.input_names), len(self.output_names)
+        matrices = {name: as_matrix(getattr(self, name), name) for name in ("Az", "Bu", "By", "Cz", "Du", "Dy")}
+        nz, nu, ny = matrices["Az"].shape[0], len(self.input_names), len(self.output_names)
         rows = len(self.state_names) + len(self.fault_names) + len(self.residual_names)
         shapes = {"Az": (nz, nz), "Bu": (nz, nu), "By": (nz, ny), "Cz": (rows, nz), "Du": (rows, nu), "Dy": (rows, ny)}
         for name, shape in shapes.items():
-            matrix = np.zeros(shape) if 0 in shape and given[name].size == 0 else given[name]
+            matrix = np.zeros(shape) if 0 in shape and matrices[name].size == 0 else matrices[name]
             require_shape(matrix.shape, shape, name)
             object.__setattr__(self, name, read_only(matrix))
         if self.constant is not None:
@@ -101,10 +101,10 @@ class LinearObserver(EstimateRows, Observer[LinearState, FloatArray]):
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field, as the constructor takes it."""
-        known = {field.name: getattr(self, field.name) for field in fields(self)}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
         if self.constant is None:
-            del known["constant"]
-        return known
+            del values["constant"]
+        return values
 
     @cached_property
     def added(self) -> FloatArray:

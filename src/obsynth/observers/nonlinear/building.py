@@ -139,9 +139,9 @@ def resolved_options(observer: DAEObserver) -> dict[str, Any]:
     return {name: bounds if name == "bounds" else getattr(observer, name) for name in OPTIONS}
 
 
-def _default_parameter_variances(model: DAEModel, given: Any) -> FloatArray:
+def _default_parameter_variances(model: DAEModel, stated: Any) -> FloatArray:
     sizes = np.abs(model.nominal_parameters)
-    if given is None and not sizes.all():
+    if stated is None and not sizes.all():
         name = model.parameter_names[int(np.argmin(sizes))]
         raise SpecError(
             f"initial_parameter_covariance is missing, and the nominal value of {name!r} is zero: state how large it "
@@ -195,8 +195,8 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
         transitions.append(np.array(rows.several.part("kept")))
 
     end = advanced(observer.steps, outputs, np.tile(u, (len(outputs), 1)), add)
-    found = gathered.estimates()
-    covariance = found.parameter_covariances[-1]
+    estimates = gathered.estimates()
+    covariance = estimates.parameter_covariances[-1]
     deviations = np.sqrt(np.diag(covariance))
     safe = np.where(deviations > 0.0, deviations, 1.0)
     identifiable = identifiability(
@@ -210,14 +210,14 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
         parameter_scales=np.sqrt(np.diag(observer.initial_parameter_covariance)),
     )
     return DAEFacts(
-        index=index_report(model, observer.dt, x=found.states[-1], u=u, theta=found.parameters[-1]).index,
-        condition=float(found.conditions.max()),
-        condition_k=int(np.argmax(found.conditions)),
-        residual=float(found.residuals.max()),
-        contraction=float(found.contraction[-1]),
+        index=index_report(model, observer.dt, x=estimates.states[-1], u=u, theta=estimates.parameters[-1]).index,
+        condition=float(estimates.conditions.max()),
+        condition_k=int(np.argmax(estimates.conditions)),
+        residual=float(estimates.residuals.max()),
+        contraction=float(estimates.contraction[-1]),
         deviations=read_only(deviations),
         correlations=read_only(covariance / np.outer(safe, safe)),
-        projection=found.projection,
+        projection=estimates.projection,
         identifiable=identifiable,
         K=read_only(observer.steps.part(end, "K")),
         Upsilon=read_only(observer.steps.part(end, "Upsilon")),

@@ -261,8 +261,8 @@ def compiler() -> list[str] | None:
     named = shlex.split(os.environ.get("CC", ""))
     if named:
         return named if shutil.which(named[0]) else None
-    found = next((name for name in COMPILERS if shutil.which(name)), None)
-    return None if found is None else [found]
+    command = next((name for name in COMPILERS if shutil.which(name)), None)
+    return None if command is None else [command]
 
 
 @lru_cache(maxsize=16)
@@ -320,9 +320,9 @@ class DAELibrary:
     def record(self, state: ctypes.Array[ctypes.c_char], y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Go on over some samples; return memory and row of each that could be taken."""
         graph = self.steps.graph
-        after, said = np.zeros((len(y), graph.memory.size)), np.zeros((len(y), graph.row.size))
-        taken = self._library.record(state, len(y), *map(_pointer, (_plain(u), _plain(y), after, said)))
-        return after[:taken], said[:taken]
+        after, rows = np.zeros((len(y), graph.memory.size)), np.zeros((len(y), graph.row.size))
+        taken = self._library.record(state, len(y), *map(_pointer, (_plain(u), _plain(y), after, rows)))
+        return after[:taken], rows[:taken]
 
     def batch(self, y: FloatArray, u: FloatArray) -> tuple[int, dict[str, FloatArray]]:
         """Run over records; return how many could be finished, and what is said by name."""

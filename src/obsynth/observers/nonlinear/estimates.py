@@ -122,12 +122,12 @@ class DAERow:
         rows = self.several
         if rows is not self:
             return np.array([self.condition])
-        found, begin = np.full(len(rows.memory), np.inf), int(self.k == 0)
-        found[:begin] = 1.0
+        numbers, begin = np.full(len(rows.memory), np.inf), int(self.k == 0)
+        numbers[:begin] = 1.0
         values = np.linalg.svd(rows.part("scaled")[begin:], compute_uv=False)
         least = values[:, -1]
-        np.divide(values[:, 0], least, out=found[begin:], where=least > 0.0)
-        return found
+        np.divide(values[:, 0], least, out=numbers[begin:], where=least > 0.0)
+        return numbers
 
     @property
     def condition(self) -> float:
@@ -188,10 +188,10 @@ class GatheredRows:
         """Return what was gathered."""
         self._keep_single()
         first, *more = self.parts
-        whole = {name: np.concatenate([part[name] for part in self.parts]) for name in first} if more else dict(first)
-        whole["excitation"] = _excitation(self.observer, whole["informations"])
-        received = read_only(~np.isnan(whole["innovations"]), bool)
-        return named_estimates(self.observer, **whole, projection=self.projection, received=received)
+        columns = {name: np.concatenate([part[name] for part in self.parts]) for name in first} if more else dict(first)
+        columns["excitation"] = _excitation(self.observer, columns["informations"])
+        received = read_only(~np.isnan(columns["innovations"]), bool)
+        return named_estimates(self.observer, **columns, projection=self.projection, received=received)
 
 
 def require_regular(observer: DAESettings, rows: DAERow, conditions: FloatArray) -> None:

@@ -242,17 +242,17 @@ class DAEObserver(DAESettings):
                 f"The C code has no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled"
             )
         library = self.library if compiled else None
-        found = GatheredRows(self)
-        found.add(_nothing(self.steps))
+        gathered = GatheredRows(self)
+        gathered.add(_nothing(self.steps))
         with shown_progress(progress, len(outputs), "samples") as note:
             if library is not None:
-                _in_c(self.steps, library, outputs, inputs, found.add_regular, note)
+                _in_c(self.steps, library, outputs, inputs, gathered.add_regular, note)
             elif compiled is None and self.is_plain and not alone:
-                advanced(self.steps, outputs, inputs, found.add_regular, note)
+                advanced(self.steps, outputs, inputs, gathered.add_regular, note)
             else:
                 state = self.init()
                 for k in range(len(outputs)):
                     state, row = self.accept(state, outputs[k], inputs[k])
-                    found.add(row)
+                    gathered.add(row)
                     note(k + 1)
-        return found.estimates()
+        return gathered.estimates()

@@ -106,7 +106,7 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what makes it again in another process: what follows from it is made there anew."""
-        return {each.name: getattr(self, each.name) for each in fields(self)}
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
         for name, value in state.items():
@@ -128,8 +128,8 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field, as the constructor takes it."""
-        found = {each.name: getattr(self, each.name) for each in fields(self)}
-        return {**found, "model": self.model.as_dict(), "faults": list(self.faults), "region": dict(self.region)}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**values, "model": self.model.as_dict(), "faults": list(self.faults), "region": dict(self.region)}
 
     @cached_property
     def terms(self) -> NonlinearTerms:
@@ -144,7 +144,9 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
     @property
     def _slope_count(self) -> int:
         terms = self.terms
-        return sum(bool(terms.state_parts[j].any()) for each in terms.nonlinearities for j in each.arguments)
+        return sum(
+            bool(terms.state_parts[j].any()) for nonlinearity in terms.nonlinearities for j in nonlinearity.arguments
+        )
 
     @property
     def input_names(self) -> tuple[str, ...]:
@@ -197,8 +199,8 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
         terms = self.terms
 
         def equations(rates: Any, z: Any, inputs: Any, _: Any) -> list[Any]:
-            state, known = ca.vertcat(*z), ca.vertcat(*inputs)
-            u, y = known[: len(terms.input_names)], known[len(terms.input_names) :]
+            state, signals = ca.vertcat(*z), ca.vertcat(*inputs)
+            u, y = signals[: len(terms.input_names)], signals[len(terms.input_names) :]
             values = self._continued(state, u)
             expected = _times(terms.C, state) + ca.DM(terms.c_y) + _times(terms.Wy, values)
             total = _times(terms.A, state) + _times(terms.B, u) + ca.DM(terms.c) + _times(terms.W, values)
@@ -226,17 +228,18 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
         arguments = _times(terms.state_parts, z) + _times(terms.input_parts, u)
         clipped = [ca.fmin(ca.fmax(arguments[j], low), high) for j, (low, high) in enumerate(ranges)]
         middle = iter(0.5 * (self.slopes[:, 0] + self.slopes[:, 1]))
-        found = []
-        for each in terms.nonlinearities:
-            known = {
-                f"{ARGUMENT}{j}": clipped[j] if terms.state_parts[j].any() else arguments[j] for j in each.arguments
+        values = []
+        for nonlinearity in terms.nonlinearities:
+            argument_values = {
+                f"{ARGUMENT}{j}": clipped[j] if terms.state_parts[j].any() else arguments[j]
+                for j in nonlinearity.arguments
             }
-            value = symbolic_value(each.expression, known)
-            for j in each.arguments:
+            value = symbolic_value(nonlinearity.expression, argument_values)
+            for j in nonlinearity.arguments:
                 if terms.state_parts[j].any():
                     value += next(middle) * (arguments[j] - clipped[j])
-            found.append(value)
-        return ca.vertcat(*found) if found else ca.SX(0, 1)
+            values.append(value)
+        return ca.vertcat(*values) if values else ca.SX(0, 1)
 
     @cached_property
     def _implicit(self) -> ImplicitStep:
@@ -247,8 +250,8 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
         """The function from z and u to the expected outputs."""
         terms = self.terms
         z, u = ca.SX.sym("z", len(terms.names)), ca.SX.sym("u", len(terms.input_names))
-        seen = _times(terms.C, z) + ca.DM(terms.c_y) + _times(terms.Wy, self._continued(z, u))
-        return ca.Function("expected", [z, u], [ca.densify(seen)])
+        outputs = _times(terms.C, z) + ca.DM(terms.c_y) + _times(terms.Wy, self._continued(z, u))
+        return ca.Function("expected", [z, u], [ca.densify(outputs)])
 
     @cached_property
     def _limits(self) -> tuple[FloatArray, FloatArray, FloatArray, tuple[tuple[int, int, float], ...]]:
@@ -264,8 +267,10 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
         """
         states, inputs, ranges, measured = self._limits
         values = states @ z + inputs @ u
-        seen = all(ranges[place, 0] <= y[output] - constant <= ranges[place, 1] for place, output, constant in measured)
-        return seen and bool(np.all((values >= ranges[:, 0]) & (values <= ranges[:, 1])))
+        outputs_inside = all(
+            ranges[place, 0] <= y[output] - constant <= ranges[place, 1] for place, output, constant in measured
+        )
+        return outputs_inside and bool(np.all((values >= ranges[:, 0]) & (values <= ranges[:, 1])))
 
     def rows_without_claim(self, seconds: float) -> int:
         """Return the rows until a hundredth of an error is left.
@@ -300,8 +305,8 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
         """
         inputs = np.concatenate([u, y])
         before = state.inputs if state.k else None
-        found = self._implicit.solve(state.z, inputs, np.zeros(0), before=before, k=state.k)
-        z = np.array(found.x)
+        solution = self._implicit.solve(state.z, inputs, np.zeros(0), before=before, k=state.k)
+        z = np.array(solution.x)
         expected = np.array(self._expected(z, u).full())[:, 0]
         inside = self.is_inside(z, u, y)
         unclaimed = max(state.unclaimed - 1, 0) if inside else self.forgetting
@@ -325,8 +330,8 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
         """
         require_kind(state, RegionState, "state", "what init() or the step before returned")
         outputs = checked_sample(y, len(self.output_names), "y")
-        known = checked_sample(u, len(self.input_names), "u") if self.input_names else np.zeros(0)
-        after, row = self.advance(state, outputs, known)
+        known_inputs = checked_sample(u, len(self.input_names), "u") if self.input_names else np.zeros(0)
+        after, row = self.advance(state, outputs, known_inputs)
         return after, self.split(row[None, :])
 
     def run(self, y: ArrayLike, u: ArrayLike | None = None) -> Estimates:
@@ -354,11 +359,11 @@ class RegionObserver(EstimateRows, Observer[RegionState, FloatArray]):
         y, u : array_like
             As for `run`.
         """
-        outputs, known = whole_record(y, u, len(self.output_names), len(self.input_names), complete=True)
+        outputs, known_inputs = whole_record(y, u, len(self.output_names), len(self.input_names), complete=True)
         state, rows = self.init(), np.empty((len(outputs), len(self.row_names)))
         claimed = np.empty(len(outputs), dtype=bool)
         for k in range(len(outputs)):
-            state, rows[k] = self.advance(state, outputs[k], known[k])
+            state, rows[k] = self.advance(state, outputs[k], known_inputs[k])
             claimed[k] = not state.unclaimed
         return rows, claimed
 

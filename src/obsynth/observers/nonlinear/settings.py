@@ -151,8 +151,8 @@ class DAESettings(StepObserver):
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field as data."""
-        found = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {**found, "model": self.model.as_dict()}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**values, "model": self.model.as_dict()}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
@@ -170,11 +170,11 @@ class Layout:
     @cached_property
     def slices(self) -> dict[str, slice]:
         """Where each array lies."""
-        found, begin = {}, 0
+        places, begin = {}, 0
         for name, (rows, columns) in self.shapes.items():
-            found[name] = slice(begin, begin + rows * columns)
+            places[name] = slice(begin, begin + rows * columns)
             begin += rows * columns
-        return found
+        return places
 
     @cached_property
     def size(self) -> int:

@@ -53,13 +53,15 @@ class ObserverGraph:
     def forecast(self) -> Any:
         """From memory and row of a sample that nothing was seen of to mean and covariance of its outputs."""
         packed, said = ca.MX.sym("memory", self.memory.size), ca.MX.sym("said", self.row.size)
-        found = {**self.memory.symbols(packed), **self.row.symbols(said)}
-        spread = found["spread"]
-        y, H, L = self.functions.output_function(found["posterior"], found["theta"])
-        cross = found["cross"] if self.settings.form == "augmented-kalman" else found["Upsilon"] @ spread
-        both = H @ cross @ L.T
-        whole = H @ found["covariance"] @ H.T + both + both.T + L @ spread @ L.T + ca.DM(self.settings.R)
-        return ca.Function("forecast", [packed, said], [ca.densify(y), ca.densify(whole)])
+        arrays = {**self.memory.symbols(packed), **self.row.symbols(said)}
+        spread = arrays["spread"]
+        y, H, L = self.functions.output_function(arrays["posterior"], arrays["theta"])
+        cross = arrays["cross"] if self.settings.form == "augmented-kalman" else arrays["Upsilon"] @ spread
+        through_both = H @ cross @ L.T
+        covariance = (
+            H @ arrays["covariance"] @ H.T + through_both + through_both.T + L @ spread @ L.T + ca.DM(self.settings.R)
+        )
+        return ca.Function("forecast", [packed, said], [ca.densify(y), ca.densify(covariance)])
 
     def over(self, samples: int) -> Any:
         """Return `whole` over several samples: from memory and arriving columns to columns of memory and row."""
@@ -85,8 +87,8 @@ def observer_graph(observer: DAESettings) -> ObserverGraph:
     before = memory.symbols(packed)
     local = step.sensitivities(X, before["posterior"], u, before["theta"])
     predicted = _predicted(observer, before, X[-nx:], local, missing)
-    found = {**nothing, **_Update(observer, functions, y, seen).later(predicted)}
-    sample = ca.Function("sample", [packed, X, u, y, seen, missing], _outcome(found, memory, row))
+    updated = {**nothing, **_Update(observer, functions, y, seen).later(predicted)}
+    sample = ca.Function("sample", [packed, X, u, y, seen, missing], _outcome(updated, memory, row))
     if step.small:
         first, sample = first.expand(), sample.expand()
     arriving = ca.MX.sym("arriving", nu + 2 * ny)
@@ -100,8 +102,8 @@ def observer_graph(observer: DAESettings) -> ObserverGraph:
     return ObserverGraph(observer, memory, row, functions, step, first, sample, whole)
 
 
-def _outcome(found: Arrays, memory: Layout, row: Layout) -> list[Any]:
-    return [memory.column(found), row.column(found)]
+def _outcome(arrays: Arrays, memory: Layout, row: Layout) -> list[Any]:
+    return [memory.column(arrays), row.column(arrays)]
 
 
 def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, ...], missing: Any) -> Arrays:
@@ -126,8 +128,8 @@ def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, 
         # What was learnt holds for the parameters before their walk: a share of it holds for those after, and what
         # that leaves open is noise of the state alone (Hsieh and Chen 1999), so that both stay uncorrelated.
         kept_share = definite_solved(walked, spread).T
-        left = spread - kept_share @ spread
-        P, carried = P + carried @ (0.5 * (left + left.T)) @ carried.T, carried @ kept_share
+        remaining_spread = spread - kept_share @ spread
+        P, carried = P + carried @ (0.5 * (remaining_spread + remaining_spread.T)) @ carried.T, carried @ kept_share
         after["S"] = before["S"] + ca.DM(observer.random_walk)
     after["P"] = 0.5 * (P + P.T)
     after["Upsilon"] = carried + G
@@ -142,67 +144,67 @@ class _Update:
         # The rows and columns of R that are not seen become those of the identity, which nothing else touches.
         self.R = ca.DM(observer.R) * (seen @ seen.T) + ca.diag(1.0 - seen)
 
-    def first(self, found: Arrays) -> Arrays:
+    def first(self, predicted: Arrays) -> Arrays:
         """Correct the state only: y(0) says nothing of the parameters that the start does not."""
-        innovation = self._innovation(found)
+        innovation = self._innovation(predicted)
         return self._joint(innovation, learns=False) if self._is_joint else self._corrected(innovation)
 
-    def later(self, found: Arrays) -> Arrays:
+    def later(self, predicted: Arrays) -> Arrays:
         """Update parameters and state."""
-        innovation = self._innovation(found)
+        innovation = self._innovation(predicted)
         return self._joint(innovation, learns=True) if self._is_joint else self._corrected(self._learnt(innovation))
 
     @property
     def _is_joint(self) -> bool:
         return self.observer.form == "augmented-kalman"
 
-    def _received_outputs(self, found: Arrays) -> tuple[Any, Any, Any, Any, Any]:
+    def _received_outputs(self, arrays: Arrays) -> tuple[Any, Any, Any, Any, Any]:
         """Return H and L as they are, and innovation, H and L with zeros where nothing is seen."""
-        predicted, H, L = self.functions.output_function(found["x"], found["theta"])
+        predicted, H, L = self.functions.output_function(arrays["x"], arrays["theta"])
         mask = ca.diag(self.seen)
         return H, L, self.seen * (self.y - predicted), mask @ H, mask @ L
 
-    def _innovation(self, found: Arrays) -> Arrays:
+    def _innovation(self, arrays: Arrays) -> Arrays:
         """Step 6, with the square of the innovation in units of its covariance and what it says of the parameters."""
-        _, _, e, H, L = self._received_outputs(found)
-        Sigma = H @ found["P"] @ H.T + self.R
-        Omega = H @ found["Upsilon"] + L
+        _, _, e, H, L = self._received_outputs(arrays)
+        Sigma = H @ arrays["P"] @ H.T + self.R
+        Omega = H @ arrays["Upsilon"] + L
         if self._is_joint:
-            through = H @ found["cross"] @ L.T
-            covariance = Sigma + through + through.T + L @ found["spread"] @ L.T
+            through = H @ arrays["cross"] @ L.T
+            covariance = Sigma + through + through.T + L @ arrays["spread"] @ L.T
         else:
-            covariance = Sigma + Omega @ found["spread"] @ Omega.T
+            covariance = Sigma + Omega @ arrays["spread"] @ Omega.T
         return {
-            **found,
+            **arrays,
             "innovation": e,
             "expected": covariance,
             "nis": e.T @ definite_solved(covariance, e),
             "Sigma": Sigma,
             "Omega": Omega,
             "information": Omega.T @ definite_solved(Sigma, Omega),
-            "score": Omega.T @ definite_solved(Sigma, e + Omega @ found["theta"]),
+            "score": Omega.T @ definite_solved(Sigma, e + Omega @ arrays["theta"]),
             "seen H": H,
             "seen L": L,
         }
 
-    def _learnt(self, found: Arrays) -> Arrays:
+    def _learnt(self, arrays: Arrays) -> Arrays:
         """Steps 7 to 9 and 11: (17)-(19); a sample without a measurement changes nothing."""
-        observer, Sigma, Omega = self.observer, found["Sigma"], found["Omega"]
-        prior, spread = self._remembered(found["S"]), found["spread"]
+        observer, Sigma, Omega = self.observer, arrays["Sigma"], arrays["Omega"]
+        prior, spread = self._remembered(arrays["S"]), arrays["spread"]
         weight = self.R if observer.weight == "paper" else Sigma
         gain = definite_solved(weight + Omega @ prior @ Omega.T, Omega @ prior).T
         S = prior - gain @ Omega @ prior
         kept = ca.DM.eye(observer.model.nq) - gain @ Omega
-        theta = self._bounded(found["theta"] + gain @ found["innovation"])
+        theta = self._bounded(arrays["theta"] + gain @ arrays["innovation"])
         spread = kept @ spread @ kept.T + gain @ Sigma @ gain.T
         after = {
             "S": 0.5 * (S + S.T),
             "spread": 0.5 * (spread + spread.T),
             "theta": theta,
-            "x": found["x"] + found["Upsilon"] @ (theta - found["theta"]),
+            "x": arrays["x"] + arrays["Upsilon"] @ (theta - arrays["theta"]),
         }
         anything = ca.sum1(self.seen) > 0.0
-        return {**found, **{name: ca.if_else(anything, value, found[name]) for name, value in after.items()}}
+        return {**arrays, **{name: ca.if_else(anything, value, arrays[name]) for name, value in after.items()}}
 
     def _remembered(self, S: Any) -> Any:
         """Return S / lambda, or S that has walked, or what is left of the information beside that of S_0."""
@@ -211,10 +213,10 @@ class _Update:
             return S
         if observer.guard == "none" or observer.forgetting == 1.0:
             return S / observer.forgetting
-        one = ca.MX(ca.DM.eye(observer.model.nq))
+        identity = ca.MX(ca.DM.eye(observer.model.nq))
         start = np.linalg.inv(observer.initial_parameter_covariance) if observer.model.nq else np.zeros((0, 0))
-        kept = observer.forgetting * definite_solved(S, one) + (1.0 - observer.forgetting) * ca.DM(start)
-        prior = definite_solved(kept, one)
+        kept = observer.forgetting * definite_solved(S, identity) + (1.0 - observer.forgetting) * ca.DM(start)
+        prior = definite_solved(kept, identity)
         return 0.5 * (prior + prior.T)
 
     def _bounded(self, theta: Any) -> Any:
@@ -224,40 +226,40 @@ class _Update:
             entries[i] = ca.fmin(entries[i], high) if np.isfinite(high) else entries[i]
         return ca.vertcat(*entries) if entries else theta
 
-    def _corrected(self, found: Arrays) -> Arrays:
+    def _corrected(self, arrays: Arrays) -> Arrays:
         """Step 10: the gain at the updated estimate, the state after the measurement, and its covariance."""
-        full_H, full_L, e, H, _ = self._received_outputs(found)
-        P = found["P"]
+        full_H, full_L, e, H, _ = self._received_outputs(arrays)
+        P = arrays["P"]
         K = definite_solved(H @ P @ H.T + self.R, H @ P).T @ ca.diag(self.seen)
         kept = ca.DM.eye(self.observer.model.nx) - K @ full_H
-        through = kept @ found["Upsilon"] - K @ full_L
+        through = kept @ arrays["Upsilon"] - K @ full_L
         own = kept @ P @ kept.T + K @ ca.DM(self.observer.R) @ K.T
-        covariance = own + through @ found["spread"] @ through.T
-        return {**found, "H": full_H, "L": full_L, "K": K, "posterior": found["x"] + K @ e, "covariance": covariance}
+        covariance = own + through @ arrays["spread"] @ through.T
+        return {**arrays, "H": full_H, "L": full_L, "K": K, "posterior": arrays["x"] + K @ e, "covariance": covariance}
 
-    def _joint(self, found: Arrays, *, learns: bool) -> Arrays:
+    def _joint(self, arrays: Arrays, *, learns: bool) -> Arrays:
         """Update states and parameters together, in Joseph's form."""
         nx, nq = self.observer.model.nx, self.observer.model.nq
-        P, cross, spread, H, L = (found[name] for name in ("P", "cross", "spread", "seen H", "seen L"))
-        whole = ca.vertcat(ca.horzcat(P, cross), ca.horzcat(cross.T, spread))
+        P, cross, spread, H, L = (arrays[name] for name in ("P", "cross", "spread", "seen H", "seen L"))
+        joint = ca.vertcat(ca.horzcat(P, cross), ca.horzcat(cross.T, spread))
         rows, mask = ca.horzcat(H, L), ca.diag(self.seen)
         if learns:
-            gain = definite_solved(rows @ whole @ rows.T + self.R, rows @ whole).T @ mask
+            gain = definite_solved(rows @ joint @ rows.T + self.R, rows @ joint).T @ mask
         else:
             gain = ca.vertcat(definite_solved(H @ P @ H.T + self.R, H @ P).T @ mask, ca.DM.zeros(nq, mask.shape[0]))
         kept = ca.DM.eye(nx + nq) - gain @ rows
-        whole = kept @ whole @ kept.T + gain @ self.R @ gain.T
-        whole = 0.5 * (whole + whole.T)
-        correction = gain @ found["innovation"]
+        joint = kept @ joint @ kept.T + gain @ self.R @ gain.T
+        joint = 0.5 * (joint + joint.T)
+        correction = gain @ arrays["innovation"]
         after = {
-            **found,
-            "P": whole[:nx, :nx],
-            "cross": whole[:nx, nx:],
-            "spread": whole[nx:, nx:],
-            "x": found["x"] + correction[:nx],
-            "theta": self._bounded(found["theta"] + correction[nx:]),
+            **arrays,
+            "P": joint[:nx, :nx],
+            "cross": joint[:nx, nx:],
+            "spread": joint[nx:, nx:],
+            "x": arrays["x"] + correction[:nx],
+            "theta": self._bounded(arrays["theta"] + correction[nx:]),
             "K": gain[:nx, :],
-            "covariance": whole[:nx, :nx],
+            "covariance": joint[:nx, :nx],
         }
         full_H, full_L, *_ = self._received_outputs(after)
         return {**after, "H": full_H, "L": full_L, "posterior": after["x"]}

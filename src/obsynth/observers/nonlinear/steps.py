@@ -120,16 +120,16 @@ class Steps:
         if math.isnan(y.dot(y)):
             seen = arriving = ~np.isnan(y)
             received = np.where(seen, y, 0.0)
-        known = taken_inputs(state.inputs, state.u, u, is_first=state.k == 0)
+        taken = taken_inputs(state.inputs, state.u, u, is_first=state.k == 0)
         if state.k == 0:
             begun, moved = self.projected(state, u)
             after, said = self._call("first", begun, received, seen)
-        elif known.variances is not None:
-            after, said = self._carefully(state, received, seen, known)
+        elif taken.variances is not None:
+            after, said = self._carefully(state, received, seen, taken)
         else:
             after, said = self._call("whole", state.memory, np.concatenate((u, received, arriving)))
             if said[-1, 0] != 1.0:
-                after, said = self._carefully(state, received, seen, known)
+                after, said = self._carefully(state, received, seen, taken)
         memory = after[:, 0]
         if not all_finite(memory):
             raise SolverError(
@@ -139,7 +139,7 @@ class Steps:
             )
         row = DAERow(self.graph, state.k, memory, said[:, 0], seen, moved)
         informations = (*state.informations, row.part("information"))[-self.settings.window :]
-        return DAEState(memory, state.k + 1, known.u, informations, *state[4:7], known.history), row
+        return DAEState(memory, state.k + 1, taken.u, informations, *state[4:7], taken.history), row
 
     def stretch(
         self, state: DAEState, y: FloatArray, u: FloatArray, run: Callable[..., tuple[FloatArray, ...]]
@@ -147,7 +147,7 @@ class Steps:
         """Advance until a step is not solved, by `ObserverGraph.whole` over so many samples; return what is reached."""
         seen = ~np.isnan(y)
         arriving = np.hstack([u, np.where(seen, y, 0.0), seen])
-        after, said = (found.T for found in run(state.memory, arriving.ravel()))
+        after, said = (part.T for part in run(state.memory, arriving.ravel()))
         good = (said[:, -1] == 1.0) & np.isfinite(after).all(axis=1)
         taken = len(y) if good.all() else int(np.argmin(good))
         rows = DAERow(self.graph, state.k, after[:taken], said[:taken], seen[:taken], np.zeros(0))
@@ -166,25 +166,25 @@ class Steps:
     def projected(self, state: DAEState, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Put the initial state onto the algebraic equations; return the memory and how far it moved."""
         start = self.part(state, "x")
-        found = onto_constraint(self.settings.model, start, u, self.part(state, "theta"), self.settings.dt)
-        if found is start:
+        on_constraint = onto_constraint(self.settings.model, start, u, self.part(state, "theta"), self.settings.dt)
+        if on_constraint is start:
             return state.memory, np.zeros_like(start)
-        return initial_memory(self.settings, found), found - start
+        return initial_memory(self.settings, on_constraint), on_constraint - start
 
     def _carefully(
-        self, state: DAEState, y: FloatArray, seen: FloatArray, known: TakenInputs
+        self, state: DAEState, y: FloatArray, seen: FloatArray, taken: TakenInputs
     ) -> tuple[FloatArray, ...]:
         """Take a step that needs damping or a homotopy, or whose inputs are not all known: solved outside the graph,
         and all else in it."""
         posterior, theta = self.part(state, "posterior"), self.part(state, "theta")
         missing = np.zeros(self.settings.model.nx**2)
-        if known.variances is None:
-            solution = self.implicit.solve_carefully(posterior, known.u, theta, before=state.u, k=state.k)
+        if taken.variances is None:
+            solution = self.implicit.solve_carefully(posterior, taken.u, theta, before=state.u, k=state.k)
         else:
-            solution = self.implicit.solve(posterior, known.u, theta, before=state.u, k=state.k)
-            (found,) = self._call("unknown", state.memory, solution.stages, known.u, known.variances)
-            missing = found.ravel(order="F")
-        after, said = self._call("sample", state.memory, solution.stages, known.u, y, seen, missing)
+            solution = self.implicit.solve(posterior, taken.u, theta, before=state.u, k=state.k)
+            (added,) = self._call("unknown", state.memory, solution.stages, taken.u, taken.variances)
+            missing = added.ravel(order="F")
+        after, said = self._call("sample", state.memory, solution.stages, taken.u, y, seen, missing)
         said[-2:, 0] = solution.residual, 1.0
         return after, said
 

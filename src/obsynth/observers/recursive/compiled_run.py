@@ -162,12 +162,12 @@ def stacked_steps(
     turned = np.concatenate((orthogonal[:, :, n:], orthogonal[:, :, :n]), axis=2)
     moved = np.matmul(step.A.transpose(0, 2, 1), turned[:, :ne])
     # The triangular factors of the rotated noise.
-    known = np.asarray(np.linalg.qr(np.matmul(step.noise.transpose(0, 2, 1), turned), mode="r"))
-    known = np.pad(known, ((0, 0), (0, rows - known.shape[1]), (0, 0)))
+    noise = np.asarray(np.linalg.qr(np.matmul(step.noise.transpose(0, 2, 1), turned), mode="r"))
+    noise = np.pad(noise, ((0, 0), (0, rows - noise.shape[1]), (0, 0)))
     right = np.concatenate((_products(step.B, before), y - _products(step.D, u), _products(step.Dn, u)), axis=1)
     data = _products(turned.transpose(0, 2, 1), right)
     head, data = np.ascontiguousarray(triangle[:, :n]), np.ascontiguousarray(data[:count])
-    return np.ascontiguousarray(moved), np.ascontiguousarray(known), head, data
+    return np.ascontiguousarray(moved), np.ascontiguousarray(noise), head, data
 
 
 def stacked_matrices(model: StepModel, first: int, count: int) -> StepMatrices:
@@ -199,8 +199,8 @@ def _stack(sequence: MatrixSequence, first: int, count: int) -> FloatArray:
 
 def _joined(above: FloatArray, below: FloatArray) -> FloatArray:
     count = max(len(above), len(below))
-    both = [np.broadcast_to(part, (count, *part.shape[1:])) for part in (above, below)]
-    return np.concatenate(both, axis=1)
+    widened = [np.broadcast_to(part, (count, *part.shape[1:])) for part in (above, below)]
+    return np.concatenate(widened, axis=1)
 
 
 def _products(matrices: FloatArray, rows: FloatArray) -> FloatArray:

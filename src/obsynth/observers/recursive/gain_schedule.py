@@ -69,28 +69,30 @@ def gain_steps(
         if nq:
             right = np.hstack([right, np.vstack([step.A @ Upsilon + step.Phi, -step.Psi])])
         complete = received is None or not k or bool(received[k].all())
-        found = None
+        solved = None
         if complete and not diffuse.shape[1]:
             prepared = PreparedStep.of(step, prepared)
-            found = prepared.taken(factor, right if nq else None)
+            solved = prepared.taken(factor, right if nq else None)
         # The literal form asks for the noise itself.
-        if found is None or recursion.literal:
+        if solved is None or recursion.literal:
             S, unknown = spreads(step, factor, diffuse, k, observer.state_names)
             H = step.H
             if not complete and received is not None:
                 kept = np.concatenate([np.ones(ne, dtype=bool), received[k], np.ones(len(step.Dn), dtype=bool)])
                 H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]
-            if found is None and not unknown.shape[1] and not complete:
-                found = least_squares_step(H, S, right)
-            found = found or rank_revealing_step(H, S, right, unknown, mapped=rows)
-        diffuse = found.diffuse
-        gain, Upsilon, factor = found.estimate[:, :rows], found.estimate[:, rows:], found.factor
-        parity, G = found.innovation[:, :rows], -found.innovation[:, rows:]
+            if solved is None and not unknown.shape[1] and not complete:
+                solved = least_squares_step(H, S, right)
+            solved = solved or rank_revealing_step(H, S, right, unknown, mapped=rows)
+        diffuse = solved.diffuse
+        gain, Upsilon, factor = solved.estimate[:, :rows], solved.estimate[:, rows:], solved.factor
+        parity, G = solved.innovation[:, :rows], -solved.innovation[:, rows:]
         learn, retain = np.zeros((nq, rows)), np.eye(nq)
         if adaptation is not None and nq:
-            seen, regressor, noise = parity, G, None
+            innovation_map, regressor, noise = parity, G, None
             if recursion.literal and len(H) > ne:
-                seen, regressor, noise = posterior_residual(found, H, S, right, ne, unknown=unknown, columns=rows)
+                innovation_map, regressor, noise = posterior_residual(
+                    solved, H, S, right, ne, unknown=unknown, columns=rows
+                )
             parameters, theta_gain = update(
                 parameters,
                 np.zeros(len(regressor)),
@@ -100,7 +102,7 @@ def gain_steps(
                 directional=recursion.directional,
                 noise=noise,
             )
-            learn, retain = theta_gain @ seen, np.eye(nq) - theta_gain @ regressor
+            learn, retain = theta_gain @ innovation_map, np.eye(nq) - theta_gain @ regressor
         yield GainStep(step, gain, parity, G, Upsilon, factor, learn, retain, parameters.spread)
 
 
@@ -110,15 +112,15 @@ Gains: TypeAlias = Callable[[RecursiveObserver, int], Iterable[GainStep]]
 
 def gains_once() -> Gains:
     """Return `gain_steps` for several that look at the same gains, which are computed once if they are few numbers."""
-    known: dict[RecursiveObserver, tuple[int, list[GainStep], Iterator[GainStep]]] = {}
+    remembered_gains: dict[RecursiveObserver, tuple[int, list[GainStep], Iterator[GainStep]]] = {}
 
     def gains(observer: RecursiveObserver, steps: int) -> Iterable[GainStep]:
         if steps * (observer.plant.nx + observer.plant.nq) * (observer.plant.ne + observer.plant.ny) > MOST_KEPT_GAINS:
             yield from gain_steps(observer, steps)
             return
-        if observer not in known or known[observer][0] < steps:
-            known[observer] = steps, [], gain_steps(observer, steps)
-        _, kept, further = known[observer]
+        if observer not in remembered_gains or remembered_gains[observer][0] < steps:
+            remembered_gains[observer] = steps, [], gain_steps(observer, steps)
+        _, kept, further = remembered_gains[observer]
         for position in range(steps + int(observer.early_constraints)):
             if position == len(kept):
                 kept.append(next(further))
@@ -134,12 +136,12 @@ def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = N
     """
     if observer.adaptation is not None and observer.adaptation.reset:
         raise SpecError("Resets depend on the data of each trial: run them one by one, or without reset.", path="reset")
-    outputs, known = batch_record(y, u, observer.plant.ny, observer.plant.input_names)
+    outputs, given_inputs = batch_record(y, u, observer.plant.ny, observer.plant.input_names)
     trials, samples = outputs.shape[:2]
     if not np.isfinite(outputs[:, 1:]).all():
         raise SpecError("A batch must be complete: run trials with missing samples one by one.", path="y")
     require_horizon(observer.plant.horizon, samples, early=observer.early_constraints)
-    inputs = np.broadcast_to(known, (trials, *known.shape[-2:]))
+    inputs = np.broadcast_to(given_inputs, (trials, *given_inputs.shape[-2:]))
     start = observer.init()
     early = observer.recursion.model.first() is not None
     x = np.broadcast_to(start.x, (trials, len(start.x)))
@@ -165,9 +167,9 @@ def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = N
         x, theta = data @ gains.gain.T, theta @ gains.retain.T + data @ gains.learn.T
         keep(k, gains.Upsilon)
         innovations.append(data @ gains.parity.T)
-    padded = np.full((trials, samples, max(found.shape[1] for found in innovations)), np.nan)
-    for k, found in enumerate(innovations):
-        padded[:, k, : found.shape[1]] = found
+    padded = np.full((trials, samples, max(rows_of_step.shape[1] for rows_of_step in innovations)), np.nan)
+    for k, rows_of_step in enumerate(innovations):
+        padded[:, k, : rows_of_step.shape[1]] = rows_of_step
     return named_estimates(observer, states=states, faults=parameters, innovations=padded)
 
 
@@ -214,26 +216,26 @@ def _settled(observer: RecursiveObserver) -> tuple[GainStep, int]:
     last: GainStep | None = None
     early: GainStep | None = None
     still, before = 0, np.inf
-    for k, found in enumerate(gain_steps(observer, MOST_SETTLING_STEPS)):
+    for k, gains in enumerate(gain_steps(observer, MOST_SETTLING_STEPS)):
         if not k % STILL_FOR_LONG:
-            if early is not None and _moved(found, early) <= SETTLED_GAINS:
-                return found, k
-            early = found
+            if early is not None and _moved(gains, early) <= SETTLED_GAINS:
+                return gains, k
+            early = gains
         # The correction of the start, which comes first with early constraints, has other rows.
-        if last is not None and last.gain.shape == found.gain.shape:
-            moved = _moved(found, last)
+        if last is not None and last.gain.shape == gains.gain.shape:
+            moved = _moved(gains, last)
             # What is left of a geometric series, from two of its terms.
             rate = min(moved / before, 1.0) if 0.0 < before < np.inf else 1.0
-            left = moved / max(1.0 - rate, np.finfo(np.float64).eps) * rate
+            remaining = moved / max(1.0 - rate, np.finfo(np.float64).eps) * rate
             quiet = (
                 moved == 0.0
-                or (moved <= SETTLED_GAINS and left <= SETTLED_GAINS)
+                or (moved <= SETTLED_GAINS and remaining <= SETTLED_GAINS)
                 or moved <= 4.0 * np.finfo(np.float64).eps
             )
             still, before = still + 1 if quiet else 0, moved
             if still == STILL_STEPS:
-                return found, k
-        last = found
+                return gains, k
+        last = gains
     raise SolverError(
         f"The gains do not settle within {MOST_SETTLING_STEPS} steps: a mode is almost unobservable, or has almost no "
         "process noise. Run the recursion itself (obsynth run), or state more noise in Q.",
@@ -245,12 +247,12 @@ def _moved(now: GainStep, then: GainStep) -> float:
     """Return the largest relative distance between two gains; infinite for those of other rows."""
     if now.gain.shape != then.gain.shape:
         return np.inf
-    return max(_distance(one, other) for one, other in zip(_parts(now), _parts(then), strict=True))
+    return max(_distance(current, earlier) for current, earlier in zip(_parts(now), _parts(then), strict=True))
 
 
-def _parts(found: GainStep) -> tuple[FloatArray, ...]:
+def _parts(gains: GainStep) -> tuple[FloatArray, ...]:
     # The sign of a direction of the innovation is free, its square is not.
-    return found.gain, found.Upsilon, found.learn, found.retain, found.parity.T @ found.parity, found.G.T @ found.G
+    return gains.gain, gains.Upsilon, gains.learn, gains.retain, gains.parity.T @ gains.parity, gains.G.T @ gains.G
 
 
 def _distance(now: FloatArray, then: FloatArray) -> float:
@@ -258,19 +260,19 @@ def _distance(now: FloatArray, then: FloatArray) -> float:
     return float(np.abs(now - then).max(initial=0.0)) / size if size else 0.0
 
 
-def _realised(observer: RecursiveObserver, found: GainStep) -> tuple[LinearObserver, FloatArray]:
-    step, plant = found.step, observer.plant
+def _realised(observer: RecursiveObserver, gains: GainStep) -> tuple[LinearObserver, FloatArray]:
+    step, plant = gains.step, observer.plant
     ne, ny, nx = len(step.A), plant.ny, plant.nx
-    early, width = step.Dn, found.gain.shape[1]
+    early, width = step.Dn, gains.gain.shape[1]
     parts = slice(0, ne), slice(ne, ne + ny), slice(ne + ny, width)
-    gain, parity = [found.gain[:, part] for part in parts], [found.parity[:, part] for part in parts]
-    learn, q = [found.learn[:, part] for part in parts], len(found.retain)
-    random_walk = found.gain.shape[0] - nx
+    gain, parity = [gains.gain[:, part] for part in parts], [gains.parity[:, part] for part in parts]
+    learn, q = [gains.learn[:, part] for part in parts], len(gains.retain)
+    random_walk = gains.gain.shape[0] - nx
     # With z(k) = A x(k-1) + B u(k-1) and the gains [L K M] of the rows [z; y - D u; Dn u] (the last with early
     # constraints): xbar = L z + K (y - D u) + M Dn u, z(k+1) = A xbar + B u, and theta = retain theta(k-1) + learn
     # [z; y - D u; Dn u] by least squares, x = xbar + Upsilon theta. States: z, then the parameters one sample before.
     state = np.hstack([gain[0], np.zeros((len(gain[0]), q))])
-    theta = np.hstack([learn[0], found.retain])
+    theta = np.hstack([learn[0], gains.retain])
     az = np.vstack([step.A @ state, theta])
     by = np.vstack([step.A @ gain[1], learn[1]])
 
@@ -280,20 +282,20 @@ def _realised(observer: RecursiveObserver, found: GainStep) -> tuple[LinearObser
 
     bu = np.vstack([step.B + step.A @ of_inputs(gain[1], gain[2]), of_inputs(learn[1], learn[2])])
     # Rows of output: x (with Upsilon theta), theta, innovation less its regressor times theta of before.
-    upsilon = found.Upsilon[:nx]
-    shown = [state[:nx] + upsilon @ theta, np.vstack([state[nx:], theta]), np.hstack([parity[0], -found.G])]
-    seen = [gain[1][:nx] + upsilon @ learn[1], np.vstack([gain[1][nx:], learn[1]]), parity[1]]
+    upsilon = gains.Upsilon[:nx]
+    from_state = [state[:nx] + upsilon @ theta, np.vstack([state[nx:], theta]), np.hstack([parity[0], -gains.G])]
+    from_outputs = [gain[1][:nx] + upsilon @ learn[1], np.vstack([gain[1][nx:], learn[1]]), parity[1]]
     constrained = [gain[2][:nx] + upsilon @ learn[2], np.vstack([gain[2][nx:], learn[2]]), parity[2]]
-    fed = [of_inputs(measured, direct) for measured, direct in zip(seen, constrained, strict=True)]
-    residuals = tuple(f"innovation {i + 1}" for i in range(len(found.parity)))
+    fed = [of_inputs(measured, direct) for measured, direct in zip(from_outputs, constrained, strict=True)]
+    residuals = tuple(f"innovation {i + 1}" for i in range(len(gains.parity)))
     names = observer.fault_names if random_walk or q else ()
     realisation = LinearObserver(
         Az=az,
         Bu=bu,
         By=by,
-        Cz=np.vstack(shown),
+        Cz=np.vstack(from_state),
         Du=np.vstack(fed),
-        Dy=np.vstack(seen),
+        Dy=np.vstack(from_outputs),
         dt=observer.dt,
         input_names=plant.input_names,
         output_names=plant.output_names,

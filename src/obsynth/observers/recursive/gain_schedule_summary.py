@@ -77,23 +77,23 @@ def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_st
     random_walk = observer.form == "random-walk"
     # Of a walk, the state filter and the regressors are those of the model without the walk.
     plain = observer.without_walk
-    whole = steps + int(observer.early_constraints)
-    product, regressors, last = ErrorProduct(observer.plant.nx, _first_end(observer, whole)), [], None
+    all_steps = steps + int(observer.early_constraints)
+    product, regressors, last = ErrorProduct(observer.plant.nx, _first_end(observer, all_steps)), [], None
     kept: tuple[float, str] | None = None
     middle: FloatArray | None = None
-    for found in gains(plain, steps):
-        last, kept = found, None
-        regressors.append(found.G)
-        product.move(found.gain[:, : len(found.step.A)] @ found.step.A)
+    for gain_step in gains(plain, steps):
+        last, kept = gain_step, None
+        regressors.append(gain_step.G)
+        product.move(gain_step.gain[:, : len(gain_step.step.A)] @ gain_step.step.A)
         if product.done == product.steps // 2:
-            middle = found.gain
-        if product.done == product.steps < whole:
+            middle = gain_step.gain
+        if product.done == product.steps < all_steps:
             shrinks = product.contraction()[0] < 1.0
             if (shrinks or (kept := product.contraction_of_kept_gains()) is not None) and (
-                plain.plant.nx > MANY_STATES or _stays(found.gain, middle)
+                plain.plant.nx > MANY_STATES or _stays(gain_step.gain, middle)
             ):
                 break
-            product.go_on_to(end_of_steps(FOLLOW_FURTHER * product.steps, whole))
+            product.go_on_to(end_of_steps(FOLLOW_FURTHER * product.steps, all_steps))
     if last is None:
         raise SpecError("The plant has no steps.", path="horizon")
     (contraction, span), ne = kept if kept is not None else product.contraction(), len(last.step.A)
@@ -135,10 +135,10 @@ def _first_end(observer: RecursiveObserver, steps: int) -> int:
     return end_of_steps(max(FEWEST_FOLLOWED, round(steps * (MANY_STATES / plant.nx) ** 3)), steps)
 
 
-def end_of_steps(steps: int, whole: int) -> int:
+def end_of_steps(steps: int, all_steps: int) -> int:
     """Return where to look next: so many steps, or all where they are not twice as many: a later end must have less
     than half of its steps behind it, as the second half is looked at by itself."""
-    return steps if 2 * steps < whole else whole
+    return steps if 2 * steps < all_steps else all_steps
 
 
 def _stays(gain: FloatArray, before: FloatArray | None) -> bool:
@@ -208,15 +208,15 @@ class ErrorProduct:
             return self.ended
         steps = self.steps
         last = self._length()
-        whole = float(np.exp(last / steps))
+        per_step = float(np.exp(last / steps))
         # In units far apart, or where errors grow before they shrink, a slow mode may take longer than the horizon to
         # make an error smaller than it was: then errors must shrink over the second half, as a whole and in every mode.
-        radius = spectral_radius(self.late) if whole >= 1.0 else 1.0
+        radius = spectral_radius(self.late) if per_step >= 1.0 else 1.0
         slowest = max(last - self.middle, self.late_logarithm + float(np.log(radius)) if radius else -np.inf)
         second = float(np.exp(slowest / (steps - steps // 2)))
-        if whole >= 1.0 and second < 1.0 - BOUNDARY_TOLERANCE:
+        if per_step >= 1.0 and second < 1.0 - BOUNDARY_TOLERANCE:
             return second, "over the second half"
-        return whole, "from the start"
+        return per_step, "from the start"
 
 
 def norm_or_bound(matrix: FloatArray) -> float:

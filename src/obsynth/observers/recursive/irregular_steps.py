@@ -76,12 +76,12 @@ class IrregularSteps:
 
     def over(self, seconds: float) -> RecursiveObserver:
         """Return the observer whose next step takes so many seconds."""
-        found = self._kept.get(seconds)
-        if found is None:
+        observer = self._kept.get(seconds)
+        if observer is None:
             if len(self._kept) >= MOST_KEPT:
                 self._kept.clear()
-            found = self._kept[seconds] = self._made(seconds)
-        return found
+            observer = self._kept[seconds] = self._made(seconds)
+        return observer
 
     def _made(self, seconds: float) -> RecursiveObserver:
         observer, share = self.observer, seconds / self.observer.dt
@@ -125,7 +125,7 @@ def _agree(own: TimeVaryingDescriptorSystem, model: TimeVaryingDescriptorSystem)
     return all(_near(getattr(own, name).at(1), getattr(model, name).at(1)) for name in _MATRICES)
 
 
-def _near(one: FloatArray, other: FloatArray) -> bool:
-    if one.shape != other.shape:
+def _near(first: FloatArray, second: FloatArray) -> bool:
+    if first.shape != second.shape:
         return False
-    return bool(np.all(np.abs(one - other) <= SAME_MODEL * np.max(np.abs(one), initial=0.0)))
+    return bool(np.all(np.abs(first - second) <= SAME_MODEL * np.max(np.abs(first), initial=0.0)))

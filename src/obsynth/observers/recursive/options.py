@@ -52,8 +52,8 @@ def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[s
 def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """Return options as they are kept with a design: arrays and sequences as data, callables as they are."""
     plain: dict[str, Any] = {}
-    for name, given in options.items():
-        value = given.item() if isinstance(given, np.generic) else given
+    for name, stated in options.items():
+        value = stated.item() if isinstance(stated, np.generic) else stated
         if isinstance(value, MatrixSequence):
             plain[name] = value.as_data() if value.is_data else value.function
         elif (
@@ -74,14 +74,14 @@ def _sequence(value: Any, size: int, name: str, plant: TimeVaryingDescriptorSyst
         return MatrixSequence.of(np.eye(size), name)
     if is_number(value):
         value = real_number(value, name, "a variance, or a covariance matrix") * np.eye(size)
-    found = MatrixSequence.of(value, name, constants=plant.constants)
-    if found.length is not None and (plant.horizon is None or found.length < plant.horizon):
+    sequence = MatrixSequence.of(value, name, constants=plant.constants)
+    if sequence.length is not None and (plant.horizon is None or sequence.length < plant.horizon):
         raise SpecError(
-            f"{name} is a stack for {found.length} steps: it must reach as far as the plant's horizon "
+            f"{name} is a stack for {sequence.length} steps: it must reach as far as the plant's horizon "
             f"({plant.horizon or 'without end'}).",
             path=name,
         )
-    return found
+    return sequence
 
 
 def _vector(value: Any, size: int, name: str) -> FloatArray:

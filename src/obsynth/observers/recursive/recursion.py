@@ -125,16 +125,16 @@ class Recursion:
             return np.zeros(plant.ny), np.diag(np.full(plant.ny, np.inf))
         return self._outputs(self.plain(state, received, u)[1], taken_now(state, u))
 
-    def _outputs(self, row: RawEstimate, known: TakenInputs) -> tuple[FloatArray, FloatArray]:
+    def _outputs(self, row: RawEstimate, inputs: TakenInputs) -> tuple[FloatArray, FloatArray]:
         """Return mean ``(ny,)`` and covariance of outputs at what is known; the variance is infinite where nothing
         is."""
         plant, k = self.settings.plant, row.k
         C = plant.C.at(k)
         D = plant.D.at(k)
-        mean, reach = C @ row.x + D @ known.u, C @ row.factor
+        mean, reach = C @ row.x + D @ inputs.u, C @ row.factor
         covariance = reach @ reach.T + self.settings.R.at(k)
-        if known.missing is not None:
-            covariance = covariance + (D * known.missing) @ D.T
+        if inputs.missing is not None:
+            covariance = covariance + (D * inputs.missing) @ D.T
         if len(row.parameters.theta):
             Psi = plant.Psi.at(k - 1)
             moved = Psi @ row.parameters.spread
@@ -150,16 +150,16 @@ class Recursion:
         rows = early_rows(settings.plant, early=not settings.early_constraints)
         if not rows.size or not settings.Q.is_constant:
             return None
-        others = np.setdiff1d(np.arange(settings.plant.ne), rows)
-        return None if np.any(settings.Q.at(0)[np.ix_(others, rows)]) else steps_of(settings, rows)
+        dynamic_rows = np.setdiff1d(np.arange(settings.plant.ne), rows)
+        return None if np.any(settings.Q.at(0)[np.ix_(dynamic_rows, rows)]) else steps_of(settings, rows)
 
     def plain(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
         """Take a sample as it is."""
         theta = state.parameters.theta
-        known = taken_now(state, u)
-        u = known.u
+        inputs = taken_now(state, u)
+        u = inputs.u
         if state.k > 0:
-            after, v, G = self._stepped(state, self.step_of(state, known), y, u)
+            after, v, G = self._stepped(state, self.step_of(state, inputs), y, u)
         elif (first := self.model.first()) is not None:
             after, v, G = self._stepped(state, first, np.zeros(0), u)
         else:
@@ -181,16 +181,16 @@ class Recursion:
             surprises,
             resets,
             refused,
-            known.history,
-            known.missing,
+            inputs.history,
+            inputs.missing,
         )
         return taken, row
 
-    def step_of(self, state: RecursiveState, known: TakenInputs) -> StepMatrices:
+    def step_of(self, state: RecursiveState, inputs: TakenInputs) -> StepMatrices:
         """Return the step that ends at a sample after the first, with the noise that missing inputs are."""
         step = self.model.at(state.k - 1)
-        parts = [part for part in (state.missing, known.returned) if part is not None]
-        return step if not parts and known.missing is None else with_missing_inputs(step, sum(parts), known.missing)
+        parts = [part for part in (state.missing, inputs.returned) if part is not None]
+        return step if not parts and inputs.missing is None else with_missing_inputs(step, sum(parts), inputs.missing)
 
     def _stepped(
         self, state: RecursiveState, step: StepMatrices, y: FloatArray, u: FloatArray
@@ -198,14 +198,14 @@ class Recursion:
         """Take the step that ends at the sample ``y``; return also innovation and regressor."""
         nq = state.Upsilon.shape[1]
         right = right_side(step, state.x, state.Upsilon, state.u, y, u)
-        found, learned = None, None
+        solved, learned = None, None
         # The product is NaN exactly if a sample is.
         if not (self.literal or state.diffuse.shape[1] or math.isnan(y.dot(y))):
             self._prepared = PreparedStep.of(step, self._prepared)
-            found = self._prepared.taken(state.factor, right)
-        if found is None:
-            found, learned = self._careful(state, step, right)
-        v, G = found.innovation[:, 0], -found.innovation[:, 1:]
+            solved = self._prepared.taken(state.factor, right)
+        if solved is None:
+            solved, learned = self._careful(state, step, right)
+        v, G = solved.innovation[:, 0], -solved.innovation[:, 1:]
         parameters, surprises, resets = state.parameters, state.surprises, state.resets
         if nq and self.settings.adaptation is not None:
             if self.settings.adaptation.reset:
@@ -228,10 +228,10 @@ class Recursion:
             )
         after = RecursiveState(
             state.k,
-            found.estimate[:, 0],
-            found.factor,
-            found.estimate[:, 1:],
-            found.diffuse,
+            solved.estimate[:, 0],
+            solved.factor,
+            solved.estimate[:, 1:],
+            solved.diffuse,
             parameters,
             state.u,
             state.regressors,
@@ -254,21 +254,21 @@ class Recursion:
         complete = bool(kept.all())
         if not complete:
             H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]
-        found = None
+        solved = None
         if not unknown.shape[1] and S.shape[1] >= len(S):
-            found = least_squares_step(H, S, right, least=DEPENDENT_COLUMN if complete else SUSPECT_COLUMN)
-        if found is None:
-            found = rank_revealing_step(H, S, right, unknown)
-            if complete and found.diffuse.shape[1] > unknown.shape[1]:
+            solved = least_squares_step(H, S, right, least=DEPENDENT_COLUMN if complete else SUSPECT_COLUMN)
+        if solved is None:
+            solved = rank_revealing_step(H, S, right, unknown)
+            if complete and solved.diffuse.shape[1] > unknown.shape[1]:
                 raise PreconditionError(
                     f"rank H_k is lost at k = {state.k}: the equations and outputs of that step do not determine the "
                     "state.",
                     condition="rank [E; C]",
                 )
         if not self.literal or len(H) <= ne:
-            return found, None
-        seen, regressor, noise = posterior_residual(found, H, S, right, ne, unknown=unknown)
-        return found, (seen[:, 0], regressor, noise)
+            return solved, None
+        data, regressor, noise = posterior_residual(solved, H, S, right, ne, unknown=unknown)
+        return solved, (data[:, 0], regressor, noise)
 
     def _estimate(
         self, state: RecursiveState, innovation: FloatArray, regressor: FloatArray, gap: FloatArray, y: FloatArray
@@ -277,13 +277,15 @@ class Recursion:
         if self.random_walk:
             nx = self.settings.plant.nx
             nq = len(x) - nx
-            known = ParameterState(x[nx:], np.zeros((nq, nq)), factor[nx:])
-            return RawEstimate(state.k, x[:nx], factor[:nx], diffuse[:nx], known, innovation, np.zeros((0, nq)), gap, y)
-        known = state.parameters
-        if len(known.theta):
-            x = x + state.Upsilon @ known.theta
-            factor = np.hstack((factor, state.Upsilon @ known.spread))
-        return RawEstimate(state.k, x, factor, diffuse, known, innovation, regressor, gap, y)
+            parameters = ParameterState(x[nx:], np.zeros((nq, nq)), factor[nx:])
+            return RawEstimate(
+                state.k, x[:nx], factor[:nx], diffuse[:nx], parameters, innovation, np.zeros((0, nq)), gap, y
+            )
+        parameters = state.parameters
+        if len(parameters.theta):
+            x = x + state.Upsilon @ parameters.theta
+            factor = np.hstack((factor, state.Upsilon @ parameters.spread))
+        return RawEstimate(state.k, x, factor, diffuse, parameters, innovation, regressor, gap, y)
 
 
 def steps_of(settings: RecursiveSettings, late: IntArray) -> StepModel:
@@ -307,7 +309,7 @@ def chosen_steps(settings: RecursiveSettings) -> StepModel:
 
 
 def posterior_residual(
-    found: LeastSquaresStep,
+    solved: LeastSquaresStep,
     H: FloatArray,
     S: FloatArray,
     right: FloatArray,
@@ -318,7 +320,7 @@ def posterior_residual(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return what (18f) learns from: ``y - C x`` weighted by R, its regressor (18d), and a root of its covariance.
     That covariance is not R but one of rank ``rank E + ny - nx`` (Moussa Ali et al. 2013, (18b), (18d), (18f))."""
-    gaps = right[ne:] - H[ne:] @ found.estimate
+    gaps = right[ne:] - H[ne:] @ solved.estimate
     triangle = np.asarray(np.linalg.qr(S[ne:].T, mode="r")).T
     if not np.all(np.abs(np.diag(triangle)) > 0.0):
         raise PreconditionError(

@@ -147,11 +147,11 @@ class RecursiveSettings(StepObserver):
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field as data."""
-        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
         if self.adaptation is not None:
-            found["adaptation"] = {field.name: getattr(self.adaptation, field.name) for field in fields(Adaptation)}
+            values["adaptation"] = {field.name: getattr(self.adaptation, field.name) for field in fields(Adaptation)}
         return {
-            **found,
+            **values,
             "plant": self.plant.as_dict(),
             "Q": self.Q.as_data(),
             "R": self.R.as_data(),
@@ -168,14 +168,14 @@ class RecursiveSettings(StepObserver):
             Every field by name.
         """
         require_kind(data, Mapping, "data", "what as_dict() returns")
-        given = dict(data)
-        constants, adaptation = given.pop("noise_constants"), given["adaptation"]
-        noise = {name: MatrixSequence.of(given[name], name, constants=constants) for name in ("Q", "R")}
+        values = dict(data)
+        constants, adaptation = values.pop("noise_constants"), values["adaptation"]
+        noise = {name: MatrixSequence.of(values[name], name, constants=constants) for name in ("Q", "R")}
         return cls(
             **{
-                **given,
+                **values,
                 **noise,
-                "plant": TimeVaryingDescriptorSystem(**given["plant"]),
+                "plant": TimeVaryingDescriptorSystem(**values["plant"]),
                 "adaptation": None if adaptation is None else Adaptation(**adaptation),
             }
         )

@@ -114,8 +114,8 @@ def steady_state_filter(
     require_all(recursive_conditions(varying, parameters=False))
     q, r = as_matrix(Q, "Q"), as_matrix(R, "R")
     q, r = (
-        float(found[0, 0]) * np.eye(size) if np.ndim(given) == 0 else found
-        for given, found, size in ((Q, q, varying.ne), (R, r, varying.ny))
+        float(following[0, 0]) * np.eye(size) if np.ndim(stated) == 0 else following
+        for stated, following, size in ((Q, q, varying.ne), (R, r, varying.ny))
     )
     for name, matrix, size in (("Q", q, varying.ne), ("R", r, varying.ny)):
         require_shape(matrix.shape, (size, size), name)
@@ -127,8 +127,8 @@ def steady_state_filter(
     P = _from_riccati(E, A, C, q, r) if decide_rank(q).full and decide_rank(r).full else None
     if P is None or not _is_fixed(P, _step(E, A, C, noise, _root(P))[1]):
         P = _from_recursion(E, A, C, noise)
-    gain, found = _step(E, A, C, noise, _root(P))
-    if not _is_fixed(P, found):
+    gain, following = _step(E, A, C, noise, _root(P))
+    if not _is_fixed(P, following):
         raise SolverError("The solution of the Riccati equation (16) fails its own residual. Run the filter instead.")
     L, K = gain[:, : varying.ne], gain[:, varying.ne :]
     return SteadyState(
@@ -205,11 +205,16 @@ def _from_riccati(E: FloatArray, A: FloatArray, C: FloatArray, q: FloatArray, r:
 
     n = E.shape[1]
     weighted = np.linalg.solve(q, np.hstack([E, A]))
-    known = E.T @ weighted[:, :n] + C.T @ np.linalg.solve(r, C)
+    information = E.T @ weighted[:, :n] + C.T @ np.linalg.solve(r, C)
     cross, square = E.T @ weighted[:, n:], A.T @ weighted[:, n:]
     try:
         inverse = discrete_riccati(
-            np.zeros((n, n)), np.eye(n), 0.5 * (known + known.T), 0.5 * (square + square.T), e=np.eye(n), s=cross
+            np.zeros((n, n)),
+            np.eye(n),
+            0.5 * (information + information.T),
+            0.5 * (square + square.T),
+            e=np.eye(n),
+            s=cross,
         )
         P = np.linalg.inv(inverse)
     except (np.linalg.LinAlgError, ValueError):  # SciPy raises ValueError where it cannot reorder the Schur form
@@ -250,8 +255,8 @@ def _step(
     S = np.hstack([np.vstack([A @ root, np.zeros((len(C), root.shape[1]))]), noise])
     S = np.hstack([S, np.zeros((len(H), max(len(H) - S.shape[1], 0)))])
     data = np.eye(len(H))
-    found = least_squares_step(H, S, data) or rank_revealing_step(H, S, data, np.zeros((len(H), 0)), mapped=len(H))
-    return found.estimate, np.asarray(found.factor @ found.factor.T)
+    solved = least_squares_step(H, S, data) or rank_revealing_step(H, S, data, np.zeros((len(H), 0)), mapped=len(H))
+    return solved.estimate, np.asarray(solved.factor @ solved.factor.T)
 
 
 def _root(P: FloatArray) -> FloatArray:

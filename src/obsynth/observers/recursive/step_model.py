@@ -156,15 +156,15 @@ class StepModel:
             noise = stacked_noise(self._factors(k)[0], outputs)
             self._noise = noise if self._noise_is_constant else None
         if H is None:
-            seen = [plant.A.at(k + 1)[late]] if self.early else []
-            H = np.asfortranarray(np.vstack([self._other(plant.E.at(k + 1)), plant.C.at(k + 1), *seen]))
+            early_outputs = [plant.A.at(k + 1)[late]] if self.early else []
+            H = np.asfortranarray(np.vstack([self._other(plant.E.at(k + 1)), plant.C.at(k + 1), *early_outputs]))
             self._H = H if self._H_is_constant else None
         if self.early:
             Psi, Dn = np.vstack([Psi, plant.Phi.at(k + 1)[late]]), -plant.B.at(k + 1)[late]
         A, B, Phi = (self._other(matrix.at(k)) for matrix in (plant.A, plant.B, plant.Phi))
-        found = StepMatrices(H, A, B, Phi, Psi, Dn, plant.D.at(k + 1), noise)
-        self._constant = found if self._is_constant else None
-        return found
+        matrices = StepMatrices(H, A, B, Phi, Psi, Dn, plant.D.at(k + 1), noise)
+        self._constant = matrices if self._is_constant else None
+        return matrices
 
     def at(self, k: int) -> StepMatrices:
         """Return the matrices of the step from k to k + 1; the same object for the same step."""
@@ -173,13 +173,13 @@ class StepModel:
             return last[2]
         step = self.without_walk(k)
         if self.walk is None:
-            found = step
+            matrices = step
         elif last is not None and last[1] is step:
-            found = last[2]
+            matrices = last[2]
         else:
-            found = with_walking_parameters(step, self.walk, early=self.early)
-        self._last = (k, step, found)
-        return found
+            matrices = with_walking_parameters(step, self.walk, early=self.early)
+        self._last = (k, step, matrices)
+        return matrices
 
     def first(self) -> StepMatrices | None:
         """Return the correction of x(0), and of parameters that walk, by the algebraic equations of step 0, where these
@@ -199,7 +199,7 @@ class StepModel:
         if self._correction is not None:
             return self._correction
         plant, late = self.plant, self.late
-        found = StepMatrices(
+        matrices = StepMatrices(
             np.vstack([np.eye(plant.nx), plant.A.at(k)[late]]),
             np.eye(plant.nx),
             np.zeros((plant.nx, plant.nu)),
@@ -209,8 +209,8 @@ class StepModel:
             np.zeros((0, plant.nu)),
             stacked_noise(np.zeros((plant.nx, 0)), self._factors(k)[1]),
         )
-        self._correction = found if self._is_constant else None
-        return found
+        self._correction = matrices if self._is_constant else None
+        return matrices
 
 
 def with_walking_parameters(step: StepMatrices, walk: FloatArray, *, early: bool = False) -> StepMatrices:
@@ -278,21 +278,27 @@ class PreparedStep:
         moved = rotation[:, : len(step.A)] @ step.A
         if same is not None and same.step.noise is step.noise:
             return cls(step, projection, moved, same.known, sizes)
-        known = (rotation @ step.noise).T
-        return cls(step, projection, moved, known if len(rotation) < MANY_ROWS else noise_triangle(known), sizes)
+        rotated_noise = (rotation @ step.noise).T
+        return cls(
+            step,
+            projection,
+            moved,
+            rotated_noise if len(rotation) < MANY_ROWS else noise_triangle(rotated_noise),
+            sizes,
+        )
 
     def taken(self, factor: FloatArray, right: FloatArray | None) -> LeastSquaresStep | None:
         """Take the step, or return ``None`` where a rank has to be decided; ``right`` is the identity by default."""
         if self.projection is None:
             return None
         rotation = self.projection.rotation
-        width, known, rows = factor.shape[1], self.known, len(rotation)
+        width, rotated_noise, rows = factor.shape[1], self.known, len(rotation)
         # `dot` is `@` with half the overhead, which for few states is most of the time.
         data = rotation if right is None else rotation.dot(right)
         if rows >= MANY_ROWS:
-            return projected_step(self.projection, (self.moved @ factor).T, data, known=known)
+            return projected_step(self.projection, (self.moved @ factor).T, data, known=rotated_noise)
         # As many rows as the projection has at least: what is missing (rectangular roots) are rows of zeros.
-        noise = np.zeros((max(width + len(known), rows), rows), order="F")
+        noise = np.zeros((max(width + len(rotated_noise), rows), rows), order="F")
         noise[:width] = self.moved.dot(factor).T
-        noise[width : width + len(known)] = known
+        noise[width : width + len(rotated_noise)] = rotated_noise
         return projected_step(self.projection, noise, data)

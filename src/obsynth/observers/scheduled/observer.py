@@ -217,8 +217,8 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field, as the constructor takes it."""
-        known = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {**known, "scheduling": self.scheduling.as_dict()}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**values, "scheduling": self.scheduling.as_dict()}
 
     def init(self) -> ScheduledState:
         """Return the state before the first sample."""
@@ -252,9 +252,9 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         """
         if self.dt == 0.0:
             return self._moved(state, y, u, seconds)
-        inputs, given = u[: self.inputs], u[self.inputs :]
+        inputs, measured = u[: self.inputs], u[self.inputs :]
         before = np.where(np.isnan(state.parameters), self.middle, state.parameters)
-        parameters = np.where(np.isnan(given), before, self.scheduling.nearest(given))
+        parameters = np.where(np.isnan(measured), before, self.scheduling.nearest(measured))
         weights = self.scheduling.weights(parameters)
         row = self.Cz @ state.z + self.Du @ inputs + self.Dy @ y
         if not self.effectiveness_is_one:
@@ -265,8 +265,8 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
             if weight:
                 after += weight * (Az @ state.z + Bu @ inputs + By @ y)
         # Before the first sample nothing moved: that comparison with NaN is false.
-        slow = not bool((np.abs(given - state.parameters) > self.steps).any())
-        inside = slow and self.scheduling.is_inside(given)
+        slow = not bool((np.abs(measured - state.parameters) > self.steps).any())
+        inside = slow and self.scheduling.is_inside(measured)
         unclaimed = max(state.unclaimed - 1, 0) if inside else self.forgetting
         return ScheduledState(after, weights, parameters, unclaimed), row
 
@@ -274,9 +274,9 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         self, state: ScheduledState, y: FloatArray, u: FloatArray, seconds: float
     ) -> tuple[ScheduledState, FloatArray]:
         """Return the state after a step of implicit Euler in continuous time, and the row at its end."""
-        inputs, given = u[: self.inputs], u[self.inputs :]
+        inputs, measured = u[: self.inputs], u[self.inputs :]
         before = np.where(np.isnan(state.parameters), self.middle, state.parameters)
-        parameters = np.where(np.isnan(given), before, self.scheduling.nearest(given))
+        parameters = np.where(np.isnan(measured), before, self.scheduling.nearest(measured))
         weights = self.scheduling.weights(parameters)
         Az, Bu, By = (np.tensordot(weights, matrix, 1) for matrix in (self.Az, self.Bu, self.By))
         driven = state.z + seconds * (Bu @ inputs + By @ y)
@@ -284,10 +284,10 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         row = self.Cz @ z + self.Du @ inputs + self.Dy @ y
         rates = np.array([np.inf if rate is None else rate for rate in self.scheduling.rates])
         far = rates * (seconds if seconds > 0.0 else np.inf) * (1.0 + RATE_TOLERANCE)
-        slow = not bool((np.abs(given - state.parameters) > far).any())
-        inside = slow and self.scheduling.is_inside(given)
-        left = max(state.unclaimed - self._forgotten(seconds), 0.0) if inside else self.forgetting
-        return ScheduledState(z, weights, parameters, left), row
+        slow = not bool((np.abs(measured - state.parameters) > far).any())
+        inside = slow and self.scheduling.is_inside(measured)
+        unclaimed = max(state.unclaimed - self._forgotten(seconds), 0.0) if inside else self.forgetting
+        return ScheduledState(z, weights, parameters, unclaimed), row
 
     def rows_without_claim(self, seconds: float) -> int:
         """Return the rows, each so long after the one before, until a hundredth of an error is left.
@@ -333,11 +333,11 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
         elapsed = self._elapsed(seconds, "seconds")
         require_kind(state, ScheduledState, "state", "what init() or the step before returned")
         outputs = checked_sample(y, len(self.output_names), "y")
-        known = np.asarray(u, dtype=np.float64).ravel()
-        if known.shape != (len(self.input_names),):
+        signals = np.asarray(u, dtype=np.float64).ravel()
+        if signals.shape != (len(self.input_names),):
             raise SpecError(f"u needs {len(self.input_names)} numbers: {', '.join(self.input_names)}.", path="u")
-        checked_sample(known[: self.inputs], self.inputs, "u")
-        after, row = self.advance(state, outputs, known, elapsed)
+        checked_sample(signals[: self.inputs], self.inputs, "u")
+        after, row = self.advance(state, outputs, signals, elapsed)
         return after, self.split(row[None, :])
 
     def _elapsed(self, seconds: float | None, name: str) -> float:
@@ -385,14 +385,14 @@ class ScheduledObserver(EstimateRows, Observer[ScheduledState, FloatArray]):
             As for `run`.
         """
         elapsed = self._elapsed(sample_time, "sample_time")
-        known = np.asarray(u, dtype=np.float64)
-        filled = np.where(np.isnan(known), 0.0, known) if known.ndim == 2 else known
-        if known.ndim == 2 and known.shape[1] == len(self.input_names):
-            filled[:, : self.inputs] = known[:, : self.inputs]
+        signals = np.asarray(u, dtype=np.float64)
+        filled = np.where(np.isnan(signals), 0.0, signals) if signals.ndim == 2 else signals
+        if signals.ndim == 2 and signals.shape[1] == len(self.input_names):
+            filled[:, : self.inputs] = signals[:, : self.inputs]
         outputs, _ = whole_record(y, filled, len(self.output_names), len(self.input_names))
         state = self.init()
         rows, claimed = np.empty((len(outputs), len(self.Cz))), np.empty(len(outputs), dtype=bool)
-        for k, (y_k, u_k) in enumerate(zip(outputs, known, strict=True)):
+        for k, (y_k, u_k) in enumerate(zip(outputs, signals, strict=True)):
             state, rows[k] = self.advance(state, y_k, u_k, elapsed if k else 0.0)
             claimed[k] = not state.unclaimed
         return rows, claimed

@@ -76,8 +76,8 @@ class WindowObserver(Observer[WindowState, float]):
         width = self.samples * (len(self.input_names) + len(self.output_names))
         programmes = np.asarray(self.programmes, dtype=np.float64).ravel()
         rows = 1 if self.horizon is None else self.horizon - self.samples + 1
-        known = programmes == np.round(programmes)
-        if weights.shape[1] != width or len(programmes) != rows or not known.all():
+        are_numbers = programmes == np.round(programmes)
+        if weights.shape[1] != width or len(programmes) != rows or not are_numbers.all():
             raise SpecError(
                 f"The observer has weights {weights.shape} and {len(programmes)} rows, but {width} weights of each sum "
                 f"and {rows} rows are needed.",
@@ -150,8 +150,12 @@ class WindowObserver(Observer[WindowState, float]):
         """
         require_horizon(self.horizon, state.k + 1, early=False)
         window = np.vstack([state.recent, np.concatenate([u, y])])
-        which = self.programme_at(state.k)
-        value = float(self.weights[which] @ window[::-1].ravel() + self.constants[which]) if which >= 0 else np.nan
+        programme = self.programme_at(state.k)
+        value = (
+            float(self.weights[programme] @ window[::-1].ravel() + self.constants[programme])
+            if programme >= 0
+            else np.nan
+        )
         return WindowState(state.k + 1, window[1:]), value
 
     def step(self, state: WindowState, y: ArrayLike, u: ArrayLike = ()) -> tuple[WindowState, Estimates]:
@@ -195,10 +199,10 @@ class WindowObserver(Observer[WindowState, float]):
         """
         outputs, inputs = whole_record(y, u, len(self.output_names), len(self.input_names))
         require_horizon(self.horizon, len(outputs), early=False)
-        state, found = self.init(), np.empty(len(outputs))
+        state, values = self.init(), np.empty(len(outputs))
         for k, (y_k, u_k) in enumerate(zip(outputs, inputs, strict=True)):
-            state, found[k] = self.advance(state, y_k, u_k)
-        return self._estimates(found)
+            state, values[k] = self.advance(state, y_k, u_k)
+        return self._estimates(values)
 
     def _estimates(self, values: FloatArray) -> Estimates:
         column, nothing = read_only(values[:, None]), read_only(np.zeros((len(values), 0)))
