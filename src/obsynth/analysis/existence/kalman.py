@@ -22,7 +22,7 @@ from obsynth.analysis.existence.recursive import recursive_conditions
 from obsynth.analysis.time_varying import as_time_varying
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_shape
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arrays import FloatArray, as_matrix, remembered
 from obsynth.numerics.ranks import numerical_rank, product_but_rounding
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.plant_units import PlantUnits
@@ -77,6 +77,7 @@ class WithoutUnknownInputs:
         return joint
 
 
+@remembered
 def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
     """Return a plant without its unknown inputs; `SpecError` for what else these methods do not take."""
     nothing = {name: None for name in ("Bd", "Dd", "disturbance_names")}

@@ -23,7 +23,7 @@ from obsynth.analysis.time_varying import (
     step_blocks,
 )
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.invariant_zeros import are_outside
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import (
@@ -133,6 +133,7 @@ def _rank_of_steps(
     return failure.in_doubt(constant.rank_doubt(statement, worst), constant.plant)
 
 
+@remembered
 def detectability_condition(plant: TimeVaryingDescriptorSystem) -> Condition:
     """Return the condition that every mode that does not decay by itself shows in the outputs."""
     E, A, C = plant.E.at(1), plant.A.at(0), plant.C.at(1)

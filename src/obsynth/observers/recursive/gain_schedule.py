@@ -65,18 +65,17 @@ def gain_steps(
     prepared: PreparedStep | None = None
     for k, step in enumerate(chain(first, (model.at(k) for k in range(steps))), 1 - len(first)):
         ne, rows, nq = len(step.A), len(step.H), Upsilon.shape[1]
-        right = np.eye(rows)
-        if nq:
-            right = np.hstack([right, np.vstack([step.A @ Upsilon + step.Phi, -step.Psi])])
+        # Of data alone it is the identity, which a prepared step knows.
+        right = np.hstack([np.eye(rows), np.vstack([step.A @ Upsilon + step.Phi, -step.Psi])]) if nq else None
         complete = received is None or not k or bool(received[k].all())
         solved = None
         if complete and not diffuse.shape[1]:
             prepared = PreparedStep.of(step, prepared)
-            solved = prepared.taken(factor, right if nq else None)
+            solved = prepared.taken(factor, right)
         # The literal form asks for the noise itself.
         if solved is None or recursion.literal:
             S, unknown = spreads(step, factor, diffuse, k, observer.state_names)
-            H = step.H
+            H, right = step.H, np.eye(rows) if right is None else right
             if not complete and received is not None:
                 kept = np.concatenate([np.ones(ne, dtype=bool), received[k], np.ones(len(step.Dn), dtype=bool)])
                 H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,12 @@ from obsynth.observers.recursive.steady_filter import settled_contraction
 
 #: Errors that shrank below this are gone; the product starts anew from there, so that it does not underflow.
 GONE = 1e-200
+
+#: A product of later steps is given another unit where its entries are so many times larger or smaller than one.
+FAR_FROM_ONE = 1e20
+
+#: A norm below this share of the largest one is smaller, whatever rounding did to both.
+NEAR_GROWTH = 1.0 - 1e-10
 
 #: On shorter horizons an error need not have shrunk yet, so that the contraction only informs.
 STEPS_TO_CONTRACT = 50
@@ -169,23 +176,35 @@ class ErrorProduct:
         if self.ended is not None:
             return
         self.factor = factor
-        self.product = factor @ self.product
+        self.product = factor.dot(self.product)
+        self._take_size()
+        if self.ended is not None:
+            return
+        if self.done == self.steps // 2:
+            self.middle = self._length()
+        elif self.done > self.steps // 2:
+            self.late = factor.dot(self.late)
+            # Singular values of every step would be most of the work: what is far from one is made one.
+            if not 1.0 / FAR_FROM_ONE < float(np.abs(self.late).max()) < FAR_FROM_ONE:
+                late_size = norm_or_bound(self.late)
+                self.late, self.late_logarithm = self.late / late_size, self.late_logarithm + float(np.log(late_size))
+
+    def _take_size(self) -> None:
+        """Take the product's norm for the growth, and give it another unit where it would underflow."""
+        if len(self.product) <= MANY_STATES:
+            flat = self.product.ravel()
+            # The Frobenius norm is at most so many times the norm, and not below it.
+            above = math.sqrt(flat.dot(flat))
+            if len(flat) * GONE < above < NEAR_GROWTH * self.growth:
+                return
         size = norm_or_bound(self.product)
         self.growth = max(self.growth, size * float(np.exp(min(self.logarithm, 0.0))))
         if not size < 1.0 / GONE:
             self.growth, self.ended = float("inf"), (float("inf"), "from the start")
-            return
-        if size == 0.0:
+        elif size == 0.0:
             self.ended = 0.0, "from the start"
-            return
-        if size < GONE:
+        elif size < GONE:
             self.product, self.logarithm = self.product / size, self.logarithm + float(np.log(size))
-        if self.done == self.steps // 2:
-            self.middle = self._length()
-        elif self.done > self.steps // 2:
-            self.late = factor @ self.late
-            late_size = norm_or_bound(self.late)
-            self.late, self.late_logarithm = self.late / late_size, self.late_logarithm + float(np.log(late_size))
 
     def _length(self) -> float:
         return self.logarithm + float(np.log(np.linalg.norm(self.product, 2)))

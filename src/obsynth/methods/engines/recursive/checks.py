@@ -22,6 +22,7 @@ from obsynth.methods.engines.recursive.horizon_proof import (
     parameter_row,
 )
 from obsynth.methods.engines.recursive.steady_state import steady_rows
+from obsynth.numerics.arrays import remembered
 from obsynth.observers.nonlinear.observer import DAEObserver
 from obsynth.observers.recursive.gain_schedule import gains_once
 from obsynth.observers.recursive.gain_schedule_summary import (
@@ -180,7 +181,7 @@ def _dynamic_rows(
             )
     yield listed_gains(design, {"L": facts.L, "K": facts.K}, tolerance=CLAIM_TOLERANCE)
     yield _claims(design, facts, ranks)
-    yield from consistency(stated, observer, looked_at(observer))
+    yield from consistency(stated, observer, looked_at(observer), gains=gains)
 
 
 def _contraction_row(facts: GainScheduleSummary, proof: HorizonProof | None) -> Check:
@@ -239,6 +240,7 @@ def claims_row(design: ObserverDesign, values: Mapping[str, float], *, rough: Co
     )
 
 
+@remembered
 def _stated(design: ObserverDesign) -> RecursiveObserver | None:
     """Return the observer that plant and options stand for, or ``None`` when they stand for none."""
     try:

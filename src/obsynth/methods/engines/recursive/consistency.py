@@ -7,13 +7,15 @@ draw x(0) and project it onto the constraint would be inconsistent, as mu(k) of 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import cache
+from typing import Any
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.logarithmic_balance import LogBalance
 from obsynth.numerics.ranks import KNOWN_SHARE, ROUNDED_BESIDE
-from obsynth.observers.recursive.gain_schedule import gain_steps
+from obsynth.observers.recursive.gain_schedule import Gains, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.step_model import StepMatrices
 from obsynth.results.checks import Check, upper_bound_check
@@ -25,51 +27,57 @@ CONSISTENCY_STEPS = 60
 
 CONSISTENCY_SEED = 20130703
 
+#: So many numbers are drawn once for all plants, two megabytes; those of larger plants go on from there.
+FIRST_NUMBERS = 2**18
+
 #: Bands are this many standard deviations of the statistic wide: a sound design fails one time in two million.
 BAND_DEVIATIONS = 5.0
 
 _SOURCE = "recomputed, Monte Carlo with a fixed seed"
 
 
-def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int) -> Iterator[Check]:
+def consistency(
+    stated: RecursiveObserver, shipped: RecursiveObserver, steps: int, *, gains: Gains = gain_steps
+) -> Iterator[Check]:
     """Yield NEES, NIS and whiteness of a shipped observer on noise as it is stated."""
-    rng = np.random.default_rng(CONSISTENCY_SEED)
+    drawn = _Drawn()
     truth = stated.init()
     nq = len(truth.parameters.theta)
-    x = rng.standard_normal((CONSISTENCY_TRIALS, truth.factor.shape[1])) @ truth.factor.T
-    theta = rng.standard_normal((CONSISTENCY_TRIALS, nq)) @ truth.parameters.spread.T
+    x = drawn.next(truth.factor.shape[1]) @ truth.factor.T
+    theta = drawn.next(nq) @ truth.parameters.spread.T
     model = stated.recursion.model
     first = model.first()
     nis, pairs = [], []
     scores: dict[int, tuple[FloatArray, FloatArray]] = {}
     before = np.zeros((CONSISTENCY_TRIALS, 0))
     count, factor = min(steps, CONSISTENCY_STEPS), truth.factor
-    for position, gains in enumerate(gain_steps(shipped, count)):
+    for position, step_gains in enumerate(gains(shipped, count)):
         k = position if first is None else position - 1
         true = model.at(k) if first is None or position else first
-        noise = rng.standard_normal((CONSISTENCY_TRIALS, true.noise.shape[1])) @ true.noise.T
-        known = np.zeros_like(noise)
-        known[:, : len(true.A)] = x @ gains.step.A.T
-        data = known + noise
-        innovation = data @ gains.parity.T
-        x, theta = data @ gains.gain.T, theta @ gains.retain.T + data @ gains.learn.T
+        data = drawn.next(true.noise.shape[1]) @ true.noise.T
+        data[:, : len(true.A)] += x @ step_gains.step.A.T
+        innovation = data @ step_gains.parity.T
+        x = data @ step_gains.gain.T
+        theta = theta @ step_gains.retain.T + data @ step_gains.learn.T if nq else theta
         if innovation.shape[1]:
             nis.append(innovation)
             shared = min(before.shape[1], innovation.shape[1])
             pairs.append(before[:, :shared] * innovation[:, :shared])
         before = innovation
         if position in (0, count // 2, count - 1):
-            joint = np.hstack([x + theta @ gains.Upsilon.T if nq else x, theta])
+            joint = np.hstack([x + theta @ step_gains.Upsilon.T if nq else x, theta])
             # Factorisations round relative to the whole noise: a covariance that tends to zero ends there.
-            terms = state_terms(gains.step, data_deviations(gains.step, factor))
-            parameters = np.linalg.norm(gains.spread, axis=1)
-            parameters = parameters + np.abs(gains.learn) @ data_deviations(gains.step, factor)
+            terms = state_terms(step_gains.step, data_deviations(step_gains.step, factor))
+            parameters = np.linalg.norm(step_gains.spread, axis=1)
+            parameters = parameters + np.abs(step_gains.learn) @ data_deviations(step_gains.step, factor)
             # Of states and parameters together: its square is their covariance after the step.
-            top = np.hstack([gains.factor, gains.Upsilon @ gains.spread])
-            root = np.vstack([top, np.hstack([np.zeros((len(gains.spread), gains.factor.shape[1])), gains.spread])])
-            terms = np.concatenate([terms + np.abs(gains.Upsilon) @ parameters, parameters])
+            top = np.hstack([step_gains.factor, step_gains.Upsilon @ step_gains.spread])
+            root = np.vstack(
+                [top, np.hstack([np.zeros((len(step_gains.spread), step_gains.factor.shape[1])), step_gains.spread])]
+            )
+            terms = np.concatenate([terms + np.abs(step_gains.Upsilon) @ parameters, parameters])
             scores[k + 1] = normalised(joint, root, terms)
-        factor = gains.factor
+        factor = step_gains.factor
     yield from _error_rows(scores)
     squares = np.concatenate([np.zeros(0), *(block.ravel() for block in nis)]) ** 2
     if squares.size:
@@ -84,6 +92,30 @@ def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
                 BAND_DEVIATIONS / float(np.sqrt(products.size)),
                 f"{products.size} products",
             )
+
+
+class _Drawn:
+    """Standard normal numbers from the fixed seed, in the order in which they are asked for."""
+
+    def __init__(self) -> None:
+        self.left, state = _first_numbers()
+        self.further = np.random.default_rng(CONSISTENCY_SEED)
+        self.further.bit_generator.state = state
+
+    def next(self, columns: int) -> FloatArray:
+        """Return the next numbers, ``(trials, columns)``."""
+        count = CONSISTENCY_TRIALS * columns
+        taken, self.left = self.left[:count], self.left[count:]
+        if len(taken) < count:
+            taken = np.concatenate([taken, self.further.standard_normal(count - len(taken))])
+        return taken.reshape(CONSISTENCY_TRIALS, columns)
+
+
+@cache
+def _first_numbers() -> tuple[FloatArray, Mapping[str, Any]]:
+    """Return the first numbers from the seed, which are the same for every plant, and the generator's state then."""
+    generator = np.random.default_rng(CONSISTENCY_SEED)
+    return read_only(generator.standard_normal(FIRST_NUMBERS)), generator.bit_generator.state
 
 
 def data_deviations(step: StepMatrices, factor: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.existence.recursive import SOURCE
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, read_only, remembered
 from obsynth.numerics.logarithmic_balance import balance_by_least_squares
 from obsynth.observers.recursive.gain_schedule import Gains, GainStep, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -94,11 +94,12 @@ def _followed(
     return errors, joint, lengths, bias, last
 
 
+@remembered
 def natural_units(observer: RecursiveObserver) -> FloatArray:
     """Return sizes of the states that equations and outputs suggest, ``(n,)``; of parameters that walk, one."""
     plant, count = observer.plant, len(observer.recursion.first.x)
     E, A, C = plant.E.at(1), plant.A.at(0), plant.C.at(1)
-    return np.concatenate([balance_by_least_squares(E, A, outputs=[C]).states, np.ones(count - plant.nx)])
+    return read_only(np.concatenate([balance_by_least_squares(E, A, outputs=[C]).states, np.ones(count - plant.nx)]))
 
 
 def _true_steps(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int) -> Iterable[StepMatrices | None]:
