@@ -5,7 +5,8 @@ equations, governors, voltage regulators and filters.  Row i is the equation of 
 zero, some filters act on nothing: two of a kind would give index 2, two a singular pencil.  What is known by
 construction: the number of dynamic states, the index, and the names of the variables that act on nothing.
 
-``python benchmarks/networks.py FOLDER VARIABLES STATES SEED`` writes a network and its specs.
+``python benchmarks/networks.py FOLDER VARIABLES STATES SEED`` writes a network and its specs;
+``python benchmarks/networks.py --andes`` takes those of the simulator ANDES instead (`andes_networks`).
 """
 
 from __future__ import annotations
@@ -235,4 +236,9 @@ def write(network: Network, folder: Path) -> None:
 
 
 if __name__ == "__main__":
+    if "--andes" in sys.argv:
+        from andes_networks import main
+
+        main([argument for argument in sys.argv[1:] if argument != "--andes"])
+        raise SystemExit
     write(random_network(int(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])), Path(sys.argv[1]))

@@ -31,7 +31,7 @@ _ONE = """\
 import json, sys, time
 from pathlib import Path
 import numpy as np
-from obsynth.spec.loader import load_spec
+from obsynth.specs.loader import load_spec
 spec = load_spec(sys.argv[1])
 loaded = time.process_time()
 found = {"load": loaded, "states": spec.plant.nx, "dropped": list(spec.transformation.dropped)}
@@ -61,7 +61,7 @@ def one(spec: Path, *what: str) -> dict:
 
 _WARM = """\
 import sys, time
-from obsynth.spec.loader import load_spec
+from obsynth.specs.loader import load_spec
 load_spec(sys.argv[1])
 begin = time.process_time()
 load_spec(sys.argv[2])

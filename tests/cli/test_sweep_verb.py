@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+from contextlib import contextmanager
 
 import pytest
 
 from obsynth.cli.main import main
+from obsynth.studies.verbs import sweeps
 
 PLANT = {
     "schema_version": 1, "name": "small",
@@ -39,6 +42,41 @@ def test_folder_table_and_picture(spec, tmp_path, capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["counts"] == {"designed": 2, "malformed": 1}
     assert [case["gamma_min"] for case in told["cases"][:2]] == [float(row["gamma_min"]) for row in rows[:2]]
+
+
+@pytest.mark.parametrize(
+    ("count", "more", "jobs"), [(10, [], 1), (11, [], 3), (11, ["--jobs", "1"], 1), (2, ["--jobs", "2"], 2)]
+)
+def test_more_than_ten_designs_are_made_on_all_processors(spec, tmp_path, monkeypatch, count, more, jobs):
+    asked = []
+
+    @contextmanager
+    def here(jobs, cluster):
+        asked.append((jobs, cluster))
+        yield None
+
+    monkeypatch.setattr(sweeps, "chosen_executor", here)
+    monkeypatch.setattr(sweeps, "usable_processors", lambda: 3)
+    values = f"gamma_margin={[-1.0 - i for i in range(count)]}"
+    assert main(["sweep", "--system", spec, "--set", values, "--out", str(tmp_path / "many"), "--quiet", *more]) == 0
+    assert asked == [(jobs, None)]
+
+
+def test_processors_that_may_be_used_are_counted():
+    assert 1 <= sweeps.usable_processors() <= os.cpu_count()
+
+
+@pytest.mark.long
+def test_designs_on_all_processors_are_those_made_here(spec, tmp_path):
+    values = f"gamma_margin={[0.05 + 0.01 * i for i in range(sweeps.FEW_DESIGNS + 1)]}"
+    tables = []
+    for name, more in (("all", []), ("one", ["--jobs", "1"])):
+        out = tmp_path / name
+        assert main(["sweep", "--system", spec, "--set", values, "--out", str(out), "--quiet", *more]) == 0
+        rows = csv.DictReader((out / "table.csv").read_text().splitlines())
+        tables.append([{key: value for key, value in row.items() if key != "seconds"} for row in rows])
+    assert tables[0] == tables[1]
+    assert {row["status"] for row in tables[0]} == {"designed"}
 
 
 @pytest.mark.one_in(4)

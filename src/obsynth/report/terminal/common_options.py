@@ -47,6 +47,8 @@ QUIET = flag("--quiet", "print no progress")
 
 JOBS = option("--jobs", "N", "processes (default: 1)", type=count)
 
+SWEEP_JOBS = option("--jobs", "N", "processes (default: 1; one a processor for more than ten designs)", type=count)
+
 CLUSTER = option("--cluster", "ADDRESS", "address of the scheduler of a Dask cluster, in place of --jobs")
 
 MAP = option("--map", "SIGNAL=COLUMN", "column of a signal (or of the time) where the names differ; may be repeated")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import math
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
@@ -21,6 +23,9 @@ from obsynth.specs.documents import read_yaml
 
 PICTURE = FileKind("a picture", rb"\A\x89PNG")
 
+
+#: More designs than these are made on all processors: a process takes as long to begin as several small designs.
+FEW_DESIGNS = 10
 
 #: Blanks between columns.
 _BLANKS_BETWEEN = 2
@@ -55,7 +60,10 @@ def run_sweep(options: argparse.Namespace) -> int:
         return designed.plot(options.claim) if claims else None
 
     table = FileKind("the table of a sweep", rb"\Acase,")
-    outcome, files = _carried_out(options, options.out, ("designs", table, "sweep.png"), work, draw)
+    jobs = options.jobs
+    if jobs is None and options.cluster is None:
+        jobs = usual_jobs(len(options.system) * math.prod(map(len, parameters.values())))
+    outcome, files = _carried_out(options, options.out, ("designs", table, "sweep.png"), work, draw, jobs=jobs)
     _print_outcome(options, outcome, files, "cases")
     return 0
 
@@ -127,6 +135,7 @@ def run_many(options: argparse.Namespace) -> int:
         ("runs", table, "fleet.png"),
         work,
         lambda fleet: fleet.plot() if "run" in fleet.counts else None,
+        jobs=options.jobs,
     )
     if options.json or not options.quiet:
         _print_outcome(options, fleet, files, "runs")
@@ -139,13 +148,15 @@ def _carried_out(
     named: tuple[str, FileKind, str],
     work: Callable[[Executor | None, Callable[[int, int], None]], Any],
     draw: Callable[[Any], Any],
+    *,
+    jobs: int | None,
 ) -> tuple[Any, tuple[Path, ...]]:
     """Return what ``work`` comes to, and the files of its table and picture; nothing is left of a folder in vain."""
     unit, kind, picture_name = named
     with made_folder(folder):
         table = output_file(folder / "table.csv", kind, options)
         picture = output_file(folder / picture_name, PICTURE, options)
-        with progress(quiet=options.quiet) as report_stage, chosen_executor(options.jobs, options.cluster) as executor:
+        with progress(quiet=options.quiet) as report_stage, chosen_executor(jobs, options.cluster) as executor:
             outcome = work(executor, lambda done, total: report_stage(f"{done} of {total} {unit}"))
             contents: dict[Path, str | bytes] = {table: outcome.csv()}
             image = _png_of(lambda: draw(outcome))
@@ -165,6 +176,18 @@ def _print_outcome(options: argparse.Namespace, outcome: Any, files: tuple[Path,
     printed = _printed_cases if unit == "cases" else _printed_runs
     console.print(printed(outcome, console.width))
     console.print(f"Written: {', '.join(map(str, files))}", soft_wrap=True)
+
+
+def usual_jobs(count: int) -> int:
+    """Return on how many processes so many designs are made where nothing is said: one, or one a processor for many."""
+    return 1 if count <= FEW_DESIGNS else usable_processors()
+
+
+def usable_processors() -> int:
+    """Return how many processors this process may use."""
+    # Not on every platform.
+    allowed = getattr(os, "sched_getaffinity", None)
+    return len(allowed(0)) if allowed is not None else os.cpu_count() or 1
 
 
 @contextmanager
