@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from obsynth.numerics import lapack
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, rank_from
 from obsynth.numerics.square_root_estimation import TPQRT_BLOCK
@@ -57,17 +58,22 @@ def iterated(triangle: NDArray[Any], count: int) -> Smallest:
     norm = float(np.sqrt(np.linalg.norm(triangle, 1) * np.linalg.norm(triangle, np.inf)))
     if norm == 0.0:
         return np.zeros(count), np.eye(size, count), 0.0
-    work = np.array(triangle)
+    work = np.array(triangle, order="F")
     diagonal = np.einsum("ii->i", work)
     # An exact zero would be divided by: as small as rounding, it does as well.
     small = np.abs(diagonal) < np.finfo(float).eps * norm
     diagonal[small] = np.finfo(float).eps * norm
+    solve = lapack.ztrtrs if np.iscomplexobj(work) else lapack.dtrtrs
     basis = np.random.default_rng(0).normal(size=(size, count)).astype(work.dtype)
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(NULL_DIRECTION_STEPS):
-            inner = scipy.linalg.solve_triangular(work, basis, trans="C", check_finite=False)
+            inner = solve(work, basis, trans=2)[0]
             inner /= np.max(np.abs(inner), axis=0, initial=0.0) + np.finfo(float).tiny
-            basis = np.linalg.qr(scipy.linalg.solve_triangular(work, inner, check_finite=False))[0]
+            basis = solve(work, inner)[0]
+            # One direction is orthonormal by its length.
+            basis = basis / np.linalg.norm(basis) if count == 1 else np.linalg.qr(basis)[0]
+    if count == 1:
+        return np.array([np.linalg.norm(triangle @ basis)]), basis, norm
     _, values, turned = np.linalg.svd(triangle @ basis, full_matrices=False)
     return values[::-1], basis @ turned[::-1].conj().T, norm
 
@@ -137,16 +143,22 @@ class PencilPoints:
             return None
         t, u = scipy.linalg.rsf2csf(*scipy.linalg.schur(np.linalg.solve(top, turned[:columns]), check_finite=False))
         # The leading part is divided by E; the rows below are brought to its size.
-        return t, u, np.asarray(turned[columns:] @ u / sizes[0]), float(sizes[0] / sizes[-1] / sizes[-1])
+        return (
+            np.asfortranarray(np.triu(t)),
+            u,
+            np.asarray(turned[columns:] @ u / sizes[0]),
+            float(sizes[0] / sizes[-1] / sizes[-1]),
+        )
 
     def _triangle(self, point: complex) -> NDArray[Any]:
-        from obsynth.numerics.lapack import ztpqrt
-
         schur = self._schur
         triangle = np.array(schur[0] if schur else self.A, order="F")
         np.einsum("ii->i", triangle)[:] -= point
         below = np.array(schur[2] if schur else self.E, dtype=np.complex128, order="F")
         if not below.shape[0]:
             return triangle
-        reduced, _, _, _ = ztpqrt(0, min(TPQRT_BLOCK, triangle.shape[0]), triangle, below, overwrite_a=1, overwrite_b=1)
-        return np.triu(reduced)
+        reduced, _, _, _ = lapack.ztpqrt(
+            0, min(TPQRT_BLOCK, triangle.shape[0]), triangle, below, overwrite_a=1, overwrite_b=1
+        )
+        # What is below the diagonal stays as it was: zero.
+        return np.asarray(reduced)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
 from obsynth.plants.faults import Exosystem
@@ -18,6 +19,9 @@ from obsynth.proofs.exact_arithmetic import written_fraction
 
 #: At most so many changes are listed.
 LISTED_CHANGES = 4
+
+#: Fractions of plants with more states are found each time: kept, they would take tens of megabytes.
+MOST_KEPT_STATES = 200
 
 #: Rational matrices, as arrays of fractions.
 Rational: TypeAlias = NDArray[Any]
@@ -80,7 +84,7 @@ class Witness:
 
     def plant(self, plant: DescriptorSystem) -> DescriptorSystem:
         """Return the changed plant: its exact numbers decide, whatever its doubles are rounded to."""
-        exact = rational_matrices(plant)
+        exact = {name: matrix.copy() for name, matrix in rational_matrices(plant).items()}
         for change in self.changes:
             if change.matrix in exact:
                 exact[change.matrix][change.row, change.column] = change.after
@@ -128,8 +132,20 @@ def _plant_in_words(plant: DescriptorSystem) -> str:
     return "plant without its algebraic states" if plant.nx < exact.states else "plant"
 
 
-def rational_matrices(plant: DescriptorSystem) -> dict[str, Rational]:
+def rational_matrices(plant: DescriptorSystem) -> Mapping[str, Rational]:
     """Return the decisive matrices of a plant in its own coordinates, as written, or as they were rounded."""
+    return _kept_matrices(plant) if plant.nx <= MOST_KEPT_STATES else _rational_matrices(plant)
+
+
+@remembered
+def _kept_matrices(plant: DescriptorSystem) -> Mapping[str, Rational]:
+    matrices = _rational_matrices(plant)
+    for matrix in matrices.values():
+        matrix.setflags(write=False)
+    return MappingProxyType(matrices)
+
+
+def _rational_matrices(plant: DescriptorSystem) -> dict[str, Rational]:
     exact = plant.exact
     if exact is not None and exact.sample_time is None and exact.own:
         return {name: as_array(exact.matrices[name], getattr(plant, name).shape) for name in DECISIVE}
