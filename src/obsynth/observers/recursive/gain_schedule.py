@@ -88,7 +88,7 @@ def gain_steps(
         learn, retain = np.zeros((nq, rows)), np.eye(nq)
         if adaptation is not None and nq:
             innovation_map, regressor, noise = parity, G, None
-            if recursion.literal and len(H) > ne:
+            if recursion.literal and right is not None and len(H) > ne:
                 innovation_map, regressor, noise = posterior_residual(
                     solved, H, S, right, ne, unknown=unknown, columns=rows
                 )

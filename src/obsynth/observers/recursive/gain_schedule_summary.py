@@ -177,8 +177,7 @@ class ErrorProduct:
             return
         self.factor = factor
         self.product = factor.dot(self.product)
-        self._take_size()
-        if self.ended is not None:
+        if not self._goes_on():
             return
         if self.done == self.steps // 2:
             self.middle = self._length()
@@ -189,14 +188,14 @@ class ErrorProduct:
                 late_size = norm_or_bound(self.late)
                 self.late, self.late_logarithm = self.late / late_size, self.late_logarithm + float(np.log(late_size))
 
-    def _take_size(self) -> None:
-        """Take the product's norm for the growth, and give it another unit where it would underflow."""
+    def _goes_on(self) -> bool:
+        """Take the norm for the growth, give the product another unit where it would underflow; False at an end."""
         if len(self.product) <= MANY_STATES:
             flat = self.product.ravel()
             # The Frobenius norm is at most so many times the norm, and not below it.
             above = math.sqrt(flat.dot(flat))
             if len(flat) * GONE < above < NEAR_GROWTH * self.growth:
-                return
+                return True
         size = norm_or_bound(self.product)
         self.growth = max(self.growth, size * float(np.exp(min(self.logarithm, 0.0))))
         if not size < 1.0 / GONE:
@@ -205,6 +204,7 @@ class ErrorProduct:
             self.ended = 0.0, "from the start"
         elif size < GONE:
             self.product, self.logarithm = self.product / size, self.logarithm + float(np.log(size))
+        return self.ended is None
 
     def _length(self) -> float:
         return self.logarithm + float(np.log(np.linalg.norm(self.product, 2)))
