@@ -193,7 +193,8 @@ class ErrorProduct:
         if len(self.product) <= MANY_STATES:
             flat = self.product.ravel()
             # The Frobenius norm is at most so many times the norm, and not below it.
-            above = math.sqrt(flat.dot(flat))
+            with np.errstate(over="ignore"):
+                above = math.sqrt(flat.dot(flat))
             if len(flat) * GONE < above < NEAR_GROWTH * self.growth:
                 return True
         size = norm_or_bound(self.product)
